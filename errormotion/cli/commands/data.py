@@ -155,8 +155,8 @@ def _show_outcomes(
         for outcome in failed:
             name = "" if outcome.reason.startswith(str(outcome.raw)) else f"{outcome.raw}: "
             show(f"  failed: {name}{outcome.reason}")
-        for raw, each in found.items():
-            for line in each.lines()[:1]:
+        for raw, conformity in found.items():
+            for line in conformity.lines()[:1]:
                 show(f"  {raw}: {line}")
         for line in remarks(decisions):
             show(line)
