@@ -1,5 +1,7 @@
 """A test that was interrupted between any two deliveries of its method has the raw data of an undisturbed one."""
 
+import contextlib
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,6 @@ import pytest
 from errormotion import plugins
 from errormotion.campaign import runner
 from errormotion.campaign.files import load_campaign
-from errormotion.campaign.folder import list_runs
 from errormotion.instruments.simulators import reset
 
 
@@ -32,24 +33,19 @@ def test_continued_run_has_the_raw_data_of_an_undisturbed_one(
 
     def interrupted(self: Any, *arguments: Any, **keywords: Any) -> Iterator[Any]:
         chunks = acquire(self, *arguments, **keywords)
-        for _ in range(2):
-            chunk = next(chunks, None)
-            if chunk is None:
-                return
-            yield chunk
+        if keywords["done"] is not None:
+            yield from chunks
+            return
+        yield from itertools.islice(chunks, 2)
         chunks.close()
         raise KeyboardInterrupt
 
-    parts = 0
-    while not list_runs(tmp_path / "runs") or not list_runs(tmp_path / "runs")[-1].finished:
-        with monkeypatch.context() as patch:
-            if parts < 2:
-                patch.setattr(cls, "acquire", interrupted)
-            try:
-                again = parts and list_runs(tmp_path / "runs")
-                runner.resume(runs=tmp_path / "runs") if again else runner.run(plan, runs=tmp_path / "runs")
-            except KeyboardInterrupt:
-                reset()
-        parts += 1
-    assert parts > 1
+    monkeypatch.setattr(cls, "acquire", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(plan, runs=tmp_path / "runs")
+    for _ in plan.tests:
+        reset()
+        with contextlib.suppress(KeyboardInterrupt):
+            runner.resume(runs=tmp_path / "runs")
+            break
     assert trials.differences(tmp_path / "runs", tmp_path / "undisturbed") == []

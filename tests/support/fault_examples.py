@@ -49,7 +49,7 @@ SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
         ],
     ),
 }
-"""By method, and by procedure where it has several: the example, its campaign, and what is replaced in it (regular expression, text)."""
+"""By method and procedure: the example, its campaign, and what is replaced in it (regular expression, text)."""
 BENCH = [(r"points=800&pitch=25e-6&artefacts=-0.6,-0.2,0.2,0.6", "points=400&pitch=50e-6&artefacts=-0.6,0.6")]
 """The same of all benches: half of the profile points, and of the artefacts."""
 

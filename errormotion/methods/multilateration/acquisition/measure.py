@@ -77,7 +77,7 @@ def measure_stations(
     if done is not None:
         stand.air_reported = _AIR[0] in done
         last = float(np.nanmax(done["reading_time"].values, initial=-np.inf))
-        repeats = hasattr(stand.control, "elapse") and stand.now() < last
+        repeats = hasattr(stand.control, "set_station") and stand.now() < last
     for number in stand.sequence:
         for _ in range(1 + stand.measuring.repeats):
             if held:
