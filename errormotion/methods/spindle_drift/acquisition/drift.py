@@ -9,6 +9,7 @@ import json
 import logging
 import math
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
@@ -189,8 +190,14 @@ class _Pending:
         return self.samples >= CHUNK_SAMPLES or time.monotonic() - self._since >= CHUNK_DURATION
 
     def go_on(self, done: xr.Dataset) -> None:
-        """Continue a record without a gap, with its last temperatures until the next reading is due."""
+        """Continue the record of a virtual machine, with its last temperatures until the next reading is due.
+
+        The noise of a simulated thermometer follows from the number of its readings: those so far are repeated.
+        """
         if "temperature" in done:
+            for _ in range(math.ceil(done.sizes["time"] / self.rate / POLL_INTERVAL)):
+                with suppress(InstrumentError):
+                    self.thermometer.read()
             self._temperature = done["temperature"].isel(time=-1).values.astype(np.float32)
             self._overdue = False
 
