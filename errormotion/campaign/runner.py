@@ -460,7 +460,7 @@ def _mark(folder: RunFolder, status: str, reason: str) -> None:
     """Write the status of a run; if this fails it remains 'running', which can be resumed as well."""
     try:
         folder.save(status=status, reason=reason)
-    except OSError:
+    except (OSError, RunError):
         log.exception("run.json cannot be written")
 
 
