@@ -32,7 +32,7 @@ WITHOUT_WIRE = {
     "tracker_table": "files",
 }
 """Instruments that are not tried, and why."""
-AHEAD = ("capancdt", "confocaldt", "leica_emscon", "optoncdt", "keyence_ljx")
+AHEAD = ("capancdt", "confocaldt", "leica_emscon", "optoncdt", "keyence_ljx", "five_sensor_frame")
 """Their devices measure ahead of what is read, so that readings after a stream are of another instant each time: they
 are compared within twice the range of the true ones. So are samples, where the stream started at another instant."""
 CORRUPT, EXCHANGE = "corrupt", "exchange"
