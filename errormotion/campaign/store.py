@@ -23,7 +23,7 @@ import zarr
 from xarray.conventions import encode_cf_variable
 from zarr.codecs import BloscCodec
 
-from errormotion.campaign.folder import replace_text
+from errormotion.campaign.folder import Presence, replace_text
 from errormotion.errors import RunError
 
 BLOCK_BYTES = 24 * 2**20
@@ -80,6 +80,7 @@ class RawStore:
         for column in self._arrays.values():
             column.load(self.count)
         self._unsynced: set[Path] = set()
+        self._presence = Presence(path)
 
     @classmethod
     def create(cls, path: Path, first: xr.Dataset, dim: str, expected: float = np.inf) -> Self:
@@ -139,7 +140,7 @@ class RawStore:
         Raises
         ------
         RunError
-            The dataset does not continue the store, or has other variables.
+            The dataset does not continue the store, has other variables, or the folder was moved or deleted.
         OSError
             The data cannot be written.
         """
@@ -167,7 +168,19 @@ class RawStore:
         self._add_counts(chunk.attrs)
 
     def commit(self) -> None:
-        """Write every sample to disk, then make all visible to readers."""
+        """Write every sample to disk, then make all visible to readers.
+
+        Raises
+        ------
+        FolderGoneError
+            The folder was moved or deleted; nothing is written where it was.
+        OSError
+            The data cannot be written.
+        """
+        with self._presence.held():
+            self._commit()
+
+    def _commit(self) -> None:
         if self.count % self.block:
             self._write_block()
         for path in self._unsynced:
@@ -189,6 +202,7 @@ class RawStore:
 
     def _write_block(self) -> None:
         """Write the current block of every array."""
+        self._presence.check()
         start = (self.count - 1) // self.block * self.block
         for column in self._arrays.values():
             self._unsynced.add(column.write(start, self.count))

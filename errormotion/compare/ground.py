@@ -15,7 +15,7 @@ from errormotion.compare import chain
 from errormotion.compare.placed import Placed
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
-from errormotion.datasets.interpolation import bracket
+from errormotion.datasets.results.interpolation import bracket
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
 from errormotion.kinematics.iso import DOF
@@ -175,6 +175,13 @@ def _check(name: str, ds: xr.Dataset) -> None:
     if ds.em.names != DOF:
         raise DatasetError(
             f"'{name}': its errors are known along one direction only (deviation), which cannot be compared"
+        )
+    variance = np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1)
+    known = np.isfinite(variance)
+    if known.any() and not (variance[known] > 0).any():
+        raise DatasetError(
+            f"'{name}': its covariance is 0 everywhere; expected the uncertainty of its errors. State a small one for "
+            "values that are exact, such as a truth"
         )
 
 
