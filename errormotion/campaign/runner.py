@@ -430,21 +430,15 @@ def _failures(folder: RunFolder) -> Iterator[None]:
         folder.step("stop", "interrupted")
         _mark(folder, "interrupted", "stopped by the operator")
         raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_continuation(folder)}") from error
-    except FolderGoneError as error:  # nothing is written where it was: this would look like a run
-        log.exception("failed")
-        first = "First remove what a write under way has left there. " if folder.path.exists() else ""
-        raise FolderGoneError(
-            f"Test '{folder.data['test']}' failed: {error}\n{_kept(folder)} in it. Move it back to {folder.path}. "
-            f"{first}{_continuation(folder)}"
-        ) from error
     except Exception as error:
         reason = cause_of(error)
         log.exception("failed")
-        if not folder.present:
-            raise RunError(
+        if isinstance(error, FolderGoneError) or not folder.present:
+            # Nothing is written where it was: this would look like a run.
+            raise FolderGoneError(
                 f"Test '{folder.data['test']}' ended: its folder {folder.path} is gone. It was moved or deleted "
-                "during the run. If it was moved, continue where it is now, with 'errormotion run --resume --runs' and "
-                "the folder that contains it."
+                f"during the run. {_kept(folder)} in it. If it was moved, continue where it is now, with 'errormotion "
+                "run --resume --runs' and the folder that contains it."
             ) from error
         marked = f"disk full: {reason}" if isinstance(error, DiskFullError) else reason
         folder.step("stop", "failed", reason=marked)
