@@ -35,7 +35,7 @@ from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
-from errormotion.errors import RunError
+from errormotion.errors import ErrormotionError, RunError
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
 
@@ -161,15 +161,23 @@ def resume(
         if "campaign" not in folder.data:  # a log
             continue
         groups.setdefault(str(folder.data["id"]), []).append(folder)
-    changed = ""
+    changed, skipped = "", []
     for run_id, folders in reversed(groups.items()):
-        if all(folder.finished for folder in folders) and len(folders) == len(folders[0].data["campaign"]["tests"]):
+        try:
+            stated = folders[0].data["campaign"]
+            if all(folder.finished for folder in folders) and len(folders) == len(stated["tests"]):
+                continue
+            if campaign and campaign.sha256 != stated["sha256"]:
+                if campaign.name == stated["name"]:
+                    changed = changed or folders[-1].path.name
+                continue
+            plan = _stored_plan(folders[0])
+        except (ErrormotionError, KeyError, TypeError, AttributeError) as error:
+            if campaign and isinstance(error, ErrormotionError):  # it is the one that was asked for
+                raise
+            skipped.append(f"{folders[0].path / 'run.json'}: is no complete record of a run ({cause_of(error)})")
+            log.warning("skipped: %s", skipped[-1])
             continue
-        if campaign and campaign.sha256 != folders[0].data["campaign"]["sha256"]:
-            if campaign.name == folders[0].data["campaign"]["name"]:
-                changed = changed or folders[-1].path.name
-            continue
-        plan = _stored_plan(folders[0])
         session = _Session(plan, runs, run_id, progress, ask, report)
         return session.work({str(folder.data["test"]): folder for folder in folders})
     if changed and campaign:
@@ -177,7 +185,8 @@ def resume(
             f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Continue with the "
             "stored files: 'errormotion run --resume' without the campaign. Or start again: without --resume."
         )
-    raise RunError(f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished.")
+    message = f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished."
+    raise RunError("\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]))
 
 
 class _Session:
