@@ -19,6 +19,7 @@ from errormotion import plugins
 from errormotion.campaign.limits import NO_MOTIONS, Limits, extent, steps_of, violations
 from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
 from errormotion.campaign.timeline import Timeline, follower
+from errormotion.compensation.online.settings import Limits as OffsetLimits
 from errormotion.datasets import certificates
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.files.folders import looking_beside
@@ -54,6 +55,15 @@ class InstrumentTable(BaseModel):
     address: str = ""
 
 
+class CompensatorTable(BaseModel):
+    """``[compensator]``: what writes offsets into the machine, its address, its settings, and the limits."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    driver: str = Field(description="the id of a compensator plugin; 'errormotion plugins list' shows them")
+    address: str = ""
+    limits: OffsetLimits = OffsetLimits()
+
+
 class BenchTable(BaseModel):
     """A bench file."""
 
@@ -62,6 +72,7 @@ class BenchTable(BaseModel):
     name: str
     machine: str = Field(description="the name of the machine tool, or the table [machine]")
     instruments: dict[str, InstrumentTable] = Field(default_factory=dict)
+    compensator: CompensatorTable | None = None
     limits: Limits = Limits()
     certificates: Certificates = {}
 
@@ -119,6 +130,16 @@ class BenchInstrument:
 
 
 @dataclass(frozen=True)
+class BenchCompensator:
+    """The compensator of a bench: its class, its checked settings and the limits of the offsets."""
+
+    driver: Any
+    address: str
+    settings: Any
+    limits: OffsetLimits
+
+
+@dataclass(frozen=True)
 class BenchPlan:
     """A checked bench file; nothing is opened yet.
 
@@ -134,6 +155,7 @@ class BenchPlan:
     limits: Limits = field(default_factory=Limits)
     description: MachineDescription | None = None
     certificates: Mapping[str, str] = field(default_factory=dict)
+    compensator: BenchCompensator | None = None
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -267,11 +289,25 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
         if settings is not None:
             driver = plugins.get("instruments", entry["driver"])
             instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
+    compensator, found = _compensator(data.get("compensator"), table)
+    mistakes += found
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
+    certified = table.certificates
     return BenchPlan(
-        table.name, table.machine, tuple(instruments), source, text, limits, description, table.certificates
+        table.name, table.machine, tuple(instruments), source, text, limits, description, certified, compensator
     )
+
+
+def _compensator(entry: Any, table: BenchTable | None) -> tuple[BenchCompensator | None, list[str]]:
+    if not isinstance(entry, dict) or not isinstance(entry.get("driver"), str):
+        return None, []
+    own = {key: value for key, value in entry.items() if key not in CompensatorTable.model_fields}
+    settings, mistakes = _settings("compensators", entry["driver"], own, ("compensator",))
+    if mistakes or table is None or table.compensator is None:
+        return None, mistakes
+    driver = plugins.get("compensators", entry["driver"])
+    return BenchCompensator(driver, entry.get("address", ""), settings, table.compensator.limits), []
 
 
 def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> CampaignPlan:
@@ -453,7 +489,7 @@ def _settings(
     try:
         cls = plugins.get(group, plugin_id)
     except PluginError as error:
-        key = "driver" if group == "instruments" else "method"
+        key = "method" if group == "methods" else "driver"
         return None, [f"{tomlfile.dotted((*place, key))}: {error}"]
-    prefix = place if group == "instruments" else (*place, "settings")
+    prefix = (*place, "settings") if group == "methods" else place
     return tomlfile.check(data, cls.Settings, prefix=prefix)

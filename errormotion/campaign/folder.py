@@ -25,6 +25,59 @@ RESERVE_BYTES = 2**18
 log = logging.getLogger(__name__)
 
 
+class FolderGoneError(RunError):
+    """A folder was moved or deleted while data were written to it."""
+
+
+class Presence:
+    """A folder that must remain where it is, and the same, while data are written to it.
+
+    Parameters
+    ----------
+    path : Path
+        The folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._identity = self._found()
+
+    def _found(self) -> tuple[int, int] | None:
+        try:
+            state = self.path.stat()
+        except OSError:
+            return None
+        return state.st_dev, state.st_ino
+
+    def check(self) -> None:
+        """Check the folder.
+
+        Raises
+        ------
+        FolderGoneError
+            It is not there, or another folder is.
+        """
+        if self._identity is None or self._found() != self._identity:
+            raise FolderGoneError(
+                f"The folder {self.path} is gone: it was moved or deleted while data were written to it."
+            )
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Check the folder before and after something is written to it.
+
+        Raises
+        ------
+        FolderGoneError
+            As `check`.
+        """
+        self.check()
+        try:
+            yield
+        finally:
+            self.check()
+
+
 class RunFolder:
     """One run on disk.
 
@@ -78,7 +131,7 @@ class RunFolder:
             data = json.loads(file.read_text(encoding="utf-8"))
         except OSError as error:
             raise RunError(f"{path}: expected a run folder with a run.json; {error.strerror}") from error
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise RunError(
                 f"{file}: is not valid JSON ({error}); restore it from a copy, "
                 "or identify raw.zarr with 'errormotion identify'"
@@ -96,6 +149,11 @@ class RunFolder:
     def step(self, name: str, outcome: str, **details: Any) -> None:
         """Append an entry to the steps of this run."""
         self.data.setdefault("steps", []).append({"step": name, "outcome": outcome, "time": now(), **details})
+
+    @property
+    def present(self) -> bool:
+        """Whether the folder is still where it was created or opened."""
+        return (self.path / "run.json").exists()
 
     @property
     def raw(self) -> Path:

@@ -24,16 +24,16 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
-from errormotion.campaign.folder import RunFolder, list_runs, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, list_runs, now
 from errormotion.campaign.journal import cause_of, journal
-from errormotion.campaign.limits import NO_MOTIONS
+from errormotion.campaign.limits import NO_MOTIONS, announcement, steps_of
 from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
 from errormotion.campaign.timeline import follower
 from errormotion.datasets import provenance
 from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
-from errormotion.datasets.merit import figures_of, stored
+from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
 from errormotion.errors import RunError
 from errormotion.tolerances.conformity import judge
@@ -47,6 +47,9 @@ log = logging.getLogger(__name__)
 
 class Progress(Protocol):
     """Receives the progress of a campaign."""
+
+    def announce(self, text: str) -> None:
+        """State what a test will do with the machine; before the bench is opened."""
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
         """Start a test, or skip a finished one."""
@@ -67,6 +70,9 @@ class Progress(Protocol):
 
 class Quiet:
     """Ignores the progress."""
+
+    def announce(self, text: str) -> None:
+        """Do nothing."""
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
         """Do nothing."""
@@ -193,6 +199,10 @@ class _Session:
 
     def work(self, folders: dict[str, RunFolder]) -> list[RunFolder]:
         """Execute the unfinished tests."""
+        for test in self.campaign.tests:
+            folder = folders.get(test.name)
+            if folder is None or not (folder.finished or folder.data["acquired"]):
+                self.progress.announce(self._announcement(test))
         with ExitStack() as opened:
             for number, test in enumerate(self.campaign.tests):
                 folder = folders.get(test.name)
@@ -208,6 +218,11 @@ class _Session:
                 with folder.locked(), journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
                     self._test(folder, test, folders)
         return [folders[test.name] for test in self.campaign.tests]
+
+    def _announcement(self, test: TestPlan) -> str:
+        bench = self.campaign.bench
+        steps = steps_of(test.method, test.settings, bench.chosen(test.instruments).settings_by_kind)
+        return announcement(test.name, steps, bench.limits)
 
     def _new_folder(self, test: TestPlan) -> RunFolder:
         plan = self.campaign
@@ -415,9 +430,22 @@ def _failures(folder: RunFolder) -> Iterator[None]:
         folder.step("stop", "interrupted")
         _mark(folder, "interrupted", "stopped by the operator")
         raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_continuation(folder)}") from error
+    except FolderGoneError as error:  # nothing is written where it was: this would look like a run
+        log.exception("failed")
+        first = "First remove what a write under way has left there. " if folder.path.exists() else ""
+        raise FolderGoneError(
+            f"Test '{folder.data['test']}' failed: {error}\n{_kept(folder)} in it. Move it back to {folder.path}. "
+            f"{first}{_continuation(folder)}"
+        ) from error
     except Exception as error:
         reason = cause_of(error)
         log.exception("failed")
+        if not folder.present:
+            raise RunError(
+                f"Test '{folder.data['test']}' ended: its folder {folder.path} is gone. It was moved or deleted "
+                "during the run. If it was moved, continue where it is now, with 'errormotion run --resume --runs' and "
+                "the folder that contains it."
+            ) from error
         marked = f"disk full: {reason}" if isinstance(error, DiskFullError) else reason
         folder.step("stop", "failed", reason=marked)
         _mark(folder, "failed", marked)

@@ -15,7 +15,7 @@ from errormotion.compare import chain
 from errormotion.compare.placed import Placed
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
-from errormotion.datasets.interpolation import bracket
+from errormotion.datasets.results.interpolation import bracket
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
 from errormotion.kinematics.iso import DOF

@@ -10,8 +10,8 @@ import xarray as xr
 
 from errormotion.arrays import Array, filled, products
 from errormotion.compare.stack import Estimate
-from errormotion.datasets.interpolation import interpolated
-from errormotion.datasets.reduction import changes, influence_of
+from errormotion.datasets.results.interpolation import interpolated
+from errormotion.datasets.results.reduction import changes, influence_of
 from errormotion.kinematics.iso import DOF
 
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import xarray as xr
 
 from errormotion import plugins
-from errormotion.datasets.error_checks import error_violations
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.raw import raw_violations, variant_of
+from errormotion.datasets.results.checks import error_violations
 from errormotion.datasets.schemas import SCHEMA, RawSchema, known_schemas
 from errormotion.errors import DatasetError
 

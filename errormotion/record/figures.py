@@ -168,7 +168,7 @@ def _of_merit(path: Path, entry: Entry, stated: FigureOfMerit) -> Reading:
 
 def _influence(errors: xr.Dataset, name: str) -> Mapping[str, float] | None:
     """Return the effects of the sources on a figure as its method states them, by name."""
-    from errormotion.datasets.merit import figures_of
+    from errormotion.datasets.results.merit import figures_of
 
     return next((each.influence for each in figures_of(errors) if each.name == name), None)
 
@@ -180,7 +180,7 @@ def _change(errors: xr.Dataset, row: int, name: str) -> float:
 
 
 def _figure(errors: xr.Dataset, name: str) -> float:
-    from errormotion.datasets.merit import figures_of
+    from errormotion.datasets.results.merit import figures_of
 
     return next((each.value for each in figures_of(errors) if each.name == name), np.nan)
 

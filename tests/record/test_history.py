@@ -17,7 +17,7 @@ from errormotion import datasets
 from errormotion.cli.app import app
 from errormotion.datasets import provenance
 from errormotion.datasets.files import events
-from errormotion.datasets.merit import figures_of, stored
+from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 from errormotion.record.figures import follow
@@ -144,7 +144,7 @@ def test_the_influence_that_a_method_states_for_its_figure_counts(lab: Path, mon
     def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
         return [replace(figure, influence={"bar": BAR / 2}) for figure in figures_of(errors)]
 
-    monkeypatch.setattr("errormotion.datasets.merit.figures_of", figures)
+    monkeypatch.setattr("errormotion.datasets.results.merit.figures_of", figures)
     series = follow(list_runs([lab]).runs[:3], "EZ after*").series
     assert series.identities == ["certificate 17"]
     assert series.influence == pytest.approx(BAR / 2)

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +24,11 @@ from errormotion import datasets
 from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.store import committed_length
 
-POLL_INTERVAL = 0.005
+if TYPE_CHECKING:
+    pass
+
+Process = "subprocess.Popen[str] | Forked"
+POLL_INTERVAL = 0.02
 """Between two looks at the state of a run, s."""
 LONGEST = 240.0
 """Time limit of one process, s."""
@@ -73,7 +77,7 @@ def start(arguments: list[Any], journal: Path, file_limit: int = 0) -> subproces
     )
 
 
-def finish(process: subprocess.Popen[str]) -> Ended:
+def finish(process: Process) -> Ended:
     """Wait for the end of a process."""
     try:
         _, message = process.communicate(timeout=LONGEST)
@@ -87,7 +91,7 @@ def finish(process: subprocess.Popen[str]) -> Ended:
     return Ended(process.returncode, message, faults=faults)
 
 
-def kill_when(process: subprocess.Popen[str], ready: Callable[[], bool], delay: float) -> float:
+def kill_when(process: Process, ready: Callable[[], bool], delay: float) -> float:
     """Send SIGKILL a delay after a state is reached; return the instant on the monotonic clock, NaN if it had ended."""
     until = time.monotonic() + LONGEST
     while process.poll() is None and time.monotonic() < until and not ready():
@@ -125,24 +129,37 @@ def stage_of(runs: Path, test: str) -> str:
     return ""
 
 
+def _delivered(folder: RunFolder, journal: Path) -> list[tuple[str, float, int]]:
+    """Return dimension, time on the monotonic clock (s) and samples of each dataset delivered for a run folder."""
+    found = []
+    for line in journal.read_text().splitlines() if journal.exists() else []:
+        path, dim, at, count = line.rsplit(" ", 3)
+        if Path(path).parent == folder.path:
+            found.append((dim, float(at), int(count)))
+    return found
+
+
+def kept(folder: RunFolder, journal: Path) -> int:
+    """Return the number of samples of a run on disk."""
+    own = _delivered(folder, journal)
+    return committed_length(folder.raw, own[0][0]) if own and (folder.raw / "zarr.json").exists() else 0
+
+
 def examined(runs: Path, journal: Path, instant: float) -> Ended:
     """Return what a kill at an instant left in the run folders."""
     ended = Ended(-signal.SIGKILL, faults=half_files(runs))
-    delivered = [line.split() for line in journal.read_text().splitlines()] if journal.exists() else []
     for folder in list_runs(runs):
         if folder.finished:
             continue
         ended.stage = stage_of(runs, folder.data["test"])
-        own = [(float(at), int(count)) for name, dim, at, count in delivered if Path(name).parent == folder.path]
+        own = _delivered(folder, journal)
         if not own:
             continue
-        dim = next(dim for name, dim, *_ in delivered if Path(name).parent == folder.path)
-        kept = committed_length(folder.raw, dim) if (folder.raw / "zarr.json").exists() else 0
-        total = np.cumsum([count for _, count in own])
-        late = total > kept
+        there, total = kept(folder, journal), np.cumsum([count for _, _, count in own])
+        late = total > there
         if late.any():
-            ended.samples = int(total[-1] - kept)
-            ended.lost = instant - own[int(np.argmax(late))][0]
+            ended.samples = int(total[-1] - there)
+            ended.lost = instant - own[int(np.argmax(late))][1]
     return ended
 
 
@@ -186,7 +203,7 @@ def differences(runs: Path, undisturbed: Path) -> list[str]:
     return texts
 
 
-def _child(journal: str, limit: int, arguments: list[str]) -> None:
+def command(journal: str, limit: int, arguments: list[str]) -> None:
     """Run the command line; note what is delivered to the recorder, before it is."""
     from errormotion.campaign.recorder import Recorder
     from errormotion.cli import main
@@ -217,4 +234,4 @@ def summary(runs: Path) -> dict[str, list[tuple[str, float]]]:
 
 
 if __name__ == "__main__":
-    _child(sys.argv[1], int(sys.argv[2]), sys.argv[3:])
+    command(sys.argv[1], int(sys.argv[2]), sys.argv[3:])

@@ -18,7 +18,7 @@ from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.cli.tolerances import end_with, lines_of, remarks
-from errormotion.datasets.merit import figures_of
+from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError
 from errormotion.tolerances.conformity import judge
@@ -155,8 +155,8 @@ def _show_outcomes(
         for outcome in failed:
             name = "" if outcome.reason.startswith(str(outcome.raw)) else f"{outcome.raw}: "
             show(f"  failed: {name}{outcome.reason}")
-        for raw, each in found.items():
-            for line in each.lines()[:1]:
+        for raw, conformity in found.items():
+            for line in conformity.lines()[:1]:
                 show(f"  {raw}: {line}")
         for line in remarks(decisions):
             show(line)

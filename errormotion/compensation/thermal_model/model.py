@@ -232,6 +232,7 @@ class ThermalModel:
             start=start_of(data),
             source_ids=self._identities(names, kinds, own_hash),
             reference_interval=(float(inputs.time[0]), float(inputs.time[0])),
+            lever_axes=str(ds.attrs.get("lever_axes", "")),
         )
         notes = [f"{int(unknown.sum())} of {n} times have no prediction: an input is unknown"] if unknown.any() else []
         if outside.any():

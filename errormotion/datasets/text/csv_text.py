@@ -9,6 +9,9 @@ from pathlib import Path
 
 from errormotion.errors import DatasetError
 
+NUMBER = re.compile(r"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?")
+"""A decimal number; possessive, so that a long text that is none takes time in proportion to its length."""
+
 _KEY = re.compile(r"#\s*([^\W\d]\w*)\s*=\s*(.*)")
 
 

@@ -81,7 +81,7 @@ def acquire(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterat
 
 def _driven(machine: Warming, measure: Measure, record: Record) -> Iterator[xr.Dataset]:
     """Yield cycles that the controller executes, with the warm-up between them."""
-    settings, number = record.settings, record.first
+    settings, number = record.settings, 0 if machine.repeats else record.first
     try:
         while (number := _due(settings, number, machine.now)) < cycle.cycles(settings):
             machine.warm_until(number * settings.interval)
@@ -96,13 +96,15 @@ def _driven(machine: Warming, measure: Measure, record: Record) -> Iterator[xr.D
                     contacts.append(contact)
             except BaseException:  # including an interruption by the operator
                 machine.stop()
-                if number and _any_good(contacts):
+                if number and number >= record.first and _any_good(contacts):
                     yield record.dataset(contacts, start, start, machine.origin, history)
                 raise
             if number == 0:
                 record.refuse_unknown_balls(contacts)
                 machine.warm_from = machine.now
-            yield record.dataset(contacts, start, machine.now, machine.origin, history)
+            found = record.dataset(contacts, start, machine.now, machine.origin, history)
+            if number >= record.first:
+                yield found
             number += 1
         machine.turn(0.0)
     except GeneratorExit:  # the acquisition was ended; the bench may be closed already

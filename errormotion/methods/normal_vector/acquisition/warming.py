@@ -36,7 +36,7 @@ class Warming:
         With ``state``, ``move_to``, ``spindle``, ``stop`` and ``elapse``.
     settings : Settings
     done : Dataset, optional
-        Cycles of an interrupted run. A virtual machine that was restarted is first warmed up again.
+        Cycles of an interrupted run.
 
     Attributes
     ----------
@@ -44,6 +44,9 @@ class Warming:
         Clock of the machine at the start of the cold cycle, s.
     warm_from : float or None
         Start of the warm-up, s since ``origin``: the end of the cold cycle.
+    repeats : bool
+        Whether the recorded cycles have to be made again, since the virtual machine was restarted: it is then as warm,
+        and its axes and clock are where they were. The data that follow are those of a run without interruption.
 
     Raises
     ------
@@ -54,6 +57,7 @@ class Warming:
     def __init__(self, control: Any, settings: Settings, done: xr.Dataset | None) -> None:
         self.control, self.settings = control, settings
         self.warm_from: float | None = None
+        self.repeats = False
         self._turned = self._path = 0.0  # 1/min s, and m, since the previous cycle
         state = self._ready_state()
         self._speed = math.nan  # unknown: the first speed is always commanded
@@ -159,24 +163,19 @@ class Warming:
 
     def _resume(self, done: xr.Dataset, clock: float) -> None:
         """Continue the clock of an interrupted run."""
-        starts, ends = done["time"].values.astype(float), _ends(done)
-        cold = float(done.attrs["cold_cycle_seconds"])
+        recorded_origin, cold = float(done.attrs["clock_origin"]), float(done.attrs["cold_cycle_seconds"])
         if not self.control.identify().simulated:
             self.origin = clock - age(done)
-            self.warm_from = cold
         elif (
-            clock - float(done.attrs["clock_origin"]) >= ends[-1] - cycle.SHORTEST_STEP
+            clock - recorded_origin >= _ends(done)[-1] - cycle.SHORTEST_STEP
         ):  # the same virtual machine, still running
-            self.origin = float(done.attrs["clock_origin"])
-            self.warm_from = cold
+            self.origin = recorded_origin
         else:
-            log.info("the virtual machine is warmed up again, to %.0f s", ends[-1])
-            for start, end in zip(starts, ends, strict=True):
-                self.warm_until(start)
-                self.turn(0.0)  # standstill during the probing
-                self.control.elapse(max(end - self.now, 0.0))
-                self.warm_from = cold
-        self._since, self._turned, self._path = float(starts[-1]), 0.0, 0.0
+            log.info("the virtual machine repeats %d cycles", done.sizes["time"])
+            self.repeats = True
+            return
+        self.warm_from = cold
+        self._since = float(done["time"].values[-1])
 
 
 def run(control: Any, text: str) -> None:

@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array, products
-from errormotion.datasets.reduction import TOLERANCE, influence_of, rebuilt
+from errormotion.datasets.results.reduction import TOLERANCE, influence_of, rebuilt
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.errors import DatasetError
 
@@ -122,7 +122,7 @@ def interpolated(
     return values, covariance, influence, q
 
 
-def intensity(t: Array, values: Array, own: Array, *, starting: bool = False) -> Array:
+def intensity(t: Array, values: Array, own: Array, *, starting: bool = False, together: bool = False) -> Array:
     """Return the intensity q of each interval, (n - 1, ..., 6), by the moments of second differences; NaN below three.
 
     Parameters
@@ -133,6 +133,8 @@ def intensity(t: Array, values: Array, own: Array, *, starting: bool = False) ->
         Covariance of what is drawn anew at every value.
     starting : bool
         Whether the errors are taken as constant before the first point.
+    together : bool
+        One intensity for all that lies between the first and the last axis; those have the length 1 then.
     """
     if len(t) < 3:
         return np.full((max(len(t) - 1, 1), *values.shape[1:]), np.nan)
@@ -145,6 +147,9 @@ def intensity(t: Array, values: Array, own: Array, *, starting: bool = False) ->
     unit = np.broadcast_to((h**2 * g**2 / (3 * (h + g))).reshape(shape), bend.shape)
     known = np.isfinite(bend) & np.isfinite(noise)
     excess, scale = np.where(known, bend**2 - noise, 0.0), np.where(known, unit, 0.0)
+    if together:
+        others = tuple(range(1, excess.ndim - 1))
+        excess, scale = excess.sum(axis=others, keepdims=True), scale.sum(axis=others, keepdims=True)
     # Beside the interval from value k to k + 1 are the second differences at k and at k + 1.
     none = np.zeros((1, *excess.shape[1:]))
     beside, unit = (np.concatenate([none, each]) + np.concatenate([each, none]) for each in (excess, scale))
