@@ -131,7 +131,9 @@ class Kinds:
         process = Forked(self._run(method, runs, report=False), journal)
         reached = lambda: trials.stage_of(runs, test) == "acquisition"  # noqa: E731
         ended = trials.examined(runs, journal, trials.kill_when(process, reached, delay))
-        result = Result(f"kill -9, {ended.stage or 'between two stages'}", method, ended.faults, ended.lost, ended.samples)
+        result = Result(
+            f"kill -9, {ended.stage or 'between two stages'}", method, ended.faults, ended.lost, ended.samples
+        )
         if ended.lost > LONGEST_LOSS:
             result.faults.append(f"{ended.samples} samples of the last {ended.lost:.2f} s are lost")
         return self._continued(result, method, runs, journal, processes=2 if number % 3 == 0 else 1)
@@ -279,7 +281,9 @@ class Kinds:
         result.sentence = ended.code != 0
         if ended.code and not _says(ended.message, code):
             result.faults.append(f"ended with {ended.code}, not with '{os.strerror(code)}': {ended.message[-300:]}")
-        result.faults += [text for each in list_runs(runs) if (each.raw / "zarr.json").exists() for text in _rows(each.raw)]
+        result.faults += [
+            text for each in list_runs(runs) if (each.raw / "zarr.json").exists() for text in _rows(each.raw)
+        ]
         return result
 
     def _after_disk(self, result: Result, ended: Ended, code: int, runs: Path, method: str) -> Result:
@@ -368,9 +372,17 @@ class Kinds:
             result.faults += result.different
         gap = begun - killed, time.monotonic() - killed + 2 * LONGEST_LOSS
         for folder in list_runs(runs):
-            resumed = kept.get(folder.data["test"], 0) and len(
-                [each for each in folder.data["steps"] if each["step"] == "acquire" and each["outcome"] == "started"]
-            ) - 1
+            resumed = (
+                kept.get(folder.data["test"], 0)
+                and len(
+                    [
+                        each
+                        for each in folder.data["steps"]
+                        if each["step"] == "acquire" and each["outcome"] == "started"
+                    ]
+                )
+                - 1
+            )
             with datasets.load(folder.raw) as raw:
                 found = joins(raw.attrs)
             result.faults += _wrong_joins(found, resumed, gap, sign * shift, restarted=restarted)
@@ -460,7 +472,9 @@ class Kinds:
         result.sentence = ended.code != 0
         gone = any(text in ended.message for text in ("is gone", "No such file"))
         if ended.code and not gone:
-            result.faults.append(f"ended with {ended.code} and does not say that the folder is gone: {ended.message[-400:]}")
+            result.faults.append(
+                f"ended with {ended.code} and does not say that the folder is gone: {ended.message[-400:]}"
+            )
         if deleted:
             return result
         return self._continued(result, method, elsewhere, journal)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from errormotion.datasets.merit import is_planned
+from errormotion.datasets.results.merit import is_planned
 from errormotion.methods.linear_positioning.identification.standard import FIGURES
 from errormotion.plugins import FigureOfMerit
 

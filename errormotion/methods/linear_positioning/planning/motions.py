@@ -58,7 +58,7 @@ def steps(settings: Settings) -> list[Step]:
         where[k] = place
         if last is None:
             found.append(Step("move", (where[0], where[1], where[2]), float("nan"), float("nan")))
-        else:
+        elif place != last:
             found.append(Step("move", (where[0], where[1], where[2]), feed, abs(place - last) / feed))
         last = place
         if rest > 0:

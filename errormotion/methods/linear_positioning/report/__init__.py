@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from errormotion.datasets.merit import is_planned
+from errormotion.datasets.results.merit import is_planned
 from errormotion.methods.linear_positioning.report import chapter
 from errormotion.report import generic
 from errormotion.report.document import Part, Source
