@@ -219,7 +219,9 @@ def _arcs(
         rest = np.arange(moves.size)
         total = np.cumsum(pieces * points + 1) // _POINTS
         for part in np.split(rest, np.flatnonzero(np.diff(total)) + 1):
-            good, nodes = _pieces(field, moves[part], pieces[part], points[part], start, shifted, tolerance, digits, first)
+            good, nodes = _pieces(
+                field, moves[part], pieces[part], points[part], start, shifted, tolerance, digits, first
+            )
             fits[part] = good
             found.append(nodes)
         first = False

@@ -318,7 +318,6 @@ def _most_decimals(move: Move, decimals: int) -> int:
     return max([decimals, *(_decimals(number) for letter, number, _ in move.block.words if letter in _AXES)])
 
 
-
 def _is_stop(letter: str, number: str) -> bool:
     return letter == "M" and float(number) in _STOPS
 
