@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +63,7 @@ def interpreter() -> str | None:
     return shutil.which("rs274")
 
 
-def commands(source: Iterable[str], offsets: Offsets, *, deleted: bool | None = None) -> Iterator[Command]:
+def commands(source: Iterable[str], offsets: Offsets, *, deleted: bool | None = None) -> Generator[Command]:
     """Yield the canonical commands of a program.
 
     Parameters

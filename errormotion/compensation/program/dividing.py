@@ -1,8 +1,8 @@
 """Where moves are divided, so that straight lines and arcs between corrected points follow the corrected path.
 
 A line between corrected ends follows the corrected path where the correction changes linearly along it; an arc through
-three corrected points follows it where the correction turns the arc into another arc. The deviation from that is examined
-at points that are at most one sampling interval apart.
+three corrected points follows it where the correction turns the arc into another arc. The deviation from that is
+examined at points that are at most one sampling interval apart.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ class Expansion:
             (0.0, 0.0, 0.0),
         )
         self._system = offsets.system
-        self._at: Triple = (0.0, 0.0, 0.0)
+        self._at = self._frame.program((0.0, 0.0, 0.0))  # where the interpreter starts
         self._plane = 0
         self._numbered = 0
         self._begun = False
@@ -193,7 +193,7 @@ class Expansion:
         if unit == "inch" and self._tolerance < 2 * _DIGIT * UNITS["inch"]:
             raise self._refusal(
                 command,
-                "inches: LinuxCNC's interpreter prints positions to 0.0001 inch; expected a tolerance of at least 2.6 um",
+                "inches: LinuxCNC's interpreter prints 0.0001 inch; expected a tolerance of at least 2.6 um",
             )
         ratio = self._frame.scale / UNITS[unit]
         self._frame = replace(self._frame, scale=UNITS[unit])
