@@ -130,7 +130,7 @@ def test_refuses_what_neither_understands(
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_text("\n".join([*HEAD, *lines, "M2"]) + "\n")
     with pytest.raises(ProgramError, match=why):
-        compensate(program, out, zero, ORIGINS, Settings(route="linuxcnc"))
+        compensate(program, out, zero, ORIGINS, Settings(route="interpreter"))
     assert [path.name for path in tmp_path.iterdir()] == ["a.ngc"]
 
 
@@ -159,7 +159,7 @@ def test_the_route_is_chosen_and_told(tmp_path: Path) -> None:
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_bytes("\r\n".join(["%", *HEAD, "#1=50", "G1 X#1 Y30", "M2", "%", ""]).encode())
     found = compensate(program, out, bent, ORIGINS, Settings(check=True), head=["machine (test) ü"])
-    assert found.route == "linuxcnc"
+    assert found.route == "interpreter"
     assert "line 5" in found.why
     assert found.checked == found.summary.written - len([x for x in out.read_text().splitlines() if "X" not in x]) + 1
     text = out.read_bytes()

@@ -1,6 +1,6 @@
 """NC programs: time and memory of a correction beside LinuxCNC's own reading, and random programs against LinuxCNC.
 
-``python benchmarks/nc_programs.py [PROGRAMS [SEED]]``: so many random programs of 60 steps (default 300).
+``python benchmarks/compensate_program.py [PROGRAMS [SEED]]``: so many random programs of 60 steps (default 300).
 """
 
 import math
