@@ -134,6 +134,8 @@ def compensate(
 
 
 def _expanded(program: Path, offsets: Offsets, settings: Settings) -> Generator[str]:
+    if settings.unit != "mm":
+        raise ProgramError("LinuxCNC's interpreter starts in mm: state the unit in the program (G20)")
     source = [text for _, text in lines_of(_lines(program))]
     screen(source)
     with closing(canonical.commands(source, offsets, deleted=settings.deleted)) as commands:

@@ -134,6 +134,12 @@ def test_refuses_what_neither_understands(
     assert [path.name for path in tmp_path.iterdir()] == ["a.ngc"]
 
 
+def test_a_loop_that_prints_nothing_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(canonical, "TIME_LIMIT", 0.5)
+    with pytest.raises(ProgramError, match="did not end within 0.5 s"):
+        expanded([*HEAD, "o1 while [1]", "#1=2", "o1 endwhile", "M2"])
+
+
 @pytest.mark.parametrize(
     "lines",
     [
