@@ -6,6 +6,7 @@ names the line that it comes from. It prints four digits after the point.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -92,7 +93,12 @@ def commands(source: Iterable[str], offsets: Offsets, *, deleted: bool | None = 
             arguments.append("-b")
         with (folder / "errors").open("wb") as errors:
             process = subprocess.Popen(
-                [*arguments, "program.ngc"], cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors
+                [*arguments, "program.ngc"],
+                cwd=folder,
+                env={**os.environ, "HOME": name},  # its tools are in a file there, which running controls share
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=errors,
             )
         expired = threading.Event()
 

@@ -134,9 +134,15 @@ def test_refuses_what_neither_understands(
     assert [path.name for path in tmp_path.iterdir()] == ["a.ngc"]
 
 
+def test_the_tools_of_a_running_control_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))  # LinuxCNC keeps the tools of a running machine in a file there
+    expanded([*HEAD, "T1 M6", "G43", "M2"])
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_loop_that_prints_nothing_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(canonical, "TIME_LIMIT", 0.5)
-    with pytest.raises(ProgramError, match="did not end within 0.5 s"):
+    with pytest.raises(ProgramError, match=r"did not end within 0\.5 s"):
         expanded([*HEAD, "o1 while [1]", "#1=2", "o1 endwhile", "M2"])
 
 
