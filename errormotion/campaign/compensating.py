@@ -38,6 +38,7 @@ from errormotion.errors import BenchError, CompensationError, InstrumentError
 FRAME = "machine"
 """Frame in which a model must state its errors: offsets are along the axes."""
 
+TEST = "compensation"
 AUDIT = "audit.jsonl"
 
 REJOIN = 3
@@ -116,7 +117,7 @@ class Compensation:
         self._check(model, arm)
         self._predictor = Predictor(model, functional_point)
         self._model_hash = provenance.hash_dataset(model.dataset)
-        self._monitor = Monitor(plan, runs, self.limits.period)
+        self._monitor = Monitor(plan, runs, self.limits.period, TEST)
         self._check_inputs()
         self._gap = 0.0 if since is None else self._replay(since)
         self._follower = Follower(self.limits)

@@ -131,7 +131,7 @@ class RunFolder:
             data = json.loads(file.read_text(encoding="utf-8"))
         except OSError as error:
             raise RunError(f"{path}: expected a run folder with a run.json; {error.strerror}") from error
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise RunError(
                 f"{file}: is not valid JSON ({error}); restore it from a copy, "
                 "or identify raw.zarr with 'errormotion identify'"
@@ -149,6 +149,11 @@ class RunFolder:
     def step(self, name: str, outcome: str, **details: Any) -> None:
         """Append an entry to the steps of this run."""
         self.data.setdefault("steps", []).append({"step": name, "outcome": outcome, "time": now(), **details})
+
+    @property
+    def present(self) -> bool:
+        """Whether the folder is still where it was created or opened."""
+        return (self.path / "run.json").exists()
 
     @property
     def raw(self) -> Path:

@@ -419,6 +419,12 @@ def _failures(folder: RunFolder) -> Iterator[None]:
     except Exception as error:
         reason = cause_of(error)
         log.exception("failed")
+        if not folder.present:
+            raise RunError(
+                f"Test '{folder.data['test']}' ended: its folder {folder.path} is gone. It was moved or deleted "
+                "during the run. If it was moved, continue where it is now, with 'errormotion run --resume --runs' and "
+                "the folder that contains it."
+            ) from error
         marked = f"disk full: {reason}" if isinstance(error, DiskFullError) else reason
         folder.step("stop", "failed", reason=marked)
         _mark(folder, "failed", marked)

@@ -657,7 +657,7 @@ def compensate_table(
     errors: Annotated[Path, typer.Argument(help="Errors over position or targets: NetCDF or a run folder.")],
     for_: Annotated[
         str,
-        typer.Option("--for", help="Format: linuxcnc, siemens, heidenhain, fanuc, generic, or that of a plugin."),
+        typer.Option("--for", metavar="CONTROL", help="Format, such as siemens or generic; a wrong one lists all."),
     ],
     axis: Annotated[str, typer.Option(help="Axis along which the points are: X, Y or Z.")],
     component: Annotated[str, typer.Option(help="Axis that is corrected; default: the same.")] = "",

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import logging
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from errormotion import datasets, plugins
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, list_runs
+from errormotion.campaign.journal import journal
 from errormotion.campaign.store import RawStore
 from errormotion.errors import BenchError, RunError
 
@@ -60,6 +62,29 @@ def test_run_folder_can_be_moved(plan: Plan, tmp_path: Path) -> None:
     assert moved[1].errors is not None
     assert moved[1].errors.exists()
     assert (moved[1].path / moved[1].data["inputs"]["zero"]).resolve() == moved[0].errors.resolve()  # type: ignore[union-attr]
+
+
+def test_folder_that_is_moved_during_the_run_is_missed_and_the_run_continued_where_it_is(
+    plan: Plan, tmp_path: Path
+) -> None:
+    runs, elsewhere = tmp_path / "runs", tmp_path / "elsewhere"
+
+    class Mover(runner.Quiet):
+        def advance(self, done: float) -> None:
+            if not elsewhere.exists():
+                runs.rename(elsewhere)
+
+    with pytest.raises(RunError, match=r"its folder .* is gone. It was moved or deleted"):
+        runner.run(plan('name = "a"'), progress=Mover())
+    assert list(runs.rglob("*.json*")) == []  # nothing that looks like a run
+    (folder,) = runner.resume(runs=elsewhere)
+    whole(folder, 1000)
+
+
+def test_log_that_cannot_be_opened_harms_nothing(tmp_path: Path) -> None:
+    with journal(tmp_path / "full" / "log.jsonl"):
+        logging.getLogger("errormotion.test").warning("no space for this")
+    assert not (tmp_path / "full").exists()
 
 
 def test_result_of_an_earlier_test_reaches_the_later_one(plan: Plan) -> None:

@@ -97,6 +97,8 @@ class Monitor:
         Folder of the run folder.
     interval : float
         Interval of the rows of the log, s.
+    test : str
+        Name of the test in the run folder.
 
     Attributes
     ----------
@@ -111,8 +113,8 @@ class Monitor:
         The bench has neither a thermometer nor a controller, or several controllers.
     """
 
-    def __init__(self, plan: BenchPlan, runs: Path, interval: float = 1.0) -> None:
-        self.plan, self.runs, self.interval = plan, runs, float(interval)
+    def __init__(self, plan: BenchPlan, runs: Path, interval: float = 1.0, test: str = TEST) -> None:
+        self.plan, self.runs, self.interval, self.test = plan, runs, float(interval), test
         kinds = ("thermometer", "controller")
         self.sources = [Source(each, self.interval) for each in plan.instruments if each.driver.info.kind in kinds]
         controllers = [source for source in self.sources if _kind(source) == "controller"]
@@ -284,7 +286,7 @@ class Monitor:
             "log": "log.jsonl",
             "steps": [],
         }
-        return RunFolder.create(self.runs, TEST, uuid4().hex[:8], data)
+        return RunFolder.create(self.runs, self.test, uuid4().hex[:8], data)
 
 
 def _kind(source: Source) -> str:
