@@ -1,4 +1,4 @@
-"""Draw docs/figures/compensation_states.png: the states of an online compensation and what leads from one to another."""
+"""Draw docs/figures/compensation_states.png: the states of an online compensation, and what leads to another one."""
 
 from pathlib import Path
 

@@ -25,6 +25,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.journal import cause_of
+from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.compensation.online.audit import AuditLog
 from errormotion.compensation.online.follower import Conditions, Follower, State, Step
@@ -88,6 +89,8 @@ class Compensation:
     since : Dataset, optional
         Log of a monitor or of an earlier compensation, whose first row is the reference state; default: the first
         readings are. Temperatures are taken as linear over the time between the log and now.
+    clock : Clock, optional
+        Its time; default that of the computer.
 
     Attributes
     ----------
@@ -111,13 +114,14 @@ class Compensation:
         arm: str | None = None,
         functional_point: Array | None = None,
         since: xr.Dataset | None = None,
+        clock: Clock | None = None,
     ) -> None:
         self.plan, self.armed = plan, arm is not None
         self.limits = plan.compensator.limits if plan.compensator else Limits()
         self._check(model, arm)
         self._predictor = Predictor(model, functional_point)
         self._model_hash = provenance.hash_dataset(model.dataset)
-        self._monitor = Monitor(plan, runs, self.limits.period, TEST)
+        self._monitor = Monitor(plan, runs, self.limits.period, clock, TEST)
         self._check_inputs()
         self._gap = 0.0 if since is None else self._replay(since)
         self._follower = Follower(self.limits)

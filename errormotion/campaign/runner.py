@@ -280,6 +280,8 @@ class _Session:
             self._acquire(folder, test, inputs)
         if folder.errors is None:
             self._identify(folder, test)
+        if test.monte_carlo is not None:
+            self._evaluate(folder, test)
         self._report(folder)
         folder.save(status="finished")
 
@@ -367,6 +369,25 @@ class _Session:
         folder.step("identify", "done")
         folder.save(errors=path, results=results_of(errors), conformity=conformity_of(folder, errors))
         log.info("identified", extra={"data": {"errors": path}})
+
+    def _evaluate(self, folder: RunFolder, test: TestPlan) -> None:
+        """Evaluate the result by the Monte Carlo method; a failure is only logged, as that of a report."""
+        from errormotion.montecarlo.beside import evaluate_beside, file_beside
+
+        file = folder.errors
+        if file is None or file_beside(file).exists():
+            return
+        trials = None if test.monte_carlo == "auto" else test.monte_carlo
+        try:
+            evaluate_beside(
+                folder.raw, test.method.info.id, test.settings, datasets.load(file), file, trials=trials,
+                progress=self.progress,
+            )  # fmt: skip
+        except Exception as error:
+            log.exception("the Monte Carlo evaluation failed")
+            folder.step("monte_carlo", "failed", reason=cause_of(error))
+        else:
+            folder.step("monte_carlo", "done")
 
     def _report(self, folder: RunFolder) -> None:
         """Write the report; a failure is only logged, since the measurement is valid without it."""

@@ -176,6 +176,13 @@ def _check(name: str, ds: xr.Dataset) -> None:
         raise DatasetError(
             f"'{name}': its errors are known along one direction only (deviation), which cannot be compared"
         )
+    variance = np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1)
+    known = np.isfinite(variance)
+    if known.any() and not (variance[known] > 0).any():
+        raise DatasetError(
+            f"'{name}': its covariance is 0 everywhere; expected the uncertainty of its errors. State a small one for "
+            "values that are exact, such as a truth"
+        )
 
 
 def _check_dimensions(name: str, ds: xr.Dataset) -> None:

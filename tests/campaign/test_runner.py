@@ -17,6 +17,7 @@ from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.journal import journal
 from errormotion.campaign.store import RawStore
 from errormotion.errors import BenchError, RunError
+from errormotion.report import write_run_report
 
 STEP = 1e-6
 Plan = Callable[..., CampaignPlan]
@@ -214,6 +215,37 @@ def test_report_that_fails_harms_no_measurement(plan: Plan) -> None:
     folders = runner.run(plan('name = "a"', 'name = "b"'), report=report)
     assert all(folder.finished for folder in folders)
     assert folders[0].data["steps"][-1]["reason"] == "OSError: no ink"
+
+
+def test_a_test_may_evaluate_its_result_by_trials(plan: Plan) -> None:
+    (folder,) = runner.run(plan('name = "a"\nmonte_carlo = 60'), report=write_run_report)
+    assert folder.errors is not None
+    (file,) = folder.errors.parent.glob("*.monte_carlo.nc")
+    assert sorted(path.name for path in folder.errors.parent.iterdir()) == [file.name, "errors.nc"]
+    assert datasets.load(file).attrs["trials"] == 60
+    assert [step["step"] for step in folder.data["steps"]][-2:] == ["monte_carlo", "report"]
+    assert "Monte Carlo evaluation" in (folder.path / "report.html").read_text(encoding="utf-8")
+
+
+def test_an_evaluation_that_fails_harms_no_measurement(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    campaign = plan('name = "a"\nmonte_carlo = 60')
+    monkeypatch.delattr(plugins.get("methods", "ramp"), "redrawing")
+    (folder,) = runner.run(campaign)
+    assert folder.finished
+    assert folder.data["steps"][-1]["outcome"] == "failed"
+    assert "redrawing" in folder.data["steps"][-1]["reason"]
+
+
+@pytest.mark.parametrize(
+    ("key", "message"), [("3", "from 40 on; found 3"), ("'often'", "monte_carlo"), ("60", "does not state how")]
+)
+def test_an_evaluation_that_cannot_be_is_refused(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch, key: str, message: str
+) -> None:
+    if key == "60":
+        monkeypatch.delattr(plugins.get("methods", "ramp"), "redrawing")
+    with pytest.raises(BenchError, match=message):
+        plan(f'name = "a"\nmonte_carlo = {key}')
 
 
 def test_method_without_data_is_a_failure(plan: Plan) -> None:
