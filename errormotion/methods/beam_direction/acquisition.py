@@ -94,13 +94,14 @@ class Stand:
     def __init__(self, bench: Bench, settings: Settings) -> None:
         self.bench, self.settings, self.layout = bench, settings, settings.layout
         self.sensor = bench.of_kind("point_lds")
-        self.control: Any = bench.of_kind("controller") if bench.has_kind("controller") else None
-        if not hasattr(self.control, "move_to"):
+        control = bench.of_kind("controller") if bench.has_kind("controller") else None
+        if control is None or not hasattr(control, "move_to"):
             raise MethodError(
                 "The calibration of a beam moves the sensor over the faces of a gauge and needs an instrument of kind "
                 "'controller' that can move to a position (move_to); the bench has none. Measure manually, write the "
                 "readings to a table, and use 'errormotion identify READINGS.csv'."
             )
+        self.control: Any = control
         virtual = hasattr(self.control, "elapse")
         self.origin: float | None = float(self.control.state()["time"]) if virtual else None
         self.low, self.high = (float(x) for x in self.sensor.measuring_range)
