@@ -11,10 +11,10 @@ from errormotion.report.document import Cell, Part, Section, Source, Table, esti
 from errormotion.report.text import SECOND_OF_ARC, UM, fixed
 
 MEASURES = {
-    "range_60min": "range, first 60 min",
-    "range_moving": "range while it moved",
-    "range_total": "range of the whole test",
-    "end_of_moving": "change at the end of the moves",
+    "range_60min": "first 60 min",
+    "range_moving": "moving",
+    "range_total": "whole test",
+    "end_of_moving": "at the end of moving",
 }
 
 
@@ -46,7 +46,7 @@ def _table(errors: xr.Dataset, freedom: str) -> Table:
         ]
         rows.append([quantity, *cells])
     caption = (
-        f"Changes of {freedom} since the cold state in {unit}, at P1 = {fixed(places[0] * 1e3, 1)} mm, P2 = "
+        f"Ranges of {freedom}, and its change at the end of moving, in {unit}, at P1 = {fixed(places[0] * 1e3, 1)} mm, P2 = "
         f"{fixed(places[1] * 1e3, 1)} mm, and of their difference. After ±: expanded uncertainty, k = 2."
     )
     return Table(caption, ["", *MEASURES.values()], rows)
