@@ -49,12 +49,8 @@ SHARES = {
     "moved": 0.06,
 }
 """Trials of each kind for one kill."""
-WITHOUT_SHIM = {"kill_acquisition", "kill_later", "kill_command", "kill_batch", "kill_monitor", "size_limit"} | {
-    "file_system",
-    "two_at_once",
-    "moved",
-}
-"""Kinds that need no C compiler."""
+SHIMMED = ("disk", "disk_command", "disk_monitor", "clock_running", "clock_between", "suspend", "suspend_monitor")
+"""Kinds that need a C compiler."""
 
 
 @dataclass
@@ -89,10 +85,13 @@ class Programme:
     failures: list[str] = field(default_factory=list)
     seconds: float = 0.0
     """Of the processors."""
+    load: float = 0.0
+    """Largest number of processes that wanted a processor, for each processor."""
 
     def one(self, kind: str, number: int) -> None:
         """Make a trial."""
         trial: Callable[[int], Result] = getattr(self.kinds, kind)
+        self.load = max(self.load, os.getloadavg()[0] / (os.cpu_count() or 1))
         try:
             result = trial(number)
         except Exception as error:  # noqa: BLE001 - a trial that breaks is a failure, and the others go on
@@ -111,41 +110,47 @@ class Programme:
         kills = sum(row.trials for (fault, _), row in self.rows.items() if fault.startswith("kill"))
         inside = sum(row.trials for (fault, _), row in self.rows.items() if fault == "kill -9, acquisition")
         lines = [
-            TEXT.format(total=total, kills=kills, inside=inside),
+            TEXT.format(total=total, kills=kills, inside=inside, load=self.load),
             "",
             "| fault | what it meets | trials | survived | worst loss | identical raw data | ended with a sentence |",
             "|---|---|---|---|---|---|---|",
         ]
         for (fault, what), row in sorted(self.rows.items()):
             loss = f"{row.lost:.2f} s, {row.samples} samples" if fault.startswith("kill -9, acq") else "-"
-            loss = f"{row.lost:.2f} s, {row.samples} rows" if what == "errormotion monitor" and "kill" in fault else loss
+            loss = (
+                f"{row.lost:.2f} s, {row.samples} rows" if what == "errormotion monitor" and "kill" in fault else loss
+            )
             same = f"{row.identical} of {row.compared}" if row.compared else "-"
             lines.append(
                 f"| {fault} | {what} | {row.trials} | {row.survived} | {loss} | {same} | {row.sentences or '-'} |"
             )
-        failures = ["Failures:", "", *(f"* {text[:400]}" for text in self.failures)] if self.failures else ["No failure."]
+        failures = (
+            ["Failures:", "", *(f"* {text[:400]}" for text in self.failures)] if self.failures else ["No failure."]
+        )
         lines += ["", *failures]
         without = "" if self.kinds.shimmed else " Without a C compiler: the faults of disks and clocks were left out."
         return "\n".join([*lines, "", f"`make faults`, seed {self.seed}, {self.seconds:.0f} s of processors.{without}"])
 
 
 TEXT = """\
-{total} trials with short campaigns on virtual machines, each in processes of its own; {kills} of them kills, {inside} in
-an acquisition, at random instants. After the fault the run is continued, in every third trial of an acquisition by two
-processes at once, of which one must finish it and the other must be refused; a command is repeated. A trial is survived
-when
+{total} trials with short campaigns on virtual machines, each in processes of its own; {kills} of them kills at random
+instants, {inside} in an acquisition. After the fault the run is continued, in every third trial of an acquisition by
+two processes at once, of which one must finish it and the other must be refused; a command is repeated. A trial is
+survived when
 
-* nothing that was delivered to the recorder more than a second before a kill is lost;
+* nothing that was delivered to the recorder more than a second before a kill is lost (longer only where more processes
+  want a processor than the computer has; here {load:.1f} on each);
 * no result is half a file, no message is an internal error, and a command that fails names the cause;
 * the run is finished by the continuation, and all its raw values are those of an undisturbed run. (Attributes state the
-  clock of the computer, and differ.) All simulated methods repeat their values, whatever interrupts them;
+  clock of the computer, and differ.) Every method repeats its values on a virtual machine; what it cannot repeat is
+  stated in [Run and resume a campaign](how-to/run-and-resume.md#on-a-virtual-machine);
 * the interruptions that the raw data state (`joins`) agree with the clocks that were set: the duration is right where
   the computer was not restarted, and unknown where the clocks contradict each other.
 
 A method delivers what belongs together: samples of a drift, the scans of a beam detection and lines of a crossbeam at
-least every 0.4 s, a face of the gauge (`beam_direction`), a set-up of the tracker (`multilateration`), a cycle of touches
-(`normal_vector`) when it is complete. What was measured of an incomplete one is not part of the loss below; it is
-measured again."""
+least every 0.4 s, a face of the gauge (`beam_direction`), a set-up of the tracker (`multilateration`), a cycle of
+touches (`normal_vector`) when it is complete. What was measured of an incomplete one is not part of the loss below; it
+is measured again."""
 
 
 def write(page: Path, body: str) -> None:
@@ -186,7 +191,7 @@ def main() -> None:
         fault_processes.prepare(library)
         programme = Programme(Kinds(folder, options.seed, shimmed=library is not None), options.seed)
         list(pool.map(programme.kinds.undisturbed, programme.kinds.methods))
-        chosen = [kind for kind in SHARES if re.search(options.only, kind) and (library or kind in WITHOUT_SHIM)]
+        chosen = [kind for kind in SHARES if re.search(options.only, kind) and (library or kind not in SHIMMED)]
         chosen = [kind for kind in chosen if kind != "file_system" or can_mount()]
         work = [(kind, k) for kind in chosen for k in range(max(round(options.kills * SHARES[kind]), 1))]
         random.Random(options.seed).shuffle(work)

@@ -17,12 +17,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-EXTRAS = ("cluster", "opcua")  # open3d is one optional check of the registration, and 400 MB
 TOOLS = ("hypothesis", "packaging", "pytest", "pytest-timeout", "pytest-xdist")
+PEERS = ("canopen", "cesapi", "geocompy", "metrolopy", "minimalmodbus", "mtconnect", "pyvisa", "pyvisa-py")
 CORE = ("datasets", "campaign", "instruments", "kinematics", "plugins", "record", "tolerances", "twin", "montecarlo")
-"""Folders of tests that touch every package: files, instruments, drivers, fits, compiled loops."""
+"""Folders of tests that touch every package: files, instruments, fits, compiled loops."""
 
-_REQUIREMENT = re.compile(r"([A-Za-z0-9._-]+)>=([0-9][0-9.]*)")
+_REQUIREMENT = re.compile(r"([A-Za-z0-9._-]+)>=([0-9][0-9.]*)(\s*;.+)?")
 
 
 def lowest(requirements: Iterable[str]) -> list[str]:
@@ -38,7 +38,7 @@ def lowest(requirements: Iterable[str]) -> list[str]:
         match = _REQUIREMENT.fullmatch(text)
         if match is None:
             raise ValueError(f"pyproject.toml: expected a requirement such as 'numpy>=2.1'; found '{text}'")
-        found.append(f"{match[1]}=={match[2]}")
+        found.append(f"{match[1]}=={match[2]}{match[3] or ''}")
     return found
 
 
@@ -62,9 +62,9 @@ def locked(names: Iterable[str], lock: str) -> list[str]:
 def pins() -> list[str]:
     """Return what the environment contains of the project's own choice."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    extras = [text for extra in EXTRAS for text in project["optional-dependencies"][extra]]
+    extras = [text for texts in project["optional-dependencies"].values() for text in texts]
     lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
-    return [*lowest([*project["dependencies"], *extras]), *locked(TOOLS, lock)]
+    return [*lowest([*project["dependencies"], *extras]), *locked([*TOOLS, *PEERS], lock)]
 
 
 def install(venv: Path, python: str) -> Path:
@@ -72,7 +72,7 @@ def install(venv: Path, python: str) -> Path:
     inside = venv / "bin" / "python"
     shutil.rmtree(venv, ignore_errors=True)
     if uv := shutil.which("uv"):
-        subprocess.run([uv, "venv", "--quiet", "--python", python, venv], check=True)
+        subprocess.run([uv, "venv", "--quiet", "--seed", "--python", python, venv], check=True)
         command = [uv, "pip", "install", "--quiet", "--python", inside]
     else:
         subprocess.run([python, "-m", "venv", venv], check=True)

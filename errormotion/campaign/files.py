@@ -92,6 +92,9 @@ class TestTable(BaseModel):
     at: Time | None = Field(
         default=None, ge=0, description="start on the timeline; default the end of the test before it"
     )
+    monte_carlo: int | Literal["auto"] | None = Field(
+        default=None, description='number of trials of a Monte Carlo evaluation of the result, or "auto"'
+    )
 
 
 class CampaignTable(BaseModel):
@@ -187,6 +190,7 @@ class TestPlan:
     instruments: Mapping[str, str] = field(default_factory=dict)
     certificates: Mapping[str, str] = field(default_factory=dict)
     at: float | None = None
+    monte_carlo: int | Literal["auto"] | None = None
 
 
 @dataclass(frozen=True)
@@ -318,7 +322,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
             mistakes += _method_mistakes(entry, ("test", number), bench)
     earlier: list[str] = []
     for number, test in enumerate(table.test if table else ()):
-        mistakes += _name_mistakes(test, ("test", number), earlier)
+        mistakes += [*_name_mistakes(test, ("test", number), earlier), *_trials_mistakes(test, ("test", number))]
         earlier.append(test.name)
     mistakes += _timeline_mistakes(table, bench) if table else []
     if table is None or mistakes:
@@ -330,7 +334,9 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         method = plugins.get("methods", test.method)
         settings = completed(method, _settings("methods", test.method, test.settings, ())[0], bench.description)
         certified = {**bench.certificates, **table.certificates, **test.certificates}
-        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments, certified, test.at))
+        tests.append(
+            TestPlan(test.name, method, settings, test.inputs, test.instruments, certified, test.at, test.monte_carlo)
+        )
     return CampaignPlan(
         name=table.name,
         bench=bench,
@@ -456,6 +462,24 @@ def _name_mistakes(test: TestTable, place: tuple[str | int, ...], earlier: list[
             known = tomlfile.nearest(name, earlier)
             mistakes.append(f"{where}: expected the name of an earlier test; found '{name}'; {known}")
     return mistakes
+
+
+def _trials_mistakes(test: TestTable, place: tuple[str | int, ...]) -> list[str]:
+    """Return why there is no Monte Carlo evaluation where a test wants one."""
+    if test.monte_carlo is None:
+        return []
+    from errormotion.montecarlo.evaluation import FEWEST
+
+    where = tomlfile.dotted((*place, "monte_carlo"))
+    if test.monte_carlo != "auto" and test.monte_carlo < FEWEST:
+        return [f"{where}: expected 'auto' or a number of trials from {FEWEST} on; found {test.monte_carlo}"]
+    try:
+        method = plugins.get("methods", test.method)
+    except PluginError:
+        return []  # reported with its settings
+    if hasattr(method, "redrawing"):
+        return []
+    return [f"{where}: the method '{test.method}' does not state how its sources are drawn anew (redrawing)"]
 
 
 def _settings(

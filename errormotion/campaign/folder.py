@@ -131,7 +131,7 @@ class RunFolder:
             data = json.loads(file.read_text(encoding="utf-8"))
         except OSError as error:
             raise RunError(f"{path}: expected a run folder with a run.json; {error.strerror}") from error
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise RunError(
                 f"{file}: is not valid JSON ({error}); restore it from a copy, "
                 "or identify raw.zarr with 'errormotion identify'"
@@ -142,13 +142,28 @@ class RunFolder:
         return cls(path, data)
 
     def save(self, **changes: Any) -> None:
-        """Change fields of ``run.json`` and write the file."""
+        """Change fields of ``run.json`` and write the file.
+
+        Raises
+        ------
+        RunError
+            The folder was moved or deleted since it was created or opened.
+        OSError
+            The file cannot be written.
+        """
+        if "updated" in self.data and not self.present:
+            raise RunError(f"{self.path} is gone: it was moved or deleted during the run")
         self.data |= changes | {"updated": now()}
         replace_text(self.path / "run.json", json.dumps(plain(self.data), indent=1, ensure_ascii=False) + "\n")
 
     def step(self, name: str, outcome: str, **details: Any) -> None:
         """Append an entry to the steps of this run."""
         self.data.setdefault("steps", []).append({"step": name, "outcome": outcome, "time": now(), **details})
+
+    @property
+    def present(self) -> bool:
+        """Whether the folder is still where it was created or opened."""
+        return (self.path / "run.json").exists()
 
     @property
     def raw(self) -> Path:

@@ -40,6 +40,10 @@ class JsonLines(logging.Formatter):
 class _Handler(logging.FileHandler):
     """Ignores write errors: a full disk must not end a measurement because of its log."""
 
+    def emit(self, record: logging.LogRecord) -> None:
+        with suppress(OSError):  # of the opening, which the standard handler lets out
+            super().emit(record)
+
     def handleError(self, record: logging.LogRecord) -> None:
         pass
 

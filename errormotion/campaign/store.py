@@ -32,6 +32,12 @@ BLOCK_BYTES = 24 * 2**20
 LONGEST_BLOCK = 2**18
 """Largest number of samples in one block."""
 
+BEFORE_COMMIT = {"zarr_format", "node_type", "attributes"}
+"""Keys of the metadata of a store before its first commit."""
+
+MOST_SAMPLES = 2**53
+"""A length beyond this is no number of samples."""
+
 PER_CHUNK = ("dropped", "invalid", "time_start")
 """Attributes that differ between the datasets that a method yields."""
 
@@ -93,6 +99,8 @@ class RawStore:
         expected : float
             Expected total length, to size the chunks; in seconds where the samples have a ``sample_rate``.
         """
+        if not path.parent.is_dir():  # zarr would create it
+            raise RunError(f"{path.parent} is gone: it was moved or deleted before data were written to it")
         if dim not in first.dims:
             raise RunError(f"expected data along '{dim}'; the method yielded dims {', '.join(map(str, first.dims))}")
         growing = {str(name): variable for name, variable in _stored(first, dim).items() if dim in variable.dims}
@@ -296,12 +304,28 @@ class _Column:
 
 
 def committed_length(path: Path, dim: str) -> int:
-    """Return the number of samples visible to a reader of a store; 0 before the first commit."""
-    root = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
-    for metadata in root.get("consolidated_metadata", {}).get("metadata", {}).values():
-        if dim in _dims(metadata):
-            return int(metadata["shape"][_dims(metadata).index(dim)])
-    return 0
+    """Return the number of samples visible to a reader of a store; 0 before the first commit.
+
+    Raises
+    ------
+    RunError
+        The metadata of the store cannot be read, or are damaged.
+    """
+    file = path / "zarr.json"
+    try:
+        root = json.loads(file.read_text(encoding="utf-8"))
+        if set(root) <= BEFORE_COMMIT and root["zarr_format"] == 3:
+            return 0
+        for metadata in root["consolidated_metadata"]["metadata"].values():
+            if dim in _dims(metadata):
+                length = metadata["shape"][_dims(metadata).index(dim)]
+                if isinstance(length, int) and 0 <= length < MOST_SAMPLES:
+                    return length
+        raise ValueError(f"no variable has a length along '{dim}'")
+    except OSError as error:
+        raise RunError(f"{file}: cannot be read: {error.strerror}") from error
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise RunError(f"{file}: is damaged; restore it from a copy ({error})") from error
 
 
 def _dims(metadata: Mapping[str, Any]) -> tuple[str, ...]:

@@ -24,6 +24,9 @@ import xarray as xr
 CLOCK, JOINS = "clock", "joins"
 """Attributes of raw data (JSON): the clocks at the last commit, and the interruptions of the record."""
 
+ORIGIN = "clock_origin"
+"""Attribute of raw data of a virtual machine: its clock at the start of the record, s."""
+
 TOLERANCE = 2.0
 """Difference of two clocks that is no contradiction, s."""
 DRIFT = 1e-3
@@ -177,13 +180,21 @@ def age(done: xr.Dataset) -> float:
     return before.began + before.elapsed - start + interval(before, now)[0]
 
 
+def restarted(done: xr.Dataset, now: float) -> bool:
+    """Return whether a virtual machine was started anew since an interrupted record was started, by its clock now, s.
+
+    True for a record that does not state its attribute ``clock_origin``.
+    """
+    return not now > float(done.attrs.get(ORIGIN, math.inf))
+
+
 def _stored(attrs: Mapping[Any, Any]) -> Reading | None:
     """Return the reading at the last commit; None where there is none, or a damaged one."""
     try:
         found = json.loads(attrs[CLOCK])
         wall, since, began, elapsed = (float(found[name]) for name in ("wall", "steady", "began", "elapsed"))
         boot = str(found["boot"])
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
         return None
     if not all(map(math.isfinite, (wall, since, began, elapsed))):
         return None
@@ -194,7 +205,7 @@ def joins(attrs: Mapping[Any, Any]) -> list[Join]:
     """Return the interruptions that raw data state; none where the attribute is damaged."""
     try:
         return [Join(**each) for each in json.loads(attrs.get(JOINS, "[]"))]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RecursionError):
         return []
 
 

@@ -26,7 +26,7 @@ from errormotion.datasets.schemas import SCHEMA
 from errormotion.errors import DatasetError, ErrormotionError
 
 _NETCDF = (".nc", ".nc4", ".h5")
-_READERS = ("/zarr/", "/numcodecs/", "/h5py/", "/h5netcdf/")
+_READERS = ("/zarr/", "/numcodecs/", "/h5py/", "/h5netcdf/", "/scipy/io/")
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _CLASSIC_SIGNATURE = b"CDF"
 
@@ -219,8 +219,11 @@ def _reading(path: Path) -> Iterator[None]:
         raise
     except PermissionError as error:
         raise DatasetError(f"{path}: cannot be read: permission denied") from error
-    except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
-        # What h5py, zarr and xarray raise on files that were cut off or are something else.
+    except (
+        *(OSError, LookupError, ValueError, RuntimeError, TypeError, AttributeError),
+        *(ArithmeticError, EOFError, MemoryError),
+    ) as error:
+        # What h5py, zarr, scipy and xarray raise on files that were cut off or are something else.
         what = "is truncated" if "truncated" in str(error) else "is damaged, or not a dataset of errormotion"
         raise DatasetError(f"{path}: {what}; create it again or copy it again. (Reader: {error})") from error
 

@@ -88,6 +88,9 @@ class FigureOfMerit:
         SI unit of both: ``m``, ``rad``, ``1``, ``degC``.
     limit : float, optional
         Largest absolute value that is accepted, where one is known.
+    influence : mapping of str to float, optional
+        Effect of one standard uncertainty of each source of the dataset, by its name. Where it is left out, it is the
+        change of the figure when the errors change; so a figure that is computed from other variables states it.
     """
 
     name: str
@@ -95,6 +98,7 @@ class FigureOfMerit:
     expanded_uncertainty: float
     unit: str
     limit: float | None = None
+    influence: Mapping[str, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -214,7 +215,21 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
     target = Path(out) if out is not None else folder / "report.html"
     if log is not None:
         return write_report(log, target, run=run)
-    return write_report([load(path) for path in files], target, raw=raw, run=run)
+    parts = []
+    for path in files:
+        errors = load(path)
+        parts += [errors, *belonging(errors, path)]
+    return write_report(parts, target, raw=raw, run=run)
+
+
+def belonging(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
+    """Return the datasets beside a file of errors that state its hash (`errors_hash`), such as an evaluation of it."""
+    from errormotion.datasets import hash_dataset, load
+
+    beside = [load(path) for path in sorted(file.parent.glob(f"{glob.escape(file.stem)}.*.nc"))]
+    stated = [ds for ds in beside if "errors_hash" in ds.attrs]
+    own = hash_dataset(errors) if stated else ""
+    return [ds for ds in stated if ds.attrs["errors_hash"] == own]
 
 
 def _provenance(dataset: xr.Dataset, run: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """A run folder that is moved or deleted while data are written to it: the message says that it is gone."""
 
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -64,15 +65,20 @@ def test_the_recorder_says_so(tmp_path: Path, loss: Callable[[Path], None], insi
     """The folder around the store, or the store itself."""
     path = tmp_path / "run" / "raw.zarr"
     path.parent.mkdir()
-    with pytest.raises(RunError, match=GONE), Recorder(path, "time", 100, {}) as recorder:
-        recorder.put(chunk(0))
-        while not recorder.committed:
-            pass
-        loss(path if inside else path.parent)
-        recorder.put(chunk(10))
+
+    def record() -> None:
+        with Recorder(path, "time", 100, {}) as recorder:
+            recorder.put(chunk(0))
+            while not recorder.committed:
+                time.sleep(0.01)
+            loss(path if inside else path.parent)
+            recorder.put(chunk(10))
+
+    with pytest.raises(RunError, match=GONE):
+        record()
 
 
-def test_a_campaign_ends_with_the_reason_and_goes_on_when_the_folder_is_back(
+def test_a_campaign_ends_with_the_reason_and_goes_on_where_the_folder_is(
     plan: Callable[..., CampaignPlan], tmp_path: Path
 ) -> None:
     class Mover(runner.Quiet):
@@ -81,22 +87,21 @@ def test_a_campaign_ends_with_the_reason_and_goes_on_when_the_folder_is_back(
                 (path,) = (tmp_path / "runs").iterdir()
                 path.rename(tmp_path / path.name)
 
-    with pytest.raises(RunError, match=GONE) as failure:
+    with pytest.raises(RunError, match=r"its folder .* is gone. It was moved or deleted during the run. \d+ samples"):
         runner.run(plan('name = "a"\nsettings = {count = 100000}'), progress=Mover())
-    (folder,) = tmp_path.glob("*-a-*")
-    assert f"Move it back to {tmp_path / 'runs' / folder.name}" in str(failure.value)
+    assert len(list(tmp_path.glob("*-a-*"))) == 1
     assert not list((tmp_path / "runs").glob("*/run.json"))
-    shutil.rmtree(tmp_path / "runs" / folder.name, ignore_errors=True)  # a write under way may leave folders
-    folder.rename(tmp_path / "runs" / folder.name)
-    (finished,) = runner.resume(runs=tmp_path / "runs")
+    (finished,) = runner.resume(runs=tmp_path)
     assert finished.data["samples"]["count"] == 100000
 
 
 def test_a_monitor_ends_with_the_reason(tmp_path: Path, loss: Callable[[Path], None]) -> None:
-    with (
-        pytest.raises(RunError, match=GONE),
-        Monitor(parse_bench(THERMOMETER, Path("bench.toml")), tmp_path, 0.01) as monitor,
-    ):
-        for snapshot in monitor.watch(20.0):
-            if snapshot.logged == 3:
-                loss(monitor.folder.path)
+
+    def watch() -> None:
+        with Monitor(parse_bench(THERMOMETER, Path("bench.toml")), tmp_path, 0.01) as monitor:
+            for snapshot in monitor.watch(20.0):
+                if snapshot.logged == 3:
+                    loss(monitor.folder.path)
+
+    with pytest.raises(RunError, match=GONE):
+        watch()

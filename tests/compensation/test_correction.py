@@ -122,6 +122,9 @@ def test_outside_of_what_was_measured_the_offset_is_held_and_flagged(scattered: 
     machine = VirtualMachine("cframe", 3)
     nodes = places(machine, 300) if scattered else grid(machine, 6)
     made = correction(machine.volumetric_truth(nodes))
+    beyond = made.at(nodes[:1] + np.array([9.0, 0.0, 0.0]), covariance=True).covariance
+    assert beyond is not None
+    assert np.isnan(beyond).all()  # nothing is known there
     centre = nodes.mean(axis=0)
     direction = np.array([1.0, -0.6, 0.3]) / np.linalg.norm([1.0, -0.6, 0.3])
     way = centre + np.linspace(0, 1.5, 3001)[:, None] * direction
@@ -131,9 +134,9 @@ def test_outside_of_what_was_measured_the_offset_is_held_and_flagged(scattered: 
     assert (np.diff(found.valid.astype(int)) <= 0).all()
     steps = np.abs(np.diff(found.offset, axis=0)).max(axis=1)
     assert steps.max() < 1e-6  # no jump at the edge, 0.5 mm a step
-    beyond = found.offset[~found.valid]
+    held = found.offset[~found.valid]
     if scattered:  # every point of the way is moved to one point of the hull, but for the offset itself
-        assert np.abs(beyond - beyond[-1]).max() < 1e-9
+        assert np.abs(held - held[-1]).max() < 1e-9
     assert np.abs(found.offset[-1]).max() <= np.abs(machine.geometry.twist(nodes)[:, :3]).max()
 
 

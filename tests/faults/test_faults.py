@@ -1,4 +1,4 @@
-"""A quick form of ``make faults``: real processes with one example, a kill in each of two stages, and a full disk."""
+"""A quick form of ``make faults``: real processes with one example; kills, disks that fail, and a clock that is set."""
 
 import errno
 import os
@@ -6,41 +6,43 @@ import subprocess
 import sys
 from pathlib import Path
 
+import fault_processes
 import fault_trials as trials
 import pytest
+from fault_kinds import Kinds
 
 from errormotion.campaign import runner
-from errormotion.campaign.files import load_campaign
 from errormotion.campaign.folder import list_runs
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "virtual_beam" / "campaign.toml"
-TEST = "beam"
+METHOD, TEST = "beam_direction", "beam"
 LIMIT = 12_000
 """Of the size of a file: enough for run.json at the start, not for the whole run, bytes."""
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("undisturbed")
-    runner.run(load_campaign(EXAMPLE), runs=folder)
-    return folder
+def kinds(tmp_path_factory: pytest.TempPathFactory) -> Kinds:
+    folder = tmp_path_factory.mktemp("faults")
+    library = fault_processes.shim(folder)
+    fault_processes.prepare(library)
+    found = Kinds(folder, seed=3, shimmed=library is not None, methods=(METHOD,))
+    found.undisturbed(METHOD)
+    return found
+
+
+@pytest.fixture
+def undisturbed(kinds: Kinds) -> Path:
+    return kinds.folder / "undisturbed" / METHOD
 
 
 @pytest.mark.timeout(120)
-@pytest.mark.parametrize("stage", trials.STAGES[:2])
-def test_run_that_was_killed_finishes_with_the_raw_data_of_an_undisturbed_one(
-    tmp_path: Path, undisturbed: Path, stage: str
-) -> None:
-    process = trials.start(["run", EXAMPLE, "--runs", tmp_path], tmp_path / "journal")
-    instant = trials.kill_when(process, lambda: trials.stage_of(tmp_path, TEST) == stage, 0.1)
-    assert process.returncode == -9, "the run ended before the kill"
-    ended = trials.examined(tmp_path, tmp_path / "journal", instant)
-    assert ended.faults == []
-    assert ended.lost < 1.0
-    (folder,) = runner.resume(runs=tmp_path)
-    assert folder.finished
-    assert trials.half_files(tmp_path) == []
-    assert trials.differences(tmp_path, undisturbed) == []
+@pytest.mark.parametrize("kind", ["kill_acquisition", "kill_later", "disk", "clock_between"])
+def test_run_survives(kinds: Kinds, kind: str) -> None:
+    if kind in ("disk", "clock_between") and not kinds.shimmed:
+        pytest.skip("no C compiler makes disk and clocks fail")
+    result = getattr(kinds, kind)(0)
+    assert result.faults == []
+    assert result.different == []
 
 
 @pytest.mark.timeout(120)

@@ -6,7 +6,6 @@ Each trial has a number, from which all that is random in it follows; it returns
 from __future__ import annotations
 
 import errno
-import json
 import os
 import random
 import shutil
@@ -27,11 +26,10 @@ from fault_trials import Ended
 
 from errormotion import datasets
 from errormotion.campaign.folder import list_runs
-from errormotion.campaign.store import committed_length
 from errormotion.datasets.clock import joins
 
 LONGEST_LOSS = 1.0
-"""Samples older than this are on disk whatever happens, s."""
+"""Samples older than this are on disk whatever happens, where the computer keeps up with the data, s."""
 BATCH = 3
 """Runs of a batch."""
 CODES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
@@ -134,14 +132,15 @@ class Kinds:
         result = Result(
             f"kill -9, {ended.stage or 'between two stages'}", method, ended.faults, ended.lost, ended.samples
         )
-        if ended.lost > LONGEST_LOSS:
+        if ended.lost > longest_loss():
             result.faults.append(f"{ended.samples} samples of the last {ended.lost:.2f} s are lost")
-        return self._continued(result, method, runs, journal, processes=2 if number % 3 == 0 else 1)
+        processes = 2 if number // len(self.methods) % 3 == 0 else 1
+        return self._continued(result, method, runs, journal, processes=processes)
 
     def kill_later(self, number: int) -> Result:
         """End the identification, or the report, of a run."""
         chance, method, runs, journal = self._place("kill_later", number)
-        stage = trials.STAGES[1 + number // len(self.methods) % 2]
+        stage = chance.choice(trials.STAGES[1:])
         test, delay = self._instant(chance, method, stage)
         process = Forked(self._run(method, runs), journal)
         trials.kill_when(process, lambda: trials.stage_of(runs, test) == stage, delay)
@@ -165,14 +164,13 @@ class Kinds:
         if not nothing and all(each.code for each in ends):
             result.faults.append(f"the run was not finished: {[each.message[-200:] for each in ends]}")
         result.different = self._different(method, runs)
-        result.faults += [text for text in result.different if "not finished" in text or "in place of" in text]
-        result.faults += trials.half_files(runs)
+        result.faults += [*result.different, *trials.half_files(runs)]
         return result
 
     def kill_command(self, number: int) -> Result:
         """End ``identify`` or ``report`` of a finished run, and repeat it."""
         chance, method, runs, journal = self._place("kill_command", number)
-        words, result_file, command = self._command(number, method, runs)
+        words, result_file, command = self._command(chance, method, runs)
         process = Forked(words, journal)
         trials.kill_when(process, lambda: True, chance.uniform(0.1, 2.0))
         result = Result("kill -9", f"errormotion {command}", trials.half_files(runs))
@@ -184,11 +182,11 @@ class Kinds:
         result.faults += [*ended.faults, *trials.half_files(runs)]
         return result
 
-    def _command(self, number: int, method: str, runs: Path) -> tuple[list[Any], Path, str]:
+    def _command(self, chance: random.Random, method: str, runs: Path) -> tuple[list[Any], Path, str]:
         """Return a command on a copy of a finished run, and the file that it writes."""
         shutil.copytree(self.folder / "undisturbed" / method, runs, dirs_exist_ok=True)
         folder = list_runs(runs)[-1]
-        if number // len(self.methods) % 2:
+        if chance.random() < 0.5:
             return ["report", folder.path], folder.path / "report.html", "report"
         out = runs / "again.nc"
         return ["identify", folder.raw, "--out", out], out, "identify"
@@ -226,7 +224,7 @@ class Kinds:
         ready = lambda: any((each.raw / "zarr.json").exists() for each in list_runs(runs))  # noqa: E731
         ended = trials.examined(runs, journal, trials.kill_when(process, ready, chance.uniform(0.0, 3.0)))
         result = Result("kill -9", "errormotion monitor", ended.faults, ended.lost, ended.samples)
-        if ended.lost > LONGEST_LOSS:
+        if ended.lost > longest_loss():
             result.faults.append(f"{ended.samples} rows of the last {ended.lost:.2f} s are lost")
         for folder in list_runs(runs):
             if (folder.raw / "zarr.json").exists():
@@ -255,13 +253,13 @@ class Kinds:
     def disk_command(self, number: int) -> Result:
         """Let ``identify`` or ``report`` meet such a disk; repeat it on a good one."""
         chance, method, runs, journal = self._place("disk_command", number)
-        words, result_file, command = self._command(number, method, runs)
+        words, result_file, command = self._command(chance, method, runs)
         code = CODES[number % len(CODES)]
         result_file.unlink(missing_ok=True)
         ended = trials.finish(Forked(words, journal, disk=Disk(runs, chance.randint(1, 60), code)))
         result = Result(_named(code), f"errormotion {command}", [*ended.faults, *trials.half_files(runs)])
         result.sentence = ended.code != 0
-        if ended.code and os.strerror(code) not in ended.message:
+        if ended.code and not _says(ended.message, code):
             result.faults.append(f"ended with {ended.code}, not with '{os.strerror(code)}': {ended.message[-300:]}")
         again = trials.finish(Forked(words, journal))
         if again.code and "exists" not in again.message:
@@ -331,7 +329,7 @@ class Kinds:
     def clock_running(self, number: int) -> Result:
         """Set the wall clock during a run, several times, forth and back."""
         chance, method, runs, journal = self._place("clock_running", number)
-        name, shift = list(SHIFTS.items())[number // 2 % len(SHIFTS)]
+        name, shift = chance.choice(list(SHIFTS.items()))
         clock = Clock(journal.with_name("clock"))
         process = Forked(self._run(method, runs), journal, clock=clock)
         done = threading.Event()
@@ -340,7 +338,7 @@ class Kinds:
             while not done.wait(chance.uniform(0.1, 1.0)):
                 clock.set(wall=chance.choice([-shift, 0.0, shift]))
 
-        with _thread(turn, done):
+        with While(turn, done):
             ended = trials.finish(process)
         result = Result(f"clock set by {name} while it runs", method, ended.faults)
         if ended.code:
@@ -352,13 +350,13 @@ class Kinds:
     def clock_between(self, number: int) -> Result:
         """Set the wall clock between a kill and the continuation, with a restart of the computer or without."""
         chance, method, runs, journal = self._place("clock_between", number)
-        name, shift = list(SHIFTS.items())[number // 2 % len(SHIFTS)]
+        name, shift = chance.choice(list(SHIFTS.items()))
         sign, restarted = chance.choice([-1, 1]), chance.random() < 0.5
         clock = Clock(journal.with_name("clock"))
         test, delay = self._instant(chance, method, "acquisition")
         process = Forked(self._run(method, runs, report=False), journal, clock=clock)
         killed = trials.kill_when(process, lambda: trials.stage_of(runs, test) == "acquisition", delay)
-        kept = {each.data["test"]: _count(each) for each in list_runs(runs)}
+        kept = {each.data["test"]: trials.kept(each, journal) for each in list_runs(runs)}
         clock.set(wall=sign * shift, boot=100.0 - time.clock_gettime(time.CLOCK_BOOTTIME) if restarted else 0.0)
         clock.started = "another start" if restarted else ""
         begun = time.monotonic()
@@ -416,7 +414,11 @@ class Kinds:
         clock = Clock(journal.with_name("clock"))
         process = Forked(self._monitor(runs, HOUR + 4.0), journal, clock=clock)
         until = time.monotonic() + trials.LONGEST
-        while process.poll() is None and not any(_count(each) for each in list_runs(runs)) and time.monotonic() < until:
+        while (
+            process.poll() is None
+            and not any(trials.kept(each, journal) for each in list_runs(runs))
+            and time.monotonic() < until
+        ):
             time.sleep(trials.POLL_INTERVAL)
         time.sleep(chance.uniform(0.2, 1.0))
         process.signal(signal.SIGSTOP)
@@ -465,19 +467,23 @@ class Kinds:
         while process.poll() is None and trials.stage_of(runs, test) != "acquisition" and time.monotonic() < until:
             time.sleep(trials.POLL_INTERVAL)
         time.sleep(delay)
-        elsewhere, deleted = runs.with_name("elsewhere"), number % 2 == 1
+        elsewhere, deleted = runs.with_name("elsewhere"), chance.random() < 0.5
         runs.rename(elsewhere)
         ended = trials.finish(process)
         result = Result("runs folder deleted" if deleted else "runs folder moved", method, ended.faults)
         result.sentence = ended.code != 0
-        gone = any(text in ended.message for text in ("is gone", "No such file"))
-        if ended.code and not gone:
+        if ended.code and "is gone" not in ended.message:
             result.faults.append(
                 f"ended with {ended.code} and does not say that the folder is gone: {ended.message[-400:]}"
             )
         if deleted:
             return result
         return self._continued(result, method, elsewhere, journal)
+
+
+def longest_loss() -> float:
+    """Return the longest loss on the computer as it is: longer where more processes want a processor than it has."""
+    return LONGEST_LOSS * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 def _named(code: int) -> str:
@@ -487,18 +493,12 @@ def _named(code: int) -> str:
 
 def _says(message: str, code: int) -> bool:
     """Whether a message names the error of a disk."""
-    full = code in (errno.ENOSPC, errno.EDQUOT) and "disk is full" in message
-    return full or os.strerror(code) in message
-
-
-def _count(folder: Any) -> int:
-    """Return the number of samples on disk."""
-    if not (folder.raw / "zarr.json").exists():
-        return 0
-    root = json.loads((folder.raw / "zarr.json").read_text())
-    metadata = root.get("consolidated_metadata", {}).get("metadata", {})
-    dims = {each["dimension_names"][0] for each in metadata.values() if each.get("dimension_names")}
-    return max((committed_length(folder.raw, dim) for dim in dims), default=0)
+    full = {
+        errno.ENOSPC: ("disk is full",),
+        errno.EDQUOT: ("disk is full", "quota is used up"),
+        errno.EFBIG: ("larger than allowed",),
+    }.get(code, ())
+    return any(text in message for text in (os.strerror(code), *full))
 
 
 def _rows(raw: Path) -> list[str]:
@@ -524,7 +524,7 @@ def _wrong_joins(found: Any, expected: int, gap: tuple[float, float], shift: flo
     return []
 
 
-class _thread:
+class While:
     """A thread that runs while the context lasts."""
 
     def __init__(self, work: Callable[[], None], done: threading.Event) -> None:

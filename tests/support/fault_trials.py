@@ -129,24 +129,37 @@ def stage_of(runs: Path, test: str) -> str:
     return ""
 
 
+def _delivered(folder: RunFolder, journal: Path) -> list[tuple[str, float, int]]:
+    """Return dimension, time on the monotonic clock (s) and samples of each dataset delivered for a run folder."""
+    found = []
+    for line in journal.read_text().splitlines() if journal.exists() else []:
+        path, dim, at, count = line.rsplit(" ", 3)
+        if Path(path).parent == folder.path:
+            found.append((dim, float(at), int(count)))
+    return found
+
+
+def kept(folder: RunFolder, journal: Path) -> int:
+    """Return the number of samples of a run on disk."""
+    own = _delivered(folder, journal)
+    return committed_length(folder.raw, own[0][0]) if own and (folder.raw / "zarr.json").exists() else 0
+
+
 def examined(runs: Path, journal: Path, instant: float) -> Ended:
     """Return what a kill at an instant left in the run folders."""
     ended = Ended(-signal.SIGKILL, faults=half_files(runs))
-    delivered = [line.split() for line in journal.read_text().splitlines()] if journal.exists() else []
     for folder in list_runs(runs):
         if folder.finished:
             continue
         ended.stage = stage_of(runs, folder.data["test"])
-        own = [(float(at), int(count)) for name, dim, at, count in delivered if Path(name).parent == folder.path]
+        own = _delivered(folder, journal)
         if not own:
             continue
-        dim = next(dim for name, dim, *_ in delivered if Path(name).parent == folder.path)
-        kept = committed_length(folder.raw, dim) if (folder.raw / "zarr.json").exists() else 0
-        total = np.cumsum([count for _, count in own])
-        late = total > kept
+        there, total = kept(folder, journal), np.cumsum([count for _, _, count in own])
+        late = total > there
         if late.any():
-            ended.samples = int(total[-1] - kept)
-            ended.lost = instant - own[int(np.argmax(late))][0]
+            ended.samples = int(total[-1] - there)
+            ended.lost = instant - own[int(np.argmax(late))][1]
     return ended
 
 

@@ -13,8 +13,8 @@ class Programs:
     ``plain`` leaves out what changes offsets, probes, or moves in machine coordinates.
     """
 
-    def __init__(self, random: Random, *, plain: bool = False) -> None:
-        self.random, self.plain = random, plain
+    def __init__(self, random: Random, *, plain: bool = False, inches: bool = True) -> None:
+        self.random, self.plain, self.inches = random, plain, inches
 
     def lines(self, blocks: int) -> list[str]:
         """Return one program."""
@@ -130,7 +130,7 @@ class Programs:
         return [self._finish(words, motion)]
 
     def _mode(self) -> list[str]:
-        kind = self.random.choice(("unit", "distance", "centre", "plane", "feed"))
+        kind = self.random.choice((*(("unit",) if self.inches else ()), "distance", "centre", "plane", "feed"))
         if kind == "unit":
             self.unit = 41 - self.unit
             ratio = 25.4 if self.unit == 21 else 1 / 25.4
@@ -149,11 +149,8 @@ class Programs:
         return [f"G{self.feed_mode}", *([] if self.feed_mode == 93 else [f"F{0.2 if self.feed_mode == 95 else 300}"])]
 
     def _other(self) -> list[str]:
-        return [
-            self.random.choice(
-                ("(comment)", "M9", "M5", "M3 S900", "G4 P0.5", "", "; text", "M64 P1", "G61", "G64 P0.01")
-            )
-        ]
+        others = ("(comment)", "M9", "M5", "M3 S900", "G4 P0.5", "", "; text", "M64 P1", "G61", "G64 P0.01")
+        return [self.random.choice(others)]
 
     def _reposition(self) -> list[str]:
         """Return a move to a stated position with all axes, in absolute coordinates."""
@@ -191,12 +188,6 @@ class Programs:
             return self._reposition()
         if self.random.random() < 0.5:
             return ["G90", f"G53 G0 {self.random.choice(AXES)}{self._value(1.5)}", *self._reposition()]
-        return [
-            "G90 G94 F100",
-            f"G38.{self.random.choice('2345')} Z{self.at[2] - 1.3:.3f}",
-            *self._mode_of_feed(),
-            *self._reposition(),
-        ]
-
-    def _mode_of_feed(self) -> list[str]:
-        return [f"G{self.feed_mode}", *([] if self.feed_mode == 93 else ["F200"])]
+        probe = f"G38.{self.random.choice('2345')} Z{self.at[2] - 1.3:.3f}"
+        feed = [] if self.feed_mode == 93 else ["F200"]
+        return ["G90 G94 F100", probe, f"G{self.feed_mode}", *feed, *self._reposition()]

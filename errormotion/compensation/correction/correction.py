@@ -34,8 +34,8 @@ class CorrectionValues:
     offset : (n, 3)
         Translation that is added to the commands of X, Y, Z, m.
     covariance : (n, 3, 3) or None
-        Of the offset, m^2; None where it was not asked for. NaN for a component that is left as it is, and where too
-        few places were measured for an estimate of the interpolation.
+        Of the offset, m^2; None where it was not asked for. NaN where it is not valid, for a component that is left as
+        it is, and where too few places were measured for an estimate of the interpolation.
     valid : (n,) of bool
         Whether place, time and temperatures lie within what was measured. Elsewhere the offset is held at its value
         at the edge.
@@ -91,11 +91,6 @@ class Correction:
             _check_rotations(fields)
         return replace(self, fields=fields)
 
-    def errors(self, positions: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """Return the displacement of the tool at commanded positions (n, 3), as the sources state it, (n, 3), m."""
-        places, times = _points(positions, time)
-        return self._displacement(places, times)
-
     def at(self, positions: ArrayLike, time: ArrayLike | None = None, *, covariance: bool = False) -> CorrectionValues:
         """Return the corrections of commands.
 
@@ -136,6 +131,8 @@ class Correction:
             valid &= each.inside & (each.of((~field.trained).astype(float)) == 0)
             turn += np.where(field.known[3:], each.of(field.values[:, 3:]), np.nan)
         found = self._covariance(places, times) if covariance else None
+        if found is not None:
+            found[~valid] = np.nan
         return CorrectionValues(offset, found, valid, turn)
 
     def _displacement(self, places: Array, time: Array | None) -> Array:
@@ -222,6 +219,11 @@ def correction(
         )
     if part:
         notes.append(f"Not known, and left as they are: {', '.join(part)}.")
+    for field in fields:
+        if missing := _unknown_rotations(field):
+            notes.append(
+                f"{field.name}: {', '.join(missing)} is not known; the correction holds on the line of the measurement."
+            )
     if not partial:
         _check_rotations(fields)
     made = Correction(tuple(fields), unknown, partial, tuple(notes))
@@ -230,13 +232,17 @@ def correction(
 
 def _check_rotations(fields: Sequence[Field]) -> None:
     for field in fields:
-        missing = [name for name in field.needed() if name in DOF[3:] and not field.known[DOF.index(name)]]
-        if missing:
+        if missing := _unknown_rotations(field):
             raise DatasetError(
                 f"{field.name}: {', '.join(missing)} is not known, and displaces the tool at the functional point "
                 f"{np.round(field.point, 6).tolist()} m or along the travel. Use the functional point of the "
                 "measurement, or a source that knows the rotations"
             )
+
+
+def _unknown_rotations(field: Field) -> list[str]:
+    """Return the rotations that displace the tool and are not known."""
+    return [name for name in field.needed() if name in DOF[3:] and not field.known[DOF.index(name)]]
 
 
 def _name(source: xr.Dataset | ThermalModel, number: int) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 
+from errormotion.compensation.program.arcs import SMALL
 from errormotion.compensation.program.canonical import Command, commands
 from errormotion.compensation.program.items import LINE, PLANES, RAPID, Left, Move
 from errormotion.compensation.program.offsets import Offsets
@@ -12,7 +14,7 @@ from errormotion.compensation.program.reader import Reader
 from errormotion.errors import ProgramError
 
 DIGIT = 1.02e-4
-"""Largest difference, in units of the program: the interpreter prints four digits, ours may have been cut in between."""
+"""Largest difference, in units of the program: the interpreter prints four digits, ours may have been cut."""
 
 _MOTIONS = {"STRAIGHT_TRAVERSE", "STRAIGHT_FEED", "ARC_FEED"}
 
@@ -37,23 +39,24 @@ def check(source: Sequence[str], offsets: Offsets, reader: Reader) -> int:
     moves = _moves(reader, source, left)
     count = 0
     move: Move | None = None
-    for command in commands(source, offsets, deleted=reader.deleted):
-        if command.name not in _MOTIONS:
-            continue
-        if command.line in left:
-            continue
-        move = move or next(moves, None)  # reading on fills what is left
-        if command.line in left:
-            continue
-        if move is None:
-            raise ProgramError(f"line {command.line}: LinuxCNC's interpreter moves, and the reader does not")
-        if move.block.line != command.line:
-            raise ProgramError(
-                f"line {move.block.line}: the reader moves; LinuxCNC's interpreter moves at line {command.line}"
-            )
-        _same(move, command)
-        move = None
-        count += 1
+    with closing(commands(source, offsets, deleted=reader.deleted)) as found:
+        for command in found:
+            if command.name not in _MOTIONS:
+                continue
+            if command.line in left:
+                continue
+            move = move or next(moves, None)  # reading on fills what is left
+            if command.line in left:
+                continue
+            if move is None:
+                raise ProgramError(f"line {command.line}: LinuxCNC's interpreter moves, and the reader does not")
+            if move.block.line != command.line:
+                raise ProgramError(
+                    f"line {move.block.line}: the reader moves; LinuxCNC's interpreter moves at line {command.line}"
+                )
+            _same(move, command)
+            move = None
+            count += 1
     rest = move or next(moves, None)
     if rest is not None:
         raise ProgramError(f"line {rest.block.line}: the reader moves, and LinuxCNC's interpreter does not")
@@ -70,16 +73,15 @@ def _moves(reader: Reader, source: Iterable[str], left: set[int]) -> Iterator[Mo
 
 def _same(move: Move, command: Command) -> None:
     numbers = command.numbers()
+    expected: tuple[float, ...] = move.end
     if command.name == "ARC_FEED":
         if move.kind <= LINE:
             raise _differ(move, command)
         a, b, c = PLANES[move.plane]
-        turns = math.ceil(abs(move.sweep) / (2 * math.pi) - 1e-7) * (1 if move.kind == 3 else -1)
+        turns = math.ceil((abs(move.sweep) - 1.001 * SMALL) / (2 * math.pi)) * (1 if move.kind == 3 else -1)
         expected = (move.end[a], move.end[b], *move.centre, turns, move.end[c])
-    else:
-        if move.kind != (RAPID if command.name == "STRAIGHT_TRAVERSE" else LINE):
-            raise _differ(move, command)
-        expected = move.end
+    elif move.kind != (RAPID if command.name == "STRAIGHT_TRAVERSE" else LINE):
+        raise _differ(move, command)
     # A centre from a radius is as uncertain as the chord is small; LinuxCNC computes it from the same numbers.
     if any(not abs(x - y) <= DIGIT for x, y in zip(expected, numbers, strict=False)):
         raise _differ(move, command)

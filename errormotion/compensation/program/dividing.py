@@ -1,8 +1,8 @@
 """Where moves are divided, so that straight lines and arcs between corrected points follow the corrected path.
 
 A line between corrected ends follows the corrected path where the correction changes linearly along it; an arc through
-three corrected points follows it where the correction turns the arc into another arc. The deviation from that is examined
-at points that are at most one sampling interval apart.
+three corrected points follows it where the correction turns the arc into another arc. The deviation from that is
+examined at points that are at most one sampling interval apart.
 """
 
 from __future__ import annotations
@@ -219,7 +219,9 @@ def _arcs(
         rest = np.arange(moves.size)
         total = np.cumsum(pieces * points + 1) // _POINTS
         for part in np.split(rest, np.flatnonzero(np.diff(total)) + 1):
-            good, nodes = _pieces(field, moves[part], pieces[part], points[part], start, shifted, tolerance, digits, first)
+            good, nodes = _pieces(
+                field, moves[part], pieces[part], points[part], start, shifted, tolerance, digits, first
+            )
             fits[part] = good
             found.append(nodes)
         first = False

@@ -50,7 +50,15 @@ _WORDS = {
     "DWELL": "G4 P{0:g}",
     "ORIENT_SPINDLE": "M19 R{1:g}",
 }
-_NOTHING = {"SET_FEED_REFERENCE", "ON_RESET", "TURN_PROBE_ON", "TURN_PROBE_OFF", "START_CHANGE", "FINISH", "PALLET_SHUTTLE"}
+_NOTHING = {
+    "SET_FEED_REFERENCE",
+    "ON_RESET",
+    "TURN_PROBE_ON",
+    "TURN_PROBE_OFF",
+    "START_CHANGE",
+    "FINISH",
+    "PALLET_SHUTTLE",
+}
 _RESET = {
     *("SET_G5X_OFFSET", "SET_XY_ROTATION", "SET_FEED_MODE", "SET_FEED_RATE", "STOP_SPINDLE_TURNING"),
     *("SET_SPINDLE_MODE", "FLOOD_OFF", "MIST_OFF", "SELECT_PLANE", "SET_G92_OFFSET"),
@@ -83,7 +91,7 @@ class Expansion:
             (0.0, 0.0, 0.0),
         )
         self._system = offsets.system
-        self._at: Triple = (0.0, 0.0, 0.0)
+        self._at = self._frame.program((0.0, 0.0, 0.0))  # where the interpreter starts
         self._plane = 0
         self._numbered = 0
         self._begun = False
@@ -185,7 +193,7 @@ class Expansion:
         if unit == "inch" and self._tolerance < 2 * _DIGIT * UNITS["inch"]:
             raise self._refusal(
                 command,
-                "inches: LinuxCNC's interpreter prints positions to 0.0001 inch; expected a tolerance of at least 2.6 um",
+                "inches: LinuxCNC's interpreter prints 0.0001 inch; expected a tolerance of at least 2.6 um",
             )
         ratio = self._frame.scale / UNITS[unit]
         self._frame = replace(self._frame, scale=UNITS[unit])

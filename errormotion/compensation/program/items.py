@@ -12,6 +12,13 @@ RAPID, LINE, CLOCKWISE, COUNTERCLOCKWISE = 0, 1, 2, 3
 PLANES = ((0, 1, 2), (2, 0, 1), (1, 2, 0))
 """Of G17, G18, G19: the two axes of the plane, right-handed with the third."""
 
+LEFT = {
+    "machine": "positions in machine coordinates (G53, G28, G30)",
+    "probe": "probing moves (G38)",
+    "unknown": "rapid moves while the position of an axis is not known",
+}
+"""Moves that stay as they are."""
+
 
 @dataclass(slots=True)
 class Text:
@@ -41,7 +48,9 @@ class Left:
     axes : tuple of int
         Axes that it leads to a commanded position: no correction acts on them from here on.
     motion : int
-        Of the moves that follow without a word of their own; -1: as before.
+        Of the moves that follow without a word of their own; -1: none.
+    explicit : bool
+        Whether its line has the word of the motion.
     kind : str
         ``machine``, ``unknown`` or ``probe``.
     """
@@ -50,6 +59,7 @@ class Left:
     line: int
     axes: tuple[int, ...]
     motion: int
+    explicit: bool
     kind: str
 
 

@@ -36,12 +36,12 @@ class Path:
         frames: dict[int, int] = {}
         known: list[Frame] = []
         self.frame: Indices = np.empty(len(moves), np.intp)
-        for k, move in enumerate(moves):
+        for number, move in enumerate(moves):
             index = frames.get(id(move.frame))
             if index is None:
                 index = frames[id(move.frame)] = len(known)
                 known.append(move.frame)
-            self.frame[k] = index
+            self.frame[number] = index
         self.frames = known
         self.scale: Array = np.array([f.scale for f in known])[self.frame]
         self._turn: Array = np.array([f.turn for f in known])[self.frame]
@@ -51,8 +51,9 @@ class Path:
         self._sweep: Array = np.zeros(len(moves))
         self._centre: Array = np.zeros((len(moves), 2))
         self._axes: Indices = np.zeros((len(moves), 3), np.intp)
-        for k in self.arcs:
-            self._sweep[k], self._centre[k], self._axes[k] = moves[k].sweep, moves[k].centre, PLANES[moves[k].plane]
+        for number in self.arcs.tolist():
+            move = moves[number]
+            self._sweep[number], self._centre[number], self._axes[number] = move.sweep, move.centre, PLANES[move.plane]
         self.length: Array = self.scale * np.linalg.norm(self.end - self.start, axis=1)
         if self.arcs.size:
             k = self.arcs
@@ -98,6 +99,10 @@ class Path:
     def machine(self, index: Indices, points: Array) -> Array:
         """Return the positions of the machine's axes (n, 3) at points of the program, m."""
         return self._rotated(index, points * self.scale[index, None], 1.0) + self._shift[index]
+
+    def vector(self, index: Indices, vectors: Array) -> Array:
+        """Return vectors (n, 3) of the program in the machine's axes, m."""
+        return self._rotated(index, vectors * self.scale[index, None], 1.0)
 
     def own(self, index: Indices, vectors: Array) -> Array:
         """Return vectors (n, 3) of the machine's axes, m, in coordinates of the program."""

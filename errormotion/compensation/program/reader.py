@@ -28,6 +28,7 @@ _CYCLES = {730, *range(810, 900, 10)}
 _STOPS = {0, 1, 60}
 _ENDS = {2, 30}
 _SWITCHES = {3, 4, 5, 6, 7, 8, 9, 19, 48, 49, 50, 51, 52, 53, 61, 62, 63, 64, 65, 67, 68}
+_WITH_P = {50, 51, 52, 53, 62, 63, 64, 65}
 _AXES = "XYZ"
 _OWN = set("NFSTXYZ")
 _OF_SWITCHES = set("PQERD")
@@ -161,6 +162,8 @@ class Reader:
             item = self._move(block, values, explicit=motion is not None, machine=machine)
             allowed = _OWN | (set("IJKRP") if item_is_arc(item) else set()) | (_OF_SWITCHES if switches else set())
             allowed |= {"H"} if 430 in codes else set()
+            if item_is_arc(item) and switches and (("P" in values and _WITH_P & {*switches}) or 19 in switches):
+                raise refusal(block.line, block.text, "an arc and a switch that share a word (P or R)")
             if more := values.keys() - allowed:
                 raise refusal(block.line, block.text, f"the word {min(more)} has no use here")
         else:
@@ -244,7 +247,7 @@ class Reader:
                 raise refusal(block.line, block.text, "a probing move without a position")
             self._forget(axes, f"the probing move of line {block.line} ends where it touches")
             self._motion = None
-            item = Left(block.text, block.line, axes, -1, "probe")
+            item = Left(block.text, block.line, axes, -1, True, "probe")
         elif code == 920:
             allowed |= set(_AXES)
             frame = self._frame
@@ -305,14 +308,16 @@ class Reader:
             new = _triple([new[k] if k in axes else at[k] for k in range(3)])
         self._at = new
         self._why = f"the position that line {block.line} leads to is not known; it stands in the parameter file"
-        return Left(block.text, block.line, axes if not self._frame.rotation else (0, 1, 2), -1, "machine")
+        moved = axes if not self._frame.rotation else (0, 1, 2)
+        motion = -1 if self._motion is None else self._motion
+        return Left(block.text, block.line, moved, motion, True, "machine")
 
     def _move(self, block: Block, values: dict[str, str], *, explicit: bool, machine: bool) -> Item:
         motion = self._motion
         if motion is None:
             raise refusal(block.line, block.text, "a position without a motion (G0 to G3)")
         if machine:
-            return self._in_machine(block, values, motion)
+            return self._in_machine(block, values, motion, explicit)
         at = self._at
         end = [math.nan] * 3
         for k, axis in enumerate(_AXES):
@@ -324,16 +329,15 @@ class Reader:
         new: Triple = (end[0], end[1], end[2])
         frame = self._frame
         centre, sweep = (0.0, 0.0), 0.0
-        if motion in (RAPID, LINE):
-            if "I" in values or "J" in values or "K" in values or "R" in values:
-                raise refusal(block.line, block.text, "I, J, K or R without an arc (G2, G3)")
+        if motion <= LINE and ("I" in values or "J" in values or "K" in values or "R" in values):
+            raise refusal(block.line, block.text, "I, J, K or R without an arc (G2, G3)")
         known = frame.known and _known(new)
         if not known and motion == RAPID:
             self._at = new
             axes = _axes(values) if self._absolute else ()
             if not self._absolute:
                 self._why = f"line {block.line} moves by an increment from an unknown position"
-            return Left(block.text, block.line, axes, motion, "unknown")
+            return Left(block.text, block.line, axes, motion, explicit, "unknown")
         if not known or not _known(at):
             if known and motion == RAPID:
                 at = new  # from anywhere: only the end counts
@@ -361,7 +365,7 @@ class Reader:
             self._speed,
         )
 
-    def _in_machine(self, block: Block, values: dict[str, str], motion: int) -> Item:
+    def _in_machine(self, block: Block, values: dict[str, str], motion: int, explicit: bool) -> Item:
         """G53: a rapid move to a position of the machine stays as it is."""
         if motion != RAPID or not self._absolute:
             raise refusal(block.line, block.text, "G53 is understood with G0 and G90 only")
@@ -375,7 +379,7 @@ class Reader:
         elif not {0, 1} <= set(axes) and axes != (2,):
             raise refusal(block.line, block.text, "G53 in a rotated coordinate system: expected both X and Y, or Z")
         self._at = new
-        return Left(block.text, block.line, axes, motion, "machine")
+        return Left(block.text, block.line, axes, motion, explicit, "machine")
 
     def _tool_offset(self, block: Block, values: dict[str, str]) -> Triple:
         number = int(_whole(block, "H", values["H"])) if "H" in values else self._tool

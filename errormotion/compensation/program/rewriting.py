@@ -11,7 +11,7 @@ import numpy as np
 from errormotion.arrays import Array
 from errormotion.compensation.program.dividing import Correcting, Division, divide
 from errormotion.compensation.program.items import LINE, RAPID, Item, Left, Move, Setting, Text
-from errormotion.compensation.program.path import Path
+from errormotion.compensation.program.path import Indices, Path
 from errormotion.compensation.program.reader import Reader
 from errormotion.compensation.program.writer import DECIMALS, Writer
 from errormotion.errors import ProgramError
@@ -19,11 +19,15 @@ from errormotion.errors import ProgramError
 MOST_WRITTEN = 20_000_000
 """Most lines of the new program."""
 
+LONGEST_BLOCK = 250
+"""Characters of a line that LinuxCNC reads; a shorter line does not become a longer one."""
+
 SHOWN = 4000
 """Most points of the path that are kept for the page."""
 
 _MOVES = 10_000  # in memory at a time
 _ITEMS = 100_000
+_ANGLE = 0.2  # between points of arcs for the page, rad
 
 
 @dataclass
@@ -151,6 +155,10 @@ class Rewriting:
                     raise ProgramError(
                         f"the new program would have more than {MOST_WRITTEN} lines: raise the tolerance"
                     )
+                if max(map(len, made)) > LONGEST_BLOCK >= len(item.block.text):
+                    raise ProgramError(
+                        f"line {item.block.line} would get longer than the {LONGEST_BLOCK} characters of a control"
+                    )
                 yield from made
                 continue
             summary.written += 1
@@ -189,21 +197,22 @@ class Rewriting:
         known = np.isfinite(seconds)
         summary.seconds += float(seconds[known].sum())
         summary.unfed += int((~known).sum())
-        self._show(moves, path, division, index)
+        self._show(moves, path, division)
 
-    def _show(self, moves: list[Move], path: Path, division: Division, index: Array) -> None:
-        """Keep points of the path for the page: the ends of pieces, ever fewer of them."""
-        chosen = np.flatnonzero((self._count + np.arange(len(index))) % self._every == 0)
-        self._count += len(index)
-        k = index[chosen]
-        places = path.machine(k, path.points(k, division.u[chosen]))
-        scaled = division.offset[chosen] * path.scale[k, None]
-        turned = np.array(
-            [moves[m].frame.vector(tuple(v)) for m, v in zip(k, division.offset[chosen].tolist(), strict=True)]
-        ).reshape(-1, 3)
-        del scaled
-        lines = np.where(path.kind[k] == RAPID, 0, [moves[m].block.line for m in k])
-        self._shown.append(np.hstack([places, turned, path.tool[k], lines[:, None]]))
+    def _show(self, moves: list[Move], path: Path, division: Division) -> None:
+        """Keep points of the path for the page, ever fewer of them: ends of pieces of lines, and points on arcs."""
+        pieces = np.diff(division.first)
+        counts = np.where(path.kind > LINE, np.ceil(np.abs(path.sweep) / _ANGLE - 1e-9), pieces).astype(np.intp)
+        ends = np.cumsum(counts)
+        chosen = np.flatnonzero((self._count + np.arange(ends[-1])) % self._every == 0)
+        self._count += int(ends[-1])
+        k = np.searchsorted(ends, chosen, side="right")
+        number = chosen - (ends - counts)[k]
+        u = np.where(path.kind[k] > LINE, (number + 1) / counts[k], division.u[division.first[k] + number % pieces[k]])
+        places = path.machine(k, path.points(k, u))
+        offset = path.vector(k, _between(division, k, u))
+        lines = np.where(path.kind[k] == RAPID, 0, np.array([move.block.line for move in moves])[k])
+        self._shown.append(np.hstack([places, offset, path.tool[k], lines[:, None]]))
         while sum(map(len, self._shown)) > SHOWN:
             self._shown = [np.concatenate(self._shown)[::2]]
             self._every *= 2
@@ -218,6 +227,18 @@ class Rewriting:
             summary.lines = rows[:, 9]
 
 
-def is_cut(move: Move) -> bool:
-    """Return whether a move cuts."""
-    return move.kind >= LINE
+def _between(division: Division, k: Indices, u: Array) -> Array:
+    """Return corrections at fractions of moves, between those at ends and middles of their pieces."""
+    size = np.diff(division.first)
+    index = np.repeat(np.arange(len(size)), size)
+    inside = np.isfinite(division.start[:, 0])  # of moves that are not divided the end alone is known
+    before = np.concatenate([[0.0], division.u[:-1]])
+    before[division.first[:-1]] = 0.0
+    arcs = np.isfinite(division.middle[:, 0])
+    keys = np.concatenate(
+        [3.0 * np.flatnonzero(inside), 3 * index + division.u, (3 * index + (before + division.u) / 2)[arcs]]
+    )
+    values = np.concatenate([division.start[inside], division.offset, division.middle[arcs]])
+    order = np.argsort(keys, kind="stable")
+    found: Array = np.stack([np.interp(3.0 * k + u, keys[order], values[order, axis]) for axis in range(3)], axis=1)
+    return found

@@ -1,6 +1,6 @@
 """The words of a block of RS-274 (ISO 6983) code, and their texts, which are kept as they are until one changes.
 
-A line is split into text that stands between words, letters, numbers and comments. Joined, the parts give the line again.
+A line is split into text that stands between words, letters, numbers and comments. Joined, the parts give the line.
 Expressions, variables and control words (``O``) are no words: the line is refused with its number.
 """
 
@@ -58,19 +58,19 @@ def split(line: int, text: str) -> Block:
     ProgramError
         The line has something else than words, comments and spaces.
     """
-    parts: list[str | None] = _PARTS.split(text)  # type: ignore[arg-type]
-    between = "".join(parts[::STRIDE]).strip()  # type: ignore[arg-type]
+    parts: list[str | None] = _PARTS.split(text)
+    between = "".join([part for part in parts[::STRIDE] if part]).strip()
     skippable = False
     if between:
         skippable = between == "/" and (parts[0] or "").strip() == "/"
         if not skippable:
             raise unknown(line, text, between)
-    words = [
-        (parts[k].upper(), parts[k + 1], k + 1)  # type: ignore[union-attr]
-        for k in range(1, len(parts), STRIDE)
-        if parts[k] is not None
-    ]
-    return Block(line, text, parts, words, skippable)  # type: ignore[arg-type]
+    words: list[tuple[str, str, int]] = []
+    for k in range(1, len(parts), STRIDE):
+        letter = parts[k]
+        if letter is not None:
+            words.append((letter.upper(), parts[k + 1] or "", k + 1))
+    return Block(line, text, parts, words, skippable)
 
 
 def unknown(line: int, text: str, what: str) -> ProgramError:

@@ -6,6 +6,7 @@ A number whose correction is below the last printed digit stays as it was writte
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 
 from errormotion.compensation.program.frames import Frame, Triple
@@ -17,6 +18,8 @@ DECIMALS = {UNITS["mm"]: 4, UNITS["inch"]: 5}
 """Printed digits after the point for each unit of programs."""
 
 _STOPS = {0.0, 1.0, 2.0, 30.0, 60.0}
+_NUMBER = re.compile(r"^\s*(?:[nN]\s*\d+\s*)?")
+_OF_MOVE = set("XYZIJKxyzijk")
 _AXES = "XYZ"
 _OFFSETS = "IJK"
 
@@ -54,8 +57,8 @@ class Writer:
         for k in item.axes:
             self._applied[k] = 0.0
         text = item.text
-        if item.motion >= 0 and self._motion not in (item.motion, -1):
-            text = f"G{item.motion} {text}"
+        if not item.explicit and self._motion not in (item.motion, -1):
+            text = _ahead(f"G{item.motion} ", text)
         self._motion = item.motion
         return text
 
@@ -125,7 +128,7 @@ class Writer:
                 self._applied = list(frame.own(old.vector((self._applied[0], self._applied[1], self._applied[2]))))
         self._frame = frame
 
-    def _modal(self, move: Move, kind: int) -> str:
+    def _modal(self, kind: int) -> str:
         """Return the word of a motion, where the control does another one."""
         before, self._motion = self._motion, kind
         return "" if before in (kind, -1) else f"G{kind} "
@@ -150,11 +153,11 @@ class Writer:
                 if not given[k] and abs(last[k] - applied[k]) > half:
                     value = move.end[k] + last[k] if move.absolute else last[k] - applied[k]
                     tail += f" {_AXES[k]}{_text(value, decimals)}"
-            word = "" if move.explicit else self._modal(move, move.kind)
+            word = "" if move.explicit else self._modal(move.kind)
             self._motion = move.kind
             if not new and not tail and not word:
                 return [move.block.text]
-            return [word + _joined(move.block.parts, new, tail)]
+            return [_ahead(word, _joined(move.block.parts, new, tail))]
         more = _most_decimals(move, decimals)
         points = [self._point(move, fraction, change) for fraction, change in zip(u, offset, strict=True)]
         return self._pieces(move, points, [(LINE, "")] * len(points), u, more)
@@ -199,7 +202,7 @@ class Writer:
             if move.feed_mode == 93 and move.kind != RAPID:
                 axes += f" F{move.feed / (u[number] - before):.6g}"
             if lines:
-                lines.append(self._modal(move, kind) + axes[1:])
+                lines.append(self._modal(kind) + axes[1:])
             else:
                 lines.append(self._first(move, kind, axes))
             here, before = place, u[number]
@@ -221,9 +224,9 @@ class Writer:
         text = _joined(move.block.parts, new, axes)
         before, self._motion = self._motion, kind
         if not move.explicit and before not in (kind, -1):
-            return f"G{kind} {text.lstrip()}"
+            return _ahead(f"G{kind} ", text)
         if not move.explicit and before == -1 and kind != move.kind:
-            return f"G{kind} {text.lstrip()}"
+            return _ahead(f"G{kind} ", text)
         return text
 
     def _shifted(self, move: Move, change: Sequence[float], decimals: int) -> str:
@@ -239,9 +242,9 @@ class Writer:
                 continue
             if k >= 0 and abs(change[k]) > half:
                 new[index] = _text(float(number) + change[k], max(decimals, _decimals(number)))
-        word = "" if move.explicit else self._modal(move, move.kind)
+        word = "" if move.explicit else self._modal(move.kind)
         self._motion = move.kind
-        return word + _joined(move.block.parts, new) if new or word else move.block.text
+        return _ahead(word, _joined(move.block.parts, new)) if new or word else move.block.text
 
     def _arc(
         self,
@@ -318,7 +321,6 @@ def _most_decimals(move: Move, decimals: int) -> int:
     return max([decimals, *(_decimals(number) for letter, number, _ in move.block.words if letter in _AXES)])
 
 
-
 def _is_stop(letter: str, number: str) -> bool:
     return letter == "M" and float(number) in _STOPS
 
@@ -333,13 +335,21 @@ def _text(value: float, decimals: int) -> str:
     return text[1:] if text.startswith("-") and not text.strip("-0.") else text
 
 
+def _ahead(word: str, text: str) -> str:
+    """Return a line with a word before all others but its number."""
+    return _NUMBER.sub(lambda found: found[0] + word, text, count=1) if word else text
+
+
 def _joined(parts: Sequence[str | None], new: dict[int, str], tail: str = "") -> str:
-    """Return a line with other numbers; ``tail`` stands behind its last word. An empty number removes the word."""
+    """Return a line with other numbers, an empty one for no word; ``tail`` follows its last word of a position."""
     found = [part or "" for part in parts]
-    end = -1
+    end = axis = -1
     for index in range(2, len(found), STRIDE):
         if found[index]:
             end = index
+            if found[index - 1] in _OF_MOVE:
+                axis = index
+    end = axis if axis >= 0 else end
     for index, number in new.items():
         found[index] = number
         if not number:

@@ -23,6 +23,12 @@ from errormotion.errors import DatasetError, ErrormotionError
 Model = TypeVar("Model", bound=BaseModel)
 Key = str | int
 
+LARGEST_FILE = 4 << 20
+"""Bytes of a TOML file: the maps and benches of people have some kilobytes."""
+MOST_PARTS = 64
+"""Parts of a dotted key: the time and memory of the parser grow with the square of their number."""
+_LONG_KEY = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{MOST_PARTS}}}""")
+
 _EXPECTED = {
     "model_type": "a table",
     "model_attributes_type": "a table",
@@ -72,12 +78,15 @@ def read_toml(path: str | Path, *, error: type[ErrormotionError] = DatasetError)
     Raises
     ------
     ErrormotionError
-        Of the type ``error``: missing, unreadable, not UTF-8, not TOML.
+        Of the type ``error``: missing, unreadable, too large, not UTF-8, not TOML, nested too deep.
     """
     try:
-        raw = Path(path).read_bytes()
+        with Path(path).open("rb") as file:
+            raw = file.read(LARGEST_FILE + 1)
     except OSError as reason:
         raise error(f"{path}: cannot be read: {reason.strerror}. Expected a TOML file there.") from reason
+    if len(raw) > LARGEST_FILE:
+        raise error(f"{path}: expected at most {LARGEST_FILE >> 20} MiB; it is larger")
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as reason:
@@ -85,8 +94,12 @@ def read_toml(path: str | Path, *, error: type[ErrormotionError] = DatasetError)
         raise error(
             f"{path}, line {line}: byte 0x{raw[reason.start]:02x} is not UTF-8. Save the file as UTF-8."
         ) from reason
+    if _LONG_KEY.search(text):
+        raise error(f"{path}: expected keys of at most {MOST_PARTS} parts; found one with more dots")
     try:
         return tomllib.loads(text)
+    except RecursionError:
+        raise error(f"{path}: arrays or tables are nested too deep") from None
     except tomllib.TOMLDecodeError as reason:
         place = re.search(r"(.*) \(at line (\d+), column (\d+)\)$", str(reason), re.DOTALL)
         if place:
@@ -94,6 +107,8 @@ def read_toml(path: str | Path, *, error: type[ErrormotionError] = DatasetError)
         lines = text.splitlines() or [""]
         complaint = str(reason).removesuffix(" (at end of document)")
         raise error(f"{path}, line {len(lines)}, column {len(lines[-1]) + 1}: not TOML: {complaint}") from reason
+    except ValueError as reason:  # a whole number of thousands of digits
+        raise error(f"{path}: not TOML: {reason}") from None
 
 
 def check(

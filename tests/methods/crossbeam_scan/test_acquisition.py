@@ -303,22 +303,39 @@ def cut_off(tmp_path, cycle, place):
     return store([chunk for chunk in kept if chunk.sizes["line"]], tmp_path / "raw.zarr")
 
 
-def test_after_a_crash_the_broken_pass_stays_and_the_next_one_follows(tmp_path):
-    done = cut_off(tmp_path, 3, 0.4)
+@pytest.mark.parametrize("cycle", [0, 1, 3])
+def test_a_virtual_machine_repeats_the_campaign_after_a_crash_and_the_record_is_an_uninterrupted_one(tmp_path, cycle):
+    uninterrupted = record(Machine(), tmp_path / "whole.zarr")
+    done = cut_off(tmp_path, cycle, 0.4)
+    assert 0 < done.sizes["line"] < uninterrupted.sizes["line"]
+    raw = record(Machine(), tmp_path / "raw.zarr", done=done)
+    assert raw.attrs["invalid"] == uninterrupted.attrs["invalid"]
+    for name, expected in uninterrupted.variables.items():
+        np.testing.assert_array_equal(raw[name].values, expected.values, err_msg=str(name))
+
+
+def still_there(done):
+    """Return the machine of an interrupted record, some seconds after its last line."""
     machine = Machine()
+    machine.t = float(np.nanmax(done["line_clock"])) + 10.0
+    return machine
+
+
+def test_on_a_virtual_machine_that_is_still_there_the_broken_pass_stays_and_the_next_one_follows(tmp_path):
+    done = cut_off(tmp_path, 3, 0.4)
+    machine = still_there(done)
     raw = record(machine, tmp_path / "raw.zarr", done=done)
     assert machine.orders == ["warm_up_3.nc", "pass.nc"]
     scans = Scans(raw)
     assert [scans.scan(cycle, 0)[0].shape for cycle in range(5)] == [(800, POINTS)] * 5
     with pytest.raises(MethodError, match="there is no line of it"):
         scans.scan(3, 1)
-    # the virtual machine begins cold again, and is let warm up for as long as the pass asks
     assert 1800 < scans.scan(4, 1)[3] < 1820
 
 
 def test_after_a_crash_in_the_cold_a_cold_pass_is_made_again(tmp_path):
     done = cut_off(tmp_path, 1, 0.4)
-    machine = Machine()
+    machine = still_there(done)
     raw = record(machine, tmp_path / "raw.zarr", done=done)
     assert machine.orders[:2] == ["pass.nc", "warm_up_1.nc"]
     scans = Scans(raw)

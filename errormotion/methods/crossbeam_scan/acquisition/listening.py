@@ -71,6 +71,11 @@ class Lines:
             part |= {"dropped": 0, "invalid": {}}
         return replace(self, **part)
 
+    def after(self, count: int) -> Lines:
+        """Return the lines without the first ones."""
+        names = ("heights", "encoder", "position", "time")
+        return replace(self, **{name: getattr(self, name)[count:] for name in names}) if count else self
+
 
 def listen(
     profiler: Any, mover: Mover, program: Program, settings: Settings, low: float, high: float

@@ -58,8 +58,9 @@ def record_scans(
     pose : Dataset, optional
         Error dataset of a test that found the profiler's pose; without it ``settings.profiler_pose`` counts.
     done : Dataset, optional
-        The record of an interrupted run. Its last pass is not repeated. On a real machine the warm-up has continued: of
-        the overdue passes only the last one is made.
+        The record of an interrupted run. Its last pass is not repeated, and the warm-up has continued: of the overdue
+        passes only the last one is made. A virtual machine that was restarted repeats the whole campaign, and the lines
+        that are recorded already are omitted: the others are those of a campaign without interruption.
 
     Raises
     ------
@@ -159,28 +160,30 @@ class _Campaign:
         self.pending = Pending(static)
         if done is None:
             static.attrs["start"] = datetime.now(UTC).isoformat(timespec="milliseconds")
+            if move.virtual:
+                static.attrs[clock.ORIGIN] = self.origin
         else:
             self._resume(done)
 
     def _resume(self, done: xr.Dataset) -> None:
         """Determine the passes that were made and the start of the warm-up."""
         cycle, since, of_line = (np.asarray(done[name].values) for name in ("cycle_of_line", "line_time", "line_clock"))
+        last = float(np.nanmax(of_line, initial=0.0))
+        if self.move.virtual:
+            if clock.restarted(done, self.origin):
+                log.info("the virtual machine was restarted: %d lines are repeated", done.sizes["line"])
+                self.pending.skip = int(done.sizes["line"])
+                return
+            self.origin = float(done.attrs[clock.ORIGIN])
+        else:
+            # After an interruption of unknown duration, the clock goes on from the last line.
+            age = _age(done)
+            self.origin = self.move.now() - (last if math.isnan(age) else age)
         self.pending.x = np.asarray(done["x"].values, dtype=float)
         tried = cycle[since != 0]  # time 0 is that of the mark
         self.next = int(tried.max()) + 1 if tried.size else 0
         if 0 < self.next <= self.plan.cold and not _complete(done, self.next - 1, self.high - self.settings.margin):
             self.next -= 1  # nothing has warmed up yet: a cold pass can be made again
-        if self.move.virtual:
-            return
-        try:
-            age = clock.age(done)
-        except ValueError as error:
-            raise MethodError(
-                f"The interrupted record does not state when it started ({error}; expected UTC such as "
-                "2025-03-01T08:00:00+00:00) and cannot be resumed. Start a new run."
-            ) from error
-        # After an interruption of unknown duration, the clock goes on from the last line.
-        self.origin = self.move.now() - (float(np.nanmax(of_line)) if math.isnan(age) else age)
         warm = np.flatnonzero(cycle >= self.plan.cold)
         if warm.size:
             self.zero = self.origin + float(of_line[warm[-1]] - since[warm[-1]])
@@ -280,7 +283,8 @@ class _Campaign:
     def _interrupted(self, error: BrokenPassError) -> Iterator[xr.Dataset]:
         """Yield the received lines, a mark after them, and the reason among the counts of invalid data."""
         text = interruption(self.next, error.position, error.reason)
-        self.pending.invalid[text] = self.pending.invalid.get(text, 0) + 1
+        if not self.pending.skip:  # else it has been counted
+            self.pending.invalid[text] = self.pending.invalid.get(text, 0) + 1
         now = self.move.now()
         zero = self.zero if self.zero is not None and self.next >= self.plan.cold else None
         since = now - zero if zero is not None else self.plan.of_cycle(self.next).end
@@ -296,7 +300,8 @@ class _Campaign:
             0, {},
         )  # fmt: skip
         self.pending.add(line, self.next, now - since, self.origin)
-        yield self.pending.chunk()
+        if self.pending.lines:
+            yield self.pending.chunk()
 
 
 def reopen(profiler: Any) -> None:
@@ -315,6 +320,17 @@ def prepare_profiler(profiler: Any) -> None:
         next(stream, None)
 
 
+def _age(done: xr.Dataset) -> float:
+    """Return the time since the start of an interrupted record, s; NaN if unknown."""
+    try:
+        return clock.age(done)
+    except ValueError as error:
+        raise MethodError(
+            f"The interrupted record does not state when it started ({error}; expected UTC such as "
+            "2025-03-01T08:00:00+00:00) and cannot be resumed. Start a new run."
+        ) from error
+
+
 def _complete(done: xr.Dataset, cycle: int, end: float) -> bool:
     """Return whether a pass has reached the end of its last scan, m."""
     counts = np.asarray(done["encoder"].values, dtype=float)[np.asarray(done["cycle_of_line"].values) == cycle]
@@ -324,10 +340,17 @@ def _complete(done: xr.Dataset, cycle: int, end: float) -> bool:
 
 @dataclass
 class Pending:
-    """Lines received since the last chunk."""
+    """Lines received since the last chunk.
+
+    Attributes
+    ----------
+    skip : int
+        Lines that are recorded already and are omitted, with their counts.
+    """
 
     static: xr.Dataset
     x: Array | None = None
+    skip: int = 0
     lines: int = 0
     dropped: int = 0
     invalid: dict[str, int] = field(default_factory=dict)
@@ -343,6 +366,9 @@ class Pending:
     def add(self, lines: Lines, cycle: int, zero: float, origin: float) -> None:
         """Add lines of a pass; ``zero`` is the start of the warm-up, ``origin`` that of the record, s."""
         self.x = lines.x
+        skipped = min(self.skip, lines.encoder.size)
+        self.skip -= skipped
+        lines = lines.after(skipped)
         size = lines.encoder.size
         if not size:
             return
