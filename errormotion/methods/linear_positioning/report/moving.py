@@ -46,7 +46,7 @@ def _table(errors: xr.Dataset, freedom: str) -> Table:
         ]
         rows.append([quantity, *cells])
     caption = (
-        f"Ranges of {freedom}, and its change at the end of moving, in {unit}, at P1 = {fixed(places[0] * 1e3, 1)} mm, P2 = "
-        f"{fixed(places[1] * 1e3, 1)} mm, and of their difference. After ±: expanded uncertainty, k = 2."
+        f"Ranges of {freedom}, and its change at the end of moving, in {unit}, at P1 = {fixed(places[0] * 1e3, 1)} mm, "
+        f"P2 = {fixed(places[1] * 1e3, 1)} mm, and of their difference. After ±: expanded uncertainty, k = 2."
     )
     return Table(caption, ["", *MEASURES.values()], rows)
