@@ -78,7 +78,10 @@ def test_figures_and_report_name_both_ends():
     assert "EXX at P2 - P1 within the first 60 min, range (ISO 230-3)" in names
     assert len(names) == 6
     (part,) = chapters(Source(errors))
-    assert part.stated
+    table = part.sections[0].blocks[0]
+    assert [row[0] for row in table.rows] == ["P1", "P2", "P2 - P1"]
+    shown = float(table.rows[1][2].text)  # P2, while it moved
+    assert shown == pytest.approx(1e6 * float(errors["distortion"][0, 1, 1]), abs=0.05)
 
 
 def test_a_machine_that_warms_up_is_measured_and_stays_within_its_stroke():

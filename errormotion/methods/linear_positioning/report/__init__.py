@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from errormotion.datasets.results.merit import is_planned
-from errormotion.methods.linear_positioning.report import chapter
-from errormotion.report import generic
+from errormotion.methods.linear_positioning.report import chapter, moving
 from errormotion.report.document import Part, Source
 
 
@@ -13,5 +12,5 @@ def chapters(source: Source) -> list[Part]:
     if is_planned(source.errors):
         return []
     if "distortion" in source.errors:
-        return [generic.part(source, source.key)]
+        return [moving.part(source, source.key)]
     return [chapter.part(source, source.key)]

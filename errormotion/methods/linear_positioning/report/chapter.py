@@ -17,7 +17,7 @@ from errormotion.report.text import decimals_of, fixed, listed
 
 KEY_FIGURES = ("A", "R", "E", "B", "M")
 APPROACHES = ("forward", "backward")
-COLUMNS = 12
+COLUMNS = 8
 """Targets in one table."""
 
 
