@@ -10,7 +10,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
-from errormotion.methods.linear_positioning.planning.warming import cycles, ends, moving_of
+from errormotion.methods.linear_positioning.moving import cycles, ends, moving_of
 from errormotion.methods.linear_positioning.schema import SCHEMA
 from errormotion.twin import VirtualMachine, truth
 

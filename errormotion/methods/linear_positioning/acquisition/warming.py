@@ -14,7 +14,7 @@ from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import iso_names
 from errormotion.methods.linear_positioning.acquisition.measure import Stand
-from errormotion.methods.linear_positioning.planning.warming import Cycle, cycles, ends, moving_of
+from errormotion.methods.linear_positioning.moving import Cycle, cycles, ends, moving_of
 from errormotion.methods.linear_positioning.schema import SCHEMA
 
 if TYPE_CHECKING:

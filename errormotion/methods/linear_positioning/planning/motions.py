@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from errormotion.errors import MethodError
-from errormotion.methods.linear_positioning.planning import warming
+from errormotion.methods.linear_positioning import moving
 from errormotion.methods.linear_positioning.planning.targets import positions, reach, seconds, sequence
 from errormotion.plugins import Step
 
@@ -30,7 +30,7 @@ def stops(settings: Settings) -> Iterator[tuple[float, float, float]]:
         The axis would leave its limits.
     """
     if settings.moving is not None:
-        yield from warming.stops(settings)
+        yield from moving.stops(settings)
         return
     low, high = reach(settings)
     if settings.limits is not None:
@@ -74,8 +74,8 @@ def programs(settings: Settings) -> Mapping[str, str]:
     axis = settings.axis
     first, *others = steps(settings)
     if settings.moving is not None:
-        P = np.array(warming.ends(settings))
-        low, high = warming.ends(settings)
+        P = np.array(moving.ends(settings))
+        low, high = moving.ends(settings)
         what = f"{axis} after ISO 230-3, both ends of a moving axis"
         duration = math.fsum(step.seconds for step in others)
     else:
