@@ -103,7 +103,7 @@ class LinearPositioning:
         from errormotion.methods.linear_positioning.planning.targets import positions
 
         if settings.moving is not None:
-            return float(sum(1 for _ in warming.cycles(settings)))
+            return float(sum(1 for _ in moving.cycles(settings)))
         return float(settings.runs if settings.cycle == "linear" else positions(settings).size)
 
     def identify(self, raw: xr.Dataset, settings: PositioningSettings | None = None) -> xr.Dataset:
