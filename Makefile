@@ -1,7 +1,7 @@
 # Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz faults lock
+.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz faults mutations lock
 
 BIN := .venv/bin
 ARGS ?=
@@ -45,6 +45,9 @@ fuzz: .venv/.dev  ## try 1e6 damaged frames of every codec (ARGS="--frames 1e5")
 
 faults: .venv/.dev  ## kill runs, fill their disks and resume them, 10 minutes, and write docs/reliability.md
 	$(BIN)/python tools/faults.py $(ARGS)
+
+mutations: .venv/.dev  ## read 2000 altered files by commands, about 15 minutes, and write docs/reliability.md
+	$(BIN)/python tools/mutations.py $(ARGS)
 
 lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)
 	uv pip compile -q --universal --python-version 3.11 pyproject.toml --all-extras --group build --group dev \

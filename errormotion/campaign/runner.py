@@ -35,6 +35,7 @@ from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
+from errormotion.datasets.validation import explained
 from errormotion.errors import RunError
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
@@ -157,7 +158,8 @@ def resume(
     """
     runs = runs or (campaign.runs if campaign else Path("runs"))
     groups: dict[str, list[RunFolder]] = {}
-    for folder in list_runs(runs):
+    skipped: list[str] = []
+    for folder in list_runs(runs, skipped):
         if "campaign" not in folder.data:  # a log
             continue
         groups.setdefault(str(folder.data["id"]), []).append(folder)
@@ -177,7 +179,8 @@ def resume(
             f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Continue with the "
             "stored files: 'errormotion run --resume' without the campaign. Or start again: without --resume."
         )
-    raise RunError(f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished.")
+    message = f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished."
+    raise RunError("\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]))
 
 
 class _Session:
@@ -359,7 +362,7 @@ class _Session:
         if (folder.path / path).exists():  # computed, but the process ended before run.json was written
             errors = datasets.load(folder.path / path)
         else:
-            with datasets.load(folder.raw) as raw:
+            with datasets.load(folder.raw) as raw, explained(folder.raw, raw):
                 errors = method.identify(raw, test.settings)
             datasets.validate(errors)
             (folder.path / path).parent.mkdir(parents=True, exist_ok=True)

@@ -25,8 +25,8 @@ SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
         "virtual_gantry",
         "campaign.toml",
         [
-            (r'positions = .*', 'positions = ["-600 mm", "600 mm"]\nline_pitch = "140 um"'),
-            (r'warm_up = .*', 'warm_up = ["7 min", "15 min", "30 min"]'),
+            (r"positions = .*", 'positions = ["-600 mm", "600 mm"]\nline_pitch = "140 um"'),
+            (r"warm_up = .*", 'warm_up = ["7 min", "15 min", "30 min"]'),
         ],
     ),
     "multilateration": ("virtual_tracker", "campaign.toml", [(r"count = .*", "count = [4, 3, 3]")]),

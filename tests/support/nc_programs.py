@@ -149,7 +149,11 @@ class Programs:
         return [f"G{self.feed_mode}", *([] if self.feed_mode == 93 else [f"F{0.2 if self.feed_mode == 95 else 300}"])]
 
     def _other(self) -> list[str]:
-        return [self.random.choice(("(comment)", "M9", "M5", "M3 S900", "G4 P0.5", "", "; text", "M64 P1", "G61", "G64 P0.01"))]
+        return [
+            self.random.choice(
+                ("(comment)", "M9", "M5", "M3 S900", "G4 P0.5", "", "; text", "M64 P1", "G61", "G64 P0.01")
+            )
+        ]
 
     def _reposition(self) -> list[str]:
         """Return a move to a stated position with all axes, in absolute coordinates."""
@@ -187,7 +191,12 @@ class Programs:
             return self._reposition()
         if self.random.random() < 0.5:
             return ["G90", f"G53 G0 {self.random.choice(AXES)}{self._value(1.5)}", *self._reposition()]
-        return ["G90 G94 F100", f"G38.{self.random.choice('2345')} Z{self.at[2] - 1.3:.3f}", *self._mode_of_feed(), *self._reposition()]
+        return [
+            "G90 G94 F100",
+            f"G38.{self.random.choice('2345')} Z{self.at[2] - 1.3:.3f}",
+            *self._mode_of_feed(),
+            *self._reposition(),
+        ]
 
     def _mode_of_feed(self) -> list[str]:
         return [f"G{self.feed_mode}", *([] if self.feed_mode == 93 else ["F200"])]
