@@ -1,7 +1,8 @@
 # Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz guided wire faults endurance lowest lock
+.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz guided wire faults mutations endurance lowest lock
+.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz guided wire faults mutations endurance lowest lock
 
 BIN := .venv/bin
 ARGS ?=
@@ -57,6 +58,8 @@ endurance: .venv/.dev  ## watch a machine for 24 simulated hours with a fault a 
 
 lowest: .venv/.dev  ## run tests with the lowest versions of packages that pyproject.toml allows, in .venv-lowest
 	$(BIN)/python tools/lowest.py $(ARGS)
+mutations: .venv/.dev  ## read 2000 altered files by commands, about 15 minutes, and write docs/reliability.md
+	$(BIN)/python tools/mutations.py $(ARGS)
 
 lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)
 	uv pip compile -q --universal --python-version 3.11 pyproject.toml --all-extras --group build --group dev \

@@ -7,7 +7,6 @@ reported in one message, each with its key, the expected and the found value.
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -268,7 +267,7 @@ def _missing(campaign: CampaignPlan) -> Iterator[str]:
 
 def parse_bench(text: str, source: Path) -> BenchPlan:
     """Check the text of a bench file; ``source`` is for the messages."""
-    data = tomllib.loads(text)
+    data = tomlfile.parse_toml(text, source, error=BenchError)
     description, mistakes, machine = None, list[str](), data.get("machine")
     if isinstance(machine, dict):
         description, mistakes = read_machine(machine)
@@ -315,7 +314,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
 
     Without a bench, BenchError reports the missing bench with all other errors.
     """
-    data = tomllib.loads(text)
+    data = tomlfile.parse_toml(text, source, error=BenchError)
     table, mistakes = tomlfile.check(data, CampaignTable)
     for number, entry in _tables(data.get("test")):
         if isinstance(entry.get("method"), str):

@@ -35,6 +35,7 @@ from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
+from errormotion.datasets.validation import explained
 from errormotion.errors import ErrormotionError, RunError
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
@@ -157,7 +158,8 @@ def resume(
     """
     runs = runs or (campaign.runs if campaign else Path("runs"))
     groups: dict[str, list[RunFolder]] = {}
-    for folder in list_runs(runs):
+    skipped: list[str] = []
+    for folder in list_runs(runs, skipped):
         if "campaign" not in folder.data:  # a log
             continue
         groups.setdefault(str(folder.data["id"]), []).append(folder)
@@ -370,7 +372,7 @@ class _Session:
         if (folder.path / path).exists():  # computed, but the process ended before run.json was written
             errors = datasets.load(folder.path / path)
         else:
-            with datasets.load(folder.raw) as raw:
+            with datasets.load(folder.raw) as raw, explained(folder.raw, raw):
                 errors = method.identify(raw, test.settings)
             datasets.validate(errors)
             (folder.path / path).parent.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -192,6 +191,7 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
     """
     from errormotion.datasets import load
     from errormotion.datasets.files import events
+    from errormotion.datasets.files.runfile import read_run
 
     folder = Path(run_folder)
     if not folder.is_dir():
@@ -204,13 +204,8 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
             f"{folder} holds no errors/*/errors.nc: nothing was identified yet. Run 'errormotion identify' first."
         )
     run: dict[str, Any] = {}
-    if (folder / "run.json").is_file():
-        try:
-            run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise RunError(
-                f"{folder / 'run.json'} is no JSON: {error}. Restore it, or remove it to report without."
-            ) from error
+    if os.path.lexists(folder / "run.json"):
+        run = dict(read_run(folder))
     run["events"] = events.read(folder)
     target = Path(out) if out is not None else folder / "report.html"
     if log is not None:

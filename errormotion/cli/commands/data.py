@@ -20,6 +20,7 @@ from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.cli.tolerances import end_with, lines_of, remarks
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.storage import reading
+from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError, ErrormotionError
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import Tolerances, from_run, load_tolerances
@@ -193,7 +194,8 @@ def _identify_one(
     with Bars(as_json) as bars:
         with reading(raw), datasets.load(raw) as dataset:
             bars.stage("identifying")
-            errors = method().identify(dataset, settings)
+            with explained(raw, dataset):
+                errors = method().identify(dataset, settings)
         datasets.validate(errors)
         if trials is not None:
             evaluation = evaluate_beside(
@@ -254,7 +256,9 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
         folder = RunFolder.open(run)
         stored = limits or from_run(folder.data)
         if stored is not None and folder.errors is not None:
-            found = judge(datasets.load(folder.errors), stored)
+            with reading(folder.errors), datasets.load(folder.errors) as errors:
+                datasets.validate(errors)
+                found = judge(errors, stored)
             folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
         with reading(run):
             path = write_run_report(run, out)
@@ -263,7 +267,7 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
             folder.step("report", "done")
             folder.save()
     else:
-        with reading(run), datasets.load(run) as errors:
+        with reading(run), datasets.load(run) as errors, explained(run, errors):
             state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
             path = write_report([errors, *belonging(errors, run)], out or run.with_suffix(".html"), run=state)
             found = judge(errors, limits) if limits is not None else None
