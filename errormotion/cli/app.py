@@ -715,7 +715,7 @@ def compensate_program(
     block_delete: Annotated[
         str | None, typer.Option("--block-delete", help="skip or run blocks that start with '/'.")
     ] = None,
-    reader: Annotated[str, typer.Option(help="auto, plain, or linuxcnc (its interpreter).")] = "auto",
+    reader: Annotated[str, typer.Option(help="auto, plain, or interpreter (that of LinuxCNC).")] = "auto",
     check: Annotated[bool, typer.Option("--check", help="LinuxCNC's interpreter must read the result alike.")] = False,
     partial: Annotated[bool, typer.Option("--partial", help="Leave out freedoms that are not known.")] = False,
     report: Annotated[Path | None, typer.Option(help="Write a page with the correction along the path, .html.")] = None,

@@ -12,12 +12,11 @@ import xarray as xr
 from pydantic import TypeAdapter, ValidationError
 
 import errormotion
-from errormotion.cli.commands.model import dataset_of
+from errormotion.cli.commands.model import dataset_of, source_of
 from errormotion.cli.output import show, show_json
 from errormotion.compensation.correction import Correction, correction
 from errormotion.compensation.program import LEFT, ByTool, Offsets, Outcome, Settings, compensate
 from errormotion.compensation.program.offsets import read_parameters, read_tools
-from errormotion.compensation.thermal_model import ThermalModel
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import DatasetError, ProgramError
 
@@ -71,8 +70,9 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
         route=choice.reader,
         check=choice.check,
     )
-    errors = [dataset_of(path) for path in sources]
-    found = _correction(sources, errors, choice)
+    given = [source_of(path) for path in sources]
+    errors = [each if isinstance(each, xr.Dataset) else each.dataset for each in given]
+    found = _correction(given, choice)
     time = None
     if found.timed:
         time = _last(found) if choice.time is None else _quantity("--time", choice.time, Time)
@@ -105,11 +105,9 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
     _show(target, outcome, found, expanded, time, choice, as_json)
 
 
-def _correction(paths: list[Path], errors: list[xr.Dataset], choice: Choice) -> Correction:
-    models = [ds.attrs.get("schema") == "errormotion.model.thermal/1" for ds in errors]
-    if any(models) and choice.temperatures is None:
+def _correction(sources: list[Any], choice: Choice) -> Correction:
+    if choice.temperatures is None and not all(isinstance(source, xr.Dataset) for source in sources):
         raise DatasetError("a thermal model needs temperatures: give --temperatures LOG")
-    sources = [ThermalModel.load(path) if model else ds for path, ds, model in zip(paths, errors, models, strict=True)]
     data = None if choice.temperatures is None else dataset_of(choice.temperatures)
     return correction(sources, choice.functional_point, data=data, partial=choice.partial)
 

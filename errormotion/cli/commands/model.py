@@ -13,6 +13,7 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
+from errormotion.compensation.thermal_model import SCHEMA as MODEL_SCHEMA
 from errormotion.compensation.thermal_model import Check, Settings, ThermalModel, check, fit
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.datasets.storage import reading
@@ -131,6 +132,12 @@ def errors_of(path: Path) -> xr.Dataset:
     if ds.attrs.get("schema") != SCHEMA:
         raise DatasetError(f"{path}: expected schema {SCHEMA}; found {ds.attrs.get('schema', 'none')}")
     return ds
+
+
+def source_of(path: Path) -> xr.Dataset | ThermalModel:
+    """Return the thermal model of a file, or the error dataset of a file or a run folder."""
+    ds = dataset_of(path)
+    return ThermalModel(ds) if ds.attrs.get("schema") == MODEL_SCHEMA else ds
 
 
 def dataset_of(path: Path) -> xr.Dataset:

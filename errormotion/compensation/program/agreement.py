@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 
+from errormotion.compensation.program.arcs import SMALL
 from errormotion.compensation.program.canonical import Command, commands
 from errormotion.compensation.program.items import LINE, PLANES, RAPID, Left, Move
 from errormotion.compensation.program.offsets import Offsets
@@ -77,7 +78,7 @@ def _same(move: Move, command: Command) -> None:
         if move.kind <= LINE:
             raise _differ(move, command)
         a, b, c = PLANES[move.plane]
-        turns = math.ceil(abs(move.sweep) / (2 * math.pi) - 1e-6) * (1 if move.kind == 3 else -1)
+        turns = math.ceil((abs(move.sweep) - 1.001 * SMALL) / (2 * math.pi)) * (1 if move.kind == 3 else -1)
         expected = (move.end[a], move.end[b], *move.centre, turns, move.end[c])
     elif move.kind != (RAPID if command.name == "STRAIGHT_TRAVERSE" else LINE):
         raise _differ(move, command)

@@ -6,6 +6,7 @@ names the line that it comes from. It prints four digits after the point.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -92,9 +93,20 @@ def commands(source: Iterable[str], offsets: Offsets, *, deleted: bool | None = 
             arguments.append("-b")
         with (folder / "errors").open("wb") as errors:
             process = subprocess.Popen(
-                [*arguments, "program.ngc"], cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors
+                [*arguments, "program.ngc"],
+                cwd=folder,
+                env={**os.environ, "HOME": name},  # its tools are in a file there, which running controls share
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=errors,
             )
-        late = threading.Timer(TIME_LIMIT, process.kill)
+        expired = threading.Event()
+
+        def end() -> None:
+            expired.set()
+            process.kill()
+
+        late = threading.Timer(TIME_LIMIT, end)
         late.daemon = True
         late.start()
         try:
@@ -107,6 +119,8 @@ def commands(source: Iterable[str], offsets: Offsets, *, deleted: bool | None = 
             process.wait()
             if process.stdout is not None:
                 process.stdout.close()
+        if expired.is_set():
+            raise ProgramError(f"LinuxCNC's interpreter did not end within {TIME_LIMIT:g} s: a loop may not end")
         if code != 0:
             raise _refused(folder, code)
 
@@ -130,7 +144,7 @@ def _refused(folder: Path, code: int) -> ProgramError:
     with (folder / "errors").open("rb") as file:
         said = [line for line in file.read(4096).decode("latin-1").splitlines() if line.strip() and line != "executing"]
     if code < 0:
-        return ProgramError(f"LinuxCNC's interpreter did not end within {TIME_LIMIT:g} s: a loop may not end")
+        return ProgramError(f"LinuxCNC's interpreter was ended by signal {-code}")
     why, where = said[0] if said else f"exit code {code}", said[1] if len(said) > 1 else ""
     number = _NUMBERED.match(where)
     if number is not None and number[2]:

@@ -23,7 +23,7 @@ from errormotion.errors import ProgramError
 LARGEST_PROGRAM = 1 << 29
 """Of a program file, bytes."""
 
-ROUTES = ("auto", "plain", "linuxcnc")
+ROUTES = ("auto", "plain", "interpreter")
 """Who reads the program: the plain reader and, for what it does not know, LinuxCNC's interpreter; or one of them."""
 
 _COMMENT = 70  # characters
@@ -66,7 +66,7 @@ class Outcome:
     ----------
     summary : Summary
     route : str
-        ``plain`` or ``linuxcnc``.
+        ``plain`` or ``interpreter``.
     why : str
         Why the plain reader was not used; empty where it was.
     checked : int
@@ -117,7 +117,7 @@ def compensate(
     why = ""
     beside = out.with_name(out.name + ".part")
     try:
-        if chosen.route != "linuxcnc":
+        if chosen.route != "interpreter":
             try:
                 return _written(program, None, beside, out, correcting, offsets, chosen, head, why)
             except ProgramError as error:
@@ -134,6 +134,8 @@ def compensate(
 
 
 def _expanded(program: Path, offsets: Offsets, settings: Settings) -> Generator[str]:
+    if settings.unit != "mm":
+        raise ProgramError("LinuxCNC's interpreter starts in mm: state the unit in the program (G20)")
     source = [text for _, text in lines_of(_lines(program))]
     screen(source)
     with closing(canonical.commands(source, offsets, deleted=settings.deleted)) as commands:
@@ -167,7 +169,7 @@ def _written(
             new, offsets, Reader(offsets, unit=unit, start=settings.start, deleted=settings.deleted)
         )
     os.replace(beside, out)
-    return Outcome(rewriting.summary, "plain" if expanded is None else "linuxcnc", why, checked, _digest(program))
+    return Outcome(rewriting.summary, "plain" if expanded is None else "interpreter", why, checked, _digest(program))
 
 
 def _with_head(lines: Iterable[str], head: Sequence[str]) -> Iterator[str]:

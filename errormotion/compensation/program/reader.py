@@ -28,6 +28,7 @@ _CYCLES = {730, *range(810, 900, 10)}
 _STOPS = {0, 1, 60}
 _ENDS = {2, 30}
 _SWITCHES = {3, 4, 5, 6, 7, 8, 9, 19, 48, 49, 50, 51, 52, 53, 61, 62, 63, 64, 65, 67, 68}
+_WITH_P = {50, 51, 52, 53, 62, 63, 64, 65}
 _AXES = "XYZ"
 _OWN = set("NFSTXYZ")
 _OF_SWITCHES = set("PQERD")
@@ -161,6 +162,8 @@ class Reader:
             item = self._move(block, values, explicit=motion is not None, machine=machine)
             allowed = _OWN | (set("IJKRP") if item_is_arc(item) else set()) | (_OF_SWITCHES if switches else set())
             allowed |= {"H"} if 430 in codes else set()
+            if item_is_arc(item) and switches and (("P" in values and _WITH_P & {*switches}) or 19 in switches):
+                raise refusal(block.line, block.text, "an arc and a switch that share a word (P or R)")
             if more := values.keys() - allowed:
                 raise refusal(block.line, block.text, f"the word {min(more)} has no use here")
         else:

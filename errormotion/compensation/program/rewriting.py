@@ -19,6 +19,9 @@ from errormotion.errors import ProgramError
 MOST_WRITTEN = 20_000_000
 """Most lines of the new program."""
 
+LONGEST_BLOCK = 250
+"""Characters of a line that LinuxCNC reads; a shorter line does not become a longer one."""
+
 SHOWN = 4000
 """Most points of the path that are kept for the page."""
 
@@ -151,6 +154,10 @@ class Rewriting:
                 if summary.written > MOST_WRITTEN:
                     raise ProgramError(
                         f"the new program would have more than {MOST_WRITTEN} lines: raise the tolerance"
+                    )
+                if max(map(len, made)) > LONGEST_BLOCK >= len(item.block.text):
+                    raise ProgramError(
+                        f"line {item.block.line} would get longer than the {LONGEST_BLOCK} characters of a control"
                     )
                 yield from made
                 continue

@@ -130,8 +130,20 @@ def test_refuses_what_neither_understands(
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_text("\n".join([*HEAD, *lines, "M2"]) + "\n")
     with pytest.raises(ProgramError, match=why):
-        compensate(program, out, zero, ORIGINS, Settings(route="linuxcnc"))
+        compensate(program, out, zero, ORIGINS, Settings(route="interpreter"))
     assert [path.name for path in tmp_path.iterdir()] == ["a.ngc"]
+
+
+def test_the_tools_of_a_running_control_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))  # LinuxCNC keeps the tools of a running machine in a file there
+    expanded([*HEAD, "T1 M6", "G43", "M2"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_loop_that_prints_nothing_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(canonical, "TIME_LIMIT", 0.5)
+    with pytest.raises(ProgramError, match=r"did not end within 0\.5 s"):
+        expanded([*HEAD, "o1 while [1]", "#1=2", "o1 endwhile", "M2"])
 
 
 @pytest.mark.parametrize(
@@ -159,7 +171,7 @@ def test_the_route_is_chosen_and_told(tmp_path: Path) -> None:
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_bytes("\r\n".join(["%", *HEAD, "#1=50", "G1 X#1 Y30", "M2", "%", ""]).encode())
     found = compensate(program, out, bent, ORIGINS, Settings(check=True), head=["machine (test) ü"])
-    assert found.route == "linuxcnc"
+    assert found.route == "interpreter"
     assert "line 5" in found.why
     assert found.checked == found.summary.written - len([x for x in out.read_text().splitlines() if "X" not in x]) + 1
     text = out.read_bytes()

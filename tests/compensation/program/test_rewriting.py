@@ -1,5 +1,6 @@
 """The new program: its cuts are where they were meant, and everything else stays."""
 
+import contextlib
 import math
 from random import Random
 
@@ -203,3 +204,23 @@ def test_the_points_for_the_page_have_the_correction_that_acts_there() -> None:
         found = made.summary
         assert np.abs(found.offsets - waves(found.places)).max() < 2e-6
         assert found.largest <= np.linalg.norm(found.offsets, axis=1).max() + 2e-6
+
+
+def test_a_line_does_not_become_longer_than_controls_read() -> None:
+    with pytest.raises(ProgramError, match=r"line 4 would get longer"):
+        rewritten([*HEAD, "G1 X1 (" + "x" * 240 + ")"], shift)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**40), st.data())
+def test_altered_programs_are_read_or_refused_by_line(seed: int, data: st.DataObject) -> None:
+    lines = Programs(Random(seed)).lines(12)
+    alphabet = st.text("GMXYZIJKRPFNSTHLDQO0123456789.-+ /%;()#[]<=ä\t", min_size=1, max_size=4)
+    for _ in range(data.draw(st.integers(1, 4))):
+        k = data.draw(st.integers(0, len(lines) - 1))
+        at = data.draw(st.integers(0, len(lines[k])))
+        lines[k] = lines[k][:at] + data.draw(alphabet) + lines[k][at + data.draw(st.integers(0, 2)) :]
+    with contextlib.suppress(ProgramError):
+        new = rewritten(lines, bent)
+        assert len(new) >= len(lines)
+        assert len(moves_of(new)) >= len(moves_of(lines))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from nc_paths import ORIGINS, deviations
+from nc_paths import ORIGINS, dense, deviations, moves_of
 
 from errormotion.compensation.correction import correction
 from errormotion.compensation.program.tools import ByTool
@@ -80,3 +80,21 @@ def test_tools_without_a_gauge_point_share_the_functional_point() -> None:
     assert np.allclose(with_gauge.offset, alone, atol=1e-15)
     assert with_gauge.covariance is not None
     assert ORIGINS.tools
+
+
+def test_what_remains_on_the_machine_is_within_the_stated_uncertainty() -> None:
+    machine, truth = machine_and_truth("cframe")
+    rng = np.random.default_rng(5)
+    sigma = 0.5e-6
+    measured = truth.copy()
+    for name in ("EX", "EY", "EZ"):
+        measured[name] = truth[name] + sigma * rng.normal(size=truth[name].shape)
+    variance = np.diag([sigma**2] * 3 + [0.0] * 3)
+    measured = measured.assign(covariance=(truth["covariance"].dims, np.tile(variance, (truth.sizes["target"], 1, 1))))
+    correcting = ByTool(correction(measured))
+    places = np.concatenate([dense(move, 20) for move in moves_of(PROGRAM)])
+    stated = correcting.values(places, np.zeros_like(places), covariance=True).covariance
+    u = np.sqrt(np.linalg.eigvalsh(stated)[:, -1].max())
+    after = [away for _, away in deviations(PROGRAM, correcting, displaced(machine, np.zeros(3)), tolerance=TOLERANCE)]
+    assert u < 2 * sigma
+    assert max(after) <= TOLERANCE + DIGITS + 4 * u  # the largest of some hundred independent values

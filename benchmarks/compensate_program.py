@@ -1,9 +1,10 @@
 """NC programs: time and memory of a correction beside LinuxCNC's own reading, and random programs against LinuxCNC.
 
-``python benchmarks/nc_programs.py [PROGRAMS [SEED]]``: so many random programs of 60 steps (default 300).
+``python benchmarks/compensate_program.py [PROGRAMS [SEED]]``: so many random programs of 60 steps (default 300).
 """
 
 import math
+import os
 import resource
 import shutil
 import subprocess
@@ -66,7 +67,8 @@ def speed(folder: Path) -> None:
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         start = time.perf_counter()
         with (folder / "canonical").open("wb") as file:
-            subprocess.run([program, "-g", str(part)], cwd=folder, stdout=file, stderr=subprocess.DEVNULL, check=False)
+            home = {**os.environ, "HOME": str(folder)}  # the tools of a running control are in a file there
+            subprocess.run([program, "-g", str(part)], cwd=folder, env=home, stdout=file, stderr=subprocess.DEVNULL)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         own = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
         print(f"  LinuxCNC's interpreter reads it in {time.perf_counter() - start:.1f} s, {own:.1f} s of CPU")
