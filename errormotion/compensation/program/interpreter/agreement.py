@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 
-from errormotion.compensation.program.arcs import SMALL
-from errormotion.compensation.program.canonical import Command, commands
-from errormotion.compensation.program.items import LINE, PLANES, RAPID, Left, Move
-from errormotion.compensation.program.offsets import Offsets
-from errormotion.compensation.program.reader import Reader
+from errormotion.compensation.program.interpreter.canonical import Command, commands
+from errormotion.compensation.program.reading.arcs import SMALL
+from errormotion.compensation.program.reading.items import LINE, PLANES, RAPID, Left, Move
+from errormotion.compensation.program.reading.offsets import Offsets
+from errormotion.compensation.program.reading.reader import Reader
 from errormotion.errors import ProgramError
 
 DIGIT = 1.02e-4
