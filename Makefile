@@ -1,7 +1,7 @@
 # Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz faults endurance lowest lock
+.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz guided wire faults endurance lowest lock
 
 BIN := .venv/bin
 ARGS ?=
@@ -42,6 +42,12 @@ validate: .venv/.dev  ## run the Monte Carlo validation and write docs/validatio
 
 fuzz: .venv/.dev  ## try 1e6 damaged frames of every codec (ARGS="--frames 1e5") and write docs/reliability.md
 	$(BIN)/python tools/fuzz.py $(ARGS)
+
+guided: .venv/.dev  ## search for inputs that reach new code in codecs and file readers (needs pip install atheris), docs/reliability.md
+	$(BIN)/python tools/guided.py $(ARGS)
+
+wire: .venv/.dev  ## try every driver on a wire that disturbs it, and write docs/reliability.md
+	$(BIN)/python tools/wire.py $(ARGS)
 
 faults: .venv/.dev  ## kill runs, fill their disks and resume them, 10 minutes, and write docs/reliability.md
 	$(BIN)/python tools/faults.py $(ARGS)

@@ -49,6 +49,20 @@ MEMORY = 2000
 # ---------------------------------------------------------------------- in processes of their own
 
 
+def good(name: str, folder: Path) -> None:
+    """Leave the good inputs in a folder: some come from sessions with simulators, which take their time elsewhere."""
+    import corpus
+
+    (folder / "good").mkdir(exist_ok=True)
+    for number, data in enumerate(corpus.TARGETS[name].seeds()):
+        (folder / "good" / f"{number:03}").write_bytes(data)
+
+
+def good_ones(folder: Path) -> list[bytes]:
+    """Return the good inputs."""
+    return [path.read_bytes() for path in sorted((folder / "good").iterdir())]
+
+
 def search(name: str, folder: Path, seconds: float) -> None:
     """Search from the good inputs and the corpus; what reaches new branches, fails or is slow is left in a folder."""
     import atheris
@@ -63,7 +77,7 @@ def search(name: str, folder: Path, seconds: float) -> None:
     limit = 10 * getattr(target, "limit", corpus.fuzzing.SLOWEST)  # of code with counters, and interpreted
     found, places = folder / "found", Counter[str]()
     found.mkdir()
-    for number, data in enumerate([*target.seeds(), *corpus.load(target)]):
+    for number, data in enumerate([*good_ones(folder), *corpus.load(target)]):
         (found / f"good{number}").write_bytes(data)
 
     def save(data: bytes, why: str) -> None:
@@ -105,7 +119,7 @@ def walk(name: str, folder: Path, seconds: float) -> None:
     from errormotion.errors import ErrormotionError
 
     target, chance, steps = corpus.TARGETS[name], random.Random(1), set[corpus.Arc]()
-    pool, tried, until = [*target.seeds(), *corpus.load(target)], 0, time.monotonic() + seconds
+    pool, tried, until = [*good_ones(folder), *corpus.load(target)], 0, time.monotonic() + seconds
     (folder / "found").mkdir(exist_ok=True)
     for number, data in enumerate(pool):
         steps |= corpus.reached(target.read, data)
@@ -134,7 +148,7 @@ def measure(name: str, folder: Path) -> None:
     import corpus
 
     target = corpus.TARGETS[name]
-    known = set().union(*(corpus.reached(target.read, data) for data in target.seeds() for _ in range(2)))
+    known = set().union(*(corpus.reached(target.read, data) for data in good_ones(folder) for _ in range(2)))
     found = [path.read_bytes() for path in sorted((folder / "found").iterdir())]
     kept, more = corpus.smallest(target.read, found, known)
     corpus.store(target, kept)
@@ -147,7 +161,7 @@ def judge(name: str, folder: Path) -> None:
     import corpus
 
     target = corpus.TARGETS[name]
-    for data in target.seeds():
+    for data in good_ones(folder):
         corpus.judge(target, data, memory=False)  # compiles what is compiled at its first use
     errors, faults, slowest, memory = Counter[str](), list[str](), 0.0, 0
     for path in sorted((folder / "found").iterdir()):
@@ -169,7 +183,7 @@ def judge(name: str, folder: Path) -> None:
 
 def run(stage: str, name: str, folder: Path, seconds: float = 0.0) -> str:
     """Run a stage in a process of its own; return what it printed."""
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "0" if stage == "judge" else "1"}
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "0" if stage in ("good", "judge") else "1"}
     words = [sys.executable, __file__, "--stage", stage, "--only", name, "--folder", folder, "--seconds", str(seconds)]
     ended = subprocess.run(
         words, env=environment, cwd=ROOT, capture_output=True, text=True, errors="replace", check=False,
@@ -196,6 +210,7 @@ def guided(name: str, seconds: float, keep: Path | None) -> tuple[str, list[str]
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if keep is None else keep / re.sub(r"\W+", "_", name)
         folder.mkdir(parents=True, exist_ok=True)
+        run("good", name, folder)
         try:
             said = run("search", name, folder, seconds)
         except RuntimeError as ended:  # of Python 3.11, atheris breaks a few functions
@@ -259,14 +274,14 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, default=None, help="folder for all that is found")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "reliability.md")
     parser.add_argument(
-        "--stage", default="", choices=["", "search", "walk", "measure", "judge"], help=argparse.SUPPRESS
+        "--stage", default="", choices=["", "good", "search", "walk", "measure", "judge"], help=argparse.SUPPRESS
     )
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.stage in ("search", "walk"):
         {"search": search, "walk": walk}[options.stage](options.only, options.folder, options.seconds)
     elif options.stage:
-        {"measure": measure, "judge": judge}[options.stage](options.only, options.folder)
+        {"good": good, "measure": measure, "judge": judge}[options.stage](options.only, options.folder)
     if options.stage:
         return
     if importlib.util.find_spec("atheris") is None:
@@ -280,7 +295,12 @@ def main() -> None:
     with ThreadPoolExecutor(options.processes) as pool:
         waiting = [pool.submit(guided, name, options.seconds, options.keep) for name in chosen]
         for name, each in zip(chosen, waiting, strict=True):
-            text, faults = each.result()
+            try:
+                text, faults = each.result()
+            except RuntimeError as error:
+                failed = True
+                print(f"{name}: {error}", flush=True)
+                continue
             failed = failed or bool(faults)
             write(options.out, list(TARGETS), {name: text}, {name: faults}, options.seconds)
             print(text, flush=True)

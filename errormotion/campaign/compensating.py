@@ -29,10 +29,8 @@ from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.compensation.online.audit import AuditLog
 from errormotion.compensation.online.follower import Conditions, Follower, State, Step
-from errormotion.compensation.online.predictor import Prediction, Predictor
+from errormotion.compensation.online.prediction import PARAMETERS, Prediction, predictor
 from errormotion.compensation.online.settings import Limits
-from errormotion.compensation.thermal_model import ThermalModel
-from errormotion.compensation.thermal_model.record import PARAMETERS
 from errormotion.datasets import provenance
 from errormotion.errors import BenchError, CompensationError, InstrumentError
 
@@ -79,7 +77,8 @@ class Compensation:
     ----------
     plan : BenchPlan
         Its thermometers and its controller are read; its compensator writes.
-    model : ThermalModel
+    model : Dataset
+        Of a kind that predicts errors from readings.
     runs : Path
         Folder of the run folder.
     arm : str, optional
@@ -108,7 +107,7 @@ class Compensation:
     def __init__(
         self,
         plan: BenchPlan,
-        model: ThermalModel,
+        model: xr.Dataset,
         runs: Path,
         *,
         arm: str | None = None,
@@ -119,8 +118,8 @@ class Compensation:
         self.plan, self.armed = plan, arm is not None
         self.limits = plan.compensator.limits if plan.compensator else Limits()
         self._check(model, arm)
-        self._predictor = Predictor(model, functional_point)
-        self._model_hash = provenance.hash_dataset(model.dataset)
+        self._predictor = predictor(model, functional_point)
+        self._model_hash = provenance.hash_dataset(model)
         self._monitor = Monitor(plan, runs, self.limits.period, clock, TEST)
         self._check_inputs()
         self._gap = 0.0 if since is None else self._replay(since)
@@ -132,8 +131,8 @@ class Compensation:
         self._last: tuple[State, str, tuple[float, ...]] | None = None
         self._stack = ExitStack()
 
-    def _check(self, model: ThermalModel, arm: str | None) -> None:
-        machine, frame = str(model.dataset.attrs["machine"]), str(model.dataset.attrs["frame"])
+    def _check(self, model: xr.Dataset, arm: str | None) -> None:
+        machine, frame = str(model.attrs.get("machine", "unknown")), str(model.attrs.get("frame", "unknown"))
         if arm is not None and arm != self.plan.machine:
             raise CompensationError(
                 f"--arm {arm}: the machine of {self.plan.source} is called '{self.plan.machine}'. Nothing was written."
@@ -146,13 +145,12 @@ class Compensation:
             raise CompensationError(f"The model states errors in the frame '{frame}'; offsets need '{FRAME}'.")
 
     def _check_inputs(self) -> None:
-        needed = [feature.source for feature in self._predictor.model.features if not feature.parameter]
-        absent = [name for name in dict.fromkeys(needed) if name not in self._monitor.sensors]
+        absent = [name for name in self._predictor.temperatures if name not in self._monitor.sensors]
         if absent:
             found = ", ".join(self._monitor.sensors) or "none"
             raise BenchError(f"{self.plan.source}: the model needs the temperatures {', '.join(absent)}; found {found}")
-        if any(feature.parameter for feature in self._predictor.model.features) and self._monitor.controller is None:
-            raise BenchError(f"{self.plan.source}: the model needs the spindle speed or the feed; found no controller")
+        if (needed := self._predictor.parameters) and self._monitor.controller is None:
+            raise BenchError(f"{self.plan.source}: the model needs {', '.join(needed)}; found no controller")
 
     def _replay(self, earlier: xr.Dataset) -> float:
         """Take the readings of a log, on a clock whose zero is now; return the time since its last row, s."""
@@ -318,7 +316,8 @@ class Compensation:
             return
         changed = self._last is None or now[:2] != self._last[:2]
         self._last = now
-        known = {name: self._known[name][1] for name in self._predictor.sources if name in self._known}
+        names = (*self._predictor.temperatures, *self._predictor.parameters)
+        known = {name: self._known[name][1] for name in names if name in self._known}
         self._audit.write(
             {
                 "elapsed": snapshot.time,

@@ -142,7 +142,17 @@ class RunFolder:
         return cls(path, data)
 
     def save(self, **changes: Any) -> None:
-        """Change fields of ``run.json`` and write the file."""
+        """Change fields of ``run.json`` and write the file.
+
+        Raises
+        ------
+        RunError
+            The folder was moved or deleted since it was created or opened.
+        OSError
+            The file cannot be written.
+        """
+        if "updated" in self.data and not self.present:
+            raise RunError(f"{self.path} is gone: it was moved or deleted during the run")
         self.data |= changes | {"updated": now()}
         replace_text(self.path / "run.json", json.dumps(plain(self.data), indent=1, ensure_ascii=False) + "\n")
 

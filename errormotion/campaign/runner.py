@@ -35,7 +35,7 @@ from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
-from errormotion.errors import RunError
+from errormotion.errors import ErrormotionError, RunError
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
 
@@ -161,15 +161,23 @@ def resume(
         if "campaign" not in folder.data:  # a log
             continue
         groups.setdefault(str(folder.data["id"]), []).append(folder)
-    changed = ""
+    changed, skipped = "", []
     for run_id, folders in reversed(groups.items()):
-        if all(folder.finished for folder in folders) and len(folders) == len(folders[0].data["campaign"]["tests"]):
+        try:
+            stated = folders[0].data["campaign"]
+            if all(folder.finished for folder in folders) and len(folders) == len(stated["tests"]):
+                continue
+            if campaign and campaign.sha256 != stated["sha256"]:
+                if campaign.name == stated["name"]:
+                    changed = changed or folders[-1].path.name
+                continue
+            plan = _stored_plan(folders[0])
+        except (ErrormotionError, KeyError, TypeError, AttributeError) as error:
+            if campaign and isinstance(error, ErrormotionError):  # it is the one that was asked for
+                raise
+            skipped.append(f"{folders[0].path / 'run.json'}: is no complete record of a run ({cause_of(error)})")
+            log.warning("skipped: %s", skipped[-1])
             continue
-        if campaign and campaign.sha256 != folders[0].data["campaign"]["sha256"]:
-            if campaign.name == folders[0].data["campaign"]["name"]:
-                changed = changed or folders[-1].path.name
-            continue
-        plan = _stored_plan(folders[0])
         session = _Session(plan, runs, run_id, progress, ask, report)
         return session.work({str(folder.data["test"]): folder for folder in folders})
     if changed and campaign:
@@ -177,7 +185,8 @@ def resume(
             f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Continue with the "
             "stored files: 'errormotion run --resume' without the campaign. Or start again: without --resume."
         )
-    raise RunError(f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished.")
+    message = f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished."
+    raise RunError("\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]))
 
 
 class _Session:
@@ -430,21 +439,15 @@ def _failures(folder: RunFolder) -> Iterator[None]:
         folder.step("stop", "interrupted")
         _mark(folder, "interrupted", "stopped by the operator")
         raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_continuation(folder)}") from error
-    except FolderGoneError as error:  # nothing is written where it was: this would look like a run
-        log.exception("failed")
-        first = "First remove what a write under way has left there. " if folder.path.exists() else ""
-        raise FolderGoneError(
-            f"Test '{folder.data['test']}' failed: {error}\n{_kept(folder)} in it. Move it back to {folder.path}. "
-            f"{first}{_continuation(folder)}"
-        ) from error
     except Exception as error:
         reason = cause_of(error)
         log.exception("failed")
-        if not folder.present:
-            raise RunError(
+        if isinstance(error, FolderGoneError) or not folder.present:
+            # Nothing is written where it was: this would look like a run.
+            raise FolderGoneError(
                 f"Test '{folder.data['test']}' ended: its folder {folder.path} is gone. It was moved or deleted "
-                "during the run. If it was moved, continue where it is now, with 'errormotion run --resume --runs' and "
-                "the folder that contains it."
+                f"during the run. {_kept(folder)} in it. If it was moved, continue where it is now, with 'errormotion "
+                "run --resume --runs' and the folder that contains it."
             ) from error
         marked = f"disk full: {reason}" if isinstance(error, DiskFullError) else reason
         folder.step("stop", "failed", reason=marked)
@@ -460,7 +463,7 @@ def _mark(folder: RunFolder, status: str, reason: str) -> None:
     """Write the status of a run; if this fails it remains 'running', which can be resumed as well."""
     try:
         folder.save(status=status, reason=reason)
-    except OSError:
+    except (OSError, RunError):
         log.exception("run.json cannot be written")
 
 

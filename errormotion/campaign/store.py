@@ -99,6 +99,8 @@ class RawStore:
         expected : float
             Expected total length, to size the chunks; in seconds where the samples have a ``sample_rate``.
         """
+        if not path.parent.is_dir():  # zarr would create it
+            raise RunError(f"{path.parent} is gone: it was moved or deleted before data were written to it")
         if dim not in first.dims:
             raise RunError(f"expected data along '{dim}'; the method yielded dims {', '.join(map(str, first.dims))}")
         growing = {str(name): variable for name, variable in _stored(first, dim).items() if dim in variable.dims}

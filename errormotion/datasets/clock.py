@@ -24,6 +24,9 @@ import xarray as xr
 CLOCK, JOINS = "clock", "joins"
 """Attributes of raw data (JSON): the clocks at the last commit, and the interruptions of the record."""
 
+ORIGIN = "clock_origin"
+"""Attribute of raw data of a virtual machine: its clock at the start of the record, s."""
+
 TOLERANCE = 2.0
 """Difference of two clocks that is no contradiction, s."""
 DRIFT = 1e-3
@@ -175,6 +178,14 @@ def age(done: xr.Dataset) -> float:
         seconds = now.wall - start
         return seconds if 0 <= seconds <= LONGEST else math.nan
     return before.began + before.elapsed - start + interval(before, now)[0]
+
+
+def restarted(done: xr.Dataset, now: float) -> bool:
+    """Return whether a virtual machine was started anew since an interrupted record was started, by its clock now, s.
+
+    True for a record that does not state its attribute ``clock_origin``.
+    """
+    return not now > float(done.attrs.get(ORIGIN, math.inf))
 
 
 def _stored(attrs: Mapping[Any, Any]) -> Reading | None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from errormotion import datasets
 from errormotion.campaign.compensating import AUDIT, Compensation, Moment
@@ -102,7 +103,7 @@ def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def model() -> ThermalModel:
+def model() -> xr.Dataset:
     """EX = 5 um/K times the temperature of the spindle, trained from 0 to 10 K."""
     feature = Feature("spindle")
     coefficient = np.zeros((6, 1))
@@ -125,7 +126,7 @@ def model() -> ThermalModel:
         "functional_point": [0.0, 0.0, 0.0],
         "variant": "lagged",
     }
-    return ThermalModel.of(parts, attrs, {})
+    return ThermalModel.of(parts, attrs, {}).dataset
 
 
 @pytest.fixture
@@ -173,7 +174,7 @@ def never_beyond(start: float = 0.0) -> None:
 
 
 def test_it_follows_the_temperature_and_ramps_to_zero_when_stopped(
-    plan: BenchPlan, model: ThermalModel, tmp_path: Path
+    plan: BenchPlan, model: xr.Dataset, tmp_path: Path
 ) -> None:
     compensation = Compensation(plan, model, tmp_path, arm=MACHINE)
     moments = run(compensation, {3: set_to(Thermometer, "value", STEADY + 2), 30: compensation.stop}, 200)
@@ -191,7 +192,7 @@ def test_it_follows_the_temperature_and_ramps_to_zero_when_stopped(
     assert float(log["temperature"].max()) == STEADY + 2
 
 
-def test_without_arming_nothing_is_written(plan: BenchPlan, model: ThermalModel, tmp_path: Path) -> None:
+def test_without_arming_nothing_is_written(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     compensation = Compensation(plan, model, tmp_path)
     moments = run(compensation, {3: set_to(Thermometer, "value", STEADY + 2)}, 30)
     assert moments[-1].step.offset[0] == pytest.approx(-10e-6)
@@ -209,7 +210,7 @@ def test_without_arming_nothing_is_written(plan: BenchPlan, model: ThermalModel,
     ids=["silent", "outside", "unknown"],
 )
 def test_without_a_valid_prediction_it_holds_then_ramps(
-    cause: float | None, text: str, plan: BenchPlan, model: ThermalModel, tmp_path: Path
+    cause: float | None, text: str, plan: BenchPlan, model: xr.Dataset, tmp_path: Path
 ) -> None:
     script = {0: set_to(Thermometer, "value", STEADY), 3: set_to(Thermometer, "value", STEADY + 2)}
     script |= {25: set_to(Thermometer, "value", cause)}
@@ -220,14 +221,14 @@ def test_without_a_valid_prediction_it_holds_then_ramps(
     never_beyond()
 
 
-def test_a_wide_prediction_is_not_used(plan: BenchPlan, model: ThermalModel, tmp_path: Path) -> None:
-    model.dataset["misfit"][1] = 15e-6
+def test_a_wide_prediction_is_not_used(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
+    model["misfit"][1] = 15e-6
     moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), {3: set_to(Thermometer, "value", STEADY + 2)}, 8)
     assert states(moments) == ["armed"]
     assert "U of the prediction is 30.0 um" in moments[-1].step.cause
 
 
-def test_nothing_changes_while_the_machine_is_busy(plan: BenchPlan, model: ThermalModel, tmp_path: Path) -> None:
+def test_nothing_changes_while_the_machine_is_busy(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     script = {2: set_to(Thermometer, "value", STEADY + 2), 8: set_to(Machine, "busy", "a probing cycle runs")}
     moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 30)
     assert len({tuple(moment.step.offset) for moment in moments[8:]}) == 1
@@ -235,7 +236,7 @@ def test_nothing_changes_while_the_machine_is_busy(plan: BenchPlan, model: Therm
     assert 0 < abs(Machine.offset[0]) < 10e-6
 
 
-def test_a_stop_of_the_machine_ends_it(plan: BenchPlan, model: ThermalModel, tmp_path: Path) -> None:
+def test_a_stop_of_the_machine_ends_it(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     script = {2: set_to(Thermometer, "value", STEADY + 2), 8: set_to(Machine, "fault", "emergency stop")}
     script |= {15: set_to(Machine, "fault", "")}
     moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 30)
@@ -243,7 +244,7 @@ def test_a_stop_of_the_machine_ends_it(plan: BenchPlan, model: ThermalModel, tmp
     assert len(Machine.written) == 8
 
 
-def test_an_offset_that_somebody_else_wrote_ends_it(plan: BenchPlan, model: ThermalModel, tmp_path: Path) -> None:
+def test_an_offset_that_somebody_else_wrote_ends_it(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     script = {2: set_to(Thermometer, "value", STEADY + 2), 8: set_to(Machine, "offset", (15e-6, 0.0, 0.0))}
     moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 20)
     assert states(moments) == ["following", "fault"]
@@ -251,7 +252,7 @@ def test_an_offset_that_somebody_else_wrote_ends_it(plan: BenchPlan, model: Ther
 
 
 def test_after_a_lost_connection_it_goes_on_from_the_offset_of_the_machine(
-    plan: BenchPlan, model: ThermalModel, tmp_path: Path
+    plan: BenchPlan, model: xr.Dataset, tmp_path: Path
 ) -> None:
     def ramped() -> None:  # what the watchdog of the machine did in the meantime
         Machine.silent, Machine.offset = False, (-4e-6, 0.0, 0.0)
@@ -264,13 +265,13 @@ def test_after_a_lost_connection_it_goes_on_from_the_offset_of_the_machine(
     assert Machine.offset[0] == pytest.approx(-10e-6)
 
 
-def test_an_offset_that_is_not_taken_is_a_fault(plan: BenchPlan, model: ThermalModel, tmp_path: Path) -> None:
+def test_an_offset_that_is_not_taken_is_a_fault(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     script = {2: set_to(Thermometer, "value", STEADY + 2), 8: set_to(Machine, "deaf", True)}
     moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 10)
     assert states(moments) == ["following", "fault"]
 
 
-def test_a_restart_does_not_jump(plan: BenchPlan, model: ThermalModel, tmp_path: Path) -> None:
+def test_a_restart_does_not_jump(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     first = Compensation(plan, model, tmp_path, arm=MACHINE)
     run(first, {2: set_to(Thermometer, "value", STEADY + 2)}, 25)
     before = Machine.offset
@@ -282,7 +283,7 @@ def test_a_restart_does_not_jump(plan: BenchPlan, model: ThermalModel, tmp_path:
     never_beyond(before[0])
 
 
-def test_one_machine_has_one_compensation(plan: BenchPlan, model: ThermalModel, tmp_path: Path) -> None:
+def test_one_machine_has_one_compensation(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     with Compensation(plan, model, tmp_path, arm=MACHINE):
         with (
             pytest.raises(CompensationError, match=r"compensated already by process \d+"),
@@ -294,11 +295,11 @@ def test_one_machine_has_one_compensation(plan: BenchPlan, model: ThermalModel, 
 
 
 def test_what_does_not_fit_is_refused_before_anything_is_opened(
-    plan: BenchPlan, model: ThermalModel, tmp_path: Path
+    plan: BenchPlan, model: xr.Dataset, tmp_path: Path
 ) -> None:
     def made(plan: BenchPlan = plan, **attrs: Any) -> Compensation:
-        ds = model.dataset.assign_attrs({key: value for key, value in attrs.items() if key != "arm"})
-        return Compensation(plan, ThermalModel(ds), tmp_path, arm=attrs.get("arm"))
+        ds = model.assign_attrs({key: value for key, value in attrs.items() if key != "arm"})
+        return Compensation(plan, ds, tmp_path, arm=attrs.get("arm"))
 
     with pytest.raises(CompensationError, match=r"--arm Mill 6: the machine of bench\.toml is called 'Mill 5'"):
         made(arm="Mill 6")

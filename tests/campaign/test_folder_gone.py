@@ -78,7 +78,7 @@ def test_the_recorder_says_so(tmp_path: Path, loss: Callable[[Path], None], insi
         record()
 
 
-def test_a_campaign_ends_with_the_reason_and_goes_on_when_the_folder_is_back(
+def test_a_campaign_ends_with_the_reason_and_goes_on_where_the_folder_is(
     plan: Callable[..., CampaignPlan], tmp_path: Path
 ) -> None:
     class Mover(runner.Quiet):
@@ -87,14 +87,11 @@ def test_a_campaign_ends_with_the_reason_and_goes_on_when_the_folder_is_back(
                 (path,) = (tmp_path / "runs").iterdir()
                 path.rename(tmp_path / path.name)
 
-    with pytest.raises(RunError, match=GONE) as failure:
+    with pytest.raises(RunError, match=r"its folder .* is gone. It was moved or deleted during the run. \d+ samples"):
         runner.run(plan('name = "a"\nsettings = {count = 100000}'), progress=Mover())
-    (folder,) = tmp_path.glob("*-a-*")
-    assert f"Move it back to {tmp_path / 'runs' / folder.name}" in str(failure.value)
+    assert len(list(tmp_path.glob("*-a-*"))) == 1
     assert not list((tmp_path / "runs").glob("*/run.json"))
-    shutil.rmtree(tmp_path / "runs" / folder.name, ignore_errors=True)  # a write under way may leave folders
-    folder.rename(tmp_path / "runs" / folder.name)
-    (finished,) = runner.resume(runs=tmp_path / "runs")
+    (finished,) = runner.resume(runs=tmp_path)
     assert finished.data["samples"]["count"] == 100000
 
 

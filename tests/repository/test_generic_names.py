@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-GROUPS = ("instruments", "methods", "datasets")
+GROUPS = ("instruments", "methods", "datasets", "compensators")
 ENTRY_POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
 HOMES = {
     plugin_id: value.partition(":")[0].rpartition(".")[0].replace(".", "/")

@@ -33,6 +33,11 @@ SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
             (r"warm_up = .*", 'warm_up = ["7 min", "15 min", "30 min"]'),
         ],
     ),
+    "crossbeam_scan, pose": (
+        "virtual_gantry",
+        "campaign.toml",
+        [(r'(?s)\[\[test\]\]\nname = "scan".*', "")],
+    ),
     "multilateration": ("virtual_tracker", "campaign.toml", [(r"count = .*", "count = [4, 3, 3]")]),
     "normal_vector": (
         "virtual_probing",
@@ -44,7 +49,7 @@ SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
         ],
     ),
 }
-"""By method: the example, its campaign, and what is replaced in it (regular expression, text)."""
+"""By method and procedure: the example, its campaign, and what is replaced in it (regular expression, text)."""
 BENCH = [(r"points=800&pitch=25e-6&artefacts=-0.6,-0.2,0.2,0.6", "points=400&pitch=50e-6&artefacts=-0.6,0.6")]
 """The same of all benches: half of the profile points, and of the artefacts."""
 
@@ -53,7 +58,7 @@ def write(folder: Path) -> dict[str, Path]:
     """Write the campaigns, and return the file of each by its method."""
     found = {}
     for method, (example, campaign, changes) in SHORT.items():
-        place = folder / example
+        place = folder / method.replace(", ", "_")
         shutil.copytree(EXAMPLES / example, place)
         _change(place / campaign, changes, all_found=True)
         _change(place / "bench.toml", BENCH, all_found=False)

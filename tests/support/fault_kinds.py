@@ -140,7 +140,7 @@ class Kinds:
     def kill_later(self, number: int) -> Result:
         """End the identification, or the report, of a run."""
         chance, method, runs, journal = self._place("kill_later", number)
-        stage = trials.STAGES[1 + number // len(self.methods) % 2]
+        stage = chance.choice(trials.STAGES[1:])
         test, delay = self._instant(chance, method, stage)
         process = Forked(self._run(method, runs), journal)
         trials.kill_when(process, lambda: trials.stage_of(runs, test) == stage, delay)
@@ -170,7 +170,7 @@ class Kinds:
     def kill_command(self, number: int) -> Result:
         """End ``identify`` or ``report`` of a finished run, and repeat it."""
         chance, method, runs, journal = self._place("kill_command", number)
-        words, result_file, command = self._command(number, method, runs)
+        words, result_file, command = self._command(chance, method, runs)
         process = Forked(words, journal)
         trials.kill_when(process, lambda: True, chance.uniform(0.1, 2.0))
         result = Result("kill -9", f"errormotion {command}", trials.half_files(runs))
@@ -182,11 +182,11 @@ class Kinds:
         result.faults += [*ended.faults, *trials.half_files(runs)]
         return result
 
-    def _command(self, number: int, method: str, runs: Path) -> tuple[list[Any], Path, str]:
+    def _command(self, chance: random.Random, method: str, runs: Path) -> tuple[list[Any], Path, str]:
         """Return a command on a copy of a finished run, and the file that it writes."""
         shutil.copytree(self.folder / "undisturbed" / method, runs, dirs_exist_ok=True)
         folder = list_runs(runs)[-1]
-        if number // len(self.methods) % 2:
+        if chance.random() < 0.5:
             return ["report", folder.path], folder.path / "report.html", "report"
         out = runs / "again.nc"
         return ["identify", folder.raw, "--out", out], out, "identify"
@@ -253,7 +253,7 @@ class Kinds:
     def disk_command(self, number: int) -> Result:
         """Let ``identify`` or ``report`` meet such a disk; repeat it on a good one."""
         chance, method, runs, journal = self._place("disk_command", number)
-        words, result_file, command = self._command(number, method, runs)
+        words, result_file, command = self._command(chance, method, runs)
         code = CODES[number % len(CODES)]
         result_file.unlink(missing_ok=True)
         ended = trials.finish(Forked(words, journal, disk=Disk(runs, chance.randint(1, 60), code)))
@@ -467,7 +467,7 @@ class Kinds:
         while process.poll() is None and trials.stage_of(runs, test) != "acquisition" and time.monotonic() < until:
             time.sleep(trials.POLL_INTERVAL)
         time.sleep(delay)
-        elsewhere, deleted = runs.with_name("elsewhere"), number % 2 == 1
+        elsewhere, deleted = runs.with_name("elsewhere"), chance.random() < 0.5
         runs.rename(elsewhere)
         ended = trials.finish(process)
         result = Result("runs folder deleted" if deleted else "runs folder moved", method, ended.faults)
@@ -493,7 +493,11 @@ def _named(code: int) -> str:
 
 def _says(message: str, code: int) -> bool:
     """Whether a message names the error of a disk."""
-    full = {errno.ENOSPC: ("disk is full",), errno.EDQUOT: ("disk is full", "quota is used up")}.get(code, ())
+    full = {
+        errno.ENOSPC: ("disk is full",),
+        errno.EDQUOT: ("disk is full", "quota is used up"),
+        errno.EFBIG: ("larger than allowed",),
+    }.get(code, ())
     return any(text in message for text in (os.strerror(code), *full))
 
 

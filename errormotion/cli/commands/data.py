@@ -145,8 +145,8 @@ def _show_outcomes(
         runs: list[dict[str, Any]] = [{key: getattr(outcome, key) for key in keys} for outcome in outcomes]
         for outcome, run in zip(outcomes, runs, strict=True):
             run["conformity"] = found[outcome.raw].plain() if outcome.raw in found else None
-            if (each := evaluations.get(outcome.raw)) is not None:
-                run["verdicts"] = each if isinstance(each, str) else monte_carlo.summary(each)
+            if (evaluation := evaluations.get(outcome.raw)) is not None:
+                run["verdicts"] = evaluation if isinstance(evaluation, str) else monte_carlo.summary(evaluation)
         show_json({"ok": not failed and not refused, "scheduler": scheduler, "runs": runs})
     else:
         stepped_over = sum(outcome.stepped_over for outcome in outcomes)
@@ -160,11 +160,11 @@ def _show_outcomes(
                 show(f"  {raw}: {line}")
         for line in remarks(decisions):
             show(line)
-        for raw, evaluation in evaluations.items():
-            if isinstance(evaluation, str):
-                show(f"  failed: Monte Carlo evaluation of {raw}: {evaluation}")
+        for raw, made_of_it in evaluations.items():
+            if isinstance(made_of_it, str):
+                show(f"  failed: Monte Carlo evaluation of {raw}: {made_of_it}")
             else:
-                monte_carlo.show_evaluation(evaluation, raw)
+                monte_carlo.show_evaluation(made_of_it, raw)
     broken = any(outcome.traceback for outcome in failed)
     if broken:
         typer.echo(f"The tracebacks are in {log_file()}.", err=True)

@@ -23,7 +23,6 @@ from errormotion.campaign.files import load_bench
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.output import show
 from errormotion.compensation.online.follower import State
-from errormotion.compensation.thermal_model import ThermalModel
 from errormotion.datasets import load
 from errormotion.datasets.units import TIME
 from errormotion.errors import BenchError, CompensationError
@@ -46,7 +45,7 @@ def run(
     length = math.inf if duration is None else _time(duration)
     compensation = Compensation(
         load_bench(file),
-        ThermalModel.load(model),
+        load(model),
         runs,
         arm=arm,
         functional_point=None if functional_point is None else np.array(functional_point),

@@ -91,11 +91,6 @@ class Correction:
             _check_rotations(fields)
         return replace(self, fields=fields)
 
-    def errors(self, positions: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """Return the displacement of the tool at commanded positions (n, 3), as the sources state it, (n, 3), m."""
-        places, times = _points(positions, time)
-        return self._displacement(places, times)
-
     def at(self, positions: ArrayLike, time: ArrayLike | None = None, *, covariance: bool = False) -> CorrectionValues:
         """Return the corrections of commands.
 

@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets import clock
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.motions import search_start, stage_path
@@ -52,7 +53,8 @@ def measure_planes(
     inputs : mapping
         Not used.
     done : Dataset, optional
-        Data of an interrupted run, whose faces are not measured again.
+        Data of an interrupted run, whose faces are not measured again. A virtual machine that was restarted repeats
+        them, without their data: the others are those of a run without interruption.
 
     Raises
     ------
@@ -66,10 +68,14 @@ def measure_planes(
     stand = Stand(bench, settings)
     faces = settings.planes
     longest = max(len(positions) for positions in stand.paths)
-    for number in range(0 if done is None else int(done.sizes["plane"]), len(faces)):
+    made = 0 if done is None else int(done.sizes["plane"])
+    repeats = done is not None and stand.origin is not None and clock.restarted(done, stand.origin)
+    for number in range(0 if repeats else made, len(faces)):
         stand.set_face(number)
         middle = stand.approach(number)
-        yield stand.measure(number, middle, longest)
+        found = stand.measure(number, middle, longest)
+        if number >= made:
+            yield found
 
 
 class Stand:
@@ -81,18 +87,23 @@ class Stand:
         Of the faces, as commanded.
     paths : list of ndarray (n, 3)
         Stage positions on each face about its middle, m.
+    origin : float or None
+        Clock of a virtual machine at the start, s; None of a real one.
     """
 
     def __init__(self, bench: Bench, settings: Settings) -> None:
         self.bench, self.settings, self.layout = bench, settings, settings.layout
         self.sensor = bench.of_kind("point_lds")
-        self.control: Any = bench.of_kind("controller") if bench.has_kind("controller") else None
-        if not hasattr(self.control, "move_to"):
+        control = bench.of_kind("controller") if bench.has_kind("controller") else None
+        if control is None or not hasattr(control, "move_to"):
             raise MethodError(
                 "The calibration of a beam moves the sensor over the faces of a gauge and needs an instrument of kind "
                 "'controller' that can move to a position (move_to); the bench has none. Measure manually, write the "
                 "readings to a table, and use 'errormotion identify READINGS.csv'."
             )
+        self.control: Any = control
+        virtual = hasattr(self.control, "elapse")
+        self.origin: float | None = float(self.control.state()["time"]) if virtual else None
         self.low, self.high = (float(x) for x in self.sensor.measuring_range)
         self.middle = float(self.sensor.mid_range)
         u = np.array(self.layout.nominal_direction, np.float64)
@@ -234,6 +245,7 @@ class Stand:
                 "start": datetime.now(UTC).isoformat(timespec="seconds"),
                 "dropped": 0,
                 "invalid": invalid,
+                **({} if self.origin is None else {clock.ORIGIN: self.origin}),
             },
         )
 

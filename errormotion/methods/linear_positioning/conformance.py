@@ -6,7 +6,7 @@ from functools import partial
 from typing import Literal
 
 from errormotion.methods.linear_positioning.method import LinearPositioning
-from errormotion.methods.linear_positioning.settings import FREEDOMS, Freedom, Settings
+from errormotion.methods.linear_positioning.settings import FREEDOMS, Freedom, Moving, Settings
 from errormotion.methods.linear_positioning.simulation import simulate
 from errormotion.plugins import MethodSubject
 
@@ -20,7 +20,19 @@ RUNS, SEEDS = 12, 100
 
 def subjects() -> tuple[MethodSubject, ...]:
     """Return the method on a short axis."""
-    return (_subject("positioning", "X", ("EX",)), _subject("six freedoms", "Y", FREEDOMS))
+    moving = Settings(freedoms=("EX", "EB"), moving=Moving(cold=5, duration=7200.0, cooling=1800.0, interval=120.0))
+    warming = MethodSubject(
+        LinearPositioning,
+        partial(simulate, moving),
+        raw_vectors={"end_position": "x", "functional_point": "point"},
+        settings=moving.model_dump(exclude_unset=True),
+        name="moving axis",
+        optional=("functional_point", "length_uncertainty"),
+        measured=("end_deviation", "end_position"),
+        motion=((0.0, 0.0, 0.0), (0.1, -0.2, 0.05)),
+        seeds=SEEDS,
+    )
+    return (_subject("positioning", "X", ("EX",)), _subject("six freedoms", "Y", FREEDOMS), warming)
 
 
 def _subject(name: str, axis: Literal["X", "Y"], freedoms: tuple[Freedom, ...]) -> MethodSubject:

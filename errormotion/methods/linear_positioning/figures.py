@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 LIMITS = {"A": "accuracy_limit", "R": "repeatability_limit", "B": "reversal_limit"}
 OTHERS = ("E", "R", "B")
 """Figures that are shown of straightness and angles."""
+DISTORTIONS = {"range_60min": "within the first 60 min, range", "range_moving": "while the axis moved, range"}
+"""Figures that are shown of a test with a moving axis."""
 
 
 def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
@@ -25,6 +27,8 @@ def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
     """
     if is_planned(errors):
         return []
+    if "distortion" in errors:
+        return _distortion(errors)
     found = []
     for freedom in map(str, errors["freedom"].values):
         of = errors.sel(freedom=freedom)
@@ -36,4 +40,21 @@ def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
                 limit = errors.attrs.get(LIMITS.get(name, "")) if along else None
                 title = f"{name} of {freedom} (ISO 230-2)"
                 found.append(FigureOfMerit(title, value, 2.0 * u + abs(bias), unit, limit))
+    return found
+
+
+def _distortion(errors: xr.Dataset) -> list[FigureOfMerit]:
+    """Return the largest changes at both ends, and of the length between them."""
+    found = []
+    for freedom in map(str, errors["freedom"].values):
+        unit = "m" if freedom[1] in "XYZ" else "rad"
+        for quantity in map(str, errors["quantity"].values):
+            for measure, words in DISTORTIONS.items():
+                value, u = (
+                    float(errors[name].sel(freedom=freedom, quantity=quantity, measure=measure))
+                    for name in ("distortion", "distortion_u")
+                )
+                if math.isfinite(value):
+                    title = f"{freedom} at {quantity} {words} (ISO 230-3)"
+                    found.append(FigureOfMerit(title, value, 2.0 * u, unit))
     return found

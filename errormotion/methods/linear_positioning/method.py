@@ -51,7 +51,10 @@ class LinearPositioning:
     ) -> Iterator[xr.Dataset]:
         """Measure; yield one raw dataset a run, or a target of a pendulum cycle. See ``acquisition``."""
         from errormotion.methods.linear_positioning.acquisition.measure import measure_axis
+        from errormotion.methods.linear_positioning.acquisition.warming import measure_moving
 
+        if settings.moving is not None:
+            return measure_moving(bench, settings, done)
         return measure_axis(bench, settings, done)
 
     def motions(
@@ -78,9 +81,10 @@ class LinearPositioning:
         """Return what contradicts the machine: an axis that it has not, targets outside of its travel."""
         from errormotion.methods.linear_positioning.planning.targets import reach
 
+        test = settings.travel if settings.moving is not None else reach(settings)
         if settings.axis not in machine.travel:
             return {"axis": f"expected one of {', '.join(machine.travel)}; found '{settings.axis}'"}
-        (low, high), (first, last) = machine.travel[settings.axis], reach(settings)
+        (low, high), (first, last) = machine.travel[settings.axis], test
         if first < low - 1e-9 or last > high + 1e-9:
             return {
                 "travel": f"expected targets and overrun within {low * 1e3:g} mm to {high * 1e3:g} mm; found "
@@ -89,13 +93,18 @@ class LinearPositioning:
         return {}
 
     def append_dim(self, settings: PositioningSettings) -> str:
-        """Return ``run``, or ``target`` for pendulum cycles."""
+        """Return ``run``, ``target`` for pendulum cycles, ``cycle`` for a moving axis."""
+        if settings.moving is not None:
+            return "cycle"
         return "run" if settings.cycle == "linear" else "target"
 
     def progress(self, settings: PositioningSettings) -> float:
-        """Return the number of runs, or of targets for pendulum cycles."""
+        """Return the number of runs, of targets for pendulum cycles, of readings of a moving axis."""
+        from errormotion.methods.linear_positioning.planning import warming
         from errormotion.methods.linear_positioning.planning.targets import positions
 
+        if settings.moving is not None:
+            return float(sum(1 for _ in warming.cycles(settings)))
         return float(settings.runs if settings.cycle == "linear" else positions(settings).size)
 
     def identify(self, raw: xr.Dataset, settings: PositioningSettings | None = None) -> xr.Dataset:
@@ -121,6 +130,10 @@ class LinearPositioning:
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"linear_positioning reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
         validate(checked)
+        if "cycle" in checked.dims:
+            from errormotion.methods.linear_positioning.identification.moving import identify_moving
+
+            return identify_moving(checked, settings or PositioningSettings(), self.info)
         return identify(checked, settings or PositioningSettings(), self.info)
 
     def plan(self, settings: PositioningSettings | None = None) -> xr.Dataset:

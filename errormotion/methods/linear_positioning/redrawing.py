@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.methods.linear_positioning.identification import budget
+from errormotion.methods.linear_positioning.identification import budget, moving
 from errormotion.methods.linear_positioning.identification.identify import Evaluated, evaluate
 from errormotion.methods.linear_positioning.schema import APPROACHES
 from errormotion.plugins import Redraw, Redrawing
@@ -27,13 +27,50 @@ FEWEST_TRIALS = 200
 """Of the figures in a trial, whose values are not used."""
 
 
-def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:  # noqa: ARG001 - the protocol
+def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
     """Return the readings, and their sources: scatter, drift, instrument, alignment, expansion."""
+    if "end_deviation" in raw:
+        return _moving(raw, settings, errors)
     found = evaluate(raw, settings, [])
     groups = dict.fromkeys(source.group for source in found.sources if source.group != budget.END)
     sources = {"readings": Redraw(_readings(found), groups=(budget.END,), own=True)}
     sources |= {group: Redraw(_shared(found, group), groups=(group,)) for group in groups}
     return Redrawing(raw.load(), settings.model_copy(update={"trials": FEWEST_TRIALS}), sources)
+
+
+def _moving(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
+    """Return the readings of a moving axis, and their sources: noise, cold reference, lengths."""
+    dims = ("freedom", "cycle", "end")
+    cold = raw["reading_time"].values <= 0.0
+    shape = tuple(raw.sizes[dim] for dim in dims)
+    noise = np.broadcast_to(errors["reading_noise"].values[:, None, None], shape)
+    along = np.array([str(name)[1] == str(name)[2] for name in errors["freedom"].values])[:, None, None]
+    P = raw["end_position"].values
+    lever = np.broadcast_to(along * (P - P.min()), shape)
+    relative = float(raw["length_uncertainty"]) if "length_uncertainty" in raw else settings.uncertainty.length
+    reference = (
+        noise[:, :1] / np.sqrt(np.isfinite(raw["end_deviation"].transpose(*dims).values[:, cold]).sum(axis=1))[:, None]
+    )
+
+    def changed(raw: xr.Dataset, change: Array) -> xr.Dataset:
+        deviation = raw["end_deviation"].transpose(*dims)
+        return raw.assign(end_deviation=deviation.copy(data=deviation.values + change))
+
+    def readings(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        return changed(raw, noise * generator.normal(size=shape) * ~cold[:, None]), settings
+
+    def cold_state(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        return changed(raw, reference * generator.normal(size=reference.shape) * cold[:, None]), settings
+
+    def lengths(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        return changed(raw, relative * lever * generator.normal() * ~cold[:, None]), settings
+
+    sources = {
+        "readings": Redraw(readings, own=True),
+        moving.COLD: Redraw(cold_state, groups=(moving.COLD,)),
+        moving.LENGTH: Redraw(lengths, groups=(moving.LENGTH,)),
+    }
+    return Redrawing(raw.load(), settings, sources)
 
 
 def _readings(found: Evaluated) -> _Draw:

@@ -1,6 +1,6 @@
 """Raw schema of the method: deviations at target positions, by run and direction of approach."""
 
-from errormotion.datasets.schemas import DIRECTION, POSITION, XYZ, RawSchema, Row
+from errormotion.datasets.schemas import DIRECTION, NO_LIMIT, POSITION, XYZ, RawSchema, Row
 
 SCHEMA = "errormotion.raw.linear_positioning/1"
 APPROACHES = ("forward", "backward")
@@ -10,11 +10,29 @@ SENSORS = ("run", "approach", "target", "sensor")
 _COEFFICIENT = (0.0, 1e-4)
 """Plausible coefficients of expansion, 1/K."""
 
+_POINT = Row(
+    "functional_point",
+    ("direction",),
+    "m",
+    *POSITION,
+    "point whose displacement was measured, with the axis at zero",
+    required=False,
+)
+_LENGTH = Row(
+    "length_uncertainty",
+    (),
+    "1",
+    0.0,
+    1e-3,
+    "relative standard uncertainty of the lengths of the instrument (wavelength, air, calibration)",
+    required=False,
+)
+
 RAW_SCHEMAS = (
     RawSchema(
         SCHEMA,
-        "",
-        "deviation",
+        "targets",
+        "target",
         (
             Row(
                 "deviation",
@@ -36,23 +54,8 @@ RAW_SCHEMAS = (
                 "position of the axis at which the instrument was set to zero; the first target where not given",
                 required=False,
             ),
-            Row(
-                "functional_point",
-                ("direction",),
-                "m",
-                *POSITION,
-                "point whose displacement was measured, with the axis at zero",
-                required=False,
-            ),
-            Row(
-                "length_uncertainty",
-                (),
-                "1",
-                0.0,
-                1e-3,
-                "relative standard uncertainty of the lengths of the instrument (wavelength, air, calibration)",
-                required=False,
-            ),
+            _POINT,
+            _LENGTH,
             Row(
                 "gain_uncertainty",
                 ("freedom",),
@@ -127,6 +130,38 @@ RAW_SCHEMAS = (
             ),
         ),
         sizes=DIRECTION,
+        labels=XYZ,
+    ),
+    RawSchema(
+        SCHEMA,
+        "moving axis",
+        "cycle",
+        (
+            Row(
+                "end_deviation",
+                ("cycle", "end", "freedom"),
+                "",
+                -0.1,
+                0.1,
+                "actual minus target at both ends of a stroke, m for EX EY EZ and rad for EA EB EC; NaN = no reading",
+                missing=True,
+                units=("m", "rad"),
+            ),
+            Row("end_position", ("end",), "m", *POSITION, "commanded positions of the two ends"),
+            Row(
+                "reading_time",
+                ("cycle",),
+                "s",
+                -NO_LIMIT,
+                NO_LIMIT,
+                "of the readings of a cycle, since the axis started to move; 0 or less: the cold state; increasing",
+            ),
+            Row("moving", ("cycle",), "1", 0.0, 1.0, "1 while the axis was moving before the reading, 0 at rest"),
+            _POINT,
+            _LENGTH,
+            Row("temperature", ("cycle", "sensor"), "degC", -40.0, 100.0, "of each sensor; NaN = none", required=False),
+        ),
+        sizes={**DIRECTION, "end": 2},
         labels=XYZ,
     ),
 )

@@ -56,6 +56,16 @@ class Budget(PluginSettings):
     )
 
 
+class Moving(PluginSettings):
+    """Thermal distortion by a moving axis (ISO 230-3): both ends of the stroke are read while it warms and cools."""
+
+    cold: int = Field(default=5, ge=1, le=1000, description="readings of both ends before the axis starts to move")
+    duration: Time = Field(default=240 * MINUTE, gt=0, description="for which the axis moves")
+    cooling: Time = Field(default=60 * MINUTE, ge=0, description="for which it is read at rest afterwards")
+    interval: Time = Field(default=5 * MINUTE, gt=0, description="from reading to reading")
+    feed: Velocity = Field(default=10.0 / MINUTE, gt=0, description="feed of the moves between the readings")
+
+
 class Settings(PluginSettings):
     """Settings of ``linear_positioning``: the test, its evaluation, and its sources of uncertainty."""
 
@@ -86,6 +96,10 @@ class Settings(PluginSettings):
         default="linear",
         description="linear: all targets forward, then all backward, for each run; pendulum: all runs at one target "
         "from both sides, then the next target",
+    )
+    moving: Moving | None = Field(
+        default=None,
+        description="measure the thermal distortion by the moving axis at both ends of the travel instead of targets",
     )
     start: Point = Field(default=(0.0, 0.0, 0.0), description="positions of the axes that do not move")
     overrun: Length = Field(default=2e-3, gt=0, description="distance beyond a target before an approach turns")

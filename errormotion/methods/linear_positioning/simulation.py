@@ -17,6 +17,7 @@ from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
 from errormotion.methods.linear_positioning.planning.targets import positions
 from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, SCHEMA, SENSORS
+from errormotion.methods.linear_positioning.warming import simulate_moving
 from errormotion.twin import VirtualMachine, truth
 
 if TYPE_CHECKING:
@@ -44,10 +45,12 @@ class Behaviour:
 
 
 def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return deviations at the targets of the settings, and the true errors of the axis.
+    """Return deviations at the targets of the settings, or at the ends of a moving axis, and the true errors.
 
     The seed selects the machine, its scatter, and the errors of the instrument.
     """
+    if settings.moving is not None:
+        return simulate_moving(settings, seed)
     return raw_and_truth(settings, seed, Behaviour())
 
 

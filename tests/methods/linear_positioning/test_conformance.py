@@ -12,6 +12,10 @@ class TestPositioning(MethodConformance):
     subject = SUBJECTS[0]
 
 
+class TestMovingAxis(MethodConformance):
+    subject = SUBJECTS[2]
+
+
 @pytest.mark.slow
 class TestSixFreedoms(MethodConformance):
     subject = SUBJECTS[1]

@@ -12,7 +12,7 @@ from errormotion.methods.linear_positioning.identification.identify import evalu
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, Statistics
 from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
 
-SEEDS = 80
+SEEDS = 60
 SETTINGS = Settings(trials=300)
 BEHAVIOURS = {"usual": Behaviour(), "drifting": Behaviour(noise=0.2e-6, offset=1e-6, slope=1e-6, opposite=0.5e-6)}
 

@@ -4,8 +4,8 @@ import re
 
 import numpy as np
 import pytest
-from errormotion.datasets.results.merit import figures_of
 
+from errormotion.datasets.results.merit import figures_of
 from errormotion.methods.linear_positioning import LinearPositioning, Settings
 from errormotion.methods.linear_positioning.report import chapters
 from errormotion.methods.linear_positioning.simulation import simulate

@@ -7,6 +7,9 @@ import numpy as np
 from errormotion.compensation.tables.table import AxisTable
 from errormotion.errors import DatasetError
 
+CHECK_SIGN = "Check the sign with one value before the table is used: it is from memory (inverted = true turns it)."
+"""Remark of formats whose sign no document of the maker states."""
+
 
 def check_points(table: AxisTable, most: int, control: str) -> None:
     """Refuse more points than a control takes."""

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from errormotion.arrays import Array
 from errormotion.compensation.tables.contract import TableSettings, Written
-from errormotion.compensation.tables.formats.checks import check_even, one_direction
+from errormotion.compensation.tables.formats.checks import CHECK_SIGN, check_even, one_direction
 from errormotion.compensation.tables.table import AxisTable
 from errormotion.datasets.units import Length
 from errormotion.errors import DatasetError
@@ -108,7 +108,7 @@ class FanucTable:
         text = "\n".join(["%", *lines, "%", *(f"({_plain(line)})" for line in comments)]) + "\n"
         removed = float(table.mean[zero])
         remarks = (
-            "Check the sign with one value before the table is used: it is from memory (inverted = true turns it).",
+            CHECK_SIGN,
             f"Compare parameters 3620 to 3624 with the control's manual (3624 is {parameters[3624]} um here), then "
             "switch off and on and return to the reference point.",
             *one_direction(table, "This table"),

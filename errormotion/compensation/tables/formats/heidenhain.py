@@ -15,7 +15,7 @@ from pydantic import Field
 
 from errormotion.arrays import Array
 from errormotion.compensation.tables.contract import FileText, TableSettings, Written
-from errormotion.compensation.tables.formats.checks import check_points
+from errormotion.compensation.tables.formats.checks import CHECK_SIGN, check_points
 from errormotion.compensation.tables.table import AxisTable
 from errormotion.errors import DatasetError
 
@@ -75,7 +75,7 @@ class HeidenhainTable:
             f"{name}.cma": _text(f"{name}.cma", {axis: [f"{name}.com"], "ACTIVE": ["*"]}, [f"{corrected} = F({axis})"]),
         }
         remarks = (
-            "Check the sign with one value before the table is used: it is from memory (inverted = true turns it).",
+            CHECK_SIGN,
             "Only one .CMA table is active: enter the line into the one of the control where it has others.",
         )
         return Written(tables, values[0] / 1e3, values[1] / 1e3, remarks=remarks)

@@ -17,13 +17,11 @@ from pydantic import Field
 
 from errormotion.arrays import Array
 from errormotion.compensation.tables.contract import TableSettings, Written
-from errormotion.compensation.tables.formats.checks import check_even, check_points, one_direction
+from errormotion.compensation.tables.formats.checks import CHECK_SIGN, check_even, check_points, one_direction
 from errormotion.compensation.tables.table import AxisTable
 
 DECIMALS = 6
 """Of a value in mm."""
-
-CHECK = "Check the sign with one value before the table is used: it is from memory (inverted = true turns it)."
 
 
 class SiemensSettings(TableSettings):
@@ -116,7 +114,7 @@ def _sag(table: AxisTable, settings: SiemensSettings, base: str, output: str) ->
     )
     numbers = ", ".join(str(settings.table + k) for k in range(len(directions)))
     remarks = (
-        CHECK,
+        CHECK_SIGN,
         f"MD18342 MM_CEC_MAX_POINTS[{numbers}] must be at least {table.positions.size}; enable with SD41300 "
         f"CEC_TABLE_ENABLE[{numbers}] and MD32710 CEC_ENABLE of {output}.",
     )

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets import clock
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.crossbeam_scan.acquisition.listening import BrokenPassError, Lines, listen
 from errormotion.methods.crossbeam_scan.acquisition.moving import Mover, mover
@@ -42,7 +43,7 @@ def record_pocket(bench: Bench, settings: Settings, done: xr.Dataset | None) -> 
         With a ``line_profiler``; a ``controller`` where there is one, else the operator is prompted.
     settings : Settings
     done : Dataset, optional
-        The complete scans of an interrupted run.
+        The complete scans of an interrupted run. A virtual machine that was restarted repeats them, without their data.
 
     Raises
     ------
@@ -61,11 +62,17 @@ def record_pocket(bench: Bench, settings: Settings, done: xr.Dataset | None) -> 
     move = mover(bench)
     static = _static(bench, settings, programs)
     first = 0 if done is None else int(done.sizes["scan"])
-    if not move.virtual:
+    repeats = False
+    if move.virtual:
+        repeats = done is not None and clock.restarted(done, move.now())
+        static.attrs[clock.ORIGIN] = move.now()
+    else:
         prepare_profiler(profiler)
-    for number in range(first, len(settings.pocket_lifts)):
+    for number in range(0 if repeats else first, len(settings.pocket_lifts)):
         program = pocket_pass(settings, number + 1)
         y, heights, x, counts = _scan(profiler, move, program, settings)
+        if number < first:
+            continue
         stage = np.zeros((1, y.size, 3))
         stage[0, :, 1], stage[0, :, 2] = y, settings.pocket_lifts[number]
         found = static.assign(

@@ -161,7 +161,7 @@ class _Campaign:
         if done is None:
             static.attrs["start"] = datetime.now(UTC).isoformat(timespec="milliseconds")
             if move.virtual:
-                static.attrs["clock_origin"] = self.origin
+                static.attrs[clock.ORIGIN] = self.origin
         else:
             self._resume(done)
 
@@ -170,12 +170,11 @@ class _Campaign:
         cycle, since, of_line = (np.asarray(done[name].values) for name in ("cycle_of_line", "line_time", "line_clock"))
         last = float(np.nanmax(of_line, initial=0.0))
         if self.move.virtual:
-            recorded_origin = float(done.attrs.get("clock_origin", np.inf))
-            if not self.origin >= recorded_origin + last:
+            if clock.restarted(done, self.origin):
                 log.info("the virtual machine was restarted: %d lines are repeated", done.sizes["line"])
                 self.pending.skip = int(done.sizes["line"])
                 return
-            self.origin = recorded_origin
+            self.origin = float(done.attrs[clock.ORIGIN])
         else:
             # After an interruption of unknown duration, the clock goes on from the last line.
             age = _age(done)

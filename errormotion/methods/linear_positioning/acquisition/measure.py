@@ -61,7 +61,7 @@ def measure_axis(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
 class Stand:
     """Machine and instrument of a bench."""
 
-    def __init__(self, bench: Bench, settings: Settings) -> None:
+    def __init__(self, bench: Bench, settings: Settings, zero: float | None = None) -> None:
         self.bench, self.settings = bench, settings
         self.control: Any = bench.of_kind("controller") if bench.has_kind("controller") else None
         if not hasattr(self.control, "move_to"):
@@ -71,6 +71,7 @@ class Stand:
             )
         self.reader = reader(bench, settings)
         self.places = positions(settings)
+        self.zero = float(self.places[0]) if zero is None else zero  # position at which the instrument is set to zero
         self.along = DOF[direction_of(settings.axis)]
         self.sensors = (*settings.machine.sensors, *settings.workpiece.sensors)
         self.thermometer = self._thermometer()
@@ -92,14 +93,14 @@ class Stand:
             if (each.target, each.approach) == (0, 0) and (self.fresh or self.reader.lost):
                 self.reader.zero()
                 self.fresh = False
-            x[(slice(None), *where)] = self.read(each)
+            x[(slice(None), *where)] = self.read(each.place)
             T[where] = self.temperatures()
             self.wait(self.settings.dwell - self.settings.settle)
         return self._dataset(x, T, approaches, along_runs, start)
 
-    def read(self, approach: Approach) -> Array:
-        """Return the deviations (freedom,) at a target, m and rad; NaN while there is no zero."""
-        way = approach.place - float(self.places[0])
+    def read(self, place: float) -> Array:
+        """Return the deviations (freedom,) at a position, m and rad; NaN while there is no zero."""
+        way = place - self.zero
         if self.fresh or self.reader.lost:
             return np.full(len(self.settings.freedoms), np.nan)
         values = self.reader.read(way).copy()
@@ -107,8 +108,8 @@ class Stand:
             values[self.settings.freedoms.index(self.along)] -= way
         return np.asarray(values)
 
-    def move(self, place: float) -> None:
-        """Move the axis to a position, m, and wait until it has arrived.
+    def move(self, place: float, feed: float | None = None) -> None:
+        """Move the axis to a position, m, with the feed of the approaches or another, and wait until it has arrived.
 
         Raises
         ------
@@ -117,7 +118,7 @@ class Stand:
         """
         goal = list(self.settings.start)
         goal[direction_of(self.settings.axis)] = place
-        self.control.move_to(goal, self.settings.feed)
+        self.control.move_to(goal, self.settings.feed if feed is None else feed)
         limit = time.monotonic() + self.settings.timeout
         while True:
             state = self.control.state()
@@ -168,7 +169,7 @@ class Stand:
         variables: dict[str, Any] = {
             "deviation": (READINGS, x),
             "target_position": ("target", places, _M),
-            "zero_position": ((), float(self.places[0]), _M),
+            "zero_position": ((), self.zero, _M),
         }
         coords: dict[str, Any] = {
             "freedom": [names[name] for name in settings.freedoms],

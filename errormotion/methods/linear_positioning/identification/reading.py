@@ -72,11 +72,11 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     MethodError
         An unknown axis, freedom or approach; fewer than three targets, targets twice, nothing measured.
     """
-    axis = _axis(raw)
+    axis = axis_of(raw)
     approaches = _labels(raw, "approach")
     if not approaches or set(approaches) - set(APPROACHES) or len(set(approaches)) < len(approaches):
         raise MethodError(f"approach: expected the labels forward, backward; found {', '.join(approaches) or 'none'}")
-    freedoms = _freedoms(raw, axis)
+    freedoms = freedoms_of(raw, axis)
     position = np.asarray(raw["target_position"].values, dtype=float)
     _check_positions(position)
     order = np.asarray(np.argsort(position), dtype=np.int64)
@@ -99,7 +99,7 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
         position=position[order],
         zero=zero,
         temperature=_temperatures(raw, approaches, order),
-        point=_point(raw, settings, notes),
+        point=point_of(raw, settings, notes),
     )
 
 
@@ -113,7 +113,7 @@ def per_freedom(raw: xr.Dataset, name: str, count: int) -> Array:
     return values
 
 
-def _axis(raw: xr.Dataset) -> str:
+def axis_of(raw: xr.Dataset) -> str:
     """Return the axis by its attribute, else by the names of the freedoms."""
     by_names = {label[-1:] for label in _labels(raw, "freedom")}
     axis = str(raw.attrs.get("axis", by_names.pop() if len(by_names) == 1 else ""))
@@ -130,7 +130,8 @@ def _text(label: object) -> str:
     return label.decode() if isinstance(label, bytes) else str(label)
 
 
-def _freedoms(raw: xr.Dataset, axis: str) -> tuple[str, ...]:
+def freedoms_of(raw: xr.Dataset, axis: str) -> tuple[str, ...]:
+    """Return the measured freedoms by the ISO 230-1 names of the data; MethodError for other names."""
     by_name = {name: dof for dof, name in iso_names(axis).items()}
     labels = _labels(raw, "freedom")
     if not labels or set(labels) - set(by_name) or len(set(labels)) < len(labels):
@@ -166,7 +167,8 @@ def _temperatures(raw: xr.Dataset, approaches: list[str], order: NDArray[np.int6
     return {name: _by_approach(values[k][..., order], approaches, axis=0) for k, name in enumerate(labels)}
 
 
-def _point(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Array:
+def point_of(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Array:
+    """Return the functional point of data or settings, (3,), m; a note where there is none."""
     if "functional_point" in raw:
         stated = raw["functional_point"]
         ordered = stated.sel(direction=["x", "y", "z"]) if "direction" in stated.coords else stated

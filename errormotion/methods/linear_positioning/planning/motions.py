@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from errormotion.errors import MethodError
+from errormotion.methods.linear_positioning.planning import warming
 from errormotion.methods.linear_positioning.planning.targets import positions, reach, seconds, sequence
 from errormotion.plugins import Step
 
@@ -17,14 +21,17 @@ PROGRAM = "positioning.nc"
 _TOLERANCE = 1e-9
 
 
-def stops(settings: Settings) -> Iterator[tuple[float, float]]:
-    """Yield every position at which the axis stops, m, and how long it rests there, s.
+def stops(settings: Settings) -> Iterator[tuple[float, float, float]]:
+    """Yield every position at which the axis stops, m, the feed towards it, m/s, and how long it rests there, s.
 
     Raises
     ------
     MethodError
         The axis would leave its limits.
     """
+    if settings.moving is not None:
+        yield from warming.stops(settings)
+        return
     low, high = reach(settings)
     if settings.limits is not None:
         least, most = settings.limits
@@ -36,8 +43,8 @@ def stops(settings: Settings) -> Iterator[tuple[float, float]]:
             )
     for approach in sequence(settings):
         if approach.before is not None:
-            yield approach.before, 0.0
-        yield approach.place, settings.dwell
+            yield approach.before, settings.feed, 0.0
+        yield approach.place, settings.feed, settings.dwell
 
 
 def steps(settings: Settings) -> list[Step]:
@@ -46,13 +53,13 @@ def steps(settings: Settings) -> list[Step]:
     k = "XYZ".index(settings.axis)
     found: list[Step] = []
     last: float | None = None
-    for place, rest in stops(settings):
+    for place, feed, rest in stops(settings):
         where = [x, y, z]
         where[k] = place
         if last is None:
             found.append(Step("move", (where[0], where[1], where[2]), float("nan"), float("nan")))
-        else:
-            found.append(Step("move", (where[0], where[1], where[2]), settings.feed, abs(place - last) / settings.feed))
+        elif place != last:
+            found.append(Step("move", (where[0], where[1], where[2]), feed, abs(place - last) / feed))
         last = place
         if rest > 0:
             found.append(Step("rest", None, float("nan"), rest))
@@ -64,25 +71,33 @@ def programs(settings: Settings) -> Mapping[str, str]:
 
     An instrument that records whenever the axis rests takes one reading a target, in the order of the program.
     """
-    P, axis = positions(settings), settings.axis
-    low, high = reach(settings)
+    axis = settings.axis
     first, *others = steps(settings)
+    if settings.moving is not None:
+        P = np.array(warming.ends(settings))
+        low, high = warming.ends(settings)
+        what = f"{axis} after ISO 230-3, both ends of a moving axis"
+        duration = math.fsum(step.seconds for step in others)
+    else:
+        P, (low, high), duration = positions(settings), reach(settings), seconds(settings)
+        what = f"{axis} after ISO 230-2, {P.size} targets, {settings.runs} runs, {settings.cycle} cycles"
     lines = [
         "%",
-        f"({PROGRAM}: {axis} after ISO 230-2, {P.size} targets, {settings.runs} runs, {settings.cycle} cycles)",
-        f"({axis}{low * MM:.3f} to {axis}{high * MM:.3f} mm, about {seconds(settings) / 60:.1f} min, dwells G4 P in s)",
+        f"({PROGRAM}: {what})",
+        f"({axis}{low * MM:.3f} to {axis}{high * MM:.3f} mm, about {duration / 60:.1f} min, dwells G4 P in s)",
         "(machine coordinates: work offset all zero, no tool length offset)",
         *(f"(target {i + 1}: {axis}{place * MM:.3f})" for i, place in enumerate(P)),
         "G90 G94 G21",
         f"G0 {_words(first)}",
     ]
-    feed = f" F{settings.feed * MM * MINUTE:.10g}"
+    feed = math.nan
     for step in others:
         if step.place is None:
             lines.append(f"G4 P{step.seconds:.3f}")
         else:
-            lines.append(f"G1 {axis}{step.place['XYZ'.index(axis)] * MM:.3f}{feed}")
-            feed = ""
+            word = "" if step.feed == feed else f" F{step.feed * MM * MINUTE:.10g}"
+            lines.append(f"G1 {axis}{step.place['XYZ'.index(axis)] * MM:.3f}{word}")
+            feed = step.feed
     return {PROGRAM: "\n".join([*lines, "M30", "%", ""])}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,8 +12,10 @@ from errormotion.datasets import provenance
 from errormotion.datasets.units import format_quantity
 from errormotion.kinematics.iso import iso_names
 from errormotion.methods.linear_positioning.identification.identify import build, evaluate
+from errormotion.methods.linear_positioning.identification.moving import identify_moving
 from errormotion.methods.linear_positioning.planning.targets import positions, seconds
 from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, SCHEMA
+from errormotion.methods.linear_positioning.warming import simulate_moving
 
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
@@ -24,6 +27,8 @@ SCATTER, DRIFT = 0.5e-6, 1.0e-6
 
 def plan(settings: Settings, info: MethodInfo) -> xr.Dataset:
     """Return an error dataset of zeros at the targets, with the covariance to expect."""
+    if settings.moving is not None:
+        return _plan_moving(settings, info)
     P = positions(settings)
     names = iso_names(settings.axis)
     raw = xr.Dataset(
@@ -55,3 +60,19 @@ def plan(settings: Settings, info: MethodInfo) -> xr.Dataset:
         f"{format_quantity(float(u.max()), unit, 2)}."
     )
     return errors.assign_attrs(reference="planned, not measured", notes=notes)
+
+
+def _plan_moving(settings: Settings, info: MethodInfo) -> xr.Dataset:
+    scatter = SCATTER if settings.uncertainty.scatter is None else settings.uncertainty.scatter
+    raw, _ = simulate_moving(settings, 0)
+    still = raw.assign(end_deviation=0.0 * raw["end_deviation"]).assign_attrs(machine="plan")
+    errors = identify_moving(still, settings, info, scatter)
+    origin = json.dumps(provenance.make(settings, None, None, steps=["plan"]))
+    k = [str(name) for name in errors["dof"].values].index(settings.freedoms[0])
+    u = float(np.sqrt(errors["covariance"].values[-1, -1, k, k]))
+    note = (
+        f"{errors.sizes['time'] - 1} readings of both ends in {float(errors['time'][-1]) / 60:.0f} min. With a scatter "
+        f"of {format_quantity(scatter, 'um', 2)} the standard uncertainty of a change at the upper end is "
+        f"{format_quantity(u, 'um' if k < 3 else 'arcsec', 2)}."
+    )
+    return errors.assign_attrs(reference="planned, not measured", provenance=origin, notes=[note])

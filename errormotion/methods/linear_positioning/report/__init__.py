@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from errormotion.datasets.results.merit import is_planned
 from errormotion.methods.linear_positioning.report import chapter
+from errormotion.report import generic
 from errormotion.report.document import Part, Source
 
 
 def chapters(source: Source) -> list[Part]:
     """Return the chapter of a result; none for a plan, which has no readings."""
-    return [] if is_planned(source.errors) else [chapter.part(source, source.key)]
+    if is_planned(source.errors):
+        return []
+    if "distortion" in source.errors:
+        return [generic.part(source, source.key)]
+    return [chapter.part(source, source.key)]

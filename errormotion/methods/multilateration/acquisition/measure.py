@@ -60,7 +60,8 @@ def measure_stations(
     inputs : mapping
         Not used.
     done : Dataset, optional
-        What an interrupted run holds: its set-ups are not measured again.
+        What an interrupted run holds: its set-ups are not measured again. A virtual machine that was restarted repeats
+        them, without their data: the others are those of a run without interruption.
     measuring : Measuring, optional
         Default: that of the settings.
 
@@ -72,8 +73,11 @@ def measure_stations(
     """
     stand = Stand(bench, settings, measuring or settings.measuring)
     held = deque(_held(done))
+    repeats = False
     if done is not None:
         stand.air_reported = _AIR[0] in done
+        last = float(np.nanmax(done["reading_time"].values, initial=-np.inf))
+        repeats = hasattr(stand.control, "set_station") and stand.now() < last
     for number in stand.sequence:
         for _ in range(1 + stand.measuring.repeats):
             if held:
@@ -83,6 +87,8 @@ def measure_stations(
                         f"The existing set-ups continue with {name}; expected {stand.names[number]}. Continue with "
                         "the sequence with which the run was started, or start a new run."
                     )
+                if repeats:
+                    stand.measure(number)
             else:
                 chunk = stand.measure(number)
                 share = _broken(chunk)[0]

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets import clock
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.spindle_drift.acquisition.drift import CHUNK_DURATION
 from errormotion.methods.spindle_drift.acquisition.motions import sphere_centres
@@ -30,7 +31,8 @@ def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
     """Yield the record of a sphere that is stepped through every beam, chunk by chunk along ``sample``.
 
     Sensor and machine need no synchronisation: the rests are found in the record. An interrupted scan is repeated as
-    another attempt.
+    another attempt. A virtual machine that was restarted repeats the whole detection, and what is recorded already is
+    omitted: the rest is that of a detection without interruption.
     """
     frame = bench.of_kind("spindle_frame")
     if not bench.has_kind("controller"):
@@ -41,6 +43,11 @@ def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
     controller = bench.of_kind("controller")
     static = _scan_plan(bench, frame, settings)
     length = round(scan_seconds(settings.steps, settings.dwell) * frame.rate)
+    recorded_samples = 0
+    if hasattr(controller, "elapse"):
+        static.attrs[clock.ORIGIN] = now = float(controller.state()["time"])
+        if done is not None and clock.restarted(done, now) and not done["attempt"].values.any():
+            recorded_samples, done = int(done.sizes["sample"]), None
     attempts = {} if done is None else last_attempts(done)
     controller.mount("sphere")
     profiles = static.sizes["profile"]
@@ -56,7 +63,11 @@ def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
             count=settings.steps,
             dwell=settings.dwell,
         )
-        yield from _record_scan(frame, static, channel, scan, attempt + 1, length)
+        for chunk in _record_scan(frame, static, channel, scan, attempt + 1, length):
+            omitted = min(recorded_samples, chunk.sizes["sample"])
+            recorded_samples -= omitted
+            if omitted < chunk.sizes["sample"]:
+                yield chunk.isel(sample=slice(omitted, None)) if omitted else chunk
 
 
 def last_attempts(raw: xr.Dataset) -> dict[int, tuple[int, int]]:

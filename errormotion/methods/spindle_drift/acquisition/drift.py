@@ -9,6 +9,7 @@ import json
 import logging
 import math
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
@@ -66,7 +67,9 @@ def record_drift(
     static.attrs["sample_rate"] = rate
     virtual = _start_machine(bench, settings, first / rate)
     pending = _Pending(static, rate, settings, first, thermometer, frame.encoding)
-    if done is not None and not virtual:
+    if done is not None and virtual:
+        pending.go_on(done)
+    elif done is not None:
         due = min(_missed(done, rate), total)
         while pending.end < due:
             pending.fill_gap(due)
@@ -172,7 +175,8 @@ class _Pending:
 
     def __post_init__(self) -> None:
         self._since = time.monotonic()
-        self._polled = -np.inf
+        self._before: int | None = None  # sample at which the previous block started
+        self._overdue = True
         self._failures = 0
         self._sensors: list[str] = []
         self._temperature = np.zeros(0, np.float32)
@@ -185,14 +189,33 @@ class _Pending:
         """Whether the chunk has its largest duration or size."""
         return self.samples >= CHUNK_SAMPLES or time.monotonic() - self._since >= CHUNK_DURATION
 
+    def go_on(self, done: xr.Dataset) -> None:
+        """Continue the record of a virtual machine, with its last temperatures until the next reading is due.
+
+        The noise of a simulated thermometer follows from the number of its readings: those so far are repeated.
+        """
+        if "temperature" in done:
+            for _ in range(math.ceil(done.sizes["time"] / self.rate / POLL_INTERVAL)):
+                with suppress(InstrumentError):
+                    self.thermometer.read()
+            self._temperature = done["temperature"].isel(time=-1).values.astype(np.float32)
+            self._overdue = False
+
+    def _poll_is_due(self, size: int) -> bool:
+        """Return whether a multiple of `POLL_INTERVAL` has been reached since the previous block, of equal size."""
+        before = self.end - size if self._before is None else self._before
+        now, then = (math.floor(sample / self.rate / POLL_INTERVAL + 1e-9) for sample in (self.end, before))
+        return self._overdue or now > then
+
     def add(self, block: Samples, total: int) -> None:
         """Add a block of samples, up to ``total`` samples of the record."""
         values = block.values[:, : total - self.end]
         if "start" not in self.static.attrs:
             started = datetime.now(UTC) - timedelta(seconds=values.shape[1] / self.rate)
             self.static.attrs["start"] = started.isoformat(timespec="milliseconds")
-        if self.thermometer is not None and self.end / self.rate - self._polled >= POLL_INTERVAL:
+        if self.thermometer is not None and self._poll_is_due(block.values.shape[1]):
             self._poll()
+        self._before = self.end
         self._take(values, self._temperature)
         self.dropped += block.dropped
         for reason, count in block.invalid.items():
@@ -212,14 +235,14 @@ class _Pending:
 
     def _poll(self) -> None:
         """Read the temperatures; a failure is counted and gives NaN, and does not abort the record."""
-        self._polled = self.end / self.rate
+        self._overdue = False
         try:
             reading = self.thermometer.read()
         except InstrumentError as error:
             self._failures += 1
             if self._failures > MAX_FAILED_POLLS:
                 raise
-            log.warning("temperatures missing at %.1f s: %s", self._polled, error)
+            log.warning("temperatures missing at %.1f s: %s", self.end / self.rate, error)
             self.invalid["thermometer without answer"] = self.invalid.get("thermometer without answer", 0) + 1
             self._temperature = np.full(len(self._sensors), np.nan, np.float32)
             return

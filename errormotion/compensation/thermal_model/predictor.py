@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
+import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.compensation.online.prediction import Prediction
 from errormotion.compensation.thermal_model.features import Feature
 from errormotion.compensation.thermal_model.model import EXTRAPOLATION, ThermalModel
 from errormotion.compensation.thermal_model.record import PARAMETERS
@@ -17,32 +18,13 @@ from errormotion.errors import CompensationError
 from errormotion.kinematics import twists
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """Predicted errors at one instant.
-
-    Attributes
-    ----------
-    errors, uncertainty : (6,)
-        Translations in m at the functional point, rotations in rad; standard uncertainty. NaN where unknown.
-    missing : tuple of str
-        Inputs that are unknown.
-    outside : tuple of str
-        Features outside the range of the training.
-    """
-
-    errors: Array
-    uncertainty: Array
-    missing: tuple[str, ...] = ()
-    outside: tuple[str, ...] = ()
-
-
-class Predictor:
+class ThermalPredictor:
     """Predicts the errors of a machine from its latest readings.
 
     Parameters
     ----------
-    model : ThermalModel
+    model : Dataset
+        A thermal model.
     functional_point : (3,), optional
         Where the translations apply, m, in the frame of the model; default: the functional point of the model.
 
@@ -52,9 +34,9 @@ class Predictor:
         The model has no prediction for one of the translations, or for a rotation that the functional point needs.
     """
 
-    def __init__(self, model: ThermalModel, functional_point: Array | None = None) -> None:
-        ds = model.dataset
-        self.model = model
+    def __init__(self, model: xr.Dataset, functional_point: Array | None = None) -> None:
+        ds = model
+        features = ThermalModel(model).features
         own = np.asarray(ds.attrs["functional_point"], dtype=float)
         lever = np.zeros(3) if functional_point is None else np.asarray(functional_point, dtype=float) - own
         self._to_point = twists.adjoint(shift=lever)
@@ -71,14 +53,23 @@ class Predictor:
         self._misfit = ds["misfit"].values
         span = EXTRAPOLATION * (ds["feature_high"].values - ds["feature_low"].values)
         self._low, self._high = ds["feature_low"].values - span, ds["feature_high"].values + span
-        self._columns = [_Column(feature) for feature in model.features]
+        self._columns = [_Column(feature) for feature in features]
         self._first: dict[str, float] = {}
         self._time = -math.inf
 
     @property
-    def sources(self) -> tuple[str, ...]:
-        """Names of the temperatures and working parameters that the model needs."""
-        return tuple(dict.fromkeys(feature.source for feature in self.model.features))
+    def temperatures(self) -> tuple[str, ...]:
+        """Names of the sensors."""
+        return self._sources(parameter=False)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the working parameters."""
+        return self._sources(parameter=True)
+
+    def _sources(self, *, parameter: bool) -> tuple[str, ...]:
+        found = (column.feature for column in self._columns)
+        return tuple(dict.fromkeys(each.source for each in found if each.parameter == parameter))
 
     def update(self, time: float, temperature: Mapping[str, float], parameter: Mapping[str, float]) -> Prediction:
         """Take the readings of one instant, and return the prediction for it.

@@ -1,0 +1,51 @@
+"""A test that was interrupted between any two deliveries of its method has the raw data of an undisturbed one."""
+
+import contextlib
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import fault_examples
+import fault_trials as trials
+import pytest
+
+from errormotion import plugins
+from errormotion.campaign import runner
+from errormotion.campaign.files import load_campaign
+from errormotion.instruments.simulators import reset
+
+
+@pytest.fixture(scope="module")
+def campaigns(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return fault_examples.write(tmp_path_factory.mktemp("campaigns"))
+
+
+@pytest.mark.slow  # a run of every method, and another in two parts
+@pytest.mark.parametrize("method", fault_examples.SHORT)
+def test_continued_run_has_the_raw_data_of_an_undisturbed_one(
+    campaigns: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    plan = load_campaign(campaigns[method])
+    runner.run(plan, runs=tmp_path / "undisturbed")
+    cls = plugins.get("methods", method.partition(",")[0])
+    acquire = cls.acquire
+
+    def interrupted(self: Any, *arguments: Any, **keywords: Any) -> Iterator[Any]:
+        chunks = acquire(self, *arguments, **keywords)
+        if keywords["done"] is not None:
+            yield from chunks
+            return
+        yield from itertools.islice(chunks, 2)
+        chunks.close()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cls, "acquire", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(plan, runs=tmp_path / "runs")
+    for _ in plan.tests:
+        reset()
+        with contextlib.suppress(KeyboardInterrupt):
+            runner.resume(runs=tmp_path / "runs")
+            break
+    assert trials.differences(tmp_path / "runs", tmp_path / "undisturbed") == []
