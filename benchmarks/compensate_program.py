@@ -18,8 +18,8 @@ import numpy as np
 
 from errormotion.compensation.correction import correction
 from errormotion.compensation.program import ByTool, Offsets, Reader, Rewriting, Settings, compensate
-from errormotion.compensation.program.agreement import check
-from errormotion.compensation.program.canonical import interpreter
+from errormotion.compensation.program.interpreter.agreement import check
+from errormotion.compensation.program.interpreter.canonical import interpreter
 from errormotion.errors import ProgramError
 from errormotion.twin import VirtualMachine
 

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from errormotion.compensation.program.items import LINE, Left, Move, Setting
-from errormotion.compensation.program.offsets import Offsets
-from errormotion.compensation.program.path import Path
-from errormotion.compensation.program.reader import Reader
-from errormotion.compensation.program.rewriting import Rewriting
+from errormotion.compensation.program.reading.items import LINE, Left, Move, Setting
+from errormotion.compensation.program.reading.offsets import Offsets
+from errormotion.compensation.program.reading.reader import Reader
+from errormotion.compensation.program.writing.path import Path
+from errormotion.compensation.program.writing.rewriting import Rewriting
 
 ORIGINS = Offsets(
     systems=np.arange(27.0).reshape(9, 3) * 1e-3,

@@ -16,7 +16,7 @@ from errormotion.cli.commands.model import dataset_of, source_of
 from errormotion.cli.output import show, show_json
 from errormotion.compensation.correction import Correction, correction
 from errormotion.compensation.program import LEFT, ByTool, Offsets, Outcome, Settings, compensate
-from errormotion.compensation.program.offsets import read_parameters, read_tools
+from errormotion.compensation.program.reading.offsets import read_parameters, read_tools
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import DatasetError, ProgramError
 

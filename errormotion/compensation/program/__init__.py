@@ -6,11 +6,11 @@ lines and arcs where that is needed for the tolerance. What neither reader under
 """
 
 from errormotion.compensation.program.compensating import Outcome, Settings, compensate
-from errormotion.compensation.program.items import LEFT
-from errormotion.compensation.program.offsets import Offsets, read_parameters, read_tools
-from errormotion.compensation.program.reader import Reader
-from errormotion.compensation.program.rewriting import Rewriting, Summary
+from errormotion.compensation.program.reading.items import LEFT
+from errormotion.compensation.program.reading.offsets import Offsets, read_parameters, read_tools
+from errormotion.compensation.program.reading.reader import Reader
 from errormotion.compensation.program.tools import ByTool
+from errormotion.compensation.program.writing.rewriting import Rewriting, Summary
 
 __all__ = [
     "LEFT",

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-from errormotion.compensation.program import agreement, canonical
-from errormotion.compensation.program.dividing import Correcting
-from errormotion.compensation.program.expanding import Expansion
-from errormotion.compensation.program.frames import Triple
-from errormotion.compensation.program.offsets import Offsets
-from errormotion.compensation.program.reader import Reader
-from errormotion.compensation.program.rewriting import Rewriting, Summary
-from errormotion.compensation.program.screening import screen
-from errormotion.compensation.program.words import LONGEST_LINE, lines_of
+from errormotion.compensation.program.interpreter import agreement, canonical
+from errormotion.compensation.program.interpreter.expanding import Expansion
+from errormotion.compensation.program.interpreter.screening import screen
+from errormotion.compensation.program.reading.frames import Triple
+from errormotion.compensation.program.reading.offsets import Offsets
+from errormotion.compensation.program.reading.reader import Reader
+from errormotion.compensation.program.reading.words import LONGEST_LINE, lines_of
+from errormotion.compensation.program.writing.dividing import Correcting
+from errormotion.compensation.program.writing.rewriting import Rewriting, Summary
 from errormotion.errors import ProgramError
 
 LARGEST_PROGRAM = 1 << 29

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure as Canvas
 
 from errormotion.arrays import Array
 from errormotion.compensation.program.compensating import Outcome, Settings
-from errormotion.compensation.program.items import LEFT
-from errormotion.compensation.program.rewriting import Summary
+from errormotion.compensation.program.reading.items import LEFT
+from errormotion.compensation.program.writing.rewriting import Summary
 from errormotion.report import canvas, provenance, write_page
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text
 from errormotion.report.text import DASH, fixed, integer, minutes, significant

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from nc_paths import ORIGINS, field, moves_of, rewritten, zero
 from nc_programs import Programs
 
-from errormotion.compensation.program import canonical
-from errormotion.compensation.program.agreement import check
 from errormotion.compensation.program.compensating import Settings, compensate
-from errormotion.compensation.program.expanding import Expansion
-from errormotion.compensation.program.items import LINE
-from errormotion.compensation.program.offsets import Offsets
-from errormotion.compensation.program.reader import Reader
+from errormotion.compensation.program.interpreter import canonical
+from errormotion.compensation.program.interpreter.agreement import check
+from errormotion.compensation.program.interpreter.expanding import Expansion
+from errormotion.compensation.program.reading.items import LINE
+from errormotion.compensation.program.reading.offsets import Offsets
+from errormotion.compensation.program.reading.reader import Reader
 from errormotion.errors import ProgramError
 
 pytestmark = pytest.mark.skipif(

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from nc_paths import ORIGINS, moves_of
 
-from errormotion.compensation.program.items import Left, Text
-from errormotion.compensation.program.offsets import Offsets, read_parameters, read_tools
-from errormotion.compensation.program.reader import Reader
-from errormotion.compensation.program.words import LONGEST_LINE
+from errormotion.compensation.program.reading.items import Left, Text
+from errormotion.compensation.program.reading.offsets import Offsets, read_parameters, read_tools
+from errormotion.compensation.program.reading.reader import Reader
+from errormotion.compensation.program.reading.words import LONGEST_LINE
 from errormotion.errors import ProgramError
 
 HEAD = ["G21 G90 G17", "G0 X0 Y0 Z0"]

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from nc_paths import ORIGINS, deviations, field, moves_of, rewritten, zero
 from nc_programs import Programs
 
-from errormotion.compensation.program import dividing
-from errormotion.compensation.program.items import LINE
-from errormotion.compensation.program.reader import Reader
-from errormotion.compensation.program.rewriting import Rewriting
+from errormotion.compensation.program.reading.items import LINE
+from errormotion.compensation.program.reading.reader import Reader
+from errormotion.compensation.program.writing import dividing
+from errormotion.compensation.program.writing.rewriting import Rewriting
 from errormotion.errors import ProgramError
 
 TOLERANCE = 1e-6

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from errormotion.compensation.program.offsets import UNITS, Offsets
-from errormotion.compensation.program.words import lines_of
+from errormotion.compensation.program.reading.offsets import UNITS, Offsets
+from errormotion.compensation.program.reading.words import lines_of
 from errormotion.errors import ProgramError
 
 MOST_COMMANDS = 5_000_000

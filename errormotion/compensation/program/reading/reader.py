@@ -10,11 +10,11 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
-from errormotion.compensation.program import arcs
-from errormotion.compensation.program.frames import Frame, Triple
-from errormotion.compensation.program.items import LINE, PLANES, RAPID, Item, Left, Move, Setting, Text
-from errormotion.compensation.program.offsets import SYSTEMS, UNITS, Offsets
-from errormotion.compensation.program.words import Block, lines_of, refusal, split
+from errormotion.compensation.program.reading import arcs
+from errormotion.compensation.program.reading.frames import Frame, Triple
+from errormotion.compensation.program.reading.items import LINE, PLANES, RAPID, Item, Left, Move, Setting, Text
+from errormotion.compensation.program.reading.offsets import SYSTEMS, UNITS, Offsets
+from errormotion.compensation.program.reading.words import Block, lines_of, refusal, split
 
 UNKNOWN: Triple = (math.nan, math.nan, math.nan)
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.compensation.program.frames import Frame
-from errormotion.compensation.program.items import LINE, PLANES, Move
+from errormotion.compensation.program.reading.frames import Frame
+from errormotion.compensation.program.reading.items import LINE, PLANES, Move
 
 Indices = NDArray[np.intp]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from errormotion.compensation.program.frames import Triple
-from errormotion.compensation.program.words import Block, refusal
+from errormotion.compensation.program.reading.frames import Triple
+from errormotion.compensation.program.reading.words import Block, refusal
 
 SPIRAL = 1e-3
 """Largest difference of the radii at start and end, relative; LinuxCNC refuses larger ones too."""

@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 
-from errormotion.compensation.program.arcs import SMALL
-from errormotion.compensation.program.canonical import Command, commands
-from errormotion.compensation.program.items import LINE, PLANES, RAPID, Left, Move
-from errormotion.compensation.program.offsets import Offsets
-from errormotion.compensation.program.reader import Reader
+from errormotion.compensation.program.interpreter.canonical import Command, commands
+from errormotion.compensation.program.reading.arcs import SMALL
+from errormotion.compensation.program.reading.items import COUNTERCLOCKWISE, LINE, PLANES, RAPID, Left, Move
+from errormotion.compensation.program.reading.offsets import Offsets
+from errormotion.compensation.program.reading.reader import Reader
 from errormotion.errors import ProgramError
 
 DIGIT = 1.02e-4
@@ -78,7 +78,10 @@ def _same(move: Move, command: Command) -> None:
         if move.kind <= LINE:
             raise _differ(move, command)
         a, b, c = PLANES[move.plane]
-        turns = math.ceil((abs(move.sweep) - 1.001 * SMALL) / (2 * math.pi)) * (1 if move.kind == 3 else -1)
+        # Where an arc ends within rounding of the angle below which it is a full circle, both numbers are right.
+        counts = {math.ceil((abs(move.sweep) - part * SMALL) / (2 * math.pi)) for part in (0.99, 1.01)}
+        sense = 1 if move.kind == COUNTERCLOCKWISE else -1
+        turns = int(numbers[4]) if abs(int(numbers[4])) in counts and numbers[4] * sense > 0 else sense * max(counts)
         expected = (move.end[a], move.end[b], *move.centre, turns, move.end[c])
     elif move.kind != (RAPID if command.name == "STRAIGHT_TRAVERSE" else LINE):
         raise _differ(move, command)

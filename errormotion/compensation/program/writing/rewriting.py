@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.compensation.program.dividing import Correcting, Division, divide
-from errormotion.compensation.program.items import LINE, RAPID, Item, Left, Move, Setting, Text
-from errormotion.compensation.program.path import Indices, Path
-from errormotion.compensation.program.reader import Reader
-from errormotion.compensation.program.writer import DECIMALS, Writer
+from errormotion.compensation.program.reading.items import LINE, RAPID, Item, Left, Move, Setting, Text
+from errormotion.compensation.program.reading.reader import Reader
+from errormotion.compensation.program.writing.dividing import Correcting, Division, divide
+from errormotion.compensation.program.writing.path import Indices, Path
+from errormotion.compensation.program.writing.writer import DECIMALS, Writer
 from errormotion.errors import ProgramError
 
 MOST_WRITTEN = 20_000_000

@@ -11,10 +11,10 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from errormotion.compensation.program.canonical import Command, own_number
-from errormotion.compensation.program.frames import Frame, Triple
-from errormotion.compensation.program.items import PLANES
-from errormotion.compensation.program.offsets import SYSTEMS, UNITS, Offsets
+from errormotion.compensation.program.interpreter.canonical import Command, own_number
+from errormotion.compensation.program.reading.frames import Frame, Triple
+from errormotion.compensation.program.reading.items import PLANES
+from errormotion.compensation.program.reading.offsets import SYSTEMS, UNITS, Offsets
 from errormotion.errors import ProgramError
 
 _DIGIT = 5e-5  # half of the last digit that the interpreter prints

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from errormotion.compensation.program.words import refusal
+from errormotion.compensation.program.reading.words import refusal
 
 _G = {
     *(0, 1, 2, 3, 4, 10, 17, 18, 19, 20, 21, 28, 30, 40, 41, 42, 43, 49, 53, 54, 55, 56, 57, 58, 59, 61, 64, 73, 80),

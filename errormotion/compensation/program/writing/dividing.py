@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.compensation.program.items import LINE
-from errormotion.compensation.program.path import Indices, Path
+from errormotion.compensation.program.reading.items import LINE
+from errormotion.compensation.program.writing.path import Indices, Path
 from errormotion.compiling import Compiler
 from errormotion.errors import ProgramError
 

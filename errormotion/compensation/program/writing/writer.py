@@ -9,10 +9,10 @@ import math
 import re
 from collections.abc import Sequence
 
-from errormotion.compensation.program.frames import Frame, Triple
-from errormotion.compensation.program.items import LINE, PLANES, RAPID, Left, Move, Setting, Text
-from errormotion.compensation.program.offsets import UNITS
-from errormotion.compensation.program.words import STRIDE
+from errormotion.compensation.program.reading.frames import Frame, Triple
+from errormotion.compensation.program.reading.items import LINE, PLANES, RAPID, Left, Move, Setting, Text
+from errormotion.compensation.program.reading.offsets import UNITS
+from errormotion.compensation.program.reading.words import STRIDE
 
 DECIMALS = {UNITS["mm"]: 4, UNITS["inch"]: 5}
 """Printed digits after the point for each unit of programs."""
