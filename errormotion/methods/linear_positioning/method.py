@@ -100,6 +100,7 @@ class LinearPositioning:
 
     def progress(self, settings: PositioningSettings) -> float:
         """Return the number of runs, of targets for pendulum cycles, of readings of a moving axis."""
+        from errormotion.methods.linear_positioning import moving
         from errormotion.methods.linear_positioning.planning.targets import positions
 
         if settings.moving is not None:
