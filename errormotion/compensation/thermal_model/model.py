@@ -316,7 +316,7 @@ def violations(dataset: xr.Dataset) -> list[str]:
             found.append(f"{dim}: expected a label for each element, and labels that differ")
         elif dim == "dof" and tuple(labels) != DOF:
             found.append(f"dof: expected {' '.join(DOF)}; found {' '.join(labels)}")
-    point = dataset.attrs.get("functional_point")
+    point: Any = dataset.attrs.get("functional_point")
     if np.shape(point) != (3,) or np.asarray(point).dtype.kind not in "fiu":
         found.append(f"attribute 'functional_point': expected three coordinates in m; found {point!r:.100}")
     if "feature_source" not in dataset.coords:

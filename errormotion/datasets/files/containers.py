@@ -151,7 +151,8 @@ def _wrong(metadata: Any) -> str:
     """Return what the metadata of an array must not state; empty for nothing."""
     if not isinstance(metadata, dict) or metadata.get("zarr_format") != 3 or metadata.get("node_type") != "array":
         return "expected an array of Zarr v3"
-    shape, names = metadata.get("shape"), metadata.get("dimension_names")
+    shape: Any = metadata.get("shape")
+    names = metadata.get("dimension_names")
     if not _is_shape(shape, 0):
         return f"expected a shape of whole numbers; found {shape!r:.100}"
     if not _item(metadata):
@@ -189,7 +190,8 @@ def _item(metadata: Mapping[str, Any]) -> int:
     if isinstance(kind, dict):
         configuration = kind.get("configuration")
         length = configuration.get("length_bytes") if isinstance(configuration, dict) else None
-        return length if kind.get("name") == _WIDE and type(length) is int and 0 < length <= LONGEST_TEXT else 0
+        known = kind.get("name") == _WIDE and type(length) is int and 0 < length <= LONGEST_TEXT
+        return int(length) if known and length is not None else 0
     return 16 if kind == _TEXT else np.dtype(kind).itemsize if kind in _NUMBERS else 0
 
 
