@@ -192,7 +192,7 @@ def _item(metadata: Mapping[str, Any]) -> int:
         length = configuration.get("length_bytes") if isinstance(configuration, dict) else None
         known = kind.get("name") == _WIDE and type(length) is int and 0 < length <= LONGEST_TEXT
         return int(length) if known and length is not None else 0
-    return 16 if kind == _TEXT else np.dtype(kind).itemsize if kind in _NUMBERS else 0
+    return 16 if kind == _TEXT else int(np.dtype(kind).itemsize) if kind in _NUMBERS else 0
 
 
 def _stated(metadata: Mapping[str, Any]) -> int:
