@@ -197,7 +197,7 @@ def _item(metadata: Mapping[str, Any]) -> int:
 
 def _stated(metadata: Mapping[str, Any]) -> int:
     """Return the bytes of the values of an array, or of one chunk where this is larger."""
-    return max(math.prod(metadata["shape"]), math.prod(_chunk_shape(metadata))) * _item(metadata)
+    return int(max(math.prod(metadata["shape"]), math.prod(_chunk_shape(metadata))) * _item(metadata))
 
 
 def _wrong_chunks(folder: Path, metadata: Mapping[str, Any], size: int) -> Iterator[str]:
