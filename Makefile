@@ -43,7 +43,7 @@ validate: .venv/.dev  ## run the Monte Carlo validation and write docs/validatio
 fuzz: .venv/.dev  ## try 1e6 damaged frames of every codec (ARGS="--frames 1e5") and write docs/reliability.md
 	$(BIN)/python tools/fuzz.py $(ARGS)
 
-faults: .venv/.dev  ## kill runs, fill their disks and resume them, 10 minutes, and write docs/reliability.md
+faults: .venv/.dev  ## kill runs, take their disks, set their clocks, and resume them, 10 minutes, and write docs/reliability.md
 	$(BIN)/python tools/faults.py $(ARGS)
 
 lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)

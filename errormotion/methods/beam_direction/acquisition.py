@@ -101,8 +101,7 @@ class Stand:
                 "'controller' that can move to a position (move_to); the bench has none. Measure manually, write the "
                 "readings to a table, and use 'errormotion identify READINGS.csv'."
             )
-        virtual = hasattr(self.control, "elapse")
-        self.origin: float | None = float(self.control.state()["time"]) if virtual else None
+        self.origin = self._virtual_time()
         self.low, self.high = (float(x) for x in self.sensor.measuring_range)
         self.middle = float(self.sensor.mid_range)
         u = np.array(self.layout.nominal_direction, np.float64)
@@ -111,6 +110,9 @@ class Stand:
         self.normals = design.plane_normals(np.array([(face.inclination, face.rotation) for face in settings.planes]))
         self.paths = [stage_path(settings, normal, self.range) for normal in self.normals]
         self.invalid: Counter[str] = Counter()
+
+    def _virtual_time(self) -> float | None:
+        return float(self.control.state()["time"]) if hasattr(self.control, "elapse") else None
 
     @property
     def range(self) -> float:
