@@ -1,7 +1,8 @@
 # Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz faults lock
+.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz guided wire faults mutations endurance lowest lock
+.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz guided wire faults mutations endurance lowest lock
 
 BIN := .venv/bin
 ARGS ?=
@@ -43,8 +44,22 @@ validate: .venv/.dev  ## run the Monte Carlo validation and write docs/validatio
 fuzz: .venv/.dev  ## try 1e6 damaged frames of every codec (ARGS="--frames 1e5") and write docs/reliability.md
 	$(BIN)/python tools/fuzz.py $(ARGS)
 
+guided: .venv/.dev  ## search for inputs that reach new code in codecs and file readers (needs pip install atheris), docs/reliability.md
+	$(BIN)/python tools/guided.py $(ARGS)
+
+wire: .venv/.dev  ## try every driver on a wire that disturbs it, and write docs/reliability.md
+	$(BIN)/python tools/wire.py $(ARGS)
+
 faults: .venv/.dev  ## kill runs, take their disks, set their clocks, and resume them, 10 minutes, and write docs/reliability.md
 	$(BIN)/python tools/faults.py $(ARGS)
+
+endurance: .venv/.dev  ## watch a machine for 24 simulated hours with a fault a minute, and write docs/reliability.md
+	$(BIN)/python tools/endurance.py $(ARGS)
+
+lowest: .venv/.dev  ## run tests with the lowest versions of packages that pyproject.toml allows, in .venv-lowest
+	$(BIN)/python tools/lowest.py $(ARGS)
+mutations: .venv/.dev  ## read 2000 altered files by commands, about 15 minutes, and write docs/reliability.md
+	$(BIN)/python tools/mutations.py $(ARGS)
 
 lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)
 	uv pip compile -q --universal --python-version 3.11 pyproject.toml --all-extras --group build --group dev \

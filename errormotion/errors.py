@@ -56,9 +56,17 @@ class RunError(ErrormotionError):
     """A run folder cannot be written, read or resumed."""
 
 
+class CompensationError(ErrormotionError):
+    """A correction cannot be made, or must not be written to a machine."""
+
+
 class PluginError(ErrormotionError):
     """A plugin is unknown or broken."""
 
 
 class PluginWarning(UserWarning):
     """A part of a plugin does not load and is ignored."""
+
+
+class ProgramError(ErrormotionError):
+    """An NC program cannot be read, or what it does is not determined."""

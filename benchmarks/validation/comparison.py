@@ -1,11 +1,11 @@
-"""Comparisons: rates of agreeing methods, planted mistakes, interpolation."""
+"""Comparisons: rates of agreeing methods, repeats, planted mistakes, interpolation."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 
-from validation.comparisons import left_out, planted, rates
+from validation.comparisons import components, left_out, planted, rates, volumes
 from validation.comparisons.pool import Pool
 
 TITLE = "Comparison"
@@ -16,5 +16,7 @@ def section(seeds: int, workers: int = 1, cache: Path | None = None) -> Iterator
     """Yield the lines of the section."""
     pool = Pool(workers, cache)
     yield from ("### Datasets that agree", "", *rates.section(seeds, pool), "")
+    yield from ("### Volumes and axes that agree", "", *volumes.section(seeds, pool), "")
+    yield from ("### Repeats", "", *components.section(seeds, pool), "")
     yield from ("### Planted mistakes", "", *planted.section(max(seeds // 2, 1), pool), "")
     yield from ("### Instants that were left out", "", *left_out.section(max(seeds // 4, 1), pool))

@@ -28,6 +28,7 @@ from errormotion.campaign.runner import Progress, Quiet, settings_hash
 from errormotion.datasets import provenance
 from errormotion.datasets.files.hashing import has_hash
 from errormotion.datasets.storage import reading
+from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError, ErrormotionError, RunError
 from errormotion.parallel import CPU_COUNT, SCHEDULERS, Workers, checked_scheduler, one_thread_at_a_time
 from errormotion.plugins import PluginSettings
@@ -289,7 +290,7 @@ def _identify_or_raise(task: Task) -> bool:
                 f"{path}: exists already, from other raw data, other settings or another version of the method, and "
                 "a result is never overwritten; specify another folder with --out"
             )
-        with _turn if one_thread_at_a_time() else nullcontext():
+        with _turn if one_thread_at_a_time() else nullcontext(), explained(task.raw, dataset):
             errors = method().identify(dataset, settings)
         mark = {"raw": datasets.hash_dataset(dataset), "settings": settings_mark}
     datasets.validate(errors)

@@ -7,7 +7,6 @@ reported in one message, each with its key, the expected and the found value.
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from errormotion import plugins
 from errormotion.campaign.limits import NO_MOTIONS, Limits, extent, steps_of, violations
 from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
 from errormotion.campaign.timeline import Timeline, follower
+from errormotion.compensation.online.settings import Limits as OffsetLimits
 from errormotion.datasets import certificates
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.files.folders import looking_beside
@@ -54,6 +54,15 @@ class InstrumentTable(BaseModel):
     address: str = ""
 
 
+class CompensatorTable(BaseModel):
+    """``[compensator]``: what writes offsets into the machine, its address, its settings, and the limits."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    driver: str = Field(description="the id of a compensator plugin; 'errormotion plugins list' shows them")
+    address: str = ""
+    limits: OffsetLimits = OffsetLimits()
+
+
 class BenchTable(BaseModel):
     """A bench file."""
 
@@ -62,6 +71,7 @@ class BenchTable(BaseModel):
     name: str
     machine: str = Field(description="the name of the machine tool, or the table [machine]")
     instruments: dict[str, InstrumentTable] = Field(default_factory=dict)
+    compensator: CompensatorTable | None = None
     limits: Limits = Limits()
     certificates: Certificates = {}
 
@@ -80,6 +90,9 @@ class TestTable(BaseModel):
     certificates: Certificates = {}
     at: Time | None = Field(
         default=None, ge=0, description="start on the timeline; default the end of the test before it"
+    )
+    monte_carlo: int | Literal["auto"] | None = Field(
+        default=None, description='number of trials of a Monte Carlo evaluation of the result, or "auto"'
     )
 
 
@@ -116,6 +129,16 @@ class BenchInstrument:
 
 
 @dataclass(frozen=True)
+class BenchCompensator:
+    """The compensator of a bench: its class, its checked settings and the limits of the offsets."""
+
+    driver: Any
+    address: str
+    settings: Any
+    limits: OffsetLimits
+
+
+@dataclass(frozen=True)
 class BenchPlan:
     """A checked bench file; nothing is opened yet.
 
@@ -131,6 +154,7 @@ class BenchPlan:
     limits: Limits = field(default_factory=Limits)
     description: MachineDescription | None = None
     certificates: Mapping[str, str] = field(default_factory=dict)
+    compensator: BenchCompensator | None = None
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -165,6 +189,7 @@ class TestPlan:
     instruments: Mapping[str, str] = field(default_factory=dict)
     certificates: Mapping[str, str] = field(default_factory=dict)
     at: float | None = None
+    monte_carlo: int | Literal["auto"] | None = None
 
 
 @dataclass(frozen=True)
@@ -242,7 +267,7 @@ def _missing(campaign: CampaignPlan) -> Iterator[str]:
 
 def parse_bench(text: str, source: Path) -> BenchPlan:
     """Check the text of a bench file; ``source`` is for the messages."""
-    data = tomllib.loads(text)
+    data = tomlfile.parse_toml(text, source, error=BenchError)
     description, mistakes, machine = None, list[str](), data.get("machine")
     if isinstance(machine, dict):
         description, mistakes = read_machine(machine)
@@ -263,11 +288,25 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
         if settings is not None:
             driver = plugins.get("instruments", entry["driver"])
             instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
+    compensator, found = _compensator(data.get("compensator"), table)
+    mistakes += found
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
+    certified = table.certificates
     return BenchPlan(
-        table.name, table.machine, tuple(instruments), source, text, limits, description, table.certificates
+        table.name, table.machine, tuple(instruments), source, text, limits, description, certified, compensator
     )
+
+
+def _compensator(entry: Any, table: BenchTable | None) -> tuple[BenchCompensator | None, list[str]]:
+    if not isinstance(entry, dict) or not isinstance(entry.get("driver"), str):
+        return None, []
+    own = {key: value for key, value in entry.items() if key not in CompensatorTable.model_fields}
+    settings, mistakes = _settings("compensators", entry["driver"], own, ("compensator",))
+    if mistakes or table is None or table.compensator is None:
+        return None, mistakes
+    driver = plugins.get("compensators", entry["driver"])
+    return BenchCompensator(driver, entry.get("address", ""), settings, table.compensator.limits), []
 
 
 def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> CampaignPlan:
@@ -275,14 +314,14 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
 
     Without a bench, BenchError reports the missing bench with all other errors.
     """
-    data = tomllib.loads(text)
+    data = tomlfile.parse_toml(text, source, error=BenchError)
     table, mistakes = tomlfile.check(data, CampaignTable)
     for number, entry in _tables(data.get("test")):
         if isinstance(entry.get("method"), str):
             mistakes += _method_mistakes(entry, ("test", number), bench)
     earlier: list[str] = []
     for number, test in enumerate(table.test if table else ()):
-        mistakes += _name_mistakes(test, ("test", number), earlier)
+        mistakes += [*_name_mistakes(test, ("test", number), earlier), *_trials_mistakes(test, ("test", number))]
         earlier.append(test.name)
     mistakes += _timeline_mistakes(table, bench) if table else []
     if table is None or mistakes:
@@ -294,7 +333,9 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         method = plugins.get("methods", test.method)
         settings = completed(method, _settings("methods", test.method, test.settings, ())[0], bench.description)
         certified = {**bench.certificates, **table.certificates, **test.certificates}
-        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments, certified, test.at))
+        tests.append(
+            TestPlan(test.name, method, settings, test.inputs, test.instruments, certified, test.at, test.monte_carlo)
+        )
     return CampaignPlan(
         name=table.name,
         bench=bench,
@@ -422,6 +463,24 @@ def _name_mistakes(test: TestTable, place: tuple[str | int, ...], earlier: list[
     return mistakes
 
 
+def _trials_mistakes(test: TestTable, place: tuple[str | int, ...]) -> list[str]:
+    """Return why there is no Monte Carlo evaluation where a test wants one."""
+    if test.monte_carlo is None:
+        return []
+    from errormotion.montecarlo.evaluation import FEWEST
+
+    where = tomlfile.dotted((*place, "monte_carlo"))
+    if test.monte_carlo != "auto" and test.monte_carlo < FEWEST:
+        return [f"{where}: expected 'auto' or a number of trials from {FEWEST} on; found {test.monte_carlo}"]
+    try:
+        method = plugins.get("methods", test.method)
+    except PluginError:
+        return []  # reported with its settings
+    if hasattr(method, "redrawing"):
+        return []
+    return [f"{where}: the method '{test.method}' does not state how its sources are drawn anew (redrawing)"]
+
+
 def _settings(
     group: plugins.Group, plugin_id: str, data: Mapping[str, Any], place: tuple[str | int, ...]
 ) -> tuple[Any, list[str]]:
@@ -429,7 +488,7 @@ def _settings(
     try:
         cls = plugins.get(group, plugin_id)
     except PluginError as error:
-        key = "driver" if group == "instruments" else "method"
+        key = "method" if group == "methods" else "driver"
         return None, [f"{tomlfile.dotted((*place, key))}: {error}"]
-    prefix = place if group == "instruments" else (*place, "settings")
+    prefix = (*place, "settings") if group == "methods" else place
     return tomlfile.check(data, cls.Settings, prefix=prefix)

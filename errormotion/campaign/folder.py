@@ -15,14 +15,67 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
+from errormotion.datasets.files.runfile import SCHEMA, read_run
 from errormotion.datasets.provenance import plain
 from errormotion.errors import RunError
 
-SCHEMA = "errormotion.run/1"
 RESERVE_BYTES = 2**18
 """Reserved during a measurement and released at its end, so that run.json and the log fit on a full disk, bytes."""
 
 log = logging.getLogger(__name__)
+
+
+class FolderGoneError(RunError):
+    """A folder was moved or deleted while data were written to it."""
+
+
+class Presence:
+    """A folder that must remain where it is, and the same, while data are written to it.
+
+    Parameters
+    ----------
+    path : Path
+        The folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._identity = self._found()
+
+    def _found(self) -> tuple[int, int] | None:
+        try:
+            state = self.path.stat()
+        except OSError:
+            return None
+        return state.st_dev, state.st_ino
+
+    def check(self) -> None:
+        """Check the folder.
+
+        Raises
+        ------
+        FolderGoneError
+            It is not there, or another folder is.
+        """
+        if self._identity is None or self._found() != self._identity:
+            raise FolderGoneError(
+                f"The folder {self.path} is gone: it was moved or deleted while data were written to it."
+            )
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Check the folder before and after something is written to it.
+
+        Raises
+        ------
+        FolderGoneError
+            As `check`.
+        """
+        self.check()
+        try:
+            yield
+        finally:
+            self.check()
 
 
 class RunFolder:
@@ -73,20 +126,7 @@ class RunFolder:
             The path is not a run folder, or its ``run.json`` is damaged.
         """
         path = Path(path)
-        file = path / "run.json"
-        try:
-            data = json.loads(file.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise RunError(f"{path}: expected a run folder with a run.json; {error.strerror}") from error
-        except ValueError as error:
-            raise RunError(
-                f"{file}: is not valid JSON ({error}); restore it from a copy, "
-                "or identify raw.zarr with 'errormotion identify'"
-            ) from error
-        if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-            found = data.get("schema") if isinstance(data, dict) else type(data).__name__
-            raise RunError(f"{file}: expected schema '{SCHEMA}'; found {found!r}")
-        return cls(path, data)
+        return cls(path, read_run(path))
 
     def save(self, **changes: Any) -> None:
         """Change fields of ``run.json`` and write the file.
@@ -114,8 +154,14 @@ class RunFolder:
 
     @property
     def raw(self) -> Path:
-        """The raw store."""
-        return self.path / "raw.zarr"
+        """The raw store.
+
+        Raises
+        ------
+        RunError
+            It is a link out of this folder.
+        """
+        return self._inside("raw.zarr")
 
     @property
     def log(self) -> Path:
@@ -135,8 +181,18 @@ class RunFolder:
         if name is None or name == "":
             return None
         if isinstance(name, str) and "\0" not in name and not Path(name).is_absolute() and ".." not in Path(name).parts:
-            return self.path / name
+            return self._inside(name)
         raise RunError(f"{self.path / 'run.json'}: errors: expected a file in this folder; found {name!r:.100}")
+
+    def _inside(self, name: str) -> Path:
+        """Return a path in this folder; RunError for one that a link leads out of it."""
+        path = self.path / name
+        try:
+            if path.resolve().is_relative_to(self.path.resolve()):
+                return path
+        except (OSError, RuntimeError) as error:  # a link to itself, a name that is too long
+            raise RunError(f"{path}: cannot be followed: {error}") from error
+        raise RunError(f"{path}: expected a file in this folder; it is a link to {path.resolve()}")
 
     @property
     def finished(self) -> bool:
@@ -179,15 +235,17 @@ class RunFolder:
             os.close(descriptor)
 
 
-def list_runs(runs: Path) -> list[RunFolder]:
-    """Return the run folders in a folder, the oldest first; unreadable ones are logged and skipped."""
+def list_runs(runs: Path, skipped: list[str] | None = None) -> list[RunFolder]:
+    """Return the run folders in a folder, the oldest first; unreadable ones are logged, and appended to ``skipped``."""
     found = []
     for path in sorted(runs.iterdir()) if runs.is_dir() else []:
-        if path.is_dir() and not path.name.startswith(".") and (path / "run.json").exists():
+        if path.is_dir() and not path.name.startswith(".") and os.path.lexists(path / "run.json"):
             try:
                 found.append(RunFolder.open(path))
             except RunError as error:
                 log.warning("skipped: %s", error)
+                if skipped is not None:
+                    skipped.append(str(error))
     return sorted(found, key=lambda folder: str(folder.data.get("created", "")))
 
 

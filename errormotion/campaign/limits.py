@@ -164,6 +164,29 @@ def _possible(step: Any) -> bool:
     )
 
 
+def announcement(test: str, steps: Sequence[Step] | None, limits: Limits) -> str:
+    """Return in one line what a test will do with the machine, beside its limits; ``steps`` as from `steps_of`."""
+    if steps is None:
+        return f"{test}: states no motions; no order to the machine is allowed."
+    found = extent(steps)
+    parts = []
+    for k, axis in enumerate(AXES):
+        if not math.isnan(found.low[k]):
+            planned = f"{axis} {_mm(found.low[k])} to {_mm(found.high[k])}"
+            span = getattr(limits, axis)
+            parts.append(f"{planned} ({'no limits' if span is None else f'limits {_mm(span[0])} and {_mm(span[1])}'})")
+    if found.feed:
+        limit = "no limit" if limits.feed is None else f"limit {_feed(limits.feed)}"
+        parts.append(f"feed up to {_feed(found.feed)} ({limit})")
+    if found.rapid:
+        held = "not limited" if limits.feed is None else f"held to {_feed(limits.feed)}"
+        parts.append(f"rapid moves: {found.rapid} ({held})")
+    if found.spindle_speed:
+        limit = "no limit" if limits.spindle_speed is None else f"limit {limits.spindle_speed:g} /min"
+        parts.append(f"spindle up to {found.spindle_speed:g} /min ({limit})")
+    return f"{test}: the machine will move: {', '.join(parts)}." if parts else f"{test}: nothing will move."
+
+
 NO_MOTIONS = "the method '{}' does not state its motions ('motions'); whether they stay within the limits is unknown"
 
 

@@ -13,6 +13,7 @@ from typing import Any, Self
 
 import xarray as xr
 
+from errormotion.campaign.folder import Presence
 from errormotion.campaign.store import RawStore
 from errormotion.datasets.clock import RecordClock
 from errormotion.errors import RunError
@@ -44,6 +45,7 @@ class Recorder:
 
     def __init__(self, path: Path, dim: str, expected: float, attrs: dict[str, Any]) -> None:
         self._path, self._dim, self._expected, self._attrs = path, dim, expected, attrs
+        self._place = Presence(path.parent)
         self._store = RawStore(path, dim) if path.exists() else None
         self._clock = RecordClock(self.attrs, self.committed, self._end())
         self._queue: queue.Queue[xr.Dataset | None] = queue.Queue(maxsize=8)
@@ -67,6 +69,8 @@ class Recorder:
         ------
         DiskFullError
             The disk is full. Committed data remain complete.
+        FolderGoneError
+            The folder was moved or deleted.
         RunError
             The data do not fit the store, or cannot be written.
         """
@@ -136,7 +140,8 @@ class Recorder:
     def _append(self, chunk: xr.Dataset) -> None:
         if self._store is None:
             first = chunk.assign_attrs({k: v for k, v in self._attrs.items() if k not in chunk.attrs})
-            self._store = RawStore.create(self._path, first, self._dim, self._expected)
+            with self._place.held():
+                self._store = RawStore.create(self._path, first, self._dim, self._expected)
         self._store.append(chunk)
 
     def _raise(self) -> None:

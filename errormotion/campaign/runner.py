@@ -24,18 +24,19 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
-from errormotion.campaign.folder import RunFolder, list_runs, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, list_runs, now
 from errormotion.campaign.journal import cause_of, journal
-from errormotion.campaign.limits import NO_MOTIONS
+from errormotion.campaign.limits import NO_MOTIONS, announcement, steps_of
 from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
 from errormotion.campaign.timeline import follower
 from errormotion.datasets import provenance
 from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
-from errormotion.datasets.merit import figures_of, stored
+from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
-from errormotion.errors import RunError
+from errormotion.datasets.validation import explained
+from errormotion.errors import ErrormotionError, RunError
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
 
@@ -47,6 +48,9 @@ log = logging.getLogger(__name__)
 
 class Progress(Protocol):
     """Receives the progress of a campaign."""
+
+    def announce(self, text: str) -> None:
+        """State what a test will do with the machine; before the bench is opened."""
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
         """Start a test, or skip a finished one."""
@@ -67,6 +71,9 @@ class Progress(Protocol):
 
 class Quiet:
     """Ignores the progress."""
+
+    def announce(self, text: str) -> None:
+        """Do nothing."""
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
         """Do nothing."""
@@ -151,19 +158,28 @@ def resume(
     """
     runs = runs or (campaign.runs if campaign else Path("runs"))
     groups: dict[str, list[RunFolder]] = {}
-    for folder in list_runs(runs):
+    skipped: list[str] = []
+    for folder in list_runs(runs, skipped):
         if "campaign" not in folder.data:  # a log
             continue
         groups.setdefault(str(folder.data["id"]), []).append(folder)
-    changed = ""
+    changed, skipped = "", []
     for run_id, folders in reversed(groups.items()):
-        if all(folder.finished for folder in folders) and len(folders) == len(folders[0].data["campaign"]["tests"]):
+        try:
+            stated = folders[0].data["campaign"]
+            if all(folder.finished for folder in folders) and len(folders) == len(stated["tests"]):
+                continue
+            if campaign and campaign.sha256 != stated["sha256"]:
+                if campaign.name == stated["name"]:
+                    changed = changed or folders[-1].path.name
+                continue
+            plan = _stored_plan(folders[0])
+        except (ErrormotionError, KeyError, TypeError, AttributeError) as error:
+            if campaign and isinstance(error, ErrormotionError):  # it is the one that was asked for
+                raise
+            skipped.append(f"{folders[0].path / 'run.json'}: is no complete record of a run ({cause_of(error)})")
+            log.warning("skipped: %s", skipped[-1])
             continue
-        if campaign and campaign.sha256 != folders[0].data["campaign"]["sha256"]:
-            if campaign.name == folders[0].data["campaign"]["name"]:
-                changed = changed or folders[-1].path.name
-            continue
-        plan = _stored_plan(folders[0])
         session = _Session(plan, runs, run_id, progress, ask, report)
         return session.work({str(folder.data["test"]): folder for folder in folders})
     if changed and campaign:
@@ -171,7 +187,8 @@ def resume(
             f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Continue with the "
             "stored files: 'errormotion run --resume' without the campaign. Or start again: without --resume."
         )
-    raise RunError(f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished.")
+    message = f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished."
+    raise RunError("\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]))
 
 
 class _Session:
@@ -193,6 +210,10 @@ class _Session:
 
     def work(self, folders: dict[str, RunFolder]) -> list[RunFolder]:
         """Execute the unfinished tests."""
+        for test in self.campaign.tests:
+            folder = folders.get(test.name)
+            if folder is None or not (folder.finished or folder.data["acquired"]):
+                self.progress.announce(self._announcement(test))
         with ExitStack() as opened:
             for number, test in enumerate(self.campaign.tests):
                 folder = folders.get(test.name)
@@ -208,6 +229,11 @@ class _Session:
                 with folder.locked(), journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
                     self._test(folder, test, folders)
         return [folders[test.name] for test in self.campaign.tests]
+
+    def _announcement(self, test: TestPlan) -> str:
+        bench = self.campaign.bench
+        steps = steps_of(test.method, test.settings, bench.chosen(test.instruments).settings_by_kind)
+        return announcement(test.name, steps, bench.limits)
 
     def _new_folder(self, test: TestPlan) -> RunFolder:
         plan = self.campaign
@@ -265,6 +291,8 @@ class _Session:
             self._acquire(folder, test, inputs)
         if folder.errors is None:
             self._identify(folder, test)
+        if test.monte_carlo is not None:
+            self._evaluate(folder, test)
         self._report(folder)
         folder.save(status="finished")
 
@@ -344,7 +372,7 @@ class _Session:
         if (folder.path / path).exists():  # computed, but the process ended before run.json was written
             errors = datasets.load(folder.path / path)
         else:
-            with datasets.load(folder.raw) as raw:
+            with datasets.load(folder.raw) as raw, explained(folder.raw, raw):
                 errors = method.identify(raw, test.settings)
             datasets.validate(errors)
             (folder.path / path).parent.mkdir(parents=True, exist_ok=True)
@@ -352,6 +380,25 @@ class _Session:
         folder.step("identify", "done")
         folder.save(errors=path, results=results_of(errors), conformity=conformity_of(folder, errors))
         log.info("identified", extra={"data": {"errors": path}})
+
+    def _evaluate(self, folder: RunFolder, test: TestPlan) -> None:
+        """Evaluate the result by the Monte Carlo method; a failure is only logged, as that of a report."""
+        from errormotion.montecarlo.beside import evaluate_beside, file_beside
+
+        file = folder.errors
+        if file is None or file_beside(file).exists():
+            return
+        trials = None if test.monte_carlo == "auto" else test.monte_carlo
+        try:
+            evaluate_beside(
+                folder.raw, test.method.info.id, test.settings, datasets.load(file), file, trials=trials,
+                progress=self.progress,
+            )  # fmt: skip
+        except Exception as error:
+            log.exception("the Monte Carlo evaluation failed")
+            folder.step("monte_carlo", "failed", reason=cause_of(error))
+        else:
+            folder.step("monte_carlo", "done")
 
     def _report(self, folder: RunFolder) -> None:
         """Write the report; a failure is only logged, since the measurement is valid without it."""
@@ -397,11 +444,12 @@ def _failures(folder: RunFolder) -> Iterator[None]:
     except Exception as error:
         reason = cause_of(error)
         log.exception("failed")
-        if not folder.present:
-            raise RunError(
+        if isinstance(error, FolderGoneError) or not folder.present:
+            # Nothing is written where it was: this would look like a run.
+            raise FolderGoneError(
                 f"Test '{folder.data['test']}' ended: its folder {folder.path} is gone. It was moved or deleted "
-                "during the run. If it was moved, continue where it is now, with 'errormotion run --resume --runs' and "
-                "the folder that contains it."
+                f"during the run. {_kept(folder)} in it. If it was moved, continue where it is now, with 'errormotion "
+                "run --resume --runs' and the folder that contains it."
             ) from error
         marked = f"disk full: {reason}" if isinstance(error, DiskFullError) else reason
         folder.step("stop", "failed", reason=marked)

@@ -23,7 +23,7 @@ import zarr
 from xarray.conventions import encode_cf_variable
 from zarr.codecs import BloscCodec
 
-from errormotion.campaign.folder import replace_text
+from errormotion.campaign.folder import Presence, replace_text
 from errormotion.errors import RunError
 
 BLOCK_BYTES = 24 * 2**20
@@ -31,6 +31,12 @@ BLOCK_BYTES = 24 * 2**20
 
 LONGEST_BLOCK = 2**18
 """Largest number of samples in one block."""
+
+BEFORE_COMMIT = {"zarr_format", "node_type", "attributes"}
+"""Keys of the metadata of a store before its first commit."""
+
+MOST_SAMPLES = 2**53
+"""A length beyond this is no number of samples."""
 
 PER_CHUNK = ("dropped", "invalid", "time_start")
 """Attributes that differ between the datasets that a method yields."""
@@ -74,6 +80,7 @@ class RawStore:
         for column in self._arrays.values():
             column.load(self.count)
         self._unsynced: set[Path] = set()
+        self._presence = Presence(path)
 
     @classmethod
     def create(cls, path: Path, first: xr.Dataset, dim: str, expected: float = np.inf) -> Self:
@@ -135,7 +142,7 @@ class RawStore:
         Raises
         ------
         RunError
-            The dataset does not continue the store, or has other variables.
+            The dataset does not continue the store, has other variables, or the folder was moved or deleted.
         OSError
             The data cannot be written.
         """
@@ -167,11 +174,15 @@ class RawStore:
 
         Raises
         ------
-        RunError
-            The store was moved or deleted.
+        FolderGoneError
+            The folder was moved or deleted; nothing is written where it was.
         OSError
             The data cannot be written.
         """
+        with self._presence.held():
+            self._commit()
+
+    def _commit(self) -> None:
         if self.count % self.block:
             self._write_block()
         for path in self._unsynced:
@@ -183,7 +194,6 @@ class RawStore:
             "must_understand": False,
             "metadata": self._static | {name: column.metadata(self.count) for name, column in self._arrays.items()},
         }
-        self._refuse_missing()
         replace_text(self.path / "zarr.json", json.dumps(root, indent=1))
         self.committed = self.count
 
@@ -194,15 +204,10 @@ class RawStore:
 
     def _write_block(self) -> None:
         """Write the current block of every array."""
-        self._refuse_missing()
+        self._presence.check()
         start = (self.count - 1) // self.block * self.block
         for column in self._arrays.values():
             self._unsynced.add(column.write(start, self.count))
-
-    def _refuse_missing(self) -> None:
-        """Refuse to write where the store no longer is: zarr would create its folders again, with a part of it."""
-        if not (self.path / "zarr.json").exists():
-            raise RunError(f"{self.path} is gone: it was moved or deleted while data were written to it")
 
     def _encoded(self, name: str, variable: xr.Variable) -> np.ndarray:
         if name not in self._arrays:
@@ -299,12 +304,28 @@ class _Column:
 
 
 def committed_length(path: Path, dim: str) -> int:
-    """Return the number of samples visible to a reader of a store; 0 before the first commit."""
-    root = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
-    for metadata in root.get("consolidated_metadata", {}).get("metadata", {}).values():
-        if dim in _dims(metadata):
-            return int(metadata["shape"][_dims(metadata).index(dim)])
-    return 0
+    """Return the number of samples visible to a reader of a store; 0 before the first commit.
+
+    Raises
+    ------
+    RunError
+        The metadata of the store cannot be read, or are damaged.
+    """
+    file = path / "zarr.json"
+    try:
+        root = json.loads(file.read_text(encoding="utf-8"))
+        if set(root) <= BEFORE_COMMIT and root["zarr_format"] == 3:
+            return 0
+        for metadata in root["consolidated_metadata"]["metadata"].values():
+            if dim in _dims(metadata):
+                length = metadata["shape"][_dims(metadata).index(dim)]
+                if isinstance(length, int) and 0 <= length < MOST_SAMPLES:
+                    return length
+        raise ValueError(f"no variable has a length along '{dim}'")
+    except OSError as error:
+        raise RunError(f"{file}: cannot be read: {error.strerror}") from error
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise RunError(f"{file}: is damaged; restore it from a copy ({error})") from error
 
 
 def _dims(metadata: Mapping[str, Any]) -> tuple[str, ...]:

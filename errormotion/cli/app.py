@@ -32,6 +32,8 @@ model_app = typer.Typer(
     no_args_is_help=True, help="Thermal models: errors predicted from temperatures.", rich_markup_mode=None
 )
 app.add_typer(model_app, name="model")
+compensate_app = typer.Typer(no_args_is_help=True, help="Compensate measured errors.", rich_markup_mode=None)
+app.add_typer(compensate_app, name="compensate")
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
 Runs = Annotated[
@@ -212,6 +214,37 @@ def monitor(
     from errormotion.cli.commands import monitor as command
 
     command.run(bench, runs, interval, duration, json_)
+
+
+@compensate_app.command("run")
+@guarded
+def compensate_run(
+    bench: Annotated[Path, typer.Argument(help="A bench file with thermometers and, to write, a table [compensator].")],
+    model: Annotated[Path, typer.Option("--model", "-m", help="A thermal model of the machine.")],
+    arm: Annotated[
+        str | None,
+        typer.Option(metavar="MACHINE", help="Write offsets; the name of the machine as in the bench file."),
+    ] = None,
+    since: Annotated[
+        Path | None,
+        typer.Option(help="Log of a monitor or an earlier compensation that began in the reference state."),
+    ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Where the errors are to vanish, mm; default: as the model states."),
+    ] = None,
+    runs: Annotated[Path, typer.Option(help="Folder for the run folder.")] = Path("runs"),
+    duration: Annotated[str | None, typer.Option(help="Ramp to zero and end after this time; default: never.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print one JSON document for each interval.")] = False,
+) -> None:
+    """Follow the temperatures of a machine with offsets; without --arm only compute and log them."""
+    from errormotion.cli.commands import follow as command
+
+    point = None if at is None else _millimetres("--at", at)
+    code = command.run(
+        bench, model, runs, arm=arm, since=since, functional_point=point, duration=duration, as_json=json_
+    )
+    raise typer.Exit(code)
 
 
 @app.command()
@@ -512,7 +545,7 @@ def plugins_check(
     plugin: Annotated[str, typer.Argument(help="Its id.")],
     address: Annotated[str | None, typer.Option(help="Address of a real instrument; default: its simulator.")] = None,
     mutants: Annotated[
-        int | None, typer.Option(min=0, help="How many changed frames an instrument has to stand; default 300, in 6 s.")
+        int | None, typer.Option(min=0, help="Changed frames to try: default 300 in 6 s; of more, all.")
     ] = None,
     json_: Json = False,
 ) -> None:
@@ -616,3 +649,102 @@ def model_check(
     from errormotion.cli.commands import model as command
 
     command.check_model(model, errors, report, json_)
+
+
+@compensate_app.command("table")
+@guarded
+def compensate_table(
+    errors: Annotated[Path, typer.Argument(help="Errors over position or targets: NetCDF or a run folder.")],
+    for_: Annotated[
+        str,
+        typer.Option("--for", metavar="CONTROL", help="Format, such as siemens or generic; a wrong one lists all."),
+    ],
+    axis: Annotated[str, typer.Option(help="Axis along which the points are: X, Y or Z.")],
+    component: Annotated[str, typer.Option(help="Axis that is corrected; default: the same.")] = "",
+    step: Annotated[str | None, typer.Option(help="Distance between points, such as 25mm; default: measured.")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the files.")] = Path(),
+    at: Annotated[str, typer.Option(help="Positions of the other axes, mm: x,y,z.")] = "0,0,0",
+    time: Annotated[str | None, typer.Option(help="Instant of errors over time, such as '90 min'.")] = None,
+    point: Annotated[str | None, typer.Option("--functional-point", help="Tool, mm: x,y,z; default: measured.")] = None,
+    chain: Annotated[str, typer.Option(help="Chain of the machine, where the errors do not state it.")] = "",
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting of the format.")
+    ] = None,
+    json_: Json = False,
+) -> None:
+    """Write a compensation table of one axis for a control."""
+    from errormotion.cli.commands import compensate as command
+
+    place = _millimetres("--at", at)
+    tool = None if point is None else _millimetres("--functional-point", point)
+    command.table(errors, for_, command.Choice(axis, component, step, place, time, tool, chain), out, set_ or [], json_)
+
+
+@compensate_app.command("program")
+@guarded
+def compensate_program(
+    part: Annotated[Path, typer.Argument(help="An NC program, RS-274 (ISO 6983).")],
+    with_: Annotated[
+        list[Path], typer.Option("--with", help="Errors (NetCDF or run folder) or a thermal model; several add up.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The new program; default: PART.corrected.ngc.")
+    ] = None,
+    temperatures: Annotated[Path | None, typer.Option(help="Temperatures over time, for a thermal model.")] = None,
+    time: Annotated[
+        str | None, typer.Option(help="Instant of errors over time, such as '90 min'; default: the last.")
+    ] = None,
+    tolerance: Annotated[str, typer.Option(help="Largest distance from the corrected path.")] = "1um",
+    sampling: Annotated[str, typer.Option(help="Largest distance of points at which it is examined.")] = "2mm",
+    parameters: Annotated[
+        Path | None, typer.Option(help="Parameter file of LinuxCNC (.var): work offsets, G92, G28.")
+    ] = None,
+    offset: Annotated[
+        list[str] | None, typer.Option(metavar="G54=X,Y,Z", help="Origin of a work offset in machine coordinates, mm.")
+    ] = None,
+    tools: Annotated[Path | None, typer.Option(help="Tool table of LinuxCNC (.tbl).")] = None,
+    machine_unit: Annotated[str, typer.Option(help="Unit of these two files: mm or inch.")] = "mm",
+    point: Annotated[
+        str | None, typer.Option("--functional-point", help="Of all tools, mm: x,y,z; default: measured.")
+    ] = None,
+    gauge: Annotated[
+        str | None, typer.Option("--gauge-point", help="Of a tool of length 0, mm: x,y,z; lengths from --tools.")
+    ] = None,
+    start: Annotated[str | None, typer.Option(help="Machine position before the program, mm: x,y,z.")] = None,
+    unit: Annotated[str, typer.Option(help="Unit before the first G20 or G21: mm or inch.")] = "mm",
+    block_delete: Annotated[
+        str | None, typer.Option("--block-delete", help="skip or run blocks that start with '/'.")
+    ] = None,
+    reader: Annotated[str, typer.Option(help="auto, plain, or interpreter (that of LinuxCNC).")] = "auto",
+    check: Annotated[bool, typer.Option("--check", help="LinuxCNC's interpreter must read the result alike.")] = False,
+    partial: Annotated[bool, typer.Option("--partial", help="Leave out freedoms that are not known.")] = False,
+    report: Annotated[Path | None, typer.Option(help="Write a page with the correction along the path, .html.")] = None,
+    json_: Json = False,
+) -> None:
+    """Write an NC program whose cuts are where those of another were meant."""
+    from errormotion.cli.commands import compensate_program as command
+
+    origins = []
+    for text in offset or []:
+        name, _, place = text.partition("=")
+        origins.append((name, _millimetres("--offset", place)))
+    choice = command.Choice(
+        temperatures=temperatures,
+        time=time,
+        tolerance=tolerance,
+        sampling=sampling,
+        parameters=parameters,
+        tools=tools,
+        machine_unit=machine_unit,
+        origins=tuple(origins),
+        functional_point=None if point is None else _millimetres("--functional-point", point),
+        gauge_point=None if gauge is None else _millimetres("--gauge-point", gauge),
+        start=None if start is None else _millimetres("--start", start),
+        unit=unit,
+        block_delete=block_delete,
+        reader=reader,
+        check=check,
+        partial=partial,
+        report=report,
+    )
+    command.program(part, with_, choice, out, json_)

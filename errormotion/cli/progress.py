@@ -20,9 +20,18 @@ from rich.progress import (
 
 
 class Bars:
-    """Progress of a campaign as bars on stderr; nothing is shown where stderr is no terminal."""
+    """Progress of a campaign as bars on stderr; where stderr is no terminal, only what will move is printed.
 
-    def __init__(self, quiet: bool = False) -> None:
+    Parameters
+    ----------
+    quiet : bool
+        No bars.
+    announcing : bool
+        Print what will move, also without bars.
+    """
+
+    def __init__(self, quiet: bool = False, *, announcing: bool = False) -> None:
+        self._announcing = announcing
         self._console = Console(stderr=True, highlight=False)
         self._shown = not quiet and sys.stderr.isatty()
         self._progress = Progress(
@@ -48,6 +57,11 @@ class Bars:
     ) -> None:
         self._finish(error is None)
         self._progress.stop()
+
+    def announce(self, text: str) -> None:
+        """Print what a test will do with the machine, on one line."""
+        if self._announcing:
+            self._console.print(text, markup=False, soft_wrap=True)
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
         """Start a test."""

@@ -10,6 +10,7 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.raw_paths import is_runs_folder
+from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, RunError
 
 
@@ -50,7 +51,9 @@ def _add(found: dict[str, xr.Dataset], name: str, file: Path) -> None:
     while own in found:
         number += 1
         own = f"{name} ({number})"
-    found[own] = datasets.load(file)
+    with reading(file):
+        found[own] = datasets.load(file)
+        datasets.validate(found[own])
 
 
 def _files(path: Path, left_out: list[str], every: bool = False) -> list[tuple[str, Path]]:

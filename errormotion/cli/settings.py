@@ -49,5 +49,5 @@ def read_settings(model: Any, file: Path | None, assignments: Sequence[str]) -> 
 def _value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text

@@ -15,7 +15,7 @@ from errormotion.compare import chain
 from errormotion.compare.placed import Placed
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
-from errormotion.datasets.interpolation import bracket
+from errormotion.datasets.results.interpolation import bracket
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
 from errormotion.kinematics.iso import DOF
@@ -24,6 +24,8 @@ SAME_POINT = 1e-6
 """Distance below which two commanded positions are the same, m."""
 SAME_MOTION = {"spindle": "tool", "tool": "tool"}
 """Components that are the same motion, the tool relative to the workpiece: a bar in the spindle shows it."""
+UNKNOWN = ("", "unknown")
+"""What stands for a machine or a frame that is not stated."""
 COORDINATES = {"position": ("x", "y", "z"), "target": ("x", "y", "z")}
 
 
@@ -116,6 +118,13 @@ def common_ground(
     first = datasets[names[0]]
     component = _same(datasets, "component", SAME_MOTION)
     machine, frame = _same(datasets, "machine"), _same(datasets, "frame")
+    if frame in UNKNOWN:
+        raise DatasetError(
+            f"{', '.join(map(repr, names))}: their frame is unknown (attribute 'frame': '{frame}'), so that their axes "
+            "may have other directions. State it"
+        )
+    if machine in UNKNOWN:
+        notes.append(f"No dataset states its machine ('{machine}'): they are taken as those of one machine.")
     dim = _dimension(datasets)
     point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
     moved = {
@@ -175,6 +184,13 @@ def _check(name: str, ds: xr.Dataset) -> None:
     if ds.em.names != DOF:
         raise DatasetError(
             f"'{name}': its errors are known along one direction only (deviation), which cannot be compared"
+        )
+    variance = np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1)
+    known = np.isfinite(variance)
+    if known.any() and not (variance[known] > 0).any():
+        raise DatasetError(
+            f"'{name}': its covariance is 0 everywhere; expected the uncertainty of its errors. State a small one for "
+            "values that are exact, such as a truth"
         )
 
 

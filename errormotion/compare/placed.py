@@ -10,8 +10,8 @@ import xarray as xr
 
 from errormotion.arrays import Array, filled, products
 from errormotion.compare.stack import Estimate
-from errormotion.datasets.interpolation import interpolated
-from errormotion.datasets.reduction import changes, influence_of
+from errormotion.datasets.results.interpolation import interpolated
+from errormotion.datasets.results.reduction import changes, influence_of
 from errormotion.kinematics.iso import DOF
 
 
@@ -47,7 +47,9 @@ class Placed:
 
     def at_times(self, time: Array, grid: Array) -> Placed:
         """Return the errors at other instants."""
-        E, C, F, _ = interpolated(np.asarray(time, dtype=float), self.value, self.total, self.influence, grid)
+        E, C, F, _ = interpolated(
+            np.asarray(time, dtype=float), self.value, self.total, self.influence, grid, starting=True
+        )
         return replace(self, value=E, total=C, influence=F)
 
     def since_first(self) -> Placed:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from errormotion.compare.ground import Ground
 from errormotion.compare.pairs import Pair
 from errormotion.compare.repeats import KINDS, Repeats
 from errormotion.compare.stack import Estimate, shared
+from errormotion.datasets.checks import matrix_violations
 from errormotion.errors import DatasetError
 
 SCHEMA = "errormotion.comparison/1"
@@ -190,12 +191,43 @@ def violations(ds: xr.Dataset) -> list[str]:
     for name in ("dataset", "pair", "dof", "dof_", "kind"):
         if name in ds.dims and name not in ds.coords:
             found.append(f"{name}: missing; expected its labels")
+    found = found or _wrong_types(ds, table) or _wrong_covariances(ds)
     if not found:
         for name in ("p", "curve_p", "misfit_p", "rest_p", *(["spread_p"] if "spread_p" in ds.variables else [])):
             values = ds.variables[name].values
             if values.dtype.kind != "f" or ((values < 0) | (values > 1)).any():
                 found.append(f"{name}: expected probabilities from 0 to 1")
     return found
+
+
+_TEXTS = ("cause", "size_name", "alike", "group")
+
+
+def _wrong_types(ds: xr.Dataset, table: Mapping[str, Any]) -> list[str]:
+    found = []
+    for name in table:
+        variable = ds.variables[name]
+        expected, kinds = ("text", "UO") if name in _TEXTS else ("numbers", "fiu")
+        if variable.size and variable.dtype.kind not in kinds:
+            found.append(f"{name}: expected {expected}; found {variable.dtype}")
+    return found
+
+
+def _wrong_covariances(ds: xr.Dataset) -> list[str]:
+    found = []
+    for values, name in _COVARIANCES.items():
+        found += matrix_violations(name, ds.variables[name].values, np.isnan(ds.variables[values].values))
+    for name in ("robust_uncertainty", "between", "size_u"):
+        if (ds.variables[name].values < 0).any():
+            found.append(f"{name}: expected standard uncertainties of 0 or more")
+    return found
+
+
+_COVARIANCES = {
+    "value": "covariance",
+    "difference": "difference_covariance",
+    "consensus": "consensus_covariance",
+}
 
 
 def estimate_of(ds: xr.Dataset, name: str) -> Estimate:

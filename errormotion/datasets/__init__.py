@@ -3,9 +3,9 @@
 Importing this package registers the accessor ``ds.em``.
 """
 
-from errormotion.datasets.accessor import Combination, ErrorMotion
-from errormotion.datasets.error_dataset import build_deviations, build_errors
 from errormotion.datasets.provenance import hash_dataset
+from errormotion.datasets.results.accessor import Combination, ErrorMotion
+from errormotion.datasets.results.build import build_deviations, build_errors
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.datasets.storage import load, save
 from errormotion.datasets.validation import validate, violations

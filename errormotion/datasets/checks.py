@@ -22,6 +22,9 @@ _MISTAKES = {
     "degC": ((1.0, -273.15, "K"),),
 }
 
+ROUNDING = 1e-8
+"""Rounding of a covariance relative to its diagonal, after moves over some metres and back."""
+
 
 def number(value: float) -> str:
     """Return a number as a person writes it."""
@@ -78,6 +81,38 @@ def unit_violations(name: str, attrs: Mapping[Any, Any], unit: str) -> list[str]
     if same:
         return []
     return [f"{name}: expected units '{unit}'; found '{found}'. Convert the values and set the attribute"]
+
+
+def matrix_violations(name: str, matrices: np.ndarray, unknown: np.ndarray) -> list[str]:
+    """Return a sentence if covariances are none.
+
+    Parameters
+    ----------
+    name : str
+    matrices : ndarray (..., k, k)
+    unknown : ndarray of bool (..., k)
+        Where the values are unknown: there, and only there, rows and columns are NaN.
+    """
+    if matrices.dtype.kind != "f" or matrices.shape != (*unknown.shape, unknown.shape[-1]):
+        return [f"{name}: expected a square matrix of numbers for each place"]
+    gaps = unknown[..., :, None] | unknown[..., None, :]
+    if not np.array_equal(np.isnan(matrices), gaps):
+        return [f"{name}: expected NaN exactly where the value is NaN"]
+    C = np.where(gaps, 0.0, matrices).astype(float)
+    if not np.isfinite(C).all():
+        return [f"{name}: expected finite numbers; found an infinite one"]
+    variance = np.diagonal(C, axis1=-2, axis2=-1)
+    if (variance < 0).any():
+        return [f"{name}: expected variances of 0 or more; found {number(float(variance.min()))}"]
+    scale = np.where(variance > 0, np.sqrt(variance), 1.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        correlation = C / scale[..., :, None] / scale[..., None, :]
+        even = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max(initial=0.0) <= ROUNDING
+    if not even:
+        return [f"{name}: expected symmetric matrices; found one that is not"]
+    if np.linalg.eigvalsh(correlation).min(initial=0.0) < -ROUNDING:
+        return [f"{name}: expected no negative variance in any direction (positive semidefinite); found one"]
+    return []
 
 
 def label_violations(ds: xr.Dataset, dim: str, labels: tuple[str, ...], *, ordered: bool = True) -> list[str]:

@@ -194,7 +194,7 @@ def _stored(attrs: Mapping[Any, Any]) -> Reading | None:
         found = json.loads(attrs[CLOCK])
         wall, since, began, elapsed = (float(found[name]) for name in ("wall", "steady", "began", "elapsed"))
         boot = str(found["boot"])
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
         return None
     if not all(map(math.isfinite, (wall, since, began, elapsed))):
         return None
@@ -205,7 +205,7 @@ def joins(attrs: Mapping[Any, Any]) -> list[Join]:
     """Return the interruptions that raw data state; none where the attribute is damaged."""
     try:
         return [Join(**each) for each in json.loads(attrs.get(JOINS, "[]"))]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RecursionError):
         return []
 
 

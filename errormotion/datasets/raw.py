@@ -78,7 +78,7 @@ def _row_violations(ds: xr.Dataset, row: Row) -> Iterator[str]:
         return
     if row.name == "time":
         yield from time_violations(row.name, variable)
-    elif row.unit == "1" and row.dims[-1] == "direction":
+    elif row.unit == "1" and row.dims[-1:] == ("direction",):
         yield from _norm_violations(row.name, variable)
     elif row.name.endswith("_covariance"):
         yield from _covariance_violations(variable.transpose(*row.dims), row)

@@ -50,6 +50,8 @@ class Row:
     required : bool
     missing : bool
         Whether single values of a required variable may be NaN: what a sensor did not see.
+    units : tuple of str
+        Inside units of the elements, where they differ and a column of a text file holds elements of one of them.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Row:
     meaning: str
     required: bool = True
     missing: bool = False
+    units: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

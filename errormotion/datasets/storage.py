@@ -16,16 +16,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import h5py  # type: ignore[import-untyped]
 import numpy as np
 import xarray as xr
 from xarray.indexes import RangeIndex
 
 from errormotion.datasets.checks import storable_violations
+from errormotion.datasets.files.containers import check_netcdf, check_zarr
+from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.schemas import SCHEMA
 from errormotion.errors import DatasetError, ErrormotionError
 
 _NETCDF = (".nc", ".nc4", ".h5")
+_NUMERICAL = ("/numpy/", "/scipy/")
 _READERS = ("/zarr/", "/numcodecs/", "/h5py/", "/h5netcdf/")
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _CLASSIC_SIGNATURE = b"CDF"
@@ -77,7 +79,9 @@ def load(path: str | Path) -> xr.Dataset:
     engine = _engine_of(path)
     with _reading(path):
         if engine == "h5netcdf":
-            probe(path)
+            check_netcdf(path)
+        elif engine == "zarr":
+            check_zarr(path)
         ds = xr.open_dataset(
             path,
             engine=engine,
@@ -91,12 +95,6 @@ def load(path: str | Path) -> xr.Dataset:
             with ds:
                 ds = ds.load()
     return _with_indexes(ds)
-
-
-def probe(path: Path) -> None:
-    """Open a NetCDF file and read its attributes with h5py: h5netcdf leaves a half-made object where these fail."""
-    with h5py.File(path) as file:
-        file.attrs.get("_nc3_strict")
 
 
 def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -185,6 +183,7 @@ def _engine_of(path: Path) -> str:
         hint = f" Did you mean {path / inside[0]}?" if inside else ""
         raise DatasetError(f"{path}: is a folder without zarr.json, so no dataset.{hint}")
     try:
+        require_regular(path)
         with path.open("rb") as file:
             head = file.read(8)
     except OSError as error:
@@ -205,8 +204,6 @@ def _engine_of(path: Path) -> str:
 
 def _is_consolidated(folder: Path) -> bool:
     """Whether the root of a Zarr folder holds the metadata of its arrays, which then counts before their own."""
-    if not (folder / "zarr.json").exists():
-        return (folder / ".zmetadata").exists()
     root = json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
     return bool(root.get("consolidated_metadata"))
 
@@ -219,7 +216,9 @@ def _reading(path: Path) -> Iterator[None]:
         raise
     except PermissionError as error:
         raise DatasetError(f"{path}: cannot be read: permission denied") from error
-    except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
+    except MemoryError as error:
+        raise DatasetError(f"{path}: needs more memory than this computer has") from error
+    except Exception as error:
         # What h5py, zarr and xarray raise on files that were cut off or are something else.
         what = "is truncated" if "truncated" in str(error) else "is damaged, or not a dataset of errormotion"
         raise DatasetError(f"{path}: {what}; create it again or copy it again. (Reader: {error})") from error
@@ -234,10 +233,14 @@ def reading(path: str | Path) -> Iterator[None]:
         if str(path) not in str(error):
             error.args = (f"{path}: {error}",)
         raise
+    except MemoryError as error:
+        raise DatasetError(f"{path}: needs more memory than this computer has") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         raise DatasetError(f"{path}: its values cannot be evaluated ({type(error).__name__}: {error})") from error
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
+        if isinstance(error, ValueError) and any(part in frames[-1].filename for part in _NUMERICAL):
+            raise DatasetError(f"{path}: its values cannot be evaluated ({error})") from error
         if not any(part in frame.filename for frame in frames for part in _READERS):
             raise
         raise DatasetError(
@@ -263,7 +266,7 @@ def _reason(error: Exception, missing: str) -> str:
         code = int(told[1])
     if code == errno.ENOENT:
         return missing
-    return _REASONS.get(code or 0, str(error))
+    return _REASONS.get(code or 0, getattr(error, "strerror", None) or str(error))
 
 
 def _refuse_existing(path: Path, overwrite: bool) -> None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
 import xarray as xr
 
 from errormotion import plugins
-from errormotion.datasets.error_checks import error_violations
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.raw import raw_violations, variant_of
+from errormotion.datasets.results.checks import error_violations
 from errormotion.datasets.schemas import SCHEMA, RawSchema, known_schemas
-from errormotion.errors import DatasetError
+from errormotion.errors import DatasetError, ErrormotionError
 
 
 def violations(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> list[str]:
@@ -37,6 +39,26 @@ def violations(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> list[str]:
     if schema is None:
         return [f"attribute 'schema': missing; expected one of {', '.join(sorted(known))}"]
     return [f"attribute 'schema': '{schema}' is unknown; {nearest(str(schema), known)}"]
+
+
+@contextmanager
+def explained(path: str | Path, ds: xr.Dataset) -> Iterator[None]:
+    """Evaluate a dataset of a file; where that fails, and the dataset breaks its schema, the violations are the error.
+
+    Raises
+    ------
+    DatasetError
+        The evaluation ended with an error of Python, and the dataset breaks its schema; one sentence each.
+    """
+    try:
+        yield
+    except ErrormotionError:
+        raise
+    except Exception as error:
+        found = violations(ds)
+        if not found:
+            raise
+        raise DatasetError(f"{path}: breaks its schema ({ds.attrs.get('schema', 'none given')}):", found) from error
 
 
 def validate(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> None:

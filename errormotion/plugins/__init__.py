@@ -1,13 +1,16 @@
-"""Plugins: what an instrument, a method and a kind of dataset are, and the registry that finds them.
+"""Plugins: what an instrument, a method, a kind of dataset and a compensator are, and the registry.
 
-A plugin is a plain class, named in the entry-point group ``errormotion.instruments``, ``errormotion.methods`` or
-``errormotion.datasets`` of any distribution. The built-in ones come through the same door.
+A plugin is a plain class, named in the entry-point group ``errormotion.instruments``, ``errormotion.methods``,
+``errormotion.datasets`` or ``errormotion.compensators`` of any distribution. The built-in ones come
+through the same door.
 """
 
 from errormotion.plugins.contracts import (
     ERRORS_SCHEMA,
+    Applied,
     Bench,
     Calibration,
+    Compensator,
     Contact,
     DatasetInfo,
     FigureOfMerit,
@@ -45,8 +48,10 @@ from errormotion.plugins.subjects import InstrumentSubject, MethodSubject
 __all__ = [
     "ERRORS_SCHEMA",
     "GROUPS",
+    "Applied",
     "Bench",
     "Calibration",
+    "Compensator",
     "Contact",
     "DatasetInfo",
     "Environment",

@@ -88,6 +88,9 @@ class FigureOfMerit:
         SI unit of both: ``m``, ``rad``, ``1``, ``degC``.
     limit : float, optional
         Largest absolute value that is accepted, where one is known.
+    influence : mapping of str to float, optional
+        Effect of one standard uncertainty of each source of the dataset, by its name. Where it is left out, it is the
+        change of the figure when the errors change; so a figure that is computed from other variables states it.
     """
 
     name: str
@@ -95,6 +98,7 @@ class FigureOfMerit:
     expanded_uncertainty: float
     unit: str
     limit: float | None = None
+    influence: Mapping[str, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -309,6 +313,52 @@ class Bench(Protocol):
 
     def ask(self, message: str) -> None:
         """Request an action of the operator and wait for it; returns immediately on a virtual machine."""
+
+
+@dataclass(frozen=True)
+class Applied:
+    """State of the offsets in a machine.
+
+    Attributes
+    ----------
+    offset : tuple of float
+        Offset of X, Y, Z in effect, m; NaN where unknown.
+    busy : str
+        Why the offset must not change now, such as a probing cycle or a thread; empty: it may.
+    fault : str
+        Why the machine takes no offsets, such as an emergency stop; empty: it does.
+    """
+
+    offset: tuple[float, float, float]
+    busy: str = ""
+    fault: str = ""
+
+
+@runtime_checkable
+class Compensator(Protocol):
+    """Writes offsets into a machine for ``errormotion compensate run``; group ``errormotion.compensators``.
+
+    The machine's side keeps a slew limit of its own, and ramps to zero when `write` is not called for the time that
+    its watchdog allows. ``open`` and `read` change nothing.
+    """
+
+    info: ClassVar[InstrumentInfo]
+    Settings: ClassVar[type[PluginSettings]]
+
+    def open(self) -> None:
+        """Connect; idempotent. InstrumentError where nothing answers."""
+
+    def close(self) -> None:
+        """Disconnect; idempotent. Offsets that were written ramp to zero by the watchdog of the machine."""
+
+    def identify(self) -> Identity:
+        """Return what answers at the address."""
+
+    def read(self) -> Applied:
+        """Return the offsets in effect, and whether they may change."""
+
+    def write(self, offset: Sequence[float]) -> None:
+        """Write the offset of X, Y, Z, m, and with it the sign of life that the machine's watchdog expects."""
 
 
 @runtime_checkable

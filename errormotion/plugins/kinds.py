@@ -179,6 +179,24 @@ class LaserTracker(Instrument, Protocol):
         """Return one length, m, or the array of all that a table holds; NaN where there is none."""
 
 
+# ---------------------------------------------------------------------- interferometer
+
+
+@contract(plausible=(-160.0, 160.0))
+class Interferometer(Instrument, Protocol):
+    """An instrument that counts displacements, or angles, of reflectors along its beams."""
+
+    @property
+    def channels(self) -> Mapping[str, str]:
+        """Unit of each channel, ``m`` or ``rad``, by its name; known before the instrument is opened."""
+
+    def read(self) -> Mapping[str, float]:
+        """Return displacement (m) or angle (rad) of each channel since `zero`; NaN from a broken beam until `zero`."""
+
+    def zero(self) -> None:
+        """Count from the present position on; raises InstrumentError where a beam is broken."""
+
+
 # ---------------------------------------------------------------------- touch_probe
 
 

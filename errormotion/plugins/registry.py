@@ -20,8 +20,8 @@ from errormotion.errors import PluginError, PluginWarning
 from errormotion.plugins import kind_registry
 from errormotion.plugins.contracts import DatasetInfo, InstrumentInfo, MethodInfo
 
-Group = Literal["instruments", "methods", "datasets"]
-GROUPS: tuple[Group, ...] = ("instruments", "methods", "datasets")
+Group = Literal["instruments", "methods", "datasets", "compensators"]
+GROUPS: tuple[Group, ...] = ("instruments", "methods", "datasets", "compensators")
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ _REQUIRED: Mapping[Group, tuple[type[InstrumentInfo | MethodInfo | DatasetInfo],
     "instruments": (InstrumentInfo, ("Settings", "open", "close", "identify", "read")),
     "methods": (MethodInfo, ("Settings", "needs", "acquire", "append_dim", "progress", "identify", "plan")),
     "datasets": (DatasetInfo, ()),
+    "compensators": (InstrumentInfo, ("Settings", "open", "close", "identify", "read", "write")),
 }
 
 

@@ -71,7 +71,8 @@ class InstrumentSubject:
         ``vary(number)`` makes the next reading another one; it is called ahead of each reading whose order is examined.
         Default: time passes in the simulated world.
     mutants : int
-        How many times a recorded session is replayed with a changed frame; 0: never.
+        How many times a recorded session is replayed with a changed frame; 0: never. Up to 300 within 6 s; of more than
+        300 all, however long it takes.
     """
 
     plugin: Any

@@ -12,6 +12,7 @@ from typing import Any
 
 from errormotion.datasets.files import events
 from errormotion.datasets.files.events import Event
+from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 
@@ -92,6 +93,7 @@ def read_entry(folder: Path) -> Entry:
     """
     file = folder / "run.json"
     try:
+        require_regular(file)
         with file.open("rb") as stream:
             raw = stream.read(LARGEST_FILE + 1)
     except OSError as error:

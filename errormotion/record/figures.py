@@ -1,8 +1,9 @@
 """One figure of many runs as a series: a figure of merit, or an error at a place.
 
 The effect of a source that several runs share, by its identity in their error datasets, comes from ``influence``: of an
-error directly, of a figure of merit as its change when the errors change by one standard uncertainty of the source. A
-figure that a method computes from other variables does not respond; its runs then count as independent.
+error directly, of a figure of merit as the method states it, else as its change when the errors change by one standard
+uncertainty of the source. A figure from other variables whose influence is not stated does not respond; its runs then
+count as independent.
 """
 
 from __future__ import annotations
@@ -156,15 +157,30 @@ def _of_merit(path: Path, entry: Entry, stated: FigureOfMerit) -> Reading:
 
         errors = datasets.load(path / entry.errors)
         origin = _origin(errors)
+        given = _influence(errors, stated.name)
         for row, identity in _identified(errors):
-            high, low = (_figure(_moved(errors, row, sign), stated.name) for sign in (1.0, -1.0))
-            if np.isfinite(high - low):
-                effects[identity] = effects.get(identity, 0.0) + 0.5 * (high - low)
+            source = str(errors["source"].values[row])
+            effect = _change(errors, row, stated.name) if given is None else float(given.get(source, 0.0))
+            if np.isfinite(effect):
+                effects[identity] = effects.get(identity, 0.0) + effect
     return Reading(entry.folder, stated.name, _time(entry), stated.value, u, stated.unit, effects, origin)
 
 
+def _influence(errors: xr.Dataset, name: str) -> Mapping[str, float] | None:
+    """Return the effects of the sources on a figure as its method states them, by name."""
+    from errormotion.datasets.results.merit import figures_of
+
+    return next((each.influence for each in figures_of(errors) if each.name == name), None)
+
+
+def _change(errors: xr.Dataset, row: int, name: str) -> float:
+    """Return the change of a figure with one standard uncertainty of a source in the errors."""
+    high, low = (_figure(_moved(errors, row, sign), name) for sign in (1.0, -1.0))
+    return 0.5 * (high - low)
+
+
 def _figure(errors: xr.Dataset, name: str) -> float:
-    from errormotion.datasets.merit import figures_of
+    from errormotion.datasets.results.merit import figures_of
 
     return next((each.value for each in figures_of(errors) if each.name == name), np.nan)
 

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
+from errormotion.datasets.files.reading import read_bytes
 from errormotion.record.entry import Entry, from_plain
 
 FILE = ".errormotion-index.json"
@@ -42,9 +43,7 @@ def load(folder: Path) -> Kept:
     """Return the entries of an index with their stamps, by name of the run folder; empty if it cannot be used."""
     file = folder / FILE
     try:
-        if file.stat().st_size > LARGEST:
-            return {}
-        data = json.loads(file.read_bytes())
+        data = json.loads(read_bytes(file, LARGEST))
     except (OSError, ValueError, RecursionError):
         return {}
     if not isinstance(data, dict) or data.get("schema") != SCHEMA or not isinstance(data.get("runs"), list):

@@ -209,7 +209,7 @@ def _complete(chosen: Iterable[tuple[Folder, Entry]]) -> int:
     lacking = [(folder, entry) for folder, entry in chosen if entry.lacks_figures]
     for folder, entry in lacking[:MOST_READ]:
         from errormotion import datasets  # 0.5 s to load: only where a dataset is opened
-        from errormotion.datasets.merit import figures_of
+        from errormotion.datasets.results.merit import figures_of
 
         try:
             with datasets.load(folder.path / entry.folder / entry.errors) as errors:

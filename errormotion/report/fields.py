@@ -28,7 +28,7 @@ def remarks(errors: xr.Dataset) -> list[str]:
     if isinstance(found, str):
         try:
             found = json.loads(found)
-        except ValueError:
+        except (ValueError, RecursionError):
             found = [found]
     if isinstance(found, str) or not isinstance(found, Sequence | np.ndarray):
         found = [found]

@@ -24,7 +24,7 @@ def read(errors: xr.Dataset) -> dict[str, Any]:
         return dict(text)
     try:
         found = json.loads(text)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RecursionError):
         return {"text": str(text)}
     return found if isinstance(found, dict) else {"text": str(text)}
 

@@ -127,6 +127,6 @@ def _reasons(invalid: Any) -> Mapping[str, Any]:
     if isinstance(invalid, str):
         try:
             invalid = json.loads(invalid)
-        except ValueError:
+        except (ValueError, RecursionError):
             return {}
     return invalid if isinstance(invalid, Mapping) else {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import glob
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -191,6 +191,7 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
     """
     from errormotion.datasets import load
     from errormotion.datasets.files import events
+    from errormotion.datasets.files.runfile import read_run
 
     folder = Path(run_folder)
     if not folder.is_dir():
@@ -203,18 +204,27 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
             f"{folder} holds no errors/*/errors.nc: nothing was identified yet. Run 'errormotion identify' first."
         )
     run: dict[str, Any] = {}
-    if (folder / "run.json").is_file():
-        try:
-            run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise RunError(
-                f"{folder / 'run.json'} is no JSON: {error}. Restore it, or remove it to report without."
-            ) from error
+    if os.path.lexists(folder / "run.json"):
+        run = dict(read_run(folder))
     run["events"] = events.read(folder)
     target = Path(out) if out is not None else folder / "report.html"
     if log is not None:
         return write_report(log, target, run=run)
-    return write_report([load(path) for path in files], target, raw=raw, run=run)
+    parts = []
+    for path in files:
+        errors = load(path)
+        parts += [errors, *belonging(errors, path)]
+    return write_report(parts, target, raw=raw, run=run)
+
+
+def belonging(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
+    """Return the datasets beside a file of errors that state its hash (`errors_hash`), such as an evaluation of it."""
+    from errormotion.datasets import hash_dataset, load
+
+    beside = [load(path) for path in sorted(file.parent.glob(f"{glob.escape(file.stem)}.*.nc"))]
+    stated = [ds for ds in beside if "errors_hash" in ds.attrs]
+    own = hash_dataset(errors) if stated else ""
+    return [ds for ds in stated if ds.attrs["errors_hash"] == own]
 
 
 def _provenance(dataset: xr.Dataset, run: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from shutil import copy
@@ -23,14 +25,25 @@ from errormotion.testing.kit import require
 
 Frames = list[tuple[str, bytes]]
 
-LONGEST_WAIT = 0.02
-"""Time limit of a missing answer in a replay, s."""
-MOST_MEMORY = 512e6
-"""Growth of the memory of this process, byte."""
+WAITS = (0.001, 0.02)
+"""Time limits of a missing answer in a replay: the first one within which the recording itself is replayed, s."""
 MUTANTS = 300
+"""So many are tried within `BUDGET`; where more are asked for, all of them."""
 BUDGET = 6.0
-"""Time after which no further mutant is tried, for each `MUTANTS` of them that are asked for, s."""
-MOST_BUDGET = 60.0
+"""Time after which no further mutant is tried, s."""
+LIMIT = 90.0
+"""Time limit of the check within the budget, s; a longer one has a limit for each mutant only."""
+MOST_TIME = 0.05
+"""Processor time of a session with a mutated frame beyond that of the recorded one, s."""
+REPEATS = 4
+"""A session above a limit is repeated so many times: what else the process does is no work of the driver."""
+MOST_MEMORY, MEMORY_PER_BYTE = 4 << 20, 64
+"""Largest memory of a session with a mutated frame beyond that of the recorded one: so many bytes, and so many for
+each byte of the frame."""
+MEASURED = 20
+"""The memory of every so manieth session is measured."""
+MOST_GROWTH = 128e6
+"""Growth of the memory of this process over all mutants, byte."""
 TIMEOUT = 0.5
 """Setting of an instrument that has one, s."""
 SEED = 20250301
@@ -43,13 +56,17 @@ def no_mutants(subject: InstrumentSubject) -> str:
     return "" if subject.simulated else "no session with a real device is recorded for it"
 
 
+def limit(subject: InstrumentSubject) -> float:
+    """Return the time limit of the check, s."""
+    return LIMIT if subject.mutants <= MUTANTS else math.inf
+
+
 def mutants(subject: InstrumentSubject) -> str:
     """Whatever bytes arrive, the driver raises only the project's errors, within bounded time and memory."""
-    budget = min(BUDGET * max(subject.mutants / MUTANTS, 1.0), MOST_BUDGET)
     if subject.make is None and "timeout" in subject.plugin.Settings.model_fields:
         subject = replace(subject, settings={**subject.settings, "timeout": TIMEOUT})
     rng = np.random.default_rng(SEED)
-    with TemporaryDirectory() as folder, _hurried():
+    with TemporaryDirectory() as folder:
         original, mutant = Path(folder) / "original" / "a.rec", Path(folder) / "mutant" / "a.rec"
         for path in (original, mutant):
             path.parent.mkdir()
@@ -59,24 +76,104 @@ def mutants(subject: InstrumentSubject) -> str:
         if not sessions:
             return "its recording has no received frames"
         _copy(original, mutant)
-        _outcome(subject, f"replay://{mutant}")  # compiles what is compiled at its first use
-        start, before, tried, refused, slowest = time.monotonic(), _memory(reset=True), 0, 0, 0.0
-        while tried < subject.mutants and time.monotonic() < start + budget:
-            part = list(sessions)[rng.integers(len(sessions))]
-            frames, what = _mutated(sessions[part], rng)
-            _copy(original, mutant)
-            rewrite(mutant.parent / part.name, frames)
-            begun = time.perf_counter()
-            error = _outcome(subject, f"replay://{mutant}")
-            seconds = time.perf_counter() - begun
-            what = f"mutant {tried} ({what})"
-            typed = error is None or isinstance(error, InstrumentError)
-            require(typed, f"{what}: expected an InstrumentError, found {error!r}")
-            require(seconds < subject.time_limit, f"{what} took {seconds:.1f} s, limit {subject.time_limit:g} s")
-            grown = _memory() - before
-            require(grown < MOST_MEMORY, f"{what}: the memory has grown by {grown / 1e6:.0f} MB")
-            tried, refused, slowest = tried + 1, refused + (error is not None), max(slowest, seconds)
-    return f"{tried} mutants, {refused} of them refused, {1e3 * slowest:.0f} ms at most"
+        with _hurried():
+            trial = Trial(subject, f"replay://{mutant}")
+            until = time.monotonic() + (BUDGET if subject.mutants <= MUTANTS else math.inf)
+            while trial.tried < subject.mutants and time.monotonic() < until:
+                part = list(sessions)[rng.integers(len(sessions))]
+                frames, size, what = _mutated(sessions[part], rng)
+                rewrite(mutant.parent / part.name, frames)
+                trial.try_one(size, what)
+                copy(part, mutant.parent / part.name)
+    return trial.summary
+
+
+class Trial:
+    """The replays of one recording, each with a mutated frame.
+
+    Parameters
+    ----------
+    subject : InstrumentSubject
+    address : str
+        Of the recording, which is replayed twice as it is: its time and memory are those that others are compared with.
+    """
+
+    def __init__(self, subject: InstrumentSubject, address: str) -> None:
+        self.tried = self.refused = 0
+        self._subject, self._address = subject, address
+        self._longest = self._work = self._memory = 0.0
+        for ReplayTransport.longest_wait in WAITS:  # the first replay compiles what is compiled at its first use
+            if (failed := _outcome(subject, address)) is None:
+                break
+        require(failed is None, f"the replay without a mutation failed: {failed!r}")
+        self._sound_work = max(self._replayed().work for _ in range(2))
+        self._sound_memory = self._replayed(measured=True).memory
+        self._before = _memory(reset=True)
+
+    def try_one(self, size: int, what: str) -> None:
+        """Replay the recording as it is now, with a frame of some bytes that was changed as stated."""
+        what = f"mutant {self.tried} ({what})"
+        found = self._replayed(measured=self.tried % MEASURED == 0)
+        typed = found.error is None or isinstance(found.error, InstrumentError)
+        require(typed, f"{what}: expected an InstrumentError, found {found.error!r}")
+        most = self._subject.time_limit
+        require(found.seconds < most, f"{what} took {found.seconds:.1f} s, limit {most:g} s")
+        for _ in range(REPEATS if found.work > self._sound_work + MOST_TIME else 0):
+            found.work = min(found.work, self._replayed().work)
+        more = max(found.work - self._sound_work, 0.0)
+        require(
+            more <= MOST_TIME,
+            f"{what} took {1e3 * more:.0f} ms of processor time more than the recorded session, limit "
+            f"{1e3 * MOST_TIME:g} ms",
+        )
+        memory = max(found.memory - self._sound_memory, 0.0)
+        most_memory = MOST_MEMORY + MEMORY_PER_BYTE * size
+        require(memory <= most_memory, f"{what} took {memory / 1024:.0f} KiB, limit {most_memory / 1024:.0f} KiB")
+        grown = _memory() - self._before
+        require(grown < MOST_GROWTH, f"{what}: the memory has grown by {grown / 1e6:.0f} MB")
+        self.tried, self.refused = self.tried + 1, self.refused + (found.error is not None)
+        self._longest, self._work = max(self._longest, found.seconds), max(self._work, more)
+        self._memory = max(self._memory, memory)
+
+    @property
+    def summary(self) -> str:
+        """What was found, in words."""
+        return (
+            f"{self.tried} mutants, {self.refused} of them refused; at most {1e3 * self._longest:.0f} ms a session, "
+            f"{1e3 * self._work:.1f} ms of processor time and {self._memory / 1024:.0f} KiB a frame"
+        )
+
+    def _replayed(self, *, measured: bool = False) -> _Replayed:
+        """Replay the recording in a thread; a driver that hangs fails at the time limit of the subject."""
+        found = _Replayed()
+        worker = threading.Thread(target=lambda: self._replay(found), name="replayed-session", daemon=True)
+        if measured:
+            tracemalloc.start()
+        try:
+            start, work = time.perf_counter(), time.process_time()
+            worker.start()
+            worker.join(2.0 * self._subject.time_limit)
+            found.seconds = time.perf_counter() - start
+            if not measured:
+                found.work = time.process_time() - work
+            else:
+                found.memory = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        return found
+
+    def _replay(self, found: _Replayed) -> None:
+        found.error = _outcome(self._subject, self._address)
+
+
+@dataclass
+class _Replayed:
+    """A replayed session: its error, wall and processor time (s), and memory (bytes; 0 where it is not measured)."""
+
+    error: BaseException | None = None
+    seconds: float = 0.0
+    work: float = 0.0
+    memory: float = 0.0
 
 
 def _sessions(path: Path) -> dict[Path, Frames]:
@@ -88,8 +185,8 @@ def _sessions(path: Path) -> dict[Path, Frames]:
     return {part: frames for part, frames in found.items() if _received(frames)}
 
 
-def _mutated(frames: Frames, rng: np.random.Generator) -> tuple[Frames, str]:
-    """Return frames of which one received one is changed, and what was changed."""
+def _mutated(frames: Frames, rng: np.random.Generator) -> tuple[Frames, int, str]:
+    """Return frames of which one received one is changed, the length of that one, and what was changed."""
     received = _received(frames)
     number = received[rng.integers(len(received))]
     data = bytearray(frames[number][1])
@@ -117,7 +214,7 @@ def _mutated(frames: Frames, rng: np.random.Generator) -> tuple[Frames, str]:
             data = bytearray(frames[received[rng.integers(len(received))]][1])
     changed = [*frames]
     changed[number] = ("R", bytes(data) or b"\0")
-    return changed, f"{how} at byte {at} of frame {number}: {bytes(data[max(0, at - 8) : at + 24])!r}"
+    return changed, len(data), f"{how} at byte {at} of frame {number}: {bytes(data[max(0, at - 8) : at + 24])!r}"
 
 
 def _received(frames: Frames) -> list[int]:
@@ -155,7 +252,8 @@ def _outcome(subject: InstrumentSubject, address: str, record: Path | None = Non
 
 @contextmanager
 def _hurried() -> Iterator[None]:
-    before, ReplayTransport.longest_wait = ReplayTransport.longest_wait, LONGEST_WAIT
+    """Restore what a trial sets."""
+    before = ReplayTransport.longest_wait
     try:
         yield
     finally:

@@ -330,7 +330,7 @@ def record_and_replay(subject: InstrumentSubject) -> str:
     return f"{original.stream.size + original.read.size} values alike"
 
 
-INSTRUMENT_CHECKS.add(limit=90.0, why_not=fuzz_checks.no_mutants)(fuzz_checks.mutants)
+INSTRUMENT_CHECKS.add(limit=fuzz_checks.limit, why_not=fuzz_checks.no_mutants)(fuzz_checks.mutants)
 
 
 @INSTRUMENT_CHECKS.add()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 import traceback
@@ -53,12 +54,13 @@ def applies_always(subject: object) -> str:  # noqa: ARG001 - one signature for 
 class Check(Generic[Subject]):
     """A named claim about a plugin, and the function that tries it.
 
-    ``why_not(subject)`` is empty where the check applies, else the reason why it does not.
+    ``why_not(subject)`` is empty where the check applies, else the reason why it does not. ``limit`` is its time limit,
+    s, or a function that returns it; infinite where the check has limits of its own.
     """
 
     name: str
     function: Callable[[Subject], str]
-    limit: float
+    limit: float | Callable[[Subject], float]
     why_not: Callable[[Subject], str] = applies_always
 
     @property
@@ -71,9 +73,9 @@ class Checks(list[Check[Subject]]):
     """Checks in the order in which they run."""
 
     def add(
-        self, limit: float = 30.0, why_not: Callable[[Subject], str] = applies_always
+        self, limit: float | Callable[[Subject], float] = 30.0, why_not: Callable[[Subject], str] = applies_always
     ) -> Callable[[Callable[[Subject], str]], Callable[[Subject], str]]:
-        """Return a decorator that appends a check named like its function, with a time limit in s."""
+        """Return a decorator that appends a check named like its function."""
 
         def register(function: Callable[[Subject], str]) -> Callable[[Subject], str]:
             self.append(Check(function.__name__, function, limit, why_not))
@@ -109,6 +111,7 @@ def run_check(check: Check[Subject], subject: Subject) -> CheckResult:
             box.append(result(False, f"{type(error).__name__}: {error}", trace=traceback.format_exc()))
 
     worker = threading.Thread(target=work, name=f"check-{check.name}", daemon=True)
+    limit = check.limit(subject) if callable(check.limit) else check.limit
     worker.start()
-    worker.join(check.limit)
-    return box[0] if box else result(False, f"still running after {check.limit:g} s")
+    worker.join(None if math.isinf(limit) else limit)
+    return box[0] if box else result(False, f"still running after {limit:g} s")

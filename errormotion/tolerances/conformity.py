@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from errormotion.datasets.merit import figures_of, is_planned
+from errormotion.datasets.results.merit import figures_of, is_planned
 from errormotion.plugins import FigureOfMerit
 from errormotion.tolerances.decision import INSIDE, OPEN, OUTSIDE, WORDS, decide, overall
 from errormotion.tolerances.table import Limit, Tolerances

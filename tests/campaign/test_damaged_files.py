@@ -6,6 +6,8 @@ import mutants
 import pytest
 
 from errormotion.campaign.files import load_bench, load_campaign
+from errormotion.campaign.folder import RunFolder
+from errormotion.errors import RunError
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -30,3 +32,9 @@ def test_damaged_campaigns(tmp_path: Path, name: str) -> None:
 
     refused = mutants.check(read, (EXAMPLES / name / "campaign.toml").read_bytes(), seed=2, number=mutants.count(100))
     assert refused > 20
+
+
+def test_a_run_json_that_is_nested_too_deep_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"schema": "errormotion.run/1", "a": ' + "[" * 5000)
+    with pytest.raises(RunError, match=r"run\.json: is not valid JSON"):
+        RunFolder.open(tmp_path)

@@ -17,6 +17,7 @@ from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.journal import journal
 from errormotion.campaign.store import RawStore
 from errormotion.errors import BenchError, RunError
+from errormotion.report import write_run_report
 
 STEP = 1e-6
 Plan = Callable[..., CampaignPlan]
@@ -216,6 +217,37 @@ def test_report_that_fails_harms_no_measurement(plan: Plan) -> None:
     assert folders[0].data["steps"][-1]["reason"] == "OSError: no ink"
 
 
+def test_a_test_may_evaluate_its_result_by_trials(plan: Plan) -> None:
+    (folder,) = runner.run(plan('name = "a"\nmonte_carlo = 60'), report=write_run_report)
+    assert folder.errors is not None
+    (file,) = folder.errors.parent.glob("*.monte_carlo.nc")
+    assert sorted(path.name for path in folder.errors.parent.iterdir()) == [file.name, "errors.nc"]
+    assert datasets.load(file).attrs["trials"] == 60
+    assert [step["step"] for step in folder.data["steps"]][-2:] == ["monte_carlo", "report"]
+    assert "Monte Carlo evaluation" in (folder.path / "report.html").read_text(encoding="utf-8")
+
+
+def test_an_evaluation_that_fails_harms_no_measurement(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    campaign = plan('name = "a"\nmonte_carlo = 60')
+    monkeypatch.delattr(plugins.get("methods", "ramp"), "redrawing")
+    (folder,) = runner.run(campaign)
+    assert folder.finished
+    assert folder.data["steps"][-1]["outcome"] == "failed"
+    assert "redrawing" in folder.data["steps"][-1]["reason"]
+
+
+@pytest.mark.parametrize(
+    ("key", "message"), [("3", "from 40 on; found 3"), ("'often'", "monte_carlo"), ("60", "does not state how")]
+)
+def test_an_evaluation_that_cannot_be_is_refused(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch, key: str, message: str
+) -> None:
+    if key == "60":
+        monkeypatch.delattr(plugins.get("methods", "ramp"), "redrawing")
+    with pytest.raises(BenchError, match=message):
+        plan(f'name = "a"\nmonte_carlo = {key}')
+
+
 def test_method_without_data_is_a_failure(plan: Plan) -> None:
     with pytest.raises(RunError, match="The method 'ramp' yielded no data"):
         runner.run(plan('name = "a"\nsettings = {count = 0}'))
@@ -269,3 +301,28 @@ def test_a_certificate_of_nothing_known_is_refused(lab: None, write: Callable[..
     file = write('name = "a"', bench='[certificates]\nbear = "K-1"\n')
     with pytest.raises(BenchError, match=r"certificates.*bear: expected the number or hash of a certificate"):
         load_campaign(file)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[" * 100_000,
+        '{"schema": "errormotion.run/1"}',
+        '{"schema": "errormotion.run/1", "id": "x", "created": "9", "campaign": {"tests": 5}}',
+        '{"schema": "errormotion.run/1", "id": "x", "created": "9", "campaign": "x"}',
+        '{"schema": "errormotion.run/1", "id": "x", "created": "9", "campaign": {"tests": []}, "status": "running"}',
+    ],
+)
+def test_a_damaged_run_beside_another_does_not_stop_its_resumption(plan: Plan, tmp_path: Path, text: str) -> None:
+    (tmp_path / "missing.txt").unlink(missing_ok=True)
+    with pytest.raises(RunError, match=r"missing\.txt"):
+        runner.run(plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "missing.txt"}"}}'))
+    damaged = tmp_path / "runs" / "99990101T000000Z-b-damaged"
+    damaged.mkdir()
+    (damaged / "run.json").write_text(text)
+    (tmp_path / "missing.txt").touch()
+    (folder,) = runner.resume(runs=tmp_path / "runs")
+    assert folder.finished
+    with pytest.raises(RunError, match="Nothing to resume"):
+        runner.resume(runs=tmp_path / "runs")

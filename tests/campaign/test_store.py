@@ -218,3 +218,30 @@ def test_joins_along_named_channels(tmp_path: Path) -> None:
         store.append(part)
         store.commit()
     same(tmp_path / "raw.zarr", xr.concat(parts, "channel"))
+
+
+def test_damaged_metadata_are_an_error_and_never_an_empty_store(tmp_path):
+    """A store without samples is removed and measured again: what is unknown must not look like one."""
+    path = tmp_path / "raw.zarr"
+    store = RawStore.create(path, chunk(0, 50), "time")
+    store.append(chunk(0, 50))
+    store.commit()
+    file = path / "zarr.json"
+    good = file.read_text()
+    assert committed_length(path, "time") == 50
+    root = json.loads(good)
+    shapeless = json.loads(good)
+    for metadata in shapeless["consolidated_metadata"]["metadata"].values():
+        metadata["shape"] = [float("nan")] * 2
+    damaged = (
+        *("", "[]", "{}", "[" * 5000, good[:-20], good.replace("consolidated_metadata", "consolidated_metadatb")),
+        json.dumps({**root, "consolidated_metadata": {"metadata": {}}}),
+        json.dumps(shapeless),
+    )
+    for text in damaged:
+        file.write_text(text)
+        with pytest.raises(RunError, match="is damaged; restore it from a copy"):
+            committed_length(path, "time")
+    file.unlink()
+    with pytest.raises(RunError, match="cannot be read"):
+        committed_length(path, "time")

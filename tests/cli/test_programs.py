@@ -25,8 +25,10 @@ def test_programs_of_every_test_are_written_each_in_its_folder(run, answer, tmp_
 
 
 def test_one_test_goes_straight_into_the_folder(run, tmp_path):
-    shown = run("program", GANTRY, "--test", "pose", "--out", tmp_path).stdout
-    assert "spindle 182 mm above where it was cut" in shown
+    shown = run("program", GANTRY, "--test", "pose", "--out", tmp_path)
+    assert "spindle 182 mm above where it was cut" in shown.stdout
+    assert shown.stderr.startswith("pose: the machine will move: ")
+    assert shown.stderr.count("\n") == 1
     assert (tmp_path / "pocket_2.nc").exists()
 
 

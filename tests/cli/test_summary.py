@@ -10,7 +10,7 @@ import xarray as xr
 from errormotion import plugins
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.datasets import build_errors, provenance
-from errormotion.datasets.merit import figures_of
+from errormotion.datasets.results.merit import figures_of
 from errormotion.methods.beam_direction import BeamDirection, Settings
 from errormotion.plugins import FigureOfMerit
 

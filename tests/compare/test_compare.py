@@ -224,6 +224,22 @@ def test_one_dataset_twice_one_alone_and_other_dims_are_refused():
     assert compare({"a": ds, "b": made(T2, rng, start="", name="b")}, same_start=True)["p"].item() > 1e-4
 
 
+def test_an_unknown_frame_is_refused_and_an_unknown_machine_is_noted():
+    rng = np.random.default_rng(9)
+    with pytest.raises(DatasetError, match="'a', 'b': their frame is unknown"):
+        compare({name: made(T2, rng, name=name, frame="unknown") for name in "ab"})
+    found = compare({name: made(T2, rng, name=name, machine="unknown") for name in "ab"}, causes=False)
+    assert any("No dataset states its machine" in note for note in found.attrs["notes"])
+
+
+def test_a_dataset_without_any_uncertainty_is_refused():
+    rng = np.random.default_rng(9)
+    exact = made(T2, rng, name="b")
+    exact = exact.assign({name: 0.0 * exact[name] for name in ("covariance", "influence")})
+    with pytest.raises(DatasetError, match="'b': its covariance is 0 everywhere; expected the uncertainty"):
+        compare({"a": made(T1, rng), "b": exact})
+
+
 def test_three_datasets_have_a_consensus_and_the_wrong_one_is_named():
     rng = np.random.default_rng(10)
     found = compare({"a": made(T1, rng), "b": made(T2, rng), "c": made(T2 + 30.0, rng, change=lambda v: v * 1.2)})

@@ -102,3 +102,13 @@ def test_record_without_a_readable_clock_has_the_age_that_the_wall_clock_states(
 def test_record_without_a_start_has_no_age(start):
     with pytest.raises(ValueError, match="attribute start"):
         clock.age(xr.Dataset(attrs={"start": start}))
+
+
+@pytest.mark.parametrize("text", ["[" * 5000, '{"wall": ' + "9" * 400 + "}", "null"])
+def test_damaged_clocks_of_a_record_are_none(text):
+    attrs = {clock.CLOCK: text, clock.JOINS: text, "start": START}
+    whole = json.dumps(asdict(STORED)).replace("5000.0", "9" * 400)
+    for stated in (attrs, attrs | {clock.CLOCK: whole}):
+        assert clock.joins(stated) == []
+        assert clock.age(xr.Dataset(attrs=stated)) >= 0 or math.isnan(clock.age(xr.Dataset(attrs=stated)))
+        assert clock.RecordClock(stated).attributes().keys() == {clock.CLOCK}

@@ -55,6 +55,16 @@ def test_intervals_hold_the_truth_at_left_out_instants(noise, step):
     assert 0.92 <= inside / count <= 0.985
 
 
+@pytest.mark.parametrize("start", [20.0, 60.0, 110.0])
+def test_the_interval_holds_a_start_between_the_first_two_instants(start):
+    """A bend at one place deviates by sqrt(3) standard deviations of the process whose slope changes as much."""
+    t = np.arange(0, 721, 120.0)
+    values = 1e-8 * np.repeat(np.maximum(t - start, 0.0)[:, None], 6, axis=1)
+    found = made(t, values, 1e-11).em.to_times([start])
+    score = found["EX"].item() / np.sqrt(found["covariance"].values[0, 0, 0])
+    assert score == pytest.approx(np.sqrt(3), rel=1e-3)
+
+
 def test_an_instant_of_the_dataset_is_returned_as_it_is():
     rng = np.random.default_rng(0)
     t = np.arange(10) * 60.0

@@ -296,3 +296,11 @@ def test_a_run_folder_may_move(errors, tmp_path) -> None:
     path = save(errors(), tmp_path / "errors.zarr")
     moved = shutil.move(path, tmp_path / "elsewhere.zarr")
     xr.testing.assert_identical(load(moved), errors())
+
+
+@pytest.mark.parametrize("head", [b"CDF", b"CDF\x02" + bytes(7) + b"\x0a" + b"\x7f" * 20])
+def test_damaged_netcdf_of_the_classic_format_is_an_error(tmp_path, head) -> None:
+    path = tmp_path / "classic.nc"
+    path.write_bytes(head)
+    with pytest.raises(DatasetError, match=r"classic\.nc: is "):
+        load(path)

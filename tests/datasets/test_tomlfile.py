@@ -145,3 +145,25 @@ def test_keys_of_an_embedded_table_carry_their_place() -> None:
 
 def test_the_nearest_name_does_not_care_for_capitals() -> None:
     assert tomlfile.nearest("ERRORMOTION", ["errormotion", "other"]).startswith("did you mean 'errormotion'?")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a = " + "[" * 5000, "nested too deep"),
+        ("a = " + "{b=" * 3000, "nested too deep"),
+        ("a = " + "9" * 5000, "not TOML: Exceeds the limit"),
+        ("a." * 3000 + "a = 1", "keys of at most 64 parts"),
+        ('a = {"b" . ' + "'b'." * 3000 + "b = 1}", "keys of at most 64 parts"),
+        ("#" * (4 << 20) + "#", "at most 4 MiB"),
+    ],
+    ids=["arrays", "tables", "digits", "dotted", "quoted", "size"],
+)
+def test_what_would_take_too_much_is_an_error(write, text: str, message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        tomlfile.read_toml(write(text))
+
+
+def test_a_long_word_and_a_sentence_with_dots_are_no_long_key(write) -> None:
+    text = f'a = "{"x" * 1_000_000}"\nb = "{". . " * 100}{"1.5 " * 100}"\n'
+    assert set(tomlfile.read_toml(write(text))) == {"a", "b"}

@@ -18,7 +18,10 @@ SLOW = ("crossbeam_scan-1",)
 def subjects():
     found = [
         subject
-        for name in ("beam_direction", "crossbeam_scan", "multilateration", "normal_vector", "spindle_drift")
+        for name in (
+            *("beam_direction", "crossbeam_scan", "linear_positioning", "multilateration"),
+            *("normal_vector", "spindle_drift"),
+        )
         for subject in plugins.get("methods", name)().conformance()
     ]
     names = [f"{each.plugin.info.id}-{k}" for k, each in enumerate(found)]

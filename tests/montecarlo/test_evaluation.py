@@ -1,6 +1,7 @@
 """Monte Carlo evaluation of a method: the same trials whatever executes them, kept, resumed, and judged."""
 
 import json
+import shutil
 from collections import Counter
 
 import numpy as np
@@ -267,6 +268,19 @@ def test_the_command_prints_and_stores_the_verdicts(measured, tmp_path):
     repeated = CliRunner().invoke(app, command)
     assert repeated.exit_code == 1
     assert "exists already" in repeated.output
+
+
+def test_several_results_are_evaluated_one_after_another_and_a_second_call_adds_nothing(measured, tmp_path):
+    raws = [shutil.copy(measured[0], tmp_path / f"{name}.nc") for name in "ab"]
+    command = ["identify", *map(str, raws), "--out", str(tmp_path / "out"), "--method", "straight"]
+    command += ["--monte-carlo", str(TRIALS), "--scheduler", "sync"]
+    result = CliRunner().invoke(app, [*command, "--json"])
+    assert result.exit_code == 0, result.output
+    assert [len(run["verdicts"]) for run in json.loads(result.stdout)["runs"]] == [2, 2]
+    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
+    assert len([path for path in made if path.name.endswith(".monte_carlo.nc")]) == 2
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == made
 
 
 def test_a_number_of_trials_is_a_number(measured, tmp_path):

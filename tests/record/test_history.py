@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,9 @@ from errormotion import datasets
 from errormotion.cli.app import app
 from errormotion.datasets import provenance
 from errormotion.datasets.files import events
-from errormotion.datasets.merit import figures_of, stored
+from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.errors import RunError
+from errormotion.plugins import FigureOfMerit
 from errormotion.record.figures import follow
 from errormotion.record.history import history
 from errormotion.record.listing import list_runs
@@ -136,6 +138,16 @@ def test_a_shared_source_is_one_draw_for_a_freedom_and_for_a_figure_of_merit(lab
         assert series.covariance[0, 1] == pytest.approx(BAR**2)
         assert series.covariance[0, 0] == pytest.approx(0.09e-12 + BAR**2)
     assert follow(runs, "EX after 60 min").series.identities == []
+
+
+def test_the_influence_that_a_method_states_for_its_figure_counts(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
+        return [replace(figure, influence={"bar": BAR / 2}) for figure in figures_of(errors)]
+
+    monkeypatch.setattr("errormotion.datasets.results.merit.figures_of", figures)
+    series = follow(list_runs([lab]).runs[:3], "EZ after*").series
+    assert series.identities == ["certificate 17"]
+    assert series.influence == pytest.approx(BAR / 2)
 
 
 def test_a_freedom_follows_the_functional_point(lab: Path) -> None:

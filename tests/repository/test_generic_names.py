@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-GROUPS = ("instruments", "methods", "datasets")
+GROUPS = ("instruments", "methods", "datasets", "compensators")
 ENTRY_POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
 HOMES = {
     plugin_id: value.partition(":")[0].rpartition(".")[0].replace(".", "/")
@@ -17,7 +17,7 @@ HOMES = {
 #: Folder of the package with examples: campaigns and benches that a person may write, and their programs.
 EXAMPLES = "errormotion/cli/demo/"
 #: Words that are ids and something else as well: variables of published datasets, the command of a package, and
-#: defaults of published settings that name another plugin.
+#: defaults of published settings that name another plugin; the package of thermal models; a format of tables.
 OTHER_MEANINGS = {
     ("optoncdt", "errormotion/instruments/spindle_frame/"),
     ("optoncdt", "errormotion/instruments/simulators/spindle_frame/"),
@@ -26,6 +26,8 @@ OTHER_MEANINGS = {
     ("beam_direction", "errormotion/instruments/"),
     ("beam_direction", "errormotion/report/parts/beams.py"),
     ("thermal_model", "errormotion/cli/commands/model.py"),
+    ("thermal_model", "errormotion/compensation/"),
+    ("linuxcnc", "errormotion/compensation/tables/formats/linuxcnc.py"),
 }
 
 

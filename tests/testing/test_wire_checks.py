@@ -1,5 +1,7 @@
 """A driver that takes a late answer for the next one, or ignores its time limit or baud rate, fails that check only."""
 
+import math
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,7 +21,7 @@ from errormotion.instruments.transports import Address, Transport, open_transpor
 from errormotion.instruments.transports.modbus.client import ModbusLine
 from errormotion.instruments.transports.serial_line import SerialTransport
 from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
-from errormotion.testing import InstrumentConformance, InstrumentSubject, run_checks, wire_checks
+from errormotion.testing import InstrumentConformance, InstrumentSubject, fuzz_checks, run_checks, wire_checks
 from errormotion.testing.kit import CheckFailedError
 
 ADDRESS = "sim://cframe/dial?seed=3"
@@ -116,6 +118,37 @@ class TakesAnySize(Dial):
         return value if abs(value) < 1.0 else float(np.ones(int(min(abs(value), 1e8))).sum())
 
 
+class NeedsTime(Dial):
+    """Looks for a number within a line it does not understand, for long."""
+
+    def read(self) -> float:
+        try:
+            return super().read()
+        except ProtocolError:
+            end = time.thread_time() + 0.08
+            while time.thread_time() < end:
+                pass
+            raise
+
+
+class NeedsMemory(Dial):
+    def read(self) -> float:
+        try:
+            return super().read()
+        except ProtocolError:
+            np.ones(1 << 20)
+            raise
+
+
+class Hangs(Dial):
+    def read(self) -> float:
+        try:
+            return super().read()
+        except ProtocolError:
+            time.sleep(5.0)
+            raise
+
+
 class AsksTwice(Dial):
     """Opens with a request: a silent device is noticed."""
 
@@ -146,6 +179,34 @@ def test_a_broken_driver_fails_exactly_its_check(check: str, plugin: type[Dial])
     subject = InstrumentSubject(plugin, ADDRESS, mutants=100 if check == "mutants" else 0)
     failed = {result.name for result in run_checks(subject) if not result.ok}
     assert failed == {check}
+
+
+@pytest.mark.parametrize(
+    ("plugin", "limit", "message"),
+    [
+        (NeedsTime, 5.0, "ms of processor time more than the recorded session"),
+        (NeedsMemory, 5.0, "KiB, limit"),
+        (Hangs, 0.2, r"took 0\.\d s, limit 0.2 s"),
+    ],
+)
+def test_a_driver_that_needs_time_or_memory_for_a_damaged_frame_fails(
+    plugin: type[Dial], limit: float, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fuzz_checks, "MEASURED", 2)
+    subject = InstrumentSubject(plugin, ADDRESS, mutants=100, time_limit=limit)
+    with pytest.raises(CheckFailedError, match=message):
+        fuzz_checks.mutants(subject)
+
+
+def test_as_many_mutants_are_tried_as_are_asked_for_without_a_limit_of_the_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(fuzz_checks, "MUTANTS", 20)
+    monkeypatch.setattr(fuzz_checks, "BUDGET", 0.0)
+    few, many = (InstrumentSubject(Dial, ADDRESS, mutants=number) for number in (20, 60))
+    assert fuzz_checks.mutants(few).startswith("0 mutants")
+    assert fuzz_checks.mutants(many).startswith("60 mutants")
+    assert (fuzz_checks.limit(few), fuzz_checks.limit(many)) == (fuzz_checks.LIMIT, math.inf)
 
 
 class TakesAnyLine(KeyenceLK):

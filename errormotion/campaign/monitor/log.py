@@ -250,7 +250,7 @@ def _meanings(dataset: xr.Dataset) -> list[str]:
     """Return the meanings of the numbers of ``temperature_flag``."""
     try:
         found = json.loads(str(dataset.attrs.get("flag_meanings", "[]")))
-    except ValueError:
+    except (ValueError, RecursionError):
         found = []
     return [str(word) for word in found] if isinstance(found, list) and found else ["known", "unknown"]
 

@@ -12,7 +12,7 @@ from typing import Any
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchInstrument
 from errormotion.campaign.journal import cause_of
-from errormotion.datasets.clock import steady
+from errormotion.campaign.monitor.clock import Clock
 
 FIRST_RETRY_INTERVAL, LONGEST_RETRY_INTERVAL = 1.0, 30.0
 """Time until an instrument is opened again after a failure, s; doubled after each failure up to the longest."""
@@ -30,7 +30,7 @@ class Reading:
     Attributes
     ----------
     at : float
-        `errormotion.datasets.clock.steady` when it was received, s.
+        Time of the monitor's clock when it was received, s.
     values : mapping
         Result of the driver's ``read``.
     flags : mapping of str to str
@@ -51,6 +51,8 @@ class Source:
         The instrument.
     interval : float
         Time from one reading to the next, s.
+    clock : Clock
+        Of the monitor.
 
     Attributes
     ----------
@@ -60,8 +62,9 @@ class Source:
         Cause of a missing reading; empty while readings arrive.
     """
 
-    def __init__(self, instrument: BenchInstrument, interval: float) -> None:
+    def __init__(self, instrument: BenchInstrument, interval: float, clock: Clock) -> None:
         self.instrument = instrument
+        self._clock = clock
         self.name = instrument.name
         self.interval = interval
         self.answer: Answer | None = None
@@ -92,7 +95,7 @@ class Source:
 
     def wait(self, timeout: float) -> None:
         """Wait for the first reading or failure."""
-        self._ready.wait(timeout)
+        self._clock.wait(self._ready, timeout)
 
     def stop(self) -> None:
         """Request the thread to end; `join` waits for it."""
@@ -103,7 +106,7 @@ class Source:
         self._thread.join()
 
     def fresh(self, oldest: float) -> Reading | None:
-        """Return the last reading if it is not older than a time of `steady`."""
+        """Return the last reading if it is not older than a time of the clock."""
         reading = self._reading
         return reading if reading is not None and reading.at >= oldest else None
 
@@ -111,25 +114,25 @@ class Source:
         wait, failed = FIRST_RETRY_INTERVAL, 0
         try:
             while not self._stop.is_set():
-                start = steady()
+                start = self._clock.now()
                 try:
                     self._open()
                     values = dict(self._driver.read())
-                    self._reading = Reading(steady(), values, _flags(self._driver, values))
+                    self._reading = Reading(self._clock.now(), values, _flags(self._driver, values))
                 except Exception as error:  # noqa: BLE001 - reported to the operator, and retried
                     failed += 1
                     self._note(cause_of(error))
                     if self._driver is None or failed >= FAILURES_BEFORE_RECONNECT:
                         self._close()
                         self._ready.set()
-                        self._stop.wait(wait)
+                        self._clock.wait(self._stop, wait)
                         wait = min(2 * wait, LONGEST_RETRY_INTERVAL)
                         continue
                 else:
                     wait, failed = FIRST_RETRY_INTERVAL, 0
                     self._note("")
                 self._ready.set()
-                self._stop.wait(max(0.0, start + self.interval - steady()))
+                self._clock.wait(self._stop, max(0.0, start + self.interval - self._clock.now()))
         finally:
             self._close()
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -25,14 +24,14 @@ import xarray as xr
 
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
-from errormotion.campaign.folder import RunFolder, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, now
 from errormotion.campaign.journal import cause_of, journal
+from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.campaign.monitor.sources import Source
 from errormotion.campaign.recorder import Recorder
 from errormotion.campaign.store import RawStore
 from errormotion.datasets import provenance
-from errormotion.datasets.clock import steady
 from errormotion.errors import BenchError
 
 TEST = "monitor"
@@ -97,6 +96,10 @@ class Monitor:
         Folder of the run folder.
     interval : float
         Interval of the rows of the log, s.
+    clock : Clock, optional
+        Its time; default that of the computer.
+    test : str
+        Name of the test in the run folder.
 
     Attributes
     ----------
@@ -111,10 +114,14 @@ class Monitor:
         The bench has neither a thermometer nor a controller, or several controllers.
     """
 
-    def __init__(self, plan: BenchPlan, runs: Path, interval: float = 1.0) -> None:
-        self.plan, self.runs, self.interval = plan, runs, float(interval)
+    def __init__(
+        self, plan: BenchPlan, runs: Path, interval: float = 1.0, clock: Clock | None = None, test: str = TEST
+    ) -> None:
+        self._clock = clock or Clock()
+        self.plan, self.runs, self.interval, self.test = plan, runs, float(interval), test
         kinds = ("thermometer", "controller")
-        self.sources = [Source(each, self.interval) for each in plan.instruments if each.driver.info.kind in kinds]
+        instruments = [each for each in plan.instruments if each.driver.info.kind in kinds]
+        self.sources = [Source(each, self.interval, self._clock) for each in instruments]
         controllers = [source for source in self.sources if _kind(source) == "controller"]
         if not self.sources or len(controllers) > 1:
             found = ", ".join(source.name for source in controllers) or ", ".join(plan.kinds)
@@ -165,7 +172,8 @@ class Monitor:
                 "invalid": {f"no answer of {name}": count for name, count in self._gaps.items()},
             }
             self.folder.step("monitor", "done" if status == "finished" else status, samples=self._recorder.committed)
-            self.folder.save(status=status, reason=reason, acquired=status == "finished")
+            if not isinstance(error, FolderGoneError):  # nothing is written where the folder was
+                self.folder.save(status=status, reason=reason, acquired=status == "finished")
 
     def watch(self, duration: float = math.inf) -> Iterator[Snapshot]:
         """Log rows, and yield each as a snapshot.
@@ -182,18 +190,18 @@ class Monitor:
         """
         for source in self.sources:
             source.wait(START_TIMEOUT)
-        start, tick, rows = steady(), 0, 0
+        start, tick, rows = self._clock.now(), 0, 0
         while tick * self.interval <= duration:
             due = start + tick * self.interval
-            if (ahead := due - steady()) > 0:
-                time.sleep(ahead)
+            if (ahead := due - self._clock.now()) > 0:
+                self._clock.sleep(ahead)
             rows += 1
-            snapshot = self._snapshot(steady() - start, rows)
+            snapshot = self._snapshot(self._clock.now() - start, rows)
             self._recorder.put(self._row(snapshot))
             self._note_instruments()
             yield snapshot
             # Intervals missed by a suspended computer give no rows; the times of the log show them.
-            tick = max(tick + 1, math.ceil((steady() - start) / self.interval))
+            tick = max(tick + 1, math.ceil((self._clock.now() - start) / self.interval))
 
     def _note_instruments(self) -> None:
         """Store the identities of the instruments in the log whenever one has been opened."""
@@ -204,7 +212,7 @@ class Monitor:
             self._noted = answers
 
     def _snapshot(self, at: float, logged: int) -> Snapshot:
-        oldest = steady() - OLDEST_READING * self.interval
+        oldest = self._clock.now() - OLDEST_READING * self.interval
         temperatures = dict.fromkeys(self.sensors, math.nan)
         flags = dict.fromkeys(self.sensors, "no answer")
         state: dict[str, Any] = {}
@@ -283,7 +291,7 @@ class Monitor:
             "log": "log.jsonl",
             "steps": [],
         }
-        return RunFolder.create(self.runs, TEST, uuid4().hex[:8], data)
+        return RunFolder.create(self.runs, self.test, uuid4().hex[:8], data)
 
 
 def _kind(source: Source) -> str:

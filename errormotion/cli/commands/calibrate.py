@@ -9,6 +9,7 @@ from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.datasets.storage import reading
+from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError
 from errormotion.plugins import Calibration
 
@@ -31,7 +32,8 @@ def run(data: Path, out: Path, assignments: list[str], settings_file: Path | Non
         calibration = _calibration_of(data, str(raw.attrs.get("schema", "none")))
         settings = read_settings(calibration.Settings, settings_file, assignments)
         bars.stage("calibrating")
-        result = calibration.make(raw, settings)
+        with explained(data, raw):
+            result = calibration.make(raw, settings)
     datasets.save(result, out)
     if as_json:
         show_json({"ok": True, "calibration": str(out), **calibration.figures(result)})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,8 +18,9 @@ from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.cli.tolerances import end_with, lines_of, remarks
-from errormotion.datasets.merit import figures_of
+from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.storage import reading
+from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError, ErrormotionError
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import Tolerances, from_run, load_tolerances
@@ -52,8 +54,6 @@ def identify(
     """Identify one raw dataset into a file, or several into a folder, and decide on tolerances."""
     limits = load_tolerances(tolerances) if tolerances is not None else None
     several = len(raws) > 1 or is_runs_folder(raws[0]) or (trials is None and (scheduler or workers))
-    if several and trials is not None:
-        raise DatasetError("--monte-carlo: expected one raw dataset; evaluate several results one after another")
     if not several and out.exists():
         raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
     method_id = method_id or _method_of(raws[0])
@@ -70,7 +70,42 @@ def identify(
         outcomes = batch.identify_runs(
             raws, method_id, settings, out, scheduler=scheduler, workers=workers, progress=bars
         )
-    _show_outcomes(outcomes, out, scheduler, limits, as_json)
+        evaluations = (
+            {} if trials is None else _evaluated(outcomes, method_id, settings, trials, scheduler, workers, bars)
+        )
+    _show_outcomes(outcomes, out, scheduler, limits, as_json, evaluations)
+
+
+def _evaluated(
+    outcomes: list[Outcome],
+    method_id: str,
+    settings: Any,
+    trials: Trials,
+    scheduler: str,
+    workers: int | None,
+    bars: Bars,
+) -> dict[Path, xr.Dataset | str]:
+    """Return the Monte Carlo evaluation of each result, or why there is none; what exists already is kept."""
+    from errormotion.montecarlo.beside import evaluate_beside, file_beside
+
+    found = dict[Path, Any]()
+    for outcome in outcomes:
+        if outcome.reason or outcome.errors is None:
+            continue
+        file = file_beside(outcome.errors)
+        try:
+            found[outcome.raw] = (
+                datasets.load(file)
+                if file.exists()
+                else evaluate_beside(
+                    raw_of(outcome.raw), method_id, settings, datasets.load(outcome.errors), outcome.errors,
+                    trials=trials.number, digits=trials.digits, seed=trials.seed, scheduler=scheduler, workers=workers,
+                    progress=bars,
+                )
+            )  # fmt: skip
+        except ErrormotionError as error:
+            found[outcome.raw] = str(error)
+    return found
 
 
 def _method_of(raw: Path) -> str:
@@ -89,9 +124,17 @@ def _method_of(raw: Path) -> str:
 
 
 def _show_outcomes(
-    outcomes: list[Outcome], out: Path, scheduler: str, limits: Tolerances | None, as_json: bool
+    outcomes: list[Outcome],
+    out: Path,
+    scheduler: str,
+    limits: Tolerances | None,
+    as_json: bool,
+    evaluations: Mapping[Path, xr.Dataset | str],
 ) -> None:
     """Print the outcome of each run; the exit code is that of a failure if one failed, else of the tolerances."""
+    from errormotion.cli.commands import monte_carlo
+
+    refused = [each for each in evaluations.values() if isinstance(each, str)]
     failed = [outcome for outcome in outcomes if outcome.reason]
     found = {}
     for outcome in outcomes:
@@ -103,7 +146,9 @@ def _show_outcomes(
         runs: list[dict[str, Any]] = [{key: getattr(outcome, key) for key in keys} for outcome in outcomes]
         for outcome, run in zip(outcomes, runs, strict=True):
             run["conformity"] = found[outcome.raw].plain() if outcome.raw in found else None
-        show_json({"ok": not failed, "scheduler": scheduler, "runs": runs})
+            if (evaluation := evaluations.get(outcome.raw)) is not None:
+                run["verdicts"] = evaluation if isinstance(evaluation, str) else monte_carlo.summary(evaluation)
+        show_json({"ok": not failed and not refused, "scheduler": scheduler, "runs": runs})
     else:
         stepped_over = sum(outcome.stepped_over for outcome in outcomes)
         made = len(outcomes) - len(failed) - stepped_over
@@ -111,15 +156,20 @@ def _show_outcomes(
         for outcome in failed:
             name = "" if outcome.reason.startswith(str(outcome.raw)) else f"{outcome.raw}: "
             show(f"  failed: {name}{outcome.reason}")
-        for raw, each in found.items():
-            for line in each.lines()[:1]:
+        for raw, conformity in found.items():
+            for line in conformity.lines()[:1]:
                 show(f"  {raw}: {line}")
         for line in remarks(decisions):
             show(line)
+        for raw, made_of_it in evaluations.items():
+            if isinstance(made_of_it, str):
+                show(f"  failed: Monte Carlo evaluation of {raw}: {made_of_it}")
+            else:
+                monte_carlo.show_evaluation(made_of_it, raw)
     broken = any(outcome.traceback for outcome in failed)
     if broken:
         typer.echo(f"The tracebacks are in {log_file()}.", err=True)
-    if failed:
+    if failed or refused:
         raise typer.Exit(INTERNAL if broken else ERROR)
     end_with(decisions)
 
@@ -138,17 +188,19 @@ def _identify_one(
     method, evaluation, file = plugins.get("methods", method_id), None, out
     if trials is not None:
         from errormotion.cli.commands import monte_carlo
+        from errormotion.montecarlo.beside import evaluate_beside
 
         file = monte_carlo.beside(out)
     with Bars(as_json) as bars:
         with reading(raw), datasets.load(raw) as dataset:
             bars.stage("identifying")
-            errors = method().identify(dataset, settings)
+            with explained(raw, dataset):
+                errors = method().identify(dataset, settings)
         datasets.validate(errors)
         if trials is not None:
-            evaluation = monte_carlo.evaluate(
-                raw, method_id, settings, errors, out, bars, trials=trials.number, digits=trials.digits,
-                seed=trials.seed, scheduler=scheduler, workers=workers,
+            evaluation = evaluate_beside(
+                raw, method_id, settings, errors, out, trials=trials.number, digits=trials.digits, seed=trials.seed,
+                scheduler=scheduler or "threads", workers=workers, progress=bars,
             )  # fmt: skip
     datasets.save(errors, out)
     results, notes = [as_printed(figure) for figure in figures_of(errors)], notes_of(errors)
@@ -196,6 +248,7 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
     """Write the report of a run folder or of one file of errors, and decide on its tolerances."""
     from errormotion.campaign.folder import RunFolder
     from errormotion.report import write_report, write_run_report
+    from errormotion.report.write import belonging
 
     limits = load_tolerances(tolerances) if tolerances is not None else None
     found = None
@@ -203,7 +256,9 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
         folder = RunFolder.open(run)
         stored = limits or from_run(folder.data)
         if stored is not None and folder.errors is not None:
-            found = judge(datasets.load(folder.errors), stored)
+            with reading(folder.errors), datasets.load(folder.errors) as errors:
+                datasets.validate(errors)
+                found = judge(errors, stored)
             folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
         with reading(run):
             path = write_run_report(run, out)
@@ -212,9 +267,9 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
             folder.step("report", "done")
             folder.save()
     else:
-        with reading(run), datasets.load(run) as errors:
+        with reading(run), datasets.load(run) as errors, explained(run, errors):
             state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
-            path = write_report([errors, *_evaluations(errors, run)], out or run.with_suffix(".html"), run=state)
+            path = write_report([errors, *belonging(errors, run)], out or run.with_suffix(".html"), run=state)
             found = judge(errors, limits) if limits is not None else None
     if as_json:
         show_json({"ok": True, "report": str(path), "conformity": found.plain() if found is not None else None})
@@ -224,17 +279,6 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
         show(str(path))
     if found is not None:
         end_with([found.plain()])
-
-
-def _evaluations(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
-    """Return the Monte Carlo evaluation beside a file of errors where it belongs to them."""
-    from errormotion.cli.commands.monte_carlo import EVALUATION
-
-    beside = file.with_suffix(EVALUATION)
-    if not beside.exists():
-        return []
-    evaluation = datasets.load(beside)
-    return [evaluation] if evaluation.attrs.get("errors_hash") == datasets.hash_dataset(errors) else []
 
 
 def validate(file: Path) -> list[str]:

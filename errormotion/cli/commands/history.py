@@ -44,7 +44,8 @@ def history(
             raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
     runs = list_runs(paths or [Path("runs")], machine=machine, method=method, test=test)
     if not runs.runs and machine.casefold() not in map(str.casefold, runs.machines):
-        raise RunError(f"--machine {machine}: no run of it; {nearest(machine, runs.machines)}")
+        message = f"--machine {machine}: no run of it; {nearest(machine, runs.machines)}"
+        raise RunError("\n  - ".join([message, *(f"could not be read: {reason}" for reason in runs.skipped)]))
     found = followed(runs, machine, figure, at)
     if out is not None:
         datasets.save(found, out)

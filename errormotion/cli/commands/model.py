@@ -13,9 +13,11 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
+from errormotion.compensation.thermal_model import SCHEMA as MODEL_SCHEMA
 from errormotion.compensation.thermal_model import Check, Settings, ThermalModel, check, fit
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.datasets.storage import reading
+from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError, RunError
 
 SHOWN = (1e6, "um"), (1e6, "um"), (1e6, "um"), (1e6, "urad"), (1e6, "urad"), (1e6, "urad")
@@ -33,7 +35,8 @@ def make(campaigns: list[Path], out: Path, assignments: list[str], settings_file
     settings = read_settings(Settings, settings_file, assignments)
     with Bars(as_json) as bars:
         bars.stage("fitting")
-        model = fit([errors_of(path) for path in campaigns], settings)
+        with reading(", ".join(map(str, campaigns))):
+            model = fit([errors_of(path) for path in campaigns], settings)
     model.save(out)
     ds = model.dataset
     removed = {name: float(value) for name, value in zip(DOF, ds["removed"].values, strict=True)}
@@ -63,7 +66,9 @@ def predict(model: Path, data: Path, out: Path, as_json: bool) -> None:
         The model or the data cannot be read, an input is missing, or the file is there already.
     """
     new_file(out)
-    predicted = ThermalModel.load(model).predict(dataset_of(data))
+    used, inputs = ThermalModel.load(model), dataset_of(data)
+    with reading(f"{data} with {model}"), explained(data, inputs):
+        predicted = used.predict(inputs)
     datasets.save(predicted, out)
     notes = json.loads(predicted.attrs.get("notes", "[]"))
     if as_json:
@@ -89,7 +94,8 @@ def check_model(model: Path, errors: Path, report: Path | None, as_json: bool) -
     if report is not None and report.suffix != ".html":
         raise DatasetError(f"{report}: expected a name that ends in .html (a page)")
     used, measured = ThermalModel.load(model), errors_of(errors)
-    found = check(used, measured)
+    with reading(f"{errors} with {model}"):
+        found = check(used, measured)
     figures = {name: getattr(found, name) for name in ("rms", "remaining", "removed", "held")}
     if report is not None:
         from errormotion.compensation.thermal_model.report import write_model_report
@@ -133,6 +139,12 @@ def errors_of(path: Path) -> xr.Dataset:
     return ds
 
 
+def source_of(path: Path) -> xr.Dataset | ThermalModel:
+    """Return the thermal model of a file, or the error dataset of a file or a run folder."""
+    ds = dataset_of(path)
+    return ThermalModel(ds) if ds.attrs.get("schema") == MODEL_SCHEMA else ds
+
+
 def dataset_of(path: Path) -> xr.Dataset:
     """Return the dataset of a file; of a run folder its errors, or its raw data where it has none."""
     if (path / "run.json").exists():
@@ -141,6 +153,8 @@ def dataset_of(path: Path) -> xr.Dataset:
         if not path.exists():
             raise RunError(f"{folder.path}: has neither errors nor raw data yet")
     with reading(path), datasets.load(path) as ds:
+        if ds.attrs.get("schema") == SCHEMA:
+            datasets.validate(ds)
         return ds.load()
 
 

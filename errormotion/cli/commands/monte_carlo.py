@@ -7,16 +7,11 @@ from typing import Any
 
 import xarray as xr
 
-from errormotion import datasets
 from errormotion.cli.output import show, table
-from errormotion.cli.progress import Bars
 from errormotion.cli.summary import notes_of
 from errormotion.errors import DatasetError, MethodError
+from errormotion.montecarlo.beside import file_beside
 from errormotion.montecarlo.result import lines
-from errormotion.montecarlo.store import Store
-
-EVALUATION = ".monte_carlo.nc"
-"""Ending of the file of an evaluation, beside that of the errors."""
 
 
 def trials_of(text: str) -> int | None:
@@ -31,42 +26,12 @@ def trials_of(text: str) -> int | None:
 
 def beside(out: Path) -> Path:
     """Return the file of the evaluation of a result; DatasetError where it exists or cannot be written."""
-    file = out.with_suffix(EVALUATION)
+    file = file_beside(out)
     if not out.parent.is_dir():
         raise DatasetError(f"{out.parent}: expected a folder for the result of --out; there is none")
     if file.exists():
         raise DatasetError(f"{file}: exists already, and a result is never overwritten; give another name to --out")
     return file
-
-
-def evaluate(
-    raw: Path,
-    method_id: str,
-    settings: Any,
-    errors: xr.Dataset,
-    out: Path,
-    bars: Bars,
-    *,
-    trials: int | None,
-    digits: int,
-    seed: int,
-    scheduler: str | None,
-    workers: int | None,
-) -> xr.Dataset:
-    """Evaluate a result; its trials are kept in a folder beside ``out`` while the evaluation is in work."""
-    from errormotion import montecarlo
-
-    folder = out.with_suffix(".trials")
-    try:
-        found = montecarlo.evaluate(
-            raw, method_id, settings, errors, folder, trials=trials, digits=digits, seed=seed,
-            scheduler=scheduler or "threads", workers=workers, progress=bars, keep=True,
-        )  # fmt: skip
-    except KeyboardInterrupt as error:
-        raise KeyboardInterrupt(f"The trials are kept in {folder}; repeat the command to continue.") from error
-    datasets.save(found, beside(out))
-    Store(folder, {}).remove()
-    return found
 
 
 def summary(found: xr.Dataset) -> list[dict[str, Any]]:

@@ -5,13 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from errormotion.campaign.files import load_campaign
+from errormotion.campaign.limits import announcement, steps_of
 from errormotion.cli.output import show, show_json, table
 from errormotion.errors import BenchError
 
 
 def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
     """Write the programs of one test, or of every test whose method has some; existing files are not replaced.
+
+    What the programs move is printed on one line a test, on stderr.
 
     With several such tests, each has its own folder in ``out``.
 
@@ -31,14 +36,21 @@ def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
         names = ", ".join(sorted({entry.method.info.id for entry in chosen}))
         raise BenchError(f"{campaign}: {names} has no NC programs: nothing to write for {test or 'any of its tests'}.")
     files: list[tuple[str, Path, str]] = []
+    announced: list[str] = []
     for entry in with_programs:
         folder = out / entry.name if len(with_programs) > 1 else out
-        texts = entry.method().programs(entry.settings, plan.bench.chosen(entry.instruments).settings_by_kind)
+        instruments = plan.bench.chosen(entry.instruments).settings_by_kind
+        announced.append(
+            announcement(entry.name, steps_of(entry.method, entry.settings, instruments), plan.bench.limits)
+        )
+        texts = entry.method().programs(entry.settings, instruments)
         files += [(entry.name, folder / name, text) for name, text in texts.items()]
     if existing := [str(path) for _, path, _ in files if path.exists()]:
         raise BenchError(
             f"{existing[0]} exists already: choose another folder, or remove the file. Nothing was written."
         )
+    for line in announced:
+        typer.echo(line, err=True)
     for _, path, text in files:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="ascii", newline="\r\n") as file:

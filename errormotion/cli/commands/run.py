@@ -18,7 +18,7 @@ from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.cli.tolerances import end_with, remarks
-from errormotion.datasets.merit import figures_of
+from errormotion.datasets.results.merit import figures_of
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run, load_tolerances
 
@@ -47,7 +47,7 @@ def run(
     plan = load_campaign(campaign) if campaign else None
     if plan is not None and limits is not None:
         plan = replace(plan, tolerances=limits)
-    folders = work(plan, resume=resume, runs=runs, yes=yes, with_report=with_report, quiet=as_json)
+    folders = work(plan, resume=resume, runs=runs, yes=yes, with_report=with_report, quiet=as_json, announcing=True)
     decisions = [folder.data["conformity"] for folder in folders if folder.data.get("conformity")]
     if as_json:
         show_json({"ok": True, "tests": [describe(folder) for folder in folders]})
@@ -70,9 +70,10 @@ def work(
     yes: bool = False,
     with_report: bool = True,
     quiet: bool = False,
+    announcing: bool = False,
 ) -> list[RunFolder]:
     """Run or resume a campaign with progress bars on a terminal; without a plan, the newest unfinished one."""
-    with Bars(quiet) as bars:
+    with Bars(quiet, announcing=announcing) as bars:
         ask = _agree if yes else bars.ask if sys.stdin.isatty() and sys.stderr.isatty() else None
         report = report_of_run if with_report else None
         if resume or plan is None:

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
-from errormotion.datasets.reduction import influence_of
+from errormotion.datasets.results.reduction import influence_of
 from errormotion.kinematics.iso import direction_of
 
 REFERENCE = "reference position"

@@ -23,7 +23,7 @@ from errormotion.arrays import Array
 from errormotion.compare.chain.curve import Curve, factor_of, is_straightness, sources_of
 from errormotion.compare.normal import Information
 from errormotion.compare.stack import Estimate
-from errormotion.datasets.reduction import influence_of
+from errormotion.datasets.results.reduction import influence_of
 from errormotion.errors import DatasetError
 from errormotion.kinematics.machines import Machine
 from errormotion.kinematics.twists import cross_matrix

@@ -20,7 +20,7 @@ from scipy.interpolate import BSpline, splrep
 
 from errormotion.arrays import Array, products
 from errormotion.compare.low_rank import Whitener
-from errormotion.datasets.reduction import influence_of
+from errormotion.datasets.results.reduction import influence_of
 from errormotion.kinematics.iso import DOF
 
 SMALLEST = 1.0

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.merit import last_values
+from errormotion.datasets.results.merit import last_values
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.plugins import FigureOfMerit
 

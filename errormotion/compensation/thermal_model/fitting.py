@@ -31,7 +31,7 @@ TIME_CONSTANTS: tuple[tuple[float, ...], ...] = (
 )
 """Candidates where the settings have none, s."""
 
-SAME = ("component", "frame", "reference", "machine")
+SAME = ("component", "frame", "reference", "machine", "lever_axes")
 """Attributes that must be equal in the campaigns of one model."""
 
 FEWEST_SAMPLES = 8
@@ -232,7 +232,7 @@ def _made(
         {"variant": c.variant, "sensors": list(c.sensors), "constants": list(c.constants), "score": c.score}
         for c in sorted(tried, key=lambda c: c.score)
     ]
-    attrs: Mapping[str, object] = {name: campaigns[0].attrs[name] for name in SAME} | {
+    attrs: Mapping[str, object] = {name: campaigns[0].attrs[name] for name in SAME if name in campaigns[0].attrs} | {
         "functional_point": np.asarray(campaigns[0].attrs["functional_point"], dtype=float),
         "variant": best.variant,
         "campaigns": len(campaigns),

@@ -232,6 +232,7 @@ class ThermalModel:
             start=start_of(data),
             source_ids=self._identities(names, kinds, own_hash),
             reference_interval=(float(inputs.time[0]), float(inputs.time[0])),
+            lever_axes=str(ds.attrs.get("lever_axes", "")),
         )
         notes = [f"{int(unknown.sum())} of {n} times have no prediction: an input is unknown"] if unknown.any() else []
         if outside.any():
@@ -309,6 +310,15 @@ def violations(dataset: xr.Dataset) -> list[str]:
             )
         else:
             found += magnitude_violations(row.name, dataset.variables[row.name], row)
+    for dim in ("dof", "feature"):
+        labels = [str(each) for each in dataset[dim].values.ravel()] if dim in dataset.coords else []
+        if len(labels) != dataset.sizes.get(dim) or len({*labels}) < len(labels):
+            found.append(f"{dim}: expected a label for each element, and labels that differ")
+        elif dim == "dof" and tuple(labels) != DOF:
+            found.append(f"dof: expected {' '.join(DOF)}; found {' '.join(labels)}")
+    point = dataset.attrs.get("functional_point")
+    if np.shape(point) != (3,) or np.asarray(point).dtype.kind not in "fiu":
+        found.append(f"attribute 'functional_point': expected three coordinates in m; found {point!r:.100}")
     if "feature_source" not in dataset.coords:
         found.append("feature_source(feature): missing; expected: sensor or working parameter of each feature")
     return found

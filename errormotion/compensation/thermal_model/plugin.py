@@ -18,4 +18,5 @@ class ThermalModelDataset:
     )
     violations = lazy("errormotion.compensation.thermal_model.model:violations")
     chapters = lazy("errormotion.compensation.thermal_model.report:chapters")
+    predictor = lazy("errormotion.compensation.thermal_model.predictor:ThermalPredictor")
     figures = lazy("errormotion.compensation.thermal_model.figures:figures")

@@ -12,6 +12,7 @@ from io import BufferedRandom
 from pathlib import Path
 from typing import Any
 
+from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import RunError
 
 FILE = "events.jsonl"
@@ -109,6 +110,7 @@ def read(folder: Path) -> tuple[tuple[Event, ...], tuple[str, ...]]:
     """Return the notes of a folder in their order, and a sentence for each line that is no note."""
     file = folder / FILE
     try:
+        require_regular(file)
         with file.open("rb") as stream:
             data = stream.read(LARGEST_FILE + 1)
     except FileNotFoundError:

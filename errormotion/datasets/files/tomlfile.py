@@ -17,11 +17,20 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from errormotion.datasets.files.reading import read_bytes
 from errormotion.datasets.units import EDGE, Quantity
 from errormotion.errors import DatasetError, ErrormotionError
 
+LARGEST_FILE = 4 << 20
+"""Bytes of a file that is read."""
+DEEPEST = 32
+"""Levels of arrays and tables."""
+
 Model = TypeVar("Model", bound=BaseModel)
 Key = str | int
+
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DOTTED = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST},}}")
 
 _EXPECTED = {
     "model_type": "a table",
@@ -72,10 +81,10 @@ def read_toml(path: str | Path, *, error: type[ErrormotionError] = DatasetError)
     Raises
     ------
     ErrormotionError
-        Of the type ``error``: missing, unreadable, not UTF-8, not TOML.
+        Of the type ``error``: missing, unreadable, too large, not UTF-8, not TOML, nested too deep.
     """
     try:
-        raw = Path(path).read_bytes()
+        raw = read_bytes(path, LARGEST_FILE)
     except OSError as reason:
         raise error(f"{path}: cannot be read: {reason.strerror}. Expected a TOML file there.") from reason
     try:
@@ -85,8 +94,24 @@ def read_toml(path: str | Path, *, error: type[ErrormotionError] = DatasetError)
         raise error(
             f"{path}, line {line}: byte 0x{raw[reason.start]:02x} is not UTF-8. Save the file as UTF-8."
         ) from reason
+    return parse_toml(text, path, error=error)
+
+
+def parse_toml(text: str, path: str | Path, *, error: type[ErrormotionError] = DatasetError) -> dict[str, Any]:
+    """Return the tables of a text; ``path`` is for the messages.
+
+    Raises
+    ------
+    ErrormotionError
+        Of the type ``error``: not TOML, nested too deeply, or with a number of too many digits.
+    """
+    if _DOTTED.search(text):  # the time and memory of tomllib grow with the square of the parts
+        raise error(f"{path}: expected keys of at most {DEEPEST} parts; found more")
+    deep = f"{path}: expected at most {DEEPEST} levels of arrays and tables; found more"
     try:
-        return tomllib.loads(text)
+        content = tomllib.loads(text)
+    except RecursionError:
+        raise error(deep) from None
     except tomllib.TOMLDecodeError as reason:
         place = re.search(r"(.*) \(at line (\d+), column (\d+)\)$", str(reason), re.DOTALL)
         if place:
@@ -94,6 +119,22 @@ def read_toml(path: str | Path, *, error: type[ErrormotionError] = DatasetError)
         lines = text.splitlines() or [""]
         complaint = str(reason).removesuffix(" (at end of document)")
         raise error(f"{path}, line {len(lines)}, column {len(lines[-1]) + 1}: not TOML: {complaint}") from reason
+    except ValueError as reason:  # a number of too many digits, a date that there is not
+        raise error(f"{path}: not TOML: {reason}") from reason
+    if _is_deep(content):
+        raise error(deep)
+    return content
+
+
+def _is_deep(content: Any) -> bool:
+    """Whether tables and arrays are nested beyond the limit; without recursion."""
+    level = [content]
+    for _ in range(DEEPEST):
+        level = [each for one in level for each in (one.values() if isinstance(one, dict) else one)
+                 if isinstance(each, (dict, list))]  # fmt: skip
+        if not level:
+            return False
+    return True
 
 
 def check(

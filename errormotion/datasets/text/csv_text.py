@@ -7,7 +7,13 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from errormotion.datasets.files.reading import read_bytes
 from errormotion.errors import DatasetError
+
+NUMBER = re.compile(r"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?")
+"""A decimal number; possessive, so that a long text that is none takes time in proportion to its length."""
+LARGEST_FILE = 64 << 20
+"""Bytes of a file that is read; its cells take more memory."""
 
 _KEY = re.compile(r"#\s*([^\W\d]\w*)\s*=\s*(.*)")
 
@@ -64,7 +70,7 @@ def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        data = path.read_bytes()
+        data = read_bytes(path, LARGEST_FILE)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):

@@ -16,7 +16,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets.files.tomlfile import load_model, nearest
 from errormotion.datasets.schemas import RawSchema, Row, variants
-from errormotion.datasets.text.csv_text import Table
+from errormotion.datasets.text.csv_text import NUMBER, Table
 from errormotion.datasets.text.dates import Clock, is_date
 from errormotion.datasets.text.log_format import Format
 from errormotion.datasets.text.log_map import LogMap, MappedColumn, MappedValue
@@ -32,7 +32,6 @@ from errormotion.datasets.text.log_reader import (
 )
 from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.text.table_reader import (
-    NUMBER,
     Column,
     Found,
     Names,

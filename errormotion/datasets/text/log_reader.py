@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
+from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.text.dates import Clock, zone_of
 from errormotion.datasets.text.log_format import Format
@@ -184,6 +185,7 @@ def _lines(log: Path, encoding: str) -> Iterator[tuple[int, str]]:
     """Yield the lines of a text with their numbers; DatasetError names the line that cannot be decoded."""
     number = 0
     try:
+        require_regular(log)
         with log.open("rb") as binary:
             marked = binary.read(2) in _UTF16_MARKS
             if marked and not encoding.startswith(("utf-16", "utf-32")):

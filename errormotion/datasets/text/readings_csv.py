@@ -27,10 +27,9 @@ import xarray as xr
 
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.schemas import Row, raw_schemas, variants
-from errormotion.datasets.text.csv_text import Table, blocks
+from errormotion.datasets.text.csv_text import NUMBER, Table, blocks
 from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.text.table_reader import (
-    NUMBER,
     Column,
     Found,
     Names,

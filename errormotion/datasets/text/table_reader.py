@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets.schemas import RawSchema, Row
-from errormotion.datasets.text.csv_text import Table
+from errormotion.datasets.text.csv_text import NUMBER, Table
 from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
-NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _EMPTY = ("", "NaN", "nan")
 
 
@@ -132,11 +131,15 @@ def converted(values: Array, unit: str, row: Row, place: str, line: int, mistake
     if not unit:
         mistakes.add(line, f"{place}: expected a unit, such as {row.unit}; found none")
         return None
-    try:
-        return np.asarray(convert(values, unit, row.unit or "1"), dtype=float)
-    except DatasetError as error:
-        mistakes.add(line, f"{place}: expected a unit of the kind of {row.unit or '1'}; found '{unit}': {error}")
-        return None
+    inside = row.units or (row.unit or "1",)
+    reasons = []
+    for goal in inside:
+        try:
+            return np.asarray(convert(values, unit, goal), dtype=float)
+        except DatasetError as error:
+            reasons.append(str(error))
+    mistakes.add(line, f"{place}: expected a unit of the kind of {' or '.join(inside)}; found '{unit}': {reasons[0]}")
+    return None
 
 
 def plausible(
@@ -161,7 +164,7 @@ def plausible(
 
 def unit_vectors(values: Array, row: Row, lines: NDArray[np.int64], mistakes: Mistakes) -> Array:
     """Return directions normalised to length 1; rounding in the file changes their length slightly."""
-    if row.unit != "1" or row.dims[-1] != "direction":
+    if row.unit != "1" or row.dims[-1:] != ("direction",):
         return values
     norms = np.linalg.norm(values, axis=-1)
     wrong = np.flatnonzero(~(np.abs(norms - 1) <= 0.01) & ~np.isnan(norms))

@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from errormotion.datasets.text.csv_text import Table, blocks
+from errormotion.datasets.text.csv_text import NUMBER, Table, blocks
 from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
@@ -58,7 +58,6 @@ MOST_LINES = 100_000
 _ENDS, _LONG_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e", (b"\xc2\x85", b"\xe2\x80\xa8", b"\xe2\x80\xa9")  # of a line of text
 _MOST_HINTS = 10  # columns for which a name is suggested
 _TITLE = re.compile(r"([^\W\d]\w*(?: \w+)*)\s*(?:[\[(]([^\])]*)[\])]|/\s*(\S.*))?")
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _EMPTY = ("", "NaN", "nan", "-", "---")
 _UNITS = {"°C": "degC", "C": "degC", "K": "kelvin", "mbar": "mbar", "%RH": "%", "% RH": "%", "%rH": "%"}
 
@@ -207,7 +206,7 @@ def _numbers(
         text = texts[place]
         if text in _EMPTY:
             continue
-        if not _NUMBER.fullmatch(text) or not np.isfinite(float(text)):
+        if not NUMBER.fullmatch(text) or not np.isfinite(float(text)):
             comma = " (the decimal sign is a point)" if "," in text else ""
             mistakes.add(line, f"column '{title}': expected a number; found '{text}'{comma}")
             continue

@@ -11,9 +11,10 @@ import numpy as np
 import xarray as xr
 from pydantic import Field
 
+from errormotion.datasets.files.reading import read_bytes
 from errormotion.datasets.units import Length
 from errormotion.errors import DatasetError, InstrumentError, ReplayError
-from errormotion.instruments.laser_tracker.table_reader import AIR, Readings, Repeats, read_table
+from errormotion.instruments.laser_tracker.table_reader import AIR, LONGEST_TABLE, Readings, Repeats, read_table
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, PluginSettings
 from errormotion.plugins.readings import Environment
 
@@ -89,7 +90,7 @@ class TrackerTable:
         wrong = ReplayError if scheme == "replay" else InstrumentError
         path = Path(rest)
         try:
-            data = path.read_bytes()
+            data = read_bytes(path, LONGEST_TABLE)
             readings = read_table(
                 path,
                 stations=self.settings.stations,

@@ -26,7 +26,9 @@ class ProbeSettings(PluginSettings):
 
     tip_radius: Length = Field(default=3e-3, description="radius of the tip", gt=0)
     noise: Length | None = Field(
-        default=None, description="standard deviation of one touch; unknown if not given", gt=0
+        default=None,
+        description="standard deviation of one touch, the mean of its contacts; unknown if not given",
+        gt=0,
     )
     pretravel: str = Field(default="", description="file of the pre-travel map that corrects the contacts")
     serial_number: str = Field(default="", description="serial number of the probe; unknown if not given")

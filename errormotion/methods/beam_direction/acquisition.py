@@ -94,14 +94,16 @@ class Stand:
     def __init__(self, bench: Bench, settings: Settings) -> None:
         self.bench, self.settings, self.layout = bench, settings, settings.layout
         self.sensor = bench.of_kind("point_lds")
-        self.control: Any = bench.of_kind("controller") if bench.has_kind("controller") else None
-        if not hasattr(self.control, "move_to"):
+        control = bench.of_kind("controller") if bench.has_kind("controller") else None
+        if control is None or not hasattr(control, "move_to"):
             raise MethodError(
                 "The calibration of a beam moves the sensor over the faces of a gauge and needs an instrument of kind "
                 "'controller' that can move to a position (move_to); the bench has none. Measure manually, write the "
                 "readings to a table, and use 'errormotion identify READINGS.csv'."
             )
-        self.origin = self._virtual_time()
+        self.control: Any = control
+        virtual = hasattr(self.control, "elapse")
+        self.origin: float | None = float(self.control.state()["time"]) if virtual else None
         self.low, self.high = (float(x) for x in self.sensor.measuring_range)
         self.middle = float(self.sensor.mid_range)
         u = np.array(self.layout.nominal_direction, np.float64)
@@ -110,9 +112,6 @@ class Stand:
         self.normals = design.plane_normals(np.array([(face.inclination, face.rotation) for face in settings.planes]))
         self.paths = [stage_path(settings, normal, self.range) for normal in self.normals]
         self.invalid: Counter[str] = Counter()
-
-    def _virtual_time(self) -> float | None:
-        return float(self.control.state()["time"]) if hasattr(self.control, "elapse") else None
 
     @property
     def range(self) -> float:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.datasets.merit import beam_errors, is_planned
+from errormotion.datasets.results.merit import beam_errors, is_planned
 from errormotion.plugins import FigureOfMerit
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Sources of scans, drawn anew for the Monte Carlo method: noise of points and lines, pose, lever, scales.
+"""Sources of scans, drawn anew for the Monte Carlo method: noise of points and lines, pose, lever, scales, guide.
 
 Scans of the pocket state no noise. Their lines are drawn with replacement, which has the scatter that they have.
 """
@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from errormotion.datasets import DOF
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification import chain
+from errormotion.methods.crossbeam_scan.identification.artefact_check import MOVED
+from errormotion.methods.crossbeam_scan.identification.carriage import carriage
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.registrations import register_all
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 
     from errormotion.arrays import Array
     from errormotion.methods.crossbeam_scan.identification.carriage import Rig
+    from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
     from errormotion.methods.crossbeam_scan.settings import Settings
 
 RADIUS_UNCERTAINTY = 1e-6
@@ -31,24 +35,21 @@ RADIUS_UNCERTAINTY = 1e-6
 HEIGHT = ("cycle", "artefact", "profile", "point")
 
 
-def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:  # noqa: ARG001 - one signature
-    """Return the scans with their sources.
-
-    Raises
-    ------
-    MethodError
-        The carriage follows a guide: how far it does is an assumption that no reading contains.
-    """
+def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
+    """Return the scans with their sources."""
     if "pocket_radius" in raw:
         return _pocket(raw, settings)
-    if settings.strain == "guided":
-        raise MethodError(
-            "The Monte Carlo method needs strain = 'free' or 'rigid': how closely the carriage follows its guide is "
-            "an assumption that is not drawn."
-        )
     reduced = _scans(raw)
-    sources = {"heights": _heights(reduced, settings, cold_cycles(raw, reduced.sizes["cycle"]))}
-    rig = rig_of(raw)
+    rig, cold = rig_of(raw), cold_cycles(raw, reduced.sizes["cycle"])
+    rows = [cold[0], *(c for c in range(reduced.sizes["cycle"]) if c not in cold)]
+    moved = np.zeros((reduced.sizes["cycle"], reduced.sizes["artefact"]), dtype=bool)
+    moved[rows] = errors["reason"].values == MOVED
+    found = register_all(Scans(reduced), cold, float(raw["height_noise"]), settings)
+    sources = {"heights": _heights(reduced, found, cold)}
+    if settings.strain == "guided":
+        # A scan that was excluded would act on its neighbours, as far as the guide couples them.
+        reduced = reduced.assign(height=reduced["height"].where(~xr.DataArray(moved, dims=HEIGHT[:2])))
+        sources["guide"] = _guide(found.without(moved), reduced, rig, settings.guide_uncertainty, rows)
     if rig.pose_covariance is not None:
         sources["profiler pose"] = _pose(rig)
     if rig.lever_uncertainty.any():
@@ -96,14 +97,14 @@ def _scans(raw: xr.Dataset) -> xr.Dataset:
     )
 
 
-def _heights(raw: xr.Dataset, settings: Settings, cold: list[int]) -> Redraw:
+def _heights(raw: xr.Dataset, found: Registrations, cold: list[int]) -> Redraw:
     """Return the noise of the points, and the jitter of the lines along z and along the feed.
 
     The noise of the points is raised to the variance of their blocks: what neighbouring points have in common is drawn
     as if they were independent, with the same effect on a block. The jitter that a registration finds is that of both
     scans; half of its variance is the cold scan's.
     """
-    quality = register_all(Scans(raw), cold, float(raw["height_noise"]), settings).quality
+    quality = found.quality
     warm = [c for c in range(raw.sizes["cycle"]) if c not in cold]
     factor, jitter_z, jitter_y = (quality[name].copy() for name in ("variance_factor", "jitter_z", "jitter_y"))
     for values, both in ((factor, 1.0), (jitter_z, 2.0), (jitter_y, 2.0)):
@@ -129,6 +130,26 @@ def _heights(raw: xr.Dataset, settings: Settings, cold: list[int]) -> Redraw:
 
 def _pitch(y: Array) -> float:
     return float(np.nanmedian(np.diff(y)))
+
+
+def _guide(found: Registrations, raw: xr.Dataset, rig: Rig, uncertainty: float, rows: list[int]) -> Redraw:
+    """Return how far pitch and yaw of the carriage are off the slopes of its guide, which no reading contains.
+
+    The least squares are those of registrations and of assumptions "EA - dEZ/dY is 0". Their effect is linear.
+    """
+    assumed = carriage(found, raw["position"].values, rig, guide=uncertainty).assumed[:, rows]
+
+    def act(errors: xr.Dataset, generator: Generator) -> xr.Dataset:
+        drawn = generator.normal(size=assumed.shape[:2])
+        change = np.einsum("ac,acki->cki", drawn, assumed)
+        return errors.assign(
+            {
+                name: errors[name].copy(data=errors[name].transpose("time", "position").values + change[..., k])
+                for k, name in enumerate(DOF)
+            }
+        )
+
+    return Redraw(act=act, groups=("cold scan",))
 
 
 def _pose(rig: Rig) -> Redraw:

@@ -78,6 +78,10 @@ class Settings(PluginSettings):
     lever_uncertainty: tuple[Length, Length, Length] = Field(
         default=(1e-3, 1e-3, 1e-3), description="standard uncertainty of the lever"
     )
+    carriage_origin: tuple[Length, Length, Length] | None = Field(
+        default=None,
+        description="origin of the carriage in machine coordinates with all axes at zero: for comparisons with others",
+    )
     profiler_pose: PoseSettings | None = Field(
         default=None, description="pose of the profiler where no test of the campaign has found it"
     )

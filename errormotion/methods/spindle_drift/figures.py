@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.datasets.merit import beam_errors, is_planned, last_values
+from errormotion.datasets.results.merit import beam_errors, is_planned, last_values
 from errormotion.plugins import FigureOfMerit
 
 if TYPE_CHECKING:
@@ -42,6 +42,16 @@ def _ranges(errors: xr.Dataset) -> list[FigureOfMerit]:
             size = float(value.sel(quantity=quantity, measure=measure))
             if np.isfinite(size):
                 u = float(uncertainty.sel(quantity=quantity, measure=measure))
-                found.append(FigureOfMerit(f"d({quantity}) {interval}, range (ISO 230-3)", size, 2.0 * u, unit))
+                name = f"d({quantity}) {interval}, range (ISO 230-3)"
+                effects = _effects(errors, quantity, measure)
+                found.append(FigureOfMerit(name, size, 2.0 * u, unit, influence=effects))
                 break
     return found
+
+
+def _effects(errors: xr.Dataset, quantity: str, measure: str) -> dict[str, float] | None:
+    """Return the effect of each source on an ISO 230-3 value; None for a dataset that does not state it."""
+    if "iso_influence" not in errors:
+        return None
+    found = errors["iso_influence"].sel(quantity=quantity, measure=measure).values
+    return dict(zip(map(str, errors["source"].values), map(float, found), strict=True))

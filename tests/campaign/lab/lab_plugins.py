@@ -15,7 +15,7 @@ from errormotion import datasets
 from errormotion.datasets import provenance
 from errormotion.datasets.units import Frequency, Length
 from errormotion.errors import InstrumentError, MethodError
-from errormotion.plugins import Identity, InstrumentInfo, MethodInfo, Needs, PluginSettings, Samples
+from errormotion.plugins import Identity, InstrumentInfo, MethodInfo, Needs, PluginSettings, Redraw, Redrawing, Samples
 
 STEP = 1e-6
 
@@ -138,6 +138,13 @@ class Ramp:
             method_version="1",
             provenance=provenance.make(settings, raw, None),
         )
+
+    def redrawing(self, raw: xr.Dataset, settings: RampSettings, errors: xr.Dataset) -> Redrawing:
+        def draw(raw: xr.Dataset, settings: Any, generator: np.random.Generator) -> tuple[xr.Dataset, Any]:
+            noise = 1e-7 * generator.normal(size=raw["distance"].shape)
+            return raw.assign(distance=raw["distance"].copy(data=raw["distance"].values + noise)), settings
+
+        return Redrawing(raw.load(), settings, {"noise": Redraw(draw, own=True)})
 
     def plan(self, settings: RampSettings) -> xr.Dataset:
         raise MethodError("a ramp has no plan")

@@ -16,6 +16,7 @@ from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.registration import kernels
 from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.montecarlo.trials import redrawing_of
 from errormotion.twin import VirtualMachine
 from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
@@ -137,6 +138,18 @@ def test_a_guide_makes_pitch_certain(found):
     free, guided = (np.array([stated(ds) for ds in found[strain]]) for strain in ("free", "guided"))
     assert np.all(guided[..., 3] < 0.5 * free[..., 3])
     assert np.all(guided[..., 1] < 0.5 * free[..., 1])  # pitch acts over 2.2 m
+
+
+@pytest.mark.slow  # registers all scans twice again
+def test_trials_of_a_guided_carriage_draw_the_guide(campaigns, found):
+    """Most of the stated uncertainty of the pitch is that of the guide, which no redrawn reading contains."""
+    settings, errors = Settings(strain="guided"), found["guided"][0]
+    drawn = redrawing_of(CrossbeamScan(), campaigns[0], settings, errors)
+    act, rng = drawn.sources["guide"].act, np.random.default_rng(1)
+    trials = np.array([act(errors, rng).em.twist().values[1:] for _ in range(300)])
+    share = trials.std(axis=0) / stated(errors)
+    assert np.all((share[..., 3] > 0.8) & (share[..., 3] < 1.1))
+    assert np.all(share < 1.1)
 
 
 def test_a_rigid_picture_is_wrong_where_the_roll_changes(found, machines):
@@ -315,6 +328,13 @@ def test_scans_on_disk_give_the_same_bits(campaigns, found, tmp_path):
     again = identify(datasets.load(path))
     for name in ("EX", "EC", "covariance"):
         np.testing.assert_array_equal(again[name].values, found["free"][0][name].values)
+
+
+def test_the_origin_of_the_carriage_is_stated_where_it_is_known(thin, thin_by_maps):
+    assert "frame_origin" not in thin_by_maps.attrs
+    placed = identify(thin[1], strain="rigid", carriage_origin=("0 mm", "-900 mm", "1200 mm"))
+    assert placed.attrs["frame_origin"].tolist() == [0.0, -0.9, 1.2]
+    assert datasets.violations(placed) == []
 
 
 # ---------------------------------------------------------------- other registrations

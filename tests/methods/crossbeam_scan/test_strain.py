@@ -111,6 +111,18 @@ def test_what_the_spline_misses_is_counted():
     assert found.slope_error[1] == 0
 
 
+def test_noise_and_assumptions_together_are_the_covariance(gantry, to_profiler):
+    truth = transform(gantry.crossbeam.twist(T, PLACES), to_profiler)
+    C = covariance(8)
+    found = strain.guided(truth, C, PLACES, np.linalg.inv(to_profiler), 1e-6)
+    noise = np.einsum("ika,kab,jkb->ij", found.gain.reshape(48, 8, 6), C, found.gain.reshape(48, 8, 6))
+    whole = noise + found.assumed.T @ found.assumed
+    for k in range(8):
+        block = slice(6 * k, 6 * k + 6)
+        scale = np.outer(SIGMA, SIGMA)
+        np.testing.assert_allclose(whole[block, block] / scale, found.covariance[k] / scale, atol=1e-6)
+
+
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 def test_any_number_of_artefacts_will_do(n, gantry, to_profiler):
     truth = transform(gantry.crossbeam.twist(T, PLACES[:n]), to_profiler)

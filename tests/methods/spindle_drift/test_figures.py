@@ -25,6 +25,19 @@ def test_a_drift_states_its_last_errors_and_its_iso_ranges(drift):
     assert tilt.value == float(drift["iso_value"].sel(quantity="A", measure="range_60min"))
 
 
+def test_an_iso_range_states_the_effect_of_each_source(drift):
+    """The beams are one draw in all records with one calibration; a history counts them once."""
+    figures = {figure.name: figure for figure in SpindleDrift.figures(drift)}
+    tilt = figures["d(A) within the first 60 min, range (ISO 230-3)"]
+    effects = np.array([tilt.influence[str(name)] for name in drift["source"].values])
+    assert len(tilt.influence) == drift.sizes["source"]
+    F = drift["influence"].values[:, :, 3]
+    assert np.all(np.abs(effects) <= np.ptp(F, axis=1) + 1e-15)
+    u = tilt.expanded_uncertainty / 2
+    assert 0.1 * u < np.sqrt(effects @ effects) < u
+    assert np.abs(effects[np.char.startswith(drift["source"].values.astype(str), "beam")]).max() > 0
+
+
 def test_a_short_record_states_the_range_to_the_end_of_running():
     short = SpindleDrift().identify(simulate(Settings(duration=600.0), 3)[0], Settings(compensate_frame=False))
     names = [figure.name for figure in SpindleDrift.figures(short)]

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import InstrumentError, ReplayError
 from errormotion.instruments.line_profiler.profile_files.readers import READERS, read_scan
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
@@ -151,6 +152,7 @@ class ProfileFiles:
 
 def _hash(path: Path) -> str:
     try:
+        require_regular(path)
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError, InstrumentError
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
@@ -78,6 +79,7 @@ def _csv_rows(path: Path, delimiter: str) -> Array:
     lines: list[tuple[int, bool]] = []  # number of the line, and whether it ends with a delimiter
     number = 0
     try:
+        require_regular(path)
         with path.open(encoding="utf-8-sig") as file:
             for number, line in enumerate(file, 1):
                 if not line.strip() or line.startswith("#"):
@@ -110,11 +112,12 @@ def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Arra
     """Read ``height(profile, point)``, ``x(point)`` and ``y(profile)``, each with its attribute ``units``."""
     import xarray as xr
 
-    from errormotion.datasets.storage import probe, reading
+    from errormotion.datasets.files.containers import check_netcdf
+    from errormotion.datasets.storage import reading
 
     try:
         with reading(path):
-            probe(path)
+            check_netcdf(path)
             dataset = xr.load_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False)
     except DatasetError as error:
         raise InstrumentError(f"{path} cannot be read as NetCDF: {error.__cause__ or error}") from None

@@ -36,6 +36,7 @@ from errormotion.instruments.point_lds.keyence_lk.codec import (
 )
 from errormotion.instruments.point_lds.keyence_lk.settings import LKSettings
 from errormotion.instruments.transports import Transport, open_transport, parse_address
+from errormotion.instruments.transports.quiet import discard_input
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, Samples
 
 BLOCK_SECONDS = 0.5
@@ -202,8 +203,10 @@ class KeyenceLK(Driver):
         return SIGNS[settings.positive] * value, reason
 
     def _query(self, request: str, header: str | None = None) -> str:
-        """Send a request and return the part of the answer after its header."""
-        if not self._synchronised:
+        """Send a request and return the part of the answer after its header. Unread bytes are discarded before."""
+        if self._synchronised:
+            discard_input(self.transport)
+        else:
             self._enter(MEASURING)
         self._synchronised = False
         self.transport.write(encode(request))

@@ -17,13 +17,14 @@ LONGEST_LINE = 256
 """Longest line, bytes; three positions, a time and a label have some 80."""
 _NUMBER = r"[-+]?+\s*+(?:\d++\.?+\d*+|\.\d++)"
 PATTERN = (
-    r"(?:N\s*+(?P<number>\d++)\s*+|[A-MO-W]\w*+\s++)?+"
+    r"(?:N\s*+(?P<number>\d++)\s*+|[A-MO-W]\w*+\s++)?"
     rf"X\s*+(?P<x>{_NUMBER})\s*+Y\s*+(?P<y>{_NUMBER})\s*+Z\s*+(?P<z>{_NUMBER})\s*+"
-    rf"(?:T\s*+(?P<time>{_NUMBER}))?+"
+    rf"(?:T\s*+(?P<time>{_NUMBER}))?"
 )
 """Default pattern of a line: number of the touch or a label, position, time.
 
 No part of it is matched in a second way (possessive quantifiers), so that the time grows with the length of the line.
+The two optional groups are not possessive: Python before 3.11.5 accepts parts of such a group.
 """
 
 _CONTROL = bytes(range(32)) + b"\x7f%"  # characters of POPEN and PCLOS around the lines

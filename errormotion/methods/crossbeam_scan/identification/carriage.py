@@ -75,6 +75,8 @@ class Carriage:
         Covariance by surface and stated noise alone.
     drift : ndarray, (cycle, artefact, 3)
         g, change of the profiler's position per metre of feed, profiler frame.
+    assumed : ndarray, (2 artefact, cycle, artefact, 6)
+        Effect of one standard uncertainty of pitch and yaw against the guide, in each cycle anew; 0 without a guide.
     """
 
     profiler: Array
@@ -86,6 +88,7 @@ class Carriage:
     source_groups: list[str]
     predicted: Array
     drift: Array
+    assumed: Array
 
 
 def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: float | None) -> Carriage:
@@ -108,6 +111,7 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
     C = np.full((cycles, artefacts, 6, 6), np.nan)
     drift = np.full((cycles, artefacts, 3), np.nan)
     influence = np.full((len(changed), cycles, artefacts, 6), np.nan)
+    assumed = np.zeros((2, artefacts, cycles, artefacts, 6))
     for c in range(cycles):
         known = np.isfinite(found.twist[c, :, 0])
         own = known & (found.cold == c)
@@ -118,7 +122,9 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
         maps = found.twist[c, used]
         seen = np.einsum("kj,ij->ki", maps, W)  # the same bits for any number of artefacts
         noise = W[:6] @ found.covariance[c, used] @ W[:6].T
-        e[c, used], C[c, used], gain = _settled(seen[:, :6], noise, y[used], A, guide)
+        settled = _settled(seen[:, :6], noise, y[used], A, guide)
+        e[c, used], C[c, used], gain = settled.twist, settled.covariance, settled.gain
+        assumed[:, used[:, None], c, used] = transform(settled.assumed.reshape(2, used.size, used.size, 6), A)
         drift[c, used] = seen[:, 6:]
         for s, (up, down) in enumerate(changed):
             there, back = (_errors(maps, gain, *rig_) for rig_ in (up, down))
@@ -136,17 +142,18 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
         source_groups=[*chain.SOURCE_GROUPS, *["cold scan"] * len(names)],
         predicted=_predicted(found, y, W, A, guide),
         drift=drift,
+        assumed=assumed.reshape(2 * artefacts, cycles, artefacts, 6),
     )
 
 
 def _settled(
     twist: Array, covariance: Array, positions: Array, to_carriage: Array, guide: float | None
-) -> tuple[Array, Array, Array]:
-    """Return twists, covariance and gain of one cycle, the guide taken into account where it is to be."""
+) -> strain.Guided:
+    """Return the twists of one cycle, the guide taken into account where it is to be."""
     if guide is None:
-        return twist, covariance, np.eye(twist.size)
-    found = strain.guided(twist, covariance, positions, to_carriage, guide)
-    return found.twist, found.covariance, found.gain
+        none = np.zeros((2 * len(twist), twist.size))
+        return strain.Guided(twist, covariance, np.eye(twist.size), none, np.zeros(2))
+    return strain.guided(twist, covariance, positions, to_carriage, guide)
 
 
 def _errors(maps: Array, gain: Array, pose: RigidTransform, lever: Array) -> Array:
@@ -174,5 +181,5 @@ def _predicted(found: Registrations, y: Array, W: Array, A: Array, guide: float 
     known = np.flatnonzero(np.isfinite(found.bound[:, 0, 0]))
     if known.size:
         C = W[:6] @ found.bound[known] @ W[:6].T
-        out[known] = transform_covariance(_settled(np.zeros((known.size, 6)), C, y[known], A, guide)[1], A)
+        out[known] = transform_covariance(_settled(np.zeros((known.size, 6)), C, y[known], A, guide).covariance, A)
     return out

@@ -169,7 +169,9 @@ def _dataset(
         reference_sources=axis.sources[len(SOURCES) :],
         reference_interval=(0.0, 0.0),
     )
-    return ds.assign_attrs(notes=notes or [""], registration=settings.registration, strain=settings.strain)
+    at = settings.carriage_origin
+    placed = {} if at is None else {"frame_origin": np.array(at)}
+    return ds.assign_attrs(notes=notes or [""], registration=settings.registration, strain=settings.strain, **placed)
 
 
 def cycle_times(scan_time: Array, rows: list[int], planned: Array | None = None) -> Array:

@@ -54,6 +54,8 @@ class Guided:
         Of these.
     gain : ndarray (6 n, 6 n)
         What takes the twists given to these.
+    assumed : ndarray (2 n, 6 n)
+        Effect of one standard uncertainty of each assumption on these: pitch and yaw of each artefact, and the guide.
     slope_error : ndarray (2,)
         What the spline's slopes of EZ and EX are taken to be off by, standard deviation, 1.
     """
@@ -61,6 +63,7 @@ class Guided:
     twist: Array
     covariance: Array
     gain: Array
+    assumed: Array
     slope_error: Array
 
 
@@ -114,7 +117,7 @@ def guided(
     e, C, A = (np.asarray(value, dtype=float) for value in (twist, covariance, to_carriage))
     n = len(e)
     if n < 2:
-        return Guided(e.copy(), C.copy(), np.eye(6 * n), np.zeros(2))
+        return Guided(e.copy(), C.copy(), np.eye(6 * n), np.zeros((2 * n, 6 * n)), np.zeros(2))
     fine, coarse = slopes(positions)
     E = e @ A.T
     rows, errors = np.zeros((2, n, n, 6)), np.zeros(2)
@@ -133,4 +136,5 @@ def guided(
     blocks = np.stack([inverse[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)]) * np.outer(_UNIT, _UNIT)
     unit = np.tile(_UNIT, n)
     gain = gain * unit[:, None] / unit
-    return Guided((gain @ e.ravel()).reshape(n, 6), blocks, gain, errors)
+    assumed = scaled.reshape(2 * n, 6 * n) @ inverse * unit
+    return Guided((gain @ e.ravel()).reshape(n, 6), blocks, gain, assumed, errors)

@@ -160,7 +160,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         influence=influence,
         sources=[name for name, _ in names],
         source_groups=[group for _, group in names],
-        extras=_extras(raw, averages, mean, state, bar, time) | results.as_extras(time),
+        extras=_extras(raw, averages, mean, state, bar, time) | results.as_extras(time, len(influence)),
         start=start_of(raw, zero),
         source_ids={s.name: s.identity for s in sources if s.identity}
         | certified(raw.attrs, {name: CERTIFIED[name] for name, _ in names if name in CERTIFIED}),

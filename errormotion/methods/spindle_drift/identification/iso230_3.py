@@ -52,17 +52,17 @@ class Series:
     influence: Array
     variance: Array
 
-    def difference(self, k: int, later: Index, earlier: Index) -> tuple[float, float]:
-        """Return value and standard uncertainty of quantity k's mean over some instants minus that over others."""
+    def difference(self, k: int, later: Index, earlier: Index) -> tuple[float, float, Array]:
+        """Return what `weighted` does of quantity k's mean over some instants minus that over others."""
         index = np.concatenate([later, earlier])
         weights = np.concatenate([np.full(later.size, 1.0 / later.size), np.full(earlier.size, -1.0 / earlier.size)])
         return self.weighted(k, index, weights)
 
-    def weighted(self, k: int, index: Index, weights: Array) -> tuple[float, float]:
-        """Return value and standard uncertainty of a weighted sum of quantity k over some instants."""
+    def weighted(self, k: int, index: Index, weights: Array) -> tuple[float, float, Array]:
+        """Return value, standard uncertainty and influence (source,) of a weighted sum of quantity k over instants."""
         shared = self.influence[:, k, index] @ weights
         own = self.variance[k, index] @ weights**2
-        return float(self.value[k, index] @ weights), float(np.sqrt(shared @ shared + own))
+        return float(self.value[k, index] @ weights), float(np.sqrt(shared @ shared + own)), shared
 
 
 def quantities(errors: Array, independent: Array, influence: Array, heights: Array, arm: Array) -> Series:
@@ -87,20 +87,26 @@ def quantities(errors: Array, independent: Array, influence: Array, heights: Arr
 
 @dataclass(frozen=True)
 class Results:
-    """ISO 230-3 values and their standard uncertainties, (quantity, measure), SI; NaN where not determined."""
+    """ISO 230-3 values and their standard uncertainties, (quantity, measure), SI; NaN where not determined.
+
+    ``influence`` (source, quantity, measure) is the effect of one standard uncertainty of each source.
+    """
 
     test: str
     value: Array
     uncertainty: Array
+    influence: Array
     sensor: str
     series: Series
 
-    def as_extras(self, time: Array) -> dict[str, xr.DataArray]:
-        """Return the values as further variables of the error dataset."""
+    def as_extras(self, time: Array, sources: int) -> dict[str, xr.DataArray]:
+        """Return the values as further variables of an error dataset with ``sources``; the last ones have no effect."""
         table = {"quantity": list(QUANTITIES), "measure": list(MEASURES)}
         units = {"units": "SI: m or rad; s for time_constant; per s for end_slope; per K for per_kelvin"}
         shared = np.einsum("skt,skt->kt", self.series.influence, self.series.influence)
         u = np.sqrt(shared + self.series.variance)
+        F = np.zeros((sources, *self.value.shape))
+        F[: len(self.influence)] = self.influence
         labels = {"level": ["L1", "L2"], "lateral": ["x", "y"], "time": time}
 
         def by_level(values: Array) -> xr.DataArray:
@@ -110,6 +116,7 @@ class Results:
         return {
             "iso_value": xr.DataArray(self.value, coords=table, dims=("quantity", "measure"), attrs=units),
             "iso_uncertainty": xr.DataArray(self.uncertainty, coords=table, dims=("quantity", "measure"), attrs=units),
+            "iso_influence": xr.DataArray(F, coords=table, dims=("source", "quantity", "measure"), attrs=units),
             "displacement": by_level(self.series.value[:4]),
             "displacement_u": by_level(u[:4]),
         }
@@ -134,6 +141,7 @@ def evaluate(
     """
     value = np.full((len(QUANTITIES), len(MEASURES)), np.nan)
     uncertainty = np.full_like(value, np.nan)
+    influence = np.zeros((len(series.influence), *value.shape))
     step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
     turning = spindle_speed is not None and bool(turns(spindle_speed).any())
     still = spindle_speed is not None and not turning
@@ -148,24 +156,27 @@ def evaluate(
             blocks = [reference, *_blocks(inside, time, average)]
             means = np.array([series.value[k, block].mean() for block in blocks])
             top, bottom = blocks[means.argmax()], blocks[means.argmin()]
-            value[k, column], uncertainty[k, column] = (
-                series.difference(k, top, bottom) if top is not bottom else (0.0, 0.0)
+            value[k, column], uncertainty[k, column], influence[:, k, column] = (
+                series.difference(k, top, bottom) if top is not bottom else (0.0, 0.0, 0.0)
             )
             if time[blocks[-1][-1]] >= until - max(1.5 * step, average):
                 # The errors are zero in the reference state: the value at the end is the difference.
                 weights = np.full(blocks[-1].size, 1.0 / blocks[-1].size)
-                value[k, column + 1], uncertainty[k, column + 1] = series.weighted(k, blocks[-1], weights)
+                place = (k, column + 1)
+                value[place], uncertainty[place], influence[:, *place] = series.weighted(k, blocks[-1], weights)
         running = np.flatnonzero(known & (time <= end))
         value[k, 6] = _time_constant(time[running], series.value[k, running])
         tail = running[time[running] >= end - _SLOPE_SPAN]
         if tail.size > 10 and np.ptp(time[tail]) > 0.9 * _SLOPE_SPAN:
-            value[k, 7], uncertainty[k, 7] = series.weighted(k, tail, _slope_weights(time[tail]))
+            found = series.weighted(k, tail, _slope_weights(time[tail]))
+            value[k, 7], uncertainty[k, 7], influence[:, k, 7] = found
         if change is not None:
             warm = running[np.isfinite(change[running])]
             if warm.size > 10 and np.ptp(change[warm]) > _LEAST_CHANGE:
-                value[k, 8], uncertainty[k, 8] = series.weighted(k, warm, _slope_weights(change[warm]))
+                found = series.weighted(k, warm, _slope_weights(change[warm]))
+                value[k, 8], uncertainty[k, 8], influence[:, k, 8] = found
     test = "ETVE (spindle still)" if still else "rotating spindle" if turning else "spindle speed not recorded"
-    return Results(test, value, uncertainty, hottest, series)
+    return Results(test, value, uncertainty, influence, hottest, series)
 
 
 def _blocks(index: Index, time: Array, length: float) -> list[Index]:

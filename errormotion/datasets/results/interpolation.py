@@ -5,8 +5,12 @@ line. At the share w of an interval of length h, with nothing known of the slope
 ``q h^3 w^2 (1 - w)^2 / 3``. The intensity is estimated for each freedom from second differences: with neighbours
 ``a, b, c`` at distances ``h`` and ``g``, the deviation of b from the line through a and c has the variance
 ``q h^2 g^2 / (3 (h + g))`` plus what the noise of the three adds. Errors bend most when a warm-up starts, so the
-intensity of an interval is that of the second differences at its ends. Sources that are one draw for many values go
-through the same weights. Nothing is extrapolated.
+intensity of an interval is that of the second differences at its ends. Before the first interval of a record over time
+there is no value. The machine is taken as steady until then: the slope is 0 before, and s and s' in the mean over the
+first two intervals. It has changed by the range J of these three at least, and ``q = J^2 / h``: the process whose slope
+changes by J (one standard deviation) within the interval. A single bend of this size, anywhere in it, deviates from the
+line by sqrt(3) standard deviations. Sources that are one draw for many values go through the same weights. Nothing
+is extrapolated.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array, products
-from errormotion.datasets.reduction import TOLERANCE, influence_of, rebuilt
+from errormotion.datasets.results.reduction import TOLERANCE, influence_of, rebuilt
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.errors import DatasetError
 
@@ -61,7 +65,7 @@ def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> x
     E = np.moveaxis(np.stack([ds[name].values for name in DOF], axis=-1), axis, 0)
     F = np.moveaxis(influence_of(ds), axis + 1, 1)
     total = np.moveaxis(np.asarray(ds["covariance"].values, dtype=float), axis, 0)
-    values, covariance, influence, q = interpolated(t, E, total, F, new)
+    values, covariance, influence, q = interpolated(t, E, total, F, new, starting=dim == "time")
     before = _neighbours(t, new)[0]
     base = ds.isel({dim: np.clip(before, 0, len(t) - 1)}).drop_vars(f"{dim}{INDEX}", errors="ignore")
     base = base.drop_vars([name for name in base.coords if base[name].dims == (dim,) and name != coordinate])
@@ -76,7 +80,9 @@ def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> x
     )
 
 
-def interpolated(t: Array, E: Array, total: Array, F: Array, new: Array) -> tuple[Array, Array, Array, Array]:
+def interpolated(
+    t: Array, E: Array, total: Array, F: Array, new: Array, *, starting: bool = False
+) -> tuple[Array, Array, Array, Array]:
     """Return errors at new points with their covariance, influence and intensity; see `to_points`.
 
     Parameters
@@ -85,6 +91,8 @@ def interpolated(t: Array, E: Array, total: Array, F: Array, new: Array) -> tupl
         Known and new points, increasing.
     E, total, F : ndarray, (n, ..., 6), (n, ..., 6, 6), (source, n, ..., 6)
         Errors, total covariance, influence.
+    starting : bool
+        Whether the errors are taken as constant before the first point.
 
     Returns
     -------
@@ -97,7 +105,7 @@ def interpolated(t: Array, E: Array, total: Array, F: Array, new: Array) -> tupl
     after = np.minimum(before + ~exact, len(t) - 1)
     w = share.reshape(-1, *[1] * (E.ndim - 1))
     between = ~exact & inside
-    q = intensity(t, E, own)
+    q = intensity(t, E, own, starting=starting)
     q = np.where(between.reshape(w.shape), q[np.minimum(before, len(q) - 1)], 0.0)
     width = np.where(exact, 0.0, t[after] - t[before])
     added = (width**3 * share**2 * (1 - share) ** 2 / 3).reshape(w.shape) * q
@@ -114,7 +122,7 @@ def interpolated(t: Array, E: Array, total: Array, F: Array, new: Array) -> tupl
     return values, covariance, influence, q
 
 
-def intensity(t: Array, values: Array, own: Array) -> Array:
+def intensity(t: Array, values: Array, own: Array, *, starting: bool = False, together: bool = False) -> Array:
     """Return the intensity q of each interval, (n - 1, ..., 6), by the moments of second differences; NaN below three.
 
     Parameters
@@ -123,6 +131,10 @@ def intensity(t: Array, values: Array, own: Array) -> Array:
     values : ndarray, (n, ..., 6)
     own : ndarray, (n, ..., 6, 6)
         Covariance of what is drawn anew at every value.
+    starting : bool
+        Whether the errors are taken as constant before the first point.
+    together : bool
+        One intensity for all that lies between the first and the last axis; those have the length 1 then.
     """
     if len(t) < 3:
         return np.full((max(len(t) - 1, 1), *values.shape[1:]), np.nan)
@@ -135,10 +147,27 @@ def intensity(t: Array, values: Array, own: Array) -> Array:
     unit = np.broadcast_to((h**2 * g**2 / (3 * (h + g))).reshape(shape), bend.shape)
     known = np.isfinite(bend) & np.isfinite(noise)
     excess, scale = np.where(known, bend**2 - noise, 0.0), np.where(known, unit, 0.0)
+    if together:
+        others = tuple(range(1, excess.ndim - 1))
+        excess, scale = excess.sum(axis=others, keepdims=True), scale.sum(axis=others, keepdims=True)
     # Beside the interval from value k to k + 1 are the second differences at k and at k + 1.
     none = np.zeros((1, *excess.shape[1:]))
     beside, unit = (np.concatenate([none, each]) + np.concatenate([each, none]) for each in (excess, scale))
     found: Array = np.maximum(beside, 0.0) / np.where(unit > 0, unit, np.inf)
+    if starting:
+        found[0] = np.where(known[0], _starting(h[0], g[0], values[:3], variance[:3]), found[0])
+    return found
+
+
+def _starting(h: float, g: float, values: Array, variance: Array) -> Array:
+    """Return the intensity of the first interval, (..., 6), of an error that is constant before its first value."""
+    first, second = (values[1] - values[0]) / h, (values[2] - values[1]) / g
+    changes = np.stack([first, second, second - first])
+    v0, v1, v2 = variance
+    noise = np.stack([(v0 + v1) / h**2, (v1 + v2) / g**2, v0 / h**2 + v1 * (1 / h + 1 / g) ** 2 + v2 / g**2])
+    largest = np.abs(changes).argmax(axis=0)[None]
+    square, of_noise = (np.take_along_axis(each, largest, axis=0)[0] for each in (changes**2, noise))
+    found: Array = np.maximum(square - of_noise, 0.0) / h
     return found
 
 

@@ -122,7 +122,7 @@ def _point_violations(value: Any, name: str = "functional_point") -> list[str]:
 def _is_json_object(text: str) -> bool:
     try:
         return isinstance(json.loads(text), dict)
-    except ValueError:
+    except (ValueError, RecursionError):
         return False
 
 

@@ -276,19 +276,19 @@ class ErrorMotion:
 
     def since(self, time: float | tuple[float, float]) -> xr.Dataset:
         """Return the changes since an instant, or since the mean of an interval; see `reduction.since`."""
-        from errormotion.datasets.reduction import since
+        from errormotion.datasets.results.reduction import since
 
         return since(self._ds, time)
 
     def change_from(self, before: xr.Dataset) -> xr.Dataset:
         """Return the changes since another measurement of the same places; see `reduction.change`."""
-        from errormotion.datasets.reduction import change
+        from errormotion.datasets.results.reduction import change
 
         return change(self._ds, before)
 
     def to_times(self, times: ArrayLike) -> xr.Dataset:
         """Return the errors at other instants, s, with what interpolation adds; see `interpolation.to_points`."""
-        from errormotion.datasets.interpolation import to_points
+        from errormotion.datasets.results.interpolation import to_points
 
         return to_points(self._ds, "time", "time", times)
 
@@ -297,7 +297,7 @@ class ErrorMotion:
 
         ``coordinate`` is ``x``, ``y`` or ``z`` along ``position``; it may be left out where there is only one.
         """
-        from errormotion.datasets.interpolation import to_points
+        from errormotion.datasets.results.interpolation import to_points
 
         own = [name for name in "xyz" if name in self._ds.variables and self._ds[name].dims == ("position",)]
         if not coordinate and len(own) != 1:
@@ -306,7 +306,7 @@ class ErrorMotion:
 
     def mean(self, dim: str) -> xr.Dataset:
         """Return the mean over a dimension with its covariance; see `reduction.mean`."""
-        from errormotion.datasets.reduction import mean
+        from errormotion.datasets.results.reduction import mean
 
         return mean(self._ds, dim)
 
@@ -336,7 +336,7 @@ class ErrorMotion:
 
     def plot(self) -> Figure:
         """Return a figure: displacements in um and rotations in arcsec, with their k = 2 bands."""
-        from errormotion.datasets.plotting import plot_errors  # matplotlib only when something is drawn
+        from errormotion.datasets.results.plotting import plot_errors  # matplotlib only when something is drawn
 
         return plot_errors(self._ds)
 

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
-from errormotion.datasets.error_checks import error_violations
+from errormotion.datasets.results.checks import error_violations
 from errormotion.datasets.schemas import CARRIED, DOF, ERROR_ROWS, ERROR_UNITS, INDEX, SCHEMA, SIGN
 from errormotion.errors import DatasetError
 

@@ -1,0 +1,95 @@
+"""The audit log: one JSON object a line, each with the hash of all lines before it; lines are only appended."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from errormotion.errors import CompensationError
+
+START = "0" * 64
+"""Hash before the first line."""
+
+LONGEST_LINE = 1 << 16
+"""Bytes."""
+
+
+class AuditLog:
+    """Appends entries to an audit log; a context manager.
+
+    Parameters
+    ----------
+    path : Path
+        Is made, or continued where it is a valid audit log.
+
+    Raises
+    ------
+    CompensationError
+        The file is there and its chain of hashes is broken.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._hash = verify(path)[1] if path.exists() else START
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.close(self._file)
+
+    def write(self, entry: Mapping[str, Any], *, sync: bool = False) -> None:
+        """Append an entry; ``sync`` waits until the disk has it.
+
+        Raises
+        ------
+        CompensationError
+            The entry cannot be written.
+        """
+        content = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), **entry}
+        text = json.dumps(content, ensure_ascii=False, allow_nan=False)
+        self._hash = _next(self._hash, text)
+        line = f'{{"hash":"{self._hash}","entry":{text}}}\n'.encode()
+        try:
+            if os.write(self._file, line) != len(line):
+                raise OSError("only a part was written")
+            if sync:
+                os.fdatasync(self._file)
+        except OSError as error:
+            raise CompensationError(f"{self.path}: the audit log cannot be written: {error}") from None
+
+
+def verify(path: Path) -> tuple[int, str]:
+    """Return how many entries an audit log has, and its last hash.
+
+    Raises
+    ------
+    CompensationError
+        A line was changed, removed or added; the message names it.
+    """
+    count, last = 0, START
+    with path.open("rb") as file:
+        while line := file.readline(LONGEST_LINE):
+            text = line.decode("utf-8", "replace")
+            head, entry = text[: len('{"hash":"') + 64], text[len('{"hash":"') + 64 + len('","entry":') : -2]
+            last = _next(last, entry)
+            if text != f'{{"hash":"{last}","entry":{entry}}}\n' or head[-64:] != last:
+                raise CompensationError(
+                    f"{path}: line {count + 1} does not follow from the lines before it: the log was altered, or its "
+                    "last line was cut off. Keep it, and start a new one."
+                )
+            count += 1
+    return count, last
+
+
+def _next(before: str, text: str) -> str:
+    return hashlib.sha256(f"{before}{text}".encode()).hexdigest()

@@ -1,0 +1,90 @@
+"""What a model must offer to be followed: predictions of the errors from the latest readings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import xarray as xr
+
+from errormotion import plugins
+from errormotion.arrays import Array
+from errormotion.errors import CompensationError
+
+PARAMETERS = ("spindle_speed", "feed")
+"""Working parameters, 1/min and m/s, by their names in a controller's state and in a log."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted errors at one instant.
+
+    Attributes
+    ----------
+    errors, uncertainty : (6,)
+        Translations in m at the functional point, rotations in rad; standard uncertainty. NaN where unknown.
+    missing : tuple of str
+        Inputs that are unknown.
+    outside : tuple of str
+        Inputs outside the range of the training.
+    """
+
+    errors: Array
+    uncertainty: Array
+    missing: tuple[str, ...] = ()
+    outside: tuple[str, ...] = ()
+
+
+class Predictor(Protocol):
+    """Predicts the errors of a machine from its latest readings.
+
+    Attributes
+    ----------
+    temperatures, parameters : sequence of str
+        Names of the sensors, and those of `PARAMETERS`, that it needs.
+    """
+
+    @property
+    def temperatures(self) -> Sequence[str]:
+        """Names of the sensors."""
+
+    @property
+    def parameters(self) -> Sequence[str]:
+        """Names of the working parameters."""
+
+    def update(self, time: float, temperature: Mapping[str, float], parameter: Mapping[str, float]) -> Prediction:
+        """Take the readings of one instant, and return the prediction for it.
+
+        Parameters
+        ----------
+        time : float
+            s, later than before. The first readings are the reference state.
+        temperature : mapping of str to float
+            degC by sensor; NaN or absent: unknown.
+        parameter : mapping of str to float
+            `PARAMETERS`; NaN or absent: unknown.
+        """
+
+
+def predictor(model: xr.Dataset, functional_point: Array | None = None) -> Predictor:
+    """Return the predictor of a model by the plugin of its schema (``predictor`` of a kind of dataset).
+
+    Parameters
+    ----------
+    model : Dataset
+    functional_point : (3,), optional
+        Where the translations apply, m, in the frame of the model; default: that of the model.
+
+    Raises
+    ------
+    CompensationError
+        No plugin predicts from such a dataset, or the model does not state what an offset needs.
+    """
+    schema = str(model.attrs.get("schema", "none"))
+    owner = plugins.owner_of_schema(schema)
+    make = getattr(owner, "predictor", None)
+    if make is None:
+        raise CompensationError(f"Expected a model that predicts errors from readings; found the schema '{schema}'")
+    found: Predictor = make(model, functional_point)
+    return found

@@ -1,0 +1,97 @@
+"""Whether LinuxCNC's interpreter moves along the path that the plain reader reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
+
+from errormotion.compensation.program.interpreter.canonical import Command, commands
+from errormotion.compensation.program.reading.arcs import SMALL
+from errormotion.compensation.program.reading.items import COUNTERCLOCKWISE, LINE, PLANES, RAPID, Left, Move
+from errormotion.compensation.program.reading.offsets import Offsets
+from errormotion.compensation.program.reading.reader import Reader
+from errormotion.errors import ProgramError
+
+DIGIT = 1.02e-4
+"""Largest difference, in units of the program: the interpreter prints four digits, ours may have been cut."""
+
+_MOTIONS = {"STRAIGHT_TRAVERSE", "STRAIGHT_FEED", "ARC_FEED"}
+
+
+def check(source: Sequence[str], offsets: Offsets, reader: Reader) -> int:
+    """Return how many moves the interpreter and the reader agree on.
+
+    Parameters
+    ----------
+    source : sequence of str
+        Lines of a program.
+    offsets : Offsets
+    reader : Reader
+        A fresh one with these offsets.
+
+    Raises
+    ------
+    ProgramError
+        The interpreter refuses a line, or moves elsewhere; with the line.
+    """
+    left: set[int] = set()
+    moves = _moves(reader, source, left)
+    count = 0
+    move: Move | None = None
+    with closing(commands(source, offsets, deleted=reader.deleted)) as found:
+        for command in found:
+            if command.name not in _MOTIONS:
+                continue
+            if command.line in left:
+                continue
+            move = move or next(moves, None)  # reading on fills what is left
+            if command.line in left:
+                continue
+            if move is None:
+                raise ProgramError(f"line {command.line}: LinuxCNC's interpreter moves, and the reader does not")
+            if move.block.line != command.line:
+                raise ProgramError(
+                    f"line {move.block.line}: the reader moves; LinuxCNC's interpreter moves at line {command.line}"
+                )
+            _same(move, command)
+            move = None
+            count += 1
+    rest = move or next(moves, None)
+    if rest is not None:
+        raise ProgramError(f"line {rest.block.line}: the reader moves, and LinuxCNC's interpreter does not")
+    return count
+
+
+def _moves(reader: Reader, source: Iterable[str], left: set[int]) -> Iterator[Move]:
+    for number, item in enumerate(reader.items(source), 1):
+        if isinstance(item, Left):
+            left.add(number)
+        elif isinstance(item, Move):
+            yield item
+
+
+def _same(move: Move, command: Command) -> None:
+    numbers = command.numbers()
+    expected: tuple[float, ...] = move.end
+    if command.name == "ARC_FEED":
+        if move.kind <= LINE:
+            raise _differ(move, command)
+        a, b, c = PLANES[move.plane]
+        # Where an arc ends within rounding of the angle below which it is a full circle, both numbers are right.
+        counts = {math.ceil((abs(move.sweep) - part * SMALL) / (2 * math.pi)) for part in (0.99, 1.01)}
+        sense = 1 if move.kind == COUNTERCLOCKWISE else -1
+        turns = int(numbers[4]) if abs(int(numbers[4])) in counts and numbers[4] * sense > 0 else sense * max(counts)
+        expected = (move.end[a], move.end[b], *move.centre, turns, move.end[c])
+    elif move.kind != (RAPID if command.name == "STRAIGHT_TRAVERSE" else LINE):
+        raise _differ(move, command)
+    # A centre from a radius is as uncertain as the chord is small; LinuxCNC computes it from the same numbers.
+    if any(not abs(x - y) <= DIGIT for x, y in zip(expected, numbers, strict=False)):
+        raise _differ(move, command)
+
+
+def _differ(move: Move, command: Command) -> ProgramError:
+    return ProgramError(
+        f"line {move.block.line} '{move.block.text.strip()[:60]}': read as motion {move.kind} to {move.end}, centre "
+        f"{move.centre}; LinuxCNC's interpreter: {command.name}({command.text})"
+    )

@@ -1,0 +1,1 @@
+"""Correction and division of moves, and the lines of the new program."""

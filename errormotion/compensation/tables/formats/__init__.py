@@ -1,0 +1,1 @@
+"""Formats of compensation tables, one module each."""

@@ -1,0 +1,57 @@
+"""Formats of tables: found through the entry points of all distributions, the built-in ones as well."""
+
+from __future__ import annotations
+
+from collections import Counter
+from difflib import get_close_matches
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING
+
+from errormotion.errors import PluginError
+
+if TYPE_CHECKING:
+    from errormotion.compensation.tables.contract import TableFormat
+
+GROUP = "errormotion.table_formats"
+"""Group of the entry points."""
+
+_REQUIRED = ("id", "title", "source", "Settings", "write")
+
+
+@cache
+def _points() -> tuple[EntryPoint, ...]:
+    return tuple(sorted(entry_points(group=GROUP), key=lambda point: point.name))
+
+
+def available() -> tuple[str, ...]:
+    """Return the ids of all formats."""
+    return tuple(dict.fromkeys(point.name for point in _points()))
+
+
+def get(name: str) -> TableFormat:
+    """Return a format.
+
+    Raises
+    ------
+    PluginError
+        Unknown, claimed by several distributions, or one that does not load.
+    """
+    points = [point for point in _points() if point.name == name]
+    if not points:
+        near = get_close_matches(name, available(), n=1)
+        hint = f" Did you mean '{near[0]}'?" if near else ""
+        raise PluginError(f"No format of tables '{name}'; there are: {', '.join(available()) or 'none'}.{hint}")
+    if Counter(point.name for point in _points())[name] > 1:
+        sources = ", ".join(point.dist.name if point.dist else "unknown" for point in points)
+        raise PluginError(f"Several distributions claim the format '{name}': {sources}. Remove all but one.")
+    try:
+        cls = points[0].load()
+        if missing := [each for each in _REQUIRED if not hasattr(cls, each)]:
+            raise PluginError(f"the class lacks {', '.join(missing)}")
+        found: TableFormat = cls()
+    except (Exception, SystemExit) as error:
+        raise PluginError(f"The format '{name}' does not load: {type(error).__name__}: {error}") from error
+    if found.id != name:
+        raise PluginError(f"The entry point is called '{name}', but the format calls itself '{found.id}'")
+    return found

@@ -1,0 +1,243 @@
+"""NetCDF files and Zarr folders of strangers: what is refused before a library reads them.
+
+A dataset is data only. Its values are in the file or folder itself, not behind links; they are numbers and texts, not
+objects that code makes; and the sizes that it states are in proportion to the bytes that it has, so that a small file
+does not take a large memory.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import stat
+import struct
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py  # type: ignore[import-untyped]
+import numpy as np
+
+from errormotion.datasets.files.reading import parse_json, read_bytes
+from errormotion.errors import DatasetError
+
+OWN_BYTES = 64 << 20
+"""Bytes of values that any dataset may state."""
+PER_BYTE = 1100
+"""Bytes of values for each byte of the file or folder; deflate, the codec of NetCDF, reaches 1032."""
+MOST_VARIABLES = 2000
+LARGEST_METADATA = 16 << 20
+"""Bytes of a zarr.json."""
+DEEPEST = 24
+"""Levels of folders in a Zarr folder."""
+CODECS = ("bytes", "transpose", "blosc", "zstd", "crc32c", "vlen-utf8")
+"""Codecs of Zarr v3 that make numbers and texts from bytes; all others are refused."""
+LONGEST_TEXT = 1 << 20
+"""Bytes of a text of fixed length."""
+_TEXT, _WIDE = "string", "fixed_length_utf32"
+_NUMBERS = ("bool", *(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)),
+            "float16", "float32", "float64")  # fmt: skip
+
+
+def check_netcdf(path: Path) -> None:
+    """Refuse a NetCDF-4 file that leads to other files, or states sizes out of proportion.
+
+    Raises
+    ------
+    DatasetError
+        All that is wrong, in one message.
+    OSError, KeyError, RuntimeError
+        The file is damaged.
+    """
+    size = path.stat().st_size
+    with h5py.File(path) as file:
+        file.attrs.get("_nc3_strict")  # h5netcdf leaves a half-made object where this fails
+        if len(file) > MOST_VARIABLES:
+            raise DatasetError(f"{path}: expected at most {MOST_VARIABLES} variables; found {len(file)}")
+        found, total = [], 0
+        for name in file:
+            link = file.get(name, getlink=True)
+            if not isinstance(link, h5py.HardLink):
+                found.append(f"{name!r:.100}: expected values in this file; found a link")
+                continue
+            variable = file[name]
+            if not isinstance(variable, h5py.Dataset):
+                continue  # groups are not read
+            if variable.external or variable.is_virtual:
+                found.append(f"{name!r:.100}: expected values in this file; found a reference to another one")
+            filters = variable.id.get_create_plist()
+            if sum(filters.get_filter(k)[0] == h5py.h5z.FILTER_DEFLATE for k in range(filters.get_nfilters())) > 1:
+                found.append(f"{name!r:.100}: expected values that are compressed once")
+            pieces = variable.chunks or ()
+            total += max(math.prod(variable.shape or ()), math.prod(pieces)) * max(1, variable.dtype.itemsize)
+    _raise(path, found, total, size)
+
+
+def check_zarr(path: Path) -> None:
+    """Refuse a Zarr folder with links, other formats than v3, codecs that make objects, or sizes out of proportion.
+
+    Raises
+    ------
+    DatasetError
+        All that is wrong, in one message.
+    OSError, ValueError
+        The folder cannot be read, or its metadata are no JSON.
+    """
+    if not (path / "zarr.json").exists():
+        raise DatasetError(f"{path}: expected a Zarr folder of format 3 (zarr.json); found another format")
+    size = sum(_files(path, path, DEEPEST))
+    root = _metadata(path / "zarr.json")
+    arrays: dict[str, Any] = {}
+    for each in sorted(path.iterdir()):
+        if (each / "zarr.json").exists():
+            arrays[each.name] = _metadata(each / "zarr.json")
+    held = root.get("consolidated_metadata")
+    if held is not None:
+        if not isinstance(held, dict) or not isinstance(held.get("metadata"), dict):
+            raise DatasetError(f"{path}: consolidated_metadata: expected an object with 'metadata'; found another one")
+        for name, each in held["metadata"].items():
+            if name not in arrays:
+                raise DatasetError(f"{path}: {name!r:.100}: expected a folder of this name with its array; found none")
+            arrays[f"{name} (consolidated)"] = each
+    if len(arrays) > 2 * MOST_VARIABLES:
+        raise DatasetError(f"{path}: expected at most {MOST_VARIABLES} arrays; found {len(arrays)}")
+    found, total = [], 0
+    for name, metadata in arrays.items():
+        if isinstance(metadata, dict) and metadata.get("node_type") == "group":
+            continue  # groups are not read
+        wrong = _wrong(metadata)
+        if wrong:
+            found.append(f"{name!r:.100}: {wrong}")
+            continue
+        total += _stated(metadata)
+        folder = path / name.removesuffix(" (consolidated)")
+        found += [f"{name!r:.100}: {text}" for text in _wrong_chunks(folder, metadata, size)]
+    _raise(path, found, total, size)
+
+
+def _raise(path: Path, found: list[str], total: int, size: int) -> None:
+    if total > OWN_BYTES + PER_BYTE * size:
+        found.append(
+            f"expected at most {OWN_BYTES} bytes of values and {PER_BYTE} for each byte on disk; it "
+            f"states {total} bytes and has {size}"
+        )
+    if found:
+        raise DatasetError(f"{path}: is damaged, or made to harm:", found)
+
+
+def _files(folder: Path, store: Path, depth: int) -> Iterator[int]:
+    """Yield the sizes of the files of a store; links, pipes and devices are refused."""
+    if depth == 0:
+        raise DatasetError(f"{store}: expected at most {DEEPEST} levels of folders; found more")
+    with os.scandir(folder) as inside:
+        for each in inside:
+            if each.is_dir(follow_symlinks=False):
+                yield from _files(Path(each.path), store, depth - 1)
+                continue
+            state = each.stat(follow_symlinks=False)
+            if not stat.S_ISREG(state.st_mode):
+                raise DatasetError(f"{each.path}: expected a file in this folder; found a link, a pipe or a device")
+            yield state.st_size
+
+
+def _metadata(file: Path) -> dict[str, Any]:
+    found = parse_json(read_bytes(file, LARGEST_METADATA))
+    if not isinstance(found, dict):
+        raise DatasetError(f"{file}: expected an object; found {type(found).__name__}")
+    return found
+
+
+def _wrong(metadata: Any) -> str:
+    """Return what the metadata of an array must not state; empty for nothing."""
+    if not isinstance(metadata, dict) or metadata.get("zarr_format") != 3 or metadata.get("node_type") != "array":
+        return "expected an array of Zarr v3"
+    shape, names = metadata.get("shape"), metadata.get("dimension_names")
+    if not _is_shape(shape, 0):
+        return f"expected a shape of whole numbers; found {shape!r:.100}"
+    if not _item(metadata):
+        return f"expected data_type {', '.join(_NUMBERS)} or {_TEXT}; found {metadata.get('data_type')!r:.100}"
+    if not _is_shape(_chunk_shape(metadata), 1) or len(_chunk_shape(metadata)) != len(shape):
+        return f"expected chunks of whole numbers; found {metadata.get('chunk_grid')!r:.100}"
+    if names is not None and not (isinstance(names, list) and len(names) == len(shape)):
+        return f"expected a dimension name for each of {len(shape)} dimensions; found {names!r:.100}"
+    if metadata.get("storage_transformers"):
+        return "expected no storage_transformers"
+    codecs = metadata.get("codecs")
+    found = (
+        [each.get("name") if isinstance(each, dict) else each for each in codecs] if isinstance(codecs, list) else []
+    )
+    if not found or not all(each in CODECS for each in found):
+        return f"expected codecs of {', '.join(CODECS)}; found {found!r:.100}"
+    if len({*found}) < len(found):
+        return f"expected each codec once; found {found!r:.100}"
+    return ""
+
+
+def _is_shape(value: Any, least: int) -> bool:
+    return isinstance(value, list) and all(type(each) is int and least <= each < 1 << 53 for each in value)
+
+
+def _chunk_shape(metadata: Mapping[str, Any]) -> Any:
+    grid = metadata.get("chunk_grid")
+    inner = grid.get("configuration") if isinstance(grid, dict) and grid.get("name") == "regular" else None
+    return inner.get("chunk_shape") if isinstance(inner, dict) else None
+
+
+def _item(metadata: Mapping[str, Any]) -> int:
+    """Return the bytes of one value; 0 for one that is neither a number nor a text."""
+    kind = metadata.get("data_type")
+    if isinstance(kind, dict):
+        configuration = kind.get("configuration")
+        length = configuration.get("length_bytes") if isinstance(configuration, dict) else None
+        return length if kind.get("name") == _WIDE and type(length) is int and 0 < length <= LONGEST_TEXT else 0
+    return 16 if kind == _TEXT else np.dtype(kind).itemsize if kind in _NUMBERS else 0
+
+
+def _stated(metadata: Mapping[str, Any]) -> int:
+    """Return the bytes of the values of an array, or of one chunk where this is larger."""
+    return max(math.prod(metadata["shape"]), math.prod(_chunk_shape(metadata))) * _item(metadata)
+
+
+def _wrong_chunks(folder: Path, metadata: Mapping[str, Any], size: int) -> Iterator[str]:
+    """Yield what is wrong with the decompressed sizes that the chunks of an array state."""
+    names = [each["name"] for each in metadata["codecs"]]
+    packed = next((name for name in ("blosc", "zstd") if name in names), "")
+    if not packed or not (folder / "c").exists():
+        return
+    items = math.prod(_chunk_shape(metadata))
+    largest = OWN_BYTES + PER_BYTE * size if metadata["data_type"] == _TEXT else items * _item(metadata)
+    for file in _below(folder / "c"):
+        with open(file, "rb") as chunk:
+            head = chunk.read(18)
+        stated = _blosc_size(head) if packed == "blosc" else _zstd_size(head)
+        if stated is None or stated > largest:
+            yield f"{Path(file).relative_to(folder)}: expected a chunk of at most {largest} bytes; it states {stated}"
+            return
+
+
+def _below(path: Path) -> Iterator[str]:
+    if path.is_file():
+        yield str(path)
+    for folder, _, names in os.walk(path):
+        for name in names:
+            if not name.endswith(".part"):
+                yield os.path.join(folder, name)
+
+
+def _blosc_size(head: bytes) -> int | None:
+    """Return the decompressed size of a Blosc chunk; None for another one."""
+    return int(struct.unpack_from("<I", head, 4)[0]) if len(head) >= 16 else None
+
+
+def _zstd_size(head: bytes) -> int | None:
+    """Return the decompressed size of a Zstandard frame (RFC 8878, section 3.1.1.1); None where it states none."""
+    if len(head) < 6 or head[:4] != b"\x28\xb5\x2f\xfd":
+        return None
+    descriptor = head[4]
+    single, flag = descriptor >> 5 & 1, descriptor >> 6
+    start = 5 + (1 - single) + (0, 1, 2, 4)[descriptor & 3]
+    width = (1 if single else 0, 2, 4, 8)[flag]
+    field = head[start : start + width]
+    if not width or len(field) < width:
+        return None
+    return int.from_bytes(field, "little") + (256 if flag == 1 else 0)

@@ -1,0 +1,127 @@
+"""``run.json``: what a run states of itself, checked for the types of its keys when it is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from errormotion.datasets.files import tomlfile
+from errormotion.datasets.files.reading import parse_json, read_bytes
+from errormotion.errors import RunError
+
+FILE = "run.json"
+SCHEMA = "errormotion.run/1"
+LARGEST_FILE = 16 << 20
+"""Bytes of a run.json that are read."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
+
+
+class _Campaign(_Table):
+    name: str = ""
+    file: str = ""
+    folder: str = ""
+    sha256: str = ""
+    text: str = ""
+    tests: list[str] = []
+
+
+class _Bench(_Table):
+    name: str = ""
+    machine: str = ""
+    file: str = ""
+    text: str = ""
+
+
+class _Method(_Table):
+    id: str = ""
+
+
+class _Clock(_Table):
+    start: str = ""
+    time: float = Field(default=0.0, ge=0.0, le=1e10)
+    schedule: list[dict[str, Any]] = []
+
+
+class _Step(_Table):
+    step: str = ""
+    outcome: str = ""
+    time: str = ""
+
+
+class _Samples(_Table):
+    dim: str = ""
+    count: int = 0
+    dropped: int = 0
+    invalid: dict[str, int] = {}
+
+
+class _Run(_Table):
+    id: str = ""
+    test: str = ""
+    created: str = ""
+    status: str = ""
+    reason: str = ""
+    acquired: bool = False
+    campaign: _Campaign = _Campaign()
+    bench: _Bench = _Bench()
+    method: _Method = _Method()
+    settings: dict[str, Any] = {}
+    inputs: dict[str, Any] = {}
+    instruments: list[dict[str, Any]] = []
+    software: dict[str, Any] = {}
+    samples: _Samples | None = None
+    errors: str | None = None
+    report: str | None = None
+    steps: list[_Step] = []
+    clock: _Clock = _Clock()
+    results: list[dict[str, Any]] | None = None
+    tolerances: dict[str, Any] | None = None
+    conformity: dict[str, Any] | None = None
+
+
+class State(dict[str, Any]):
+    """An object of a ``run.json``; a key that is missing is an error that names the file."""
+
+    file: Path = Path(FILE)
+
+    def __missing__(self, key: str) -> Any:
+        raise RunError(f"{self.file}: expected the key '{key}'; found none")
+
+
+def read_run(folder: Path) -> State:
+    """Return the content of the ``run.json`` of a folder.
+
+    Raises
+    ------
+    RunError
+        It cannot be read, is too large, is no JSON, has another schema, or keys of other types; all mistakes in one
+        message.
+    """
+    file = folder / FILE
+    try:
+        found = parse_json(read_bytes(file, LARGEST_FILE))
+    except OSError as error:
+        raise RunError(f"{folder}: expected a run folder with a {FILE}; {error.strerror}") from error
+    except ValueError as error:
+        raise RunError(
+            f"{file}: is not valid JSON ({error}); restore it from a copy, "
+            "or identify raw.zarr with 'errormotion identify'"
+        ) from error
+    if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+        what = found.get("schema") if isinstance(found, dict) else type(found).__name__
+        raise RunError(f"{file}: expected schema '{SCHEMA}'; found {what!r:.100}")
+    mistakes = tomlfile.check(found, _Run, edge=False)[1]
+    if mistakes:
+        raise RunError(tomlfile.report(file, mistakes))
+    return _stated(found, file)
+
+
+def _stated(found: dict[str, Any], file: Path) -> State:
+    state = State({key: _stated(each, file) if isinstance(each, dict) else each for key, each in found.items()})
+    state.file = file
+    return state

@@ -1,0 +1,1 @@
+"""Error datasets: how they are built, checked, interpolated, reduced and drawn, and the accessor ``ds.em``."""

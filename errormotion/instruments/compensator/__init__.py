@@ -1,0 +1,1 @@
+"""Compensators: what writes offsets into a machine."""

@@ -1,0 +1,136 @@
+"""``offset_file``: offsets in a small JSON file, for a control or another program that reads one.
+
+The file is replaced as a whole at every write. Its reader must ramp to zero when ``number`` has not changed for
+``valid`` seconds; ``examples`` of a reader are in the documentation. If the reader writes a file of its own with the
+offset in effect, `read` reports it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from errormotion.datasets.units import Time
+from errormotion.errors import InstrumentError
+from errormotion.plugins import Applied, Identity, InstrumentInfo, PluginSettings
+
+SCHEMA = "errormotion.offset/1"
+LONGEST = 1 << 16
+"""Bytes of a file that is read."""
+
+
+class OffsetFileSettings(PluginSettings):
+    """Settings of the file."""
+
+    valid: Time = Field(default=5.0, gt=0, le=60.0, description="time after which the reader must ramp to zero")
+    state: str = Field(
+        default="", description="file that the reader writes, with the offset in effect; default: what was written"
+    )
+
+
+class OffsetFile:
+    """Writes offsets to a file.
+
+    Parameters
+    ----------
+    address : str
+        ``file:///path/offset.json``, or a path.
+    settings : OffsetFileSettings, optional
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="offset_file",
+        kind="compensator",
+        summary="Offsets in a file, for a control that reads one.",
+        status="simulated_only",
+    )
+    Settings: ClassVar[type[PluginSettings]] = OffsetFileSettings
+
+    def __init__(self, address: str, settings: Any = None) -> None:
+        self.address = address
+        self.settings: Any = self.Settings() if settings is None else settings
+        self.path = Path(address.removeprefix("file://"))
+        self._number = 0
+
+    def open(self) -> None:
+        """Check that the folder is there.
+
+        Raises
+        ------
+        InstrumentError
+            No folder, or the file is not one of offsets.
+        """
+        if not self.path.parent.is_dir():
+            raise InstrumentError(f"{self.address}: expected a folder {self.path.parent}; found none")
+        if self.path.exists():
+            found = self._content(self.path)
+            number = found.get("number", 0)
+            self._number = number if isinstance(number, int) and not isinstance(number, bool) else 0
+
+    def close(self) -> None:
+        """Do nothing: the file keeps the last offset, whose time to live ends."""
+
+    def identify(self) -> Identity:
+        """Return the file."""
+        return Identity("errormotion", "offset file", self.path.name)
+
+    def read(self) -> Applied:
+        """Return the offset that the reader reports, or the last one written; zero before the first."""
+        source = Path(self.settings.state) if self.settings.state else self.path
+        if not source.exists():
+            if self.settings.state:
+                raise InstrumentError(f"{source}: expected the state that the reader of offsets writes; found no file")
+            return Applied((0.0, 0.0, 0.0))
+        found = self._content(source)
+        offset = [_number(found.get(axis)) for axis in "XYZ"]
+        return Applied((offset[0], offset[1], offset[2]), _text(found, "busy"), _text(found, "fault"))
+
+    def write(self, offset: Sequence[float]) -> None:
+        """Replace the file.
+
+        Raises
+        ------
+        InstrumentError
+            It cannot be written.
+        """
+        self._number += 1
+        values = dict(zip("XYZ", map(float, offset), strict=True))
+        content = {"schema": SCHEMA, "number": self._number, "unit": "m", "valid": self.settings.valid, **values}
+        new = self.path.with_name(f".{self.path.name}.new")
+        try:
+            new.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
+            os.replace(new, self.path)
+        except (OSError, ValueError) as error:
+            with suppress(OSError):
+                new.unlink()
+            raise InstrumentError(f"{self.address}: the offset cannot be written: {error}") from None
+
+    def _content(self, path: Path) -> dict[str, Any]:
+        try:
+            with path.open("rb") as file:
+                text = file.read(LONGEST + 1)
+            if len(text) > LONGEST:
+                raise ValueError(f"longer than {LONGEST} bytes")
+            found = json.loads(text)
+            if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+                raise ValueError(f"expected an object with the schema {SCHEMA}")
+        except (OSError, ValueError, RecursionError) as error:
+            raise InstrumentError(f"{path}: not a file of offsets: {error}") from None
+        return found
+
+
+def _number(value: Any) -> float:
+    known = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1.0
+    return float(value) if known else math.nan
+
+
+def _text(found: dict[str, Any], key: str) -> str:
+    value = found.get(key, "")
+    return value[:200] if isinstance(value, str) else f"{key} is no text"

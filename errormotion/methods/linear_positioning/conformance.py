@@ -1,0 +1,50 @@
+"""Subjects of the conformance kit: positioning with temperatures, and all six freedoms."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+from errormotion.methods.linear_positioning.method import LinearPositioning
+from errormotion.methods.linear_positioning.settings import FREEDOMS, Freedom, Moving, Settings
+from errormotion.methods.linear_positioning.simulation import simulate
+from errormotion.plugins import MethodSubject
+
+OPTIONAL = (
+    *("zero_position", "functional_point", "length_uncertainty", "alignment_uncertainty"),
+    *("temperature_uncertainty", "machine_expansion_uncertainty"),
+)
+RUNS, SEEDS = 12, 100
+"""More runs than usual: with few, the Student distribution of a mean has a tail that chi-square does not have."""
+
+
+def subjects() -> tuple[MethodSubject, ...]:
+    """Return the method on a short axis."""
+    moving = Settings(freedoms=("EX", "EB"), moving=Moving(cold=5, duration=7200.0, cooling=1800.0, interval=120.0))
+    warming = MethodSubject(
+        LinearPositioning,
+        partial(simulate, moving),
+        raw_vectors={"end_position": "x", "functional_point": "point"},
+        settings=moving.model_dump(exclude_unset=True),
+        name="moving axis",
+        optional=("functional_point", "length_uncertainty"),
+        measured=("end_deviation", "end_position"),
+        motion=((0.0, 0.0, 0.0), (0.1, -0.2, 0.05)),
+        seeds=SEEDS,
+    )
+    return (_subject("positioning", "X", ("EX",)), _subject("six freedoms", "Y", FREEDOMS), warming)
+
+
+def _subject(name: str, axis: Literal["X", "Y"], freedoms: tuple[Freedom, ...]) -> MethodSubject:
+    coordinate: Literal["x", "y"] = "x" if axis == "X" else "y"
+    return MethodSubject(
+        LinearPositioning,
+        partial(simulate, Settings(freedoms=freedoms, axis=axis, runs=RUNS, count=7)),
+        raw_vectors={"target_position": coordinate, "zero_position": coordinate, "functional_point": "point"},
+        settings={"freedoms": freedoms, "axis": axis, "trials": 200},
+        name=name,
+        optional=OPTIONAL,
+        measured=("deviation", "target_position"),
+        seeds=SEEDS,
+        motion=((0.0, 0.0, 0.0), (0.1, -0.2, 0.05)),
+    )

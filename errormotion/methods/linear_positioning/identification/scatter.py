@@ -1,0 +1,224 @@
+"""How the readings of one freedom vary: scatter from reading to reading, and drift from run to run.
+
+Model of a reading of approach a, run j, target i, with the position scaled to z = -1 ... 1::
+
+    x_aji = mu_ai + (o_j + q_j z_i) +- (p_j + w_j z_i) + e_aji
+
+``o`` and ``q`` are an offset and a slope that both approaches of a run share (the machine drifts, its scale expands);
+``p`` and ``w`` differ in sign between forward and backward. All are independent from run to run. A least-squares line
+of each run and approach, about the means of the targets, gives the coefficients; half their sum and half their
+difference over the approaches give the four variances, with n - 1 degrees of freedom each.
+
+A variance that is estimated with v degrees of freedom makes the standardised mean Student-distributed. Its standard
+deviation is larger by sqrt(v / (v - 2)) (JCGM 101:2008, 6.4.9.4), and that is what is stated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+
+DRIFTS = ("offset", "slope")
+FEWEST_RUNS = 4
+"""Runs from which the variance of the drift has a Student factor, v / (v - 2) with v = n - 1 above 2."""
+SIGNIFICANT = 1e-3
+"""Probability of the test of equal variances (Bartlett) below which each target gets its own."""
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Variances of one freedom, m^2 or rad^2.
+
+    Attributes
+    ----------
+    z : ndarray, (target,)
+        Scaled position.
+    own : ndarray, (approach, target)
+        Of one reading, by what is new at each reading; estimate.
+    own_factor : float
+        Student factor of ``own`` in a variance of a mean.
+    common, opposite : ndarray, (2,)
+        Of offset and slope of a run that the approaches share, and of those that differ in sign; estimates.
+    common_mean, opposite_mean : ndarray, (2,)
+        The same as stated for the mean of one run: with Student factor and stated drift, less the part that ``own``
+        contains already.
+    pooled : bool
+        Whether all targets have one variance.
+    freedom : int
+        Degrees of freedom of ``common`` and ``opposite``; 0 where they are stated.
+    noise : ndarray, (2,)
+        Variance of the coefficients of a run by ``own``, which was taken off.
+    """
+
+    z: Array
+    own: Array
+    own_factor: float
+    common: Array
+    opposite: Array
+    common_mean: Array
+    opposite_mean: Array
+    pooled: bool
+    freedom: int
+    noise: Array
+
+
+def scaled(position: Array) -> Array:
+    """Return positions scaled to -1 ... 1 about their mean, in units of half their range."""
+    return np.asarray((position - position.mean()) / (np.ptp(position) / 2.0))
+
+
+def scatter(
+    x: Array,
+    position: Array,
+    *,
+    kind: Literal["auto", "pooled", "target", "stated"],
+    drift: float | None,
+    stated: float | None,
+) -> Scatter:
+    """Return the variances of readings (approach, run, target).
+
+    Parameters
+    ----------
+    x : ndarray
+        NaN where there is no reading.
+    position : ndarray, (target,)
+        m.
+    kind : {"auto", "pooled", "target", "stated"}
+        Whether targets have variances of their own; ``stated`` takes ``drift`` and ``stated`` and estimates nothing.
+    drift : float, optional
+        Standard deviation by drift of a run of one approach, stated; at least this is taken.
+    stated : float, optional
+        Standard deviation of a reading, for a single run.
+
+    Raises
+    ------
+    MethodError
+        Too few runs to estimate what is not stated.
+    """
+    z = scaled(position)
+    Z = np.stack([np.ones_like(z), z], axis=1)
+    approaches = [a for a in range(2) if np.isfinite(x[a]).any()]
+    runs = x.shape[1]
+    stated_drift = np.array([0.0 if drift is None else drift**2 / len(approaches), 0.0])
+    if runs == 1 or kind == "stated":
+        return _stated(x, z, stated, drift, stated_drift)
+    if drift is None and runs < FEWEST_RUNS:
+        raise MethodError(
+            f"Expected {FEWEST_RUNS} runs or more, or the drift during one run (setting uncertainty.drift); found "
+            f"{runs} runs: the drift from run to run cannot be estimated."
+        )
+    residual, coefficient, g = _lines(x, Z)
+    own, factor, pooled = _own(residual, kind)
+    mean_own = float(np.nanmean(own))
+    both = len(approaches) == 2
+    half_sum = coefficient.mean(axis=0) if both else coefficient[approaches[0]]
+    half_difference = (coefficient[0] - coefficient[1]) / 2.0 if both else np.zeros_like(half_sum)
+    noise = mean_own * g / len(approaches)
+    common, opposite = (_mean_square(part) for part in (half_sum, half_difference))
+    if runs >= FEWEST_RUNS:
+        student = (runs - 1) / (runs - 3)
+        common_mean, opposite_mean = (np.maximum(student * part - noise, 0.0) for part in (common, opposite))
+    else:
+        common_mean, opposite_mean = np.zeros(2), np.zeros(2)
+    return Scatter(
+        z=z,
+        own=own,
+        own_factor=factor,
+        common=np.maximum(common - noise, stated_drift),
+        opposite=np.maximum(opposite - noise, stated_drift) if both else np.zeros(2),
+        common_mean=np.maximum(common_mean, stated_drift),
+        opposite_mean=np.maximum(opposite_mean, stated_drift) if both else np.zeros(2),
+        pooled=pooled,
+        freedom=runs - 1 if runs >= FEWEST_RUNS else 0,
+        noise=noise,
+    )
+
+
+def _stated(x: Array, z: Array, stated: float | None, drift: float | None, stated_drift: Array) -> Scatter:
+    if stated is None or drift is None:
+        raise MethodError(
+            "One run does not show how readings scatter. Expected more runs, or the settings uncertainty.scatter "
+            "and uncertainty.drift."
+        )
+    own = np.where(np.isfinite(x).any(axis=1), stated**2, np.nan)
+    return Scatter(z, own, 1.0, stated_drift, stated_drift, stated_drift, stated_drift, True, 0, np.zeros(2))
+
+
+def _lines(x: Array, Z: Array) -> tuple[Array, Array, Array]:
+    """Return residuals of a line in each run about the means of the targets, its coefficients, and their cofactors.
+
+    Shapes (approach, run, target), (approach, run, 2) and (2,).
+    """
+    known = np.isfinite(x)
+    n = known.sum(axis=1, keepdims=True)
+    mean = np.where(known, x, 0.0).sum(axis=1, keepdims=True) / np.maximum(n, 1)
+    centred = np.where(known & (n > 1), x - mean, np.nan)
+    coefficient = np.full((*x.shape[:2], 2), np.nan)
+    residual, cofactors = np.full_like(x, np.nan), []
+    for a, j in np.ndindex(*x.shape[:2]):
+        here = np.isfinite(centred[a, j])
+        if here.sum() < 3 or np.ptp(Z[here, 1]) == 0:
+            continue
+        normal = np.linalg.inv(Z[here].T @ Z[here])
+        coefficient[a, j] = normal @ Z[here].T @ centred[a, j, here]
+        residual[a, j, here] = centred[a, j, here] - Z[here] @ coefficient[a, j]
+        cofactors.append(np.diagonal(normal))
+    if not cofactors:
+        raise MethodError("deviation: expected runs with readings at three targets or more; found none")
+    return residual, coefficient, np.mean(cofactors, axis=0)
+
+
+def _own(residual: Array, kind: str) -> tuple[Array, float, bool]:
+    """Return the variance of one reading (approach, target), its Student factor, and whether it is pooled."""
+    known = np.isfinite(residual)
+    n = known.sum(axis=1)
+    square = np.where(known, residual**2, 0.0).sum(axis=1)
+    runs = known.any(axis=2).sum(axis=1)
+    lost = 2 * np.maximum(runs - 1, 0).sum()  # lines of all runs, less one that the means of the targets contain
+    total = int(np.maximum(n - 1, 0).sum())
+    freedom = total - int(lost)
+    if freedom < 3:
+        raise MethodError(
+            f"Expected enough readings to estimate their scatter; {freedom} degrees of freedom remain. Measure more "
+            "targets or runs."
+        )
+    pooled = float(square.sum() / freedom)
+    if kind == "pooled" or (kind == "auto" and not _differ(square, n)):
+        return np.where(n > 0, pooled, np.nan), freedom / (freedom - 2), True
+    share = freedom / total
+    each = np.where(n > 1, square / np.maximum(n - 1, 1) / share, pooled)
+    own_freedom = share * (float(np.median(n[n > 0])) - 1.0)
+    if own_freedom <= 2:
+        raise MethodError(
+            f"Variances by target: expected more than {FEWEST_RUNS} runs; found {int(n.max())}. Use scatter 'pooled'."
+        )
+    return np.where(n > 0, each, np.nan), own_freedom / (own_freedom - 2), False
+
+
+def _differ(square: Array, n: Array) -> bool:
+    """Return whether the variances of the targets differ significantly (Bartlett's test)."""
+    usable = (n > 2) & (square > 0)
+    if usable.sum() < 2:
+        return False
+    k, v = usable.sum(), (n[usable] - 1).astype(float)
+    variance = square[usable] / v
+    pooled = (v @ variance) / v.sum()
+    if not pooled > 0:
+        return False
+    statistic = v.sum() * np.log(pooled) - v @ np.log(variance)
+    correction = 1.0 + ((1.0 / v).sum() - 1.0 / v.sum()) / (3.0 * (k - 1))
+    return bool(stats.chi2.sf(statistic / correction, k - 1) < SIGNIFICANT)
+
+
+def _mean_square(part: Array) -> Array:
+    """Return the variance of coefficients (run, 2) over the runs, (2,)."""
+    known = part[np.isfinite(part).all(axis=1)]
+    if len(known) < 2:
+        return np.zeros(2)
+    return np.asarray(((known - known.mean(axis=0)) ** 2).sum(axis=0) / (len(known) - 1))

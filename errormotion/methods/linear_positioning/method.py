@@ -1,0 +1,143 @@
+"""The plugin ``linear_positioning``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from errormotion.errors import MethodError
+from errormotion.methods.linear_positioning.schema import SCHEMA
+from errormotion.methods.linear_positioning.settings import Settings as PositioningSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    import xarray as xr
+
+    from errormotion.kinematics.description import MachineDescription
+
+
+class LinearPositioning:
+    """Errors of one linear axis at target positions, approached again and again from both sides (ISO 230-2)."""
+
+    info: ClassVar[MethodInfo] = MethodInfo(
+        id="linear_positioning",
+        summary="Positioning accuracy and repeatability of a linear axis after ISO 230-2; its straightness and angles",
+        status="simulated_only",
+        version="1",
+        cannot_see=(
+            "freedoms that were not measured",
+            "the errors between the targets, where they change faster than the targets follow one another",
+            "the slope of a straightness: its reference line joins the first and the last target",
+            "errors of the instrument that its stated uncertainty does not cover",
+        ),
+    )
+    needs: ClassVar[Needs] = Needs(instruments=("controller",), raw_schema=SCHEMA)
+    Settings: ClassVar[type[PluginSettings]] = PositioningSettings
+    raw_schemas = lazy("errormotion.methods.linear_positioning.schema:RAW_SCHEMAS")
+    simulate = lazy("errormotion.methods.linear_positioning.simulation:simulate")
+    chapters = lazy("errormotion.methods.linear_positioning.report:chapters")
+    redrawing = lazy("errormotion.methods.linear_positioning.redrawing:redrawing")
+    conformance = lazy("errormotion.methods.linear_positioning.conformance:subjects")
+    figures = lazy("errormotion.methods.linear_positioning.figures:figures")
+
+    def acquire(
+        self,
+        bench: Bench,
+        settings: PositioningSettings,
+        *,
+        inputs: Mapping[str, xr.Dataset],  # noqa: ARG002 - part of the protocol
+        done: xr.Dataset | None = None,
+    ) -> Iterator[xr.Dataset]:
+        """Measure; yield one raw dataset a run, or a target of a pendulum cycle. See ``acquisition``."""
+        from errormotion.methods.linear_positioning.acquisition.measure import measure_axis
+        from errormotion.methods.linear_positioning.acquisition.warming import measure_moving
+
+        if settings.moving is not None:
+            return measure_moving(bench, settings, done)
+        return measure_axis(bench, settings, done)
+
+    def motions(
+        self,
+        settings: PositioningSettings,
+        instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
+    ) -> list[Step]:
+        """Return every step of the machine, for the check of its limits and for a dry run."""
+        from errormotion.methods.linear_positioning.planning.motions import steps
+
+        return steps(settings)
+
+    def programs(
+        self,
+        settings: PositioningSettings,
+        instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
+    ) -> Mapping[str, str]:
+        """Return the NC program of the test by file name."""
+        from errormotion.methods.linear_positioning.planning.motions import programs
+
+        return programs(settings)
+
+    def check_machine(self, settings: PositioningSettings, machine: MachineDescription) -> dict[str, str]:
+        """Return what contradicts the machine: an axis that it has not, targets outside of its travel."""
+        from errormotion.methods.linear_positioning.planning.targets import reach
+
+        test = settings.travel if settings.moving is not None else reach(settings)
+        if settings.axis not in machine.travel:
+            return {"axis": f"expected one of {', '.join(machine.travel)}; found '{settings.axis}'"}
+        (low, high), (first, last) = machine.travel[settings.axis], test
+        if first < low - 1e-9 or last > high + 1e-9:
+            return {
+                "travel": f"expected targets and overrun within {low * 1e3:g} mm to {high * 1e3:g} mm; found "
+                f"{first * 1e3:.3f} mm to {last * 1e3:.3f} mm"
+            }
+        return {}
+
+    def append_dim(self, settings: PositioningSettings) -> str:
+        """Return ``run``, ``target`` for pendulum cycles, ``cycle`` for a moving axis."""
+        if settings.moving is not None:
+            return "cycle"
+        return "run" if settings.cycle == "linear" else "target"
+
+    def progress(self, settings: PositioningSettings) -> float:
+        """Return the number of runs, of targets for pendulum cycles, of readings of a moving axis."""
+        from errormotion.methods.linear_positioning import moving
+        from errormotion.methods.linear_positioning.planning.targets import positions
+
+        if settings.moving is not None:
+            return float(sum(1 for _ in moving.cycles(settings)))
+        return float(settings.runs if settings.cycle == "linear" else positions(settings).size)
+
+    def identify(self, raw: xr.Dataset, settings: PositioningSettings | None = None) -> xr.Dataset:
+        """Turn a raw dataset into an error dataset of an axis over ``position``.
+
+        Parameters
+        ----------
+        raw : Dataset
+            Schema ``errormotion.raw.linear_positioning/1``; not modified.
+        settings : Settings, optional
+
+        Raises
+        ------
+        DatasetError
+            The raw dataset violates its schema; all violations are reported together.
+        MethodError
+            The data do not determine the result.
+        """
+        from errormotion.datasets import validate
+        from errormotion.methods.linear_positioning.identification.identify import identify
+
+        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
+        if checked.attrs["schema"] != SCHEMA:
+            raise MethodError(f"linear_positioning reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        validate(checked)
+        if "cycle" in checked.dims:
+            from errormotion.methods.linear_positioning.identification.moving import identify_moving
+
+            return identify_moving(checked, settings or PositioningSettings(), self.info)
+        return identify(checked, settings or PositioningSettings(), self.info)
+
+    def plan(self, settings: PositioningSettings | None = None) -> xr.Dataset:
+        """Return an error dataset of zeros with the expected covariance. See ``planning``."""
+        from errormotion.methods.linear_positioning.planning.plan import plan
+
+        return plan(settings or PositioningSettings(), self.info)

@@ -1,0 +1,16 @@
+"""Report chapter: positioning of a linear axis after ISO 230-2."""
+
+from __future__ import annotations
+
+from errormotion.datasets.results.merit import is_planned
+from errormotion.methods.linear_positioning.report import chapter, moving
+from errormotion.report.document import Part, Source
+
+
+def chapters(source: Source) -> list[Part]:
+    """Return the chapter of a result; none for a plan, which has no readings."""
+    if is_planned(source.errors):
+        return []
+    if "distortion" in source.errors:
+        return [moving.part(source, source.key)]
+    return [chapter.part(source, source.key)]

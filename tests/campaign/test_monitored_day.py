@@ -1,0 +1,30 @@
+"""A monitor for some simulated minutes with a fault a minute; ``make endurance`` does the same for 24 hours."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from monitored_day import FAULT_INTERVAL, INTERVAL, watch
+
+from errormotion import datasets
+from errormotion.campaign.monitor import sources
+
+MINUTES = 8
+
+
+def test_every_gap_is_marked_and_nothing_comes_twice(tmp_path: Path) -> None:
+    folder, day = watch(tmp_path, MINUTES / 60, 30.0, seed=2)
+    assert not day.errors
+    assert sum(day.faults.values()) >= MINUTES - 2  # a suspension may take the rest
+    assert folder.finished
+    assert len(day.resources) > 3
+    assert len({each.descriptors for each in day.resources}) == 1
+    with datasets.load(folder.raw) as log:
+        assert log.time[-1] >= MINUTES * FAULT_INTERVAL - INTERVAL
+        assert np.diff(log.time).max() < 100 * INTERVAL
+
+
+def test_the_examination_finds_readings_that_are_kept_too_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sources.Source, "fresh", lambda source, oldest: source._reading)
+    _, day = watch(tmp_path, MINUTES / 60, 30.0, 3)
+    assert any("is not marked" in text for text in day.errors)

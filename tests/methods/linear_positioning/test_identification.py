@@ -1,0 +1,149 @@
+"""Errors over the position with their covariance, and what the data must hold."""
+
+import numpy as np
+import pytest
+
+from errormotion.errors import MethodError
+from errormotion.methods.linear_positioning.identification import scatter
+
+P = np.linspace(0.0, 1.0, 11)
+
+
+def noisy(seed=0, freedoms=1, runs=5, size=1e-6):
+    return size * np.random.default_rng(seed).normal(size=(freedoms, runs, 2, P.size))
+
+
+def test_value_is_the_mean_of_both_approaches(raw_of, identify):
+    readings = noisy()
+    errors = identify(raw_of(readings, P, axis="Y", freedoms=("EY",)))
+    np.testing.assert_allclose(errors["EY"], readings[0].mean(axis=(0, 1)), atol=1e-18)
+    np.testing.assert_allclose(errors["y"], P)
+    assert errors.attrs["component"] == "Y"
+    assert np.isnan(errors["EX"]).all()
+
+
+def test_targets_may_come_in_any_order(raw_of, identify):
+    readings, order = noisy(), np.random.default_rng(1).permutation(P.size)
+    straight, mixed = identify(raw_of(readings, P)), identify(raw_of(readings[..., order], P[order]))
+    np.testing.assert_allclose(mixed["EX"], straight["EX"], atol=1e-18)
+    np.testing.assert_allclose(mixed["covariance"], straight["covariance"], rtol=1e-9)
+
+
+def test_covariance_of_the_means_is_the_cramer_rao_bound_of_the_model(raw_of, identify):
+    """Where all readings are there, the mean is the weighted least-squares estimate of the model of the scatter."""
+    readings = noisy() + 1e-6 * np.random.default_rng(1).normal(size=(1, 5, 1, 1))
+    errors = identify(raw_of(readings, P))
+    found = scatter.scatter(readings[0].transpose(1, 0, 2), P, kind="auto", drift=None, stated=None)
+    z = found.z
+    # variances as the method states them, with their Student factors
+    own = found.own_factor * float(found.own[0, 0])
+    D = found.common_mean[0] + found.common_mean[1] * np.outer(z, z)
+    H = found.opposite_mean[0] + found.opposite_mean[1] * np.outer(z, z)
+    V = np.block([[D + H, D - H], [D - H, D + H]]) + own * np.eye(2 * P.size)  # of one run, forward then backward
+    information = 5 * np.linalg.inv(V)
+    mean = np.hstack([np.eye(P.size), np.eye(P.size)]) / 2.0
+    bound = mean @ np.linalg.inv(information) @ mean.T
+    stated = np.array([[errors.em.covariance_between(i, j).values[0, 0] for j in range(0, 11, 5)] for i in (0, 5, 10)])
+    np.testing.assert_allclose(stated, bound[::5, ::5], rtol=1e-6)
+
+
+def test_a_warm_axis_is_corrected_to_20_degrees(raw_of, identify):
+    warm = 2.0
+    readings = noisy() + 11.5e-6 * warm * P
+    side = {"expansion": 11.5e-6, "temperature": 20.0 + warm}
+    errors = identify(raw_of(readings, P), machine=side)
+    cold = identify(raw_of(noisy(), P))
+    np.testing.assert_allclose(errors["EX"], cold["EX"], atol=1e-12)
+    assert "20 degC" in errors.attrs["reference"]
+    assert "temperature of the test" in cold.attrs["reference"]
+    u = errors.em.budget().sel(group="expansion", dof="EX").values
+    # 0.6e-6 1/K at 2 K, and 0.2 K at 11.5e-6 1/K, over the distance from the zero
+    np.testing.assert_allclose(u, np.hypot(1.2e-6, 2.3e-6) * P, atol=1e-15)
+
+
+def test_expansion_of_an_artefact_has_the_opposite_sign(raw_of, identify):
+    both = {"expansion": 11.5e-6, "temperature": 25.0}
+    errors = identify(raw_of(noisy(), P), machine=both, workpiece=both)
+    np.testing.assert_allclose(errors["EX"], identify(raw_of(noisy(), P))["EX"], atol=1e-15)
+
+
+def test_mean_cosine_error_is_corrected_and_its_spread_stated(raw_of, identify):
+    plain, u = identify(raw_of(noisy(), P)), 1e-3
+    errors = identify(raw_of(noisy(), P), uncertainty={"length": 0.0, "alignment": u})
+    np.testing.assert_allclose(errors["EX"] - plain["EX"], u**2 * P, atol=1e-15)
+    # two normal components: half the square of the angle is exponential, mean and standard deviation u^2
+    angles = u * np.random.default_rng(0).normal(size=(200_000, 2))
+    half = (angles**2).sum(axis=1) / 2.0
+    budget = errors.em.budget().sel(group="alignment", dof="EX").values
+    np.testing.assert_allclose(budget, half.std() * P, rtol=0.02)
+    np.testing.assert_allclose(half.mean(), u**2, rtol=0.02)
+
+
+def test_a_straightness_does_not_depend_on_the_line_of_the_instrument(raw_of, identify):
+    readings = noisy()
+    straight = identify(raw_of(readings, P, freedoms=("EY",)))
+    inclined = identify(raw_of(readings + 3e-5 + 1e-4 * P, P, freedoms=("EY",)))
+    np.testing.assert_allclose(inclined["EY"], straight["EY"], atol=1e-15)
+    assert float(straight["EY"][0]) == float(straight["EY"][-1]) == 0.0
+    np.testing.assert_allclose(inclined["figure_value"], straight["figure_value"], atol=1e-15)
+
+
+def test_missing_readings_are_counted_and_enlarge_the_uncertainty_there(raw_of, identify):
+    readings = noisy()
+    full = identify(raw_of(readings, P))
+    readings[0, :3, :, 4] = np.nan
+    errors = identify(raw_of(readings, P))
+    assert "6 of 110 readings are missing" in " ".join(errors.em.notes)
+    ratio = errors["covariance"][4, 0, 0] / full["covariance"][4, 0, 0]
+    assert ratio > 1.5  # two runs are left of five
+    readings[0, :, 1, 7] = np.nan
+    assert np.isnan(identify(raw_of(readings, P))["EX"][7])
+
+
+def test_one_run_needs_what_it_does_not_show(raw_of, identify):
+    readings = noisy(runs=1)
+    with pytest.raises(MethodError, match=r"uncertainty\.scatter"):
+        identify(raw_of(readings, P))
+    stated = {"length": 0.0, "alignment": 0.0, "scatter": 1e-6, "drift": 0.0}
+    errors = identify(raw_of(readings, P), uncertainty=stated)
+    np.testing.assert_allclose(errors["covariance"][:, 0, 0], 0.5e-12, rtol=1e-9)
+    assert np.isnan(float(errors["R"]))
+
+
+def test_three_runs_need_the_drift(raw_of, identify):
+    with pytest.raises(MethodError, match=r"uncertainty\.drift"):
+        identify(raw_of(noisy(runs=3), P))
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda raw: raw.assign_attrs(axis="C"), "attribute axis"),
+        (lambda raw: raw.assign_coords(approach=["up", "down"]), "forward, backward; found up, down"),
+        (lambda raw: raw.assign_coords(freedom=["EXY"]), "for axis X; found EXY"),
+        (lambda raw: raw.isel(target=slice(2)), "3 targets or more; found 2"),
+        (lambda raw: raw.assign(target_position=0.0 * raw["target_position"]), "found one twice"),
+        (lambda raw: raw.assign(deviation=raw["deviation"] * np.nan), "one or more with none"),
+    ],
+)
+def test_what_is_wrong_with_the_data_is_said(raw_of, identify, change, text):
+    with pytest.raises(MethodError, match=text):
+        identify(change(raw_of(noisy(), P)))
+
+
+def test_variances_that_differ_from_target_to_target_are_found(raw_of, identify):
+    readings = noisy() * np.where(P < 0.5, 1.0, 6.0)
+    errors = identify(raw_of(readings, P))
+    u = np.sqrt(errors["covariance"][:, 0, 0])
+    assert u[:4].max() < u[-4:].min()
+    assert "a variance for each target" in errors.attrs["provenance"]
+    assert "one variance for all targets" in identify(raw_of(noisy(), P)).attrs["provenance"]
+
+
+def test_drift_from_run_to_run_is_shared_by_the_targets(raw_of, identify):
+    drift = 3e-6 * np.random.default_rng(2).normal(size=(1, 5, 1, 1))
+    errors = identify(raw_of(noisy(size=0.1e-6) + drift, P))
+    expected = np.sqrt(drift.var(ddof=1) / 5 * 2)  # Student factor of 4 degrees of freedom: 4 / (4 - 2)
+    u = errors.em.budget().sel(group="drift from run to run", dof="EX").values
+    assert u[5] == pytest.approx(expected, rel=0.05)
+    assert np.sqrt(errors.em.covariance_between(0, 10).values[0, 0]) == pytest.approx(expected, rel=0.1)

@@ -1,0 +1,134 @@
+"""Thermal distortion by a moving axis after ISO 230-3."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from axis_doubles import Bench, Interferometer, Machine
+from scipy import stats
+
+from errormotion import datasets
+from errormotion.datasets.results.merit import figures_of
+from errormotion.errors import MethodError
+from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning.acquisition.warming import measure_moving
+from errormotion.methods.linear_positioning.report import chapters
+from errormotion.methods.linear_positioning.settings import Moving
+from errormotion.methods.linear_positioning.simulation import simulate
+from errormotion.report.document import Source
+
+METHOD = LinearPositioning()
+SETTINGS = Settings(moving=Moving(cold=5, duration=7200.0, cooling=1800.0, interval=120.0))
+GROWTH_OF_A_METRE = 1e-6
+"""Of the test's machine, for each metre that it has moved fast."""
+
+
+class Screw(Machine):
+    """An axis whose screw grows with the way that it has moved, fast, and that has no other error."""
+
+    def __init__(self):
+        super().__init__()
+        self.warm_way = 0.0
+
+    def move_to(self, position, feed=None):
+        way = abs(position[0] - self.place[0])
+        self.warm_way += way * (feed is not None and feed > 0.1)
+        self.place = np.array(position, float)
+        self.actual = position[0] * (1.0 + GROWTH_OF_A_METRE * self.warm_way)
+        self.time += way / (feed or 1.0)
+        self.path.append(position[0])
+
+
+def true_ranges(truth):
+    """Return the true ranges while the axis moved, of both ends and of the length between them."""
+    moved = truth["EX"].sel(time=slice(0.0, 7200.0)).values
+    both = np.column_stack([moved, moved[:, 1] - moved[:, 0]])
+    return np.ptp(both, axis=0)
+
+
+def test_ranges_hold_the_true_ones_within_their_uncertainty():
+    seeds, held, noise = 40, np.zeros(3), []
+    for seed in range(seeds):
+        raw, truth = simulate(SETTINGS, seed)
+        errors = METHOD.identify(raw, SETTINGS)
+        found, u = (
+            errors[name].sel(freedom="EXX", measure="range_moving").values for name in ("distortion", "distortion_u")
+        )
+        # the last mean lies up to two intervals before the end: 2 % of the change there
+        held += np.abs(found - true_ranges(truth)) <= 2.0 * u + 0.01 * true_ranges(truth)
+        noise.append(float(errors["reading_noise"][0]))
+    assert (held >= stats.binom.ppf(1e-3, seeds, 0.95)).all()
+    assert np.mean(noise) == pytest.approx(0.3e-6, rel=0.05)  # of the simulation, from second differences
+
+
+def test_the_cold_state_is_the_reference():
+    errors = METHOD.identify(simulate(SETTINGS, 1)[0], SETTINGS)
+    assert (errors["EX"].isel(time=0) == 0.0).all()
+    assert (errors["covariance"].isel(time=0).sel(dof="EX", dof_="EX") == 0.0).all()
+    again = errors.em.since(3600.0)  # the reference cancels between two warm states
+    late = errors["covariance"].sel(dof="EX", dof_="EX").isel(time=-1, position=0)
+    noise = float(errors["reading_noise"][0])
+    assert float(late) == pytest.approx(noise**2 * (1.0 + 1.0 / 5.0), rel=1e-6)
+    changed = again["covariance"].sel(dof="EX", dof_="EX").isel(time=-1, position=0)
+    assert float(changed) == pytest.approx(2.0 * noise**2, rel=1e-6)
+
+
+def test_figures_and_report_name_both_ends():
+    errors = METHOD.identify(simulate(SETTINGS, 1)[0], SETTINGS)
+    names = [figure.name for figure in figures_of(errors)]
+    assert "EXX at P2 - P1 within the first 60 min, range (ISO 230-3)" in names
+    assert len(names) == 6
+    (part,) = chapters(Source(errors))
+    table = part.sections[0].blocks[0]
+    assert [row[0] for row in table.rows] == ["P1", "P2", "P2 - P1"]
+    shown = float(table.rows[1][2].text)  # P2, while it moved
+    assert shown == pytest.approx(1e6 * float(errors["distortion"][0, 1, 1]), abs=0.05)
+
+
+def test_a_machine_that_warms_up_is_measured_and_stays_within_its_stroke():
+    settings = Settings(
+        travel=(0.0, 0.4),
+        dwell=0.5,
+        settle=0.2,
+        average=1,
+        feed=0.05,
+        moving=Moving(cold=3, duration=600.0, cooling=120.0, interval=60.0, feed=0.2),
+    )
+    machine = Screw()
+    bench = Bench(controller=machine, interferometer=Interferometer(machine))
+    settings = settings.model_copy(update={"channels": {"EX": "-length"}})
+    parts = list(measure_moving(bench, settings, None))
+    raw = xr.concat(
+        parts, dim="cycle", data_vars="minimal", coords="minimal", compat="override", combine_attrs="override"
+    )
+    raw.attrs.pop("invalid")
+    datasets.validate(raw)
+    assert raw.sizes["cycle"] == METHOD.progress(settings) == 3 + 10 + 2
+    planned = [step.place[0] for step in METHOD.motions(settings) if step.what == "move"]
+    assert machine.path == planned
+    errors = METHOD.identify(raw, settings)
+    np.testing.assert_allclose(errors["EX"].isel(position=0), 0.0, atol=1e-12)
+    grown = 0.4 * GROWTH_OF_A_METRE * machine.warm_way
+    assert float(errors["EX"][-1, 1]) == pytest.approx(grown, rel=1e-6)
+    assert errors["moving"].values.tolist() == [0.0] + 10 * [1.0] + 2 * [0.0]
+    (text,) = METHOD.programs(settings).values()
+    assert text.count("G4 P0.500") == 2 * 15
+
+
+def test_an_interrupted_warm_up_is_not_continued():
+    raw, _ = simulate(SETTINGS, 0)
+    with pytest.raises(MethodError, match="the axis has cooled down meanwhile"):
+        next(measure_moving(Bench(), SETTINGS, raw))
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda raw: raw.assign(reading_time=raw["reading_time"] + 1e4), "a cold state at times of 0 or less"),
+        (lambda raw: raw.assign(reading_time=-raw["reading_time"]), "increasing times"),
+        (lambda raw: raw.isel(cycle=slice(8)), "6 cycles or more after the cold state; found 3"),
+        (lambda raw: raw.assign(end_position=0.0 * raw["end_position"]), "two positions that differ"),
+    ],
+)
+def test_what_is_wrong_with_the_data_is_said(change, text):
+    with pytest.raises(MethodError, match=text):
+        METHOD.identify(change(simulate(SETTINGS, 0)[0]), SETTINGS)

@@ -1,0 +1,93 @@
+"""Targets, cycles, motions, program and expected uncertainty."""
+
+import re
+
+import numpy as np
+import pytest
+
+from errormotion.errors import MethodError
+from errormotion.kinematics.description import MachineDescription
+from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning.planning import motions, targets
+from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
+
+METHOD = LinearPositioning()
+
+
+@pytest.mark.parametrize(("length", "count"), [(0.5, 11), (2.0, 11), (1.99, 11), (3.0, 13), (10.0, 41)])
+def test_as_many_targets_as_the_standard_asks_for(length, count):
+    assert targets.needed(length) == count
+
+
+def test_targets_have_a_random_part_and_stay_within_the_travel():
+    for seed in range(50):
+        settings = Settings(travel=(0.1, 0.6), seed=seed)
+        P = targets.positions(settings)
+        assert P[0] >= 0.1
+        assert P[-1] <= 0.6
+        assert (np.diff(P) > 0).all()
+        assert np.ptp(np.diff(P)) > 1e-3  # not periodic
+    again = targets.positions(settings)
+    np.testing.assert_array_equal(P, again)
+
+
+@pytest.mark.parametrize("cycle", ["linear", "pendulum"])
+def test_every_target_is_approached_from_its_side_by_the_overrun(cycle):
+    settings = Settings(cycle=cycle, runs=3, count=5, targets=())
+    P, visits, place = targets.positions(settings), [], None
+    for approach in targets.sequence(settings):
+        place = approach.before if approach.before is not None else place
+        way = approach.place - place
+        assert (way > 0) == (approach.approach == 0)
+        assert abs(way) >= settings.overrun - 1e-12
+        assert approach.place == P[approach.target]
+        place = approach.place
+        visits.append((approach.run, approach.approach, approach.target))
+    assert sorted(visits) == [(run, way, i) for run in range(3) for way in range(2) for i in range(5)]
+
+
+def test_motions_are_those_of_the_program_and_stay_within_the_limits():
+    settings = Settings(axis="Y", travel=(0.0, 0.4), limits=(-0.01, 0.41), start=(0.1, 0.0, 0.2))
+    steps = METHOD.motions(settings)
+    places = [step.place for step in steps if step.place is not None]
+    assert {place[0] for place in places} == {0.1}
+    assert {place[2] for place in places} == {0.2}
+    y = np.array([place[1] for place in places])
+    assert y.min() >= -0.01
+    assert y.max() <= 0.41
+    (text,) = METHOD.programs(settings).values()
+    moved = [float(found) for found in re.findall(r"^G[01] .*?Y(-?[0-9.]+)", text, flags=re.MULTILINE)]
+    np.testing.assert_allclose(moved, 1e3 * y, atol=1e-9 + 5e-4)
+    assert text.count("G4 P4.000") == sum(step.what == "rest" for step in steps) == 2 * 5 * 11
+
+
+def test_a_test_beyond_the_limits_is_refused():
+    settings = Settings(travel=(0.0, 0.4), limits=(0.0, 0.4), overrun=0.1)
+    with pytest.raises(MethodError, match=r"expected X from 0\.000 to 400\.000 mm; with an overrun of 100 mm"):
+        motions.steps(settings)
+    machine = MachineDescription("C-frame", "workpiece-X-Y-bed-Z-spindle-tool", dict.fromkeys("XYZ", (0.0, 0.3)))
+    assert "travel" in METHOD.check_machine(settings, machine)
+    assert METHOD.check_machine(Settings(travel=(0.1, 0.2)), machine) == {}
+
+
+def test_the_plan_states_what_a_test_of_such_an_axis_gives():
+    """Scatter and drift as assumed by the plan, measured: the stated uncertainty is that of the plan on average."""
+    stated = {"scatter": 0.5e-6, "drift": np.sqrt(12.0) * 0.6e-6}
+    settings = Settings(runs=12, trials=200, uncertainty=stated)
+    plan = METHOD.plan(settings)
+    groups = ["drift from run to run", "independent"]
+    planned = plan.em.budget().sel(group=groups, dof="EX").isel(position=5).values
+    # half of the variance of a run of one approach is common to both
+    assert planned == pytest.approx([0.6e-6 / np.sqrt(24), 0.5e-6 / np.sqrt(24)])
+    behaviour = Behaviour(0.5e-6, 0.6e-6 / np.sqrt(2.0), 0.0, 0.6e-6 / np.sqrt(2.0))
+    free, measured = Settings(runs=12, trials=200), []
+    for seed in range(20):
+        errors = METHOD.identify(raw_and_truth(free, seed, behaviour)[0], free)
+        measured.append(errors.em.budget().sel(group=groups, dof="EX").isel(position=5).values ** 2)
+    # a variance with 11 degrees of freedom is known to 43 %, its mean over 20 tests to 10 %; Student's factor is 11/9
+    assert np.sqrt(np.mean(measured, axis=0)) == pytest.approx(planned, rel=0.2)
+
+
+def test_targets_are_not_measured_twice():
+    with pytest.raises(ValueError, match="three or more positions that differ"):
+        Settings(targets=(0.1, 0.1, 0.2))

@@ -1,0 +1,126 @@
+"""Watch a machine for 24 simulated hours while something fails every minute: ``make endurance``.
+
+The trial is in ``tests/support/monitored_day.py``. The section of docs/reliability.md is written by this program.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT / "tools")]
+
+import monitored_day  # noqa: E402
+from fuzz import PAGE, sections  # noqa: E402
+from monitored_day import Day  # noqa: E402
+
+TITLE = "A monitor over 24 hours"
+LARGEST_GROWTH = 0.05
+"""Of the memory, from the end of the first hour to the end."""
+NAMES = {
+    "corrupt": "answers with a wrong bit",
+    "disconnect": "connection broken",
+    "garbage": "stray bytes ahead of answers",
+    "late": "answer held back until the fault ends",
+    "open": "sensors open (out of range)",
+    "refuse": "connection broken, new ones refused",
+    "silence": "no answers",
+    "suspension": "computer suspended, 10 s to 60 s",
+    "wall clock": "wall clock set by an hour, a day or 50 years",
+}
+
+
+def failures(day: Day) -> list[str]:
+    """Return what is wrong with a day."""
+    found = list(day.errors)
+    first, last = day.resources[0], day.resources[-1]
+    if day.growth() > LARGEST_GROWTH:
+        found.append(f"the memory grew from {first.memory / 2**20:.1f} to {last.memory / 2**20:.1f} MiB")
+    for name in ("descriptors", "threads"):
+        numbers = sorted({getattr(each, name) for each in day.resources})
+        if len(numbers) > 1:
+            found.append(f"the number of {name} varies: {numbers}")
+    return found
+
+
+def section(day: Day, seed: int) -> str:
+    """Return the section of the page."""
+    first, last = day.resources[0], day.resources[-1]
+    memory = [each.memory / 2**20 for each in day.resources]
+    rows = [
+        ("rows written", f"{day.rows}, one a second"),
+        ("rows missing while the computer was suspended", f"{day.suspended}, as gaps of the times"),
+        ("other rows missing, the computer being busy", f"{day.missed - day.suspended}, as gaps of the times"),
+        ("rows in gaps", ", ".join(f"{name} {count}" for name, count in day.gap_rows.items())),
+        ("gaps", ", ".join(f"{name} {count}" for name, count in day.gaps.items())),
+        ("rows in gaps that no fault explains", str(day.unplanned)),
+        ("rows that repeat the reading of the row before", str(day.repeated)),
+        ("greatest age of a reading in a row", f"{day.oldest:.1f} s"),
+        (
+            "memory",
+            f"{first.memory / 2**20:.1f} MiB after {first.time / 3600:.0f} h, {last.memory / 2**20:.1f} MiB after "
+            f"{last.time / 3600:.0f} h ({100 * day.growth():+.1f} %), at most {max(memory):.1f} MiB",
+        ),
+        ("file descriptors", _range([each.descriptors for each in day.resources])),
+        ("threads", _range([each.threads for each in day.resources])),
+    ]
+    lines = [
+        f"`errormotion monitor` watched two modules, a thermometer and a controller over TCP for "
+        f"{day.duration / 3600:.1f} simulated hours, in {day.seconds / 60:.0f} minutes, while something failed every "
+        "minute. The monitor's clock advances to the next deadline while all threads wait, and runs at "
+        f"{day.speed:g} times the computer's rate while an answer is awaited. The modules send the number of each "
+        "reading as its temperature: every value in the log was sent, shortly before its row, none came back after a "
+        "later one, and every row without a reading is marked, by instrument, and counted alike in the log, in "
+        "run.json and in the report. Resources were counted every hour while all instruments answered.",
+        "",
+        "| fault | number |",
+        "|---|---|",
+        *(f"| {NAMES[kind]} | {count} |" for kind, count in sorted(day.faults.items())),
+        "",
+        "| result | |",
+        "|---|---|",
+        *(f"| {name} | {value} |" for name, value in rows),
+        "",
+    ]
+    wrong = failures(day)
+    lines += ["Failures:", "", *(f"* {text}" for text in wrong)] if wrong else ["No failure."]
+    where = f"{platform.machine()}, Python {platform.python_version()}"
+    return "\n".join([*lines, "", f"`make endurance`, seed {seed}, {where}."])
+
+
+def _range(numbers: list[int]) -> str:
+    low, high = min(numbers), max(numbers)
+    return f"{low}, constant" if low == high else f"{low} to {high}"
+
+
+def write(page: Path, body: str) -> None:
+    """Replace this programme's section of the page; the others stay."""
+    head, found = sections(page)
+    found[TITLE] = body
+    text = "".join(f"\n## {name}\n\n{part}\n" for name, part in found.items())
+    page.write_text(head.rstrip("\n") + "\n" + text, encoding="utf-8")
+
+
+def main() -> None:
+    """Run the day and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hours", type=float, default=24.0, help="simulated")
+    parser.add_argument("--speed", type=float, default=30.0, help="rate of the clock while an answer is awaited")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=PAGE)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="endurance") as folder:
+        _, day = monitored_day.watch(Path(folder), options.hours, options.speed, options.seed)
+    body = section(day, options.seed)
+    print(body)
+    write(options.out, body)
+    print(f"written to {options.out}")
+    sys.exit(bool(failures(day)))
+
+
+if __name__ == "__main__":
+    main()
