@@ -50,7 +50,7 @@ guided: .venv/.dev  ## search for inputs that reach new code in codecs and file 
 wire: .venv/.dev  ## try every driver on a wire that disturbs it, and write docs/reliability.md
 	$(BIN)/python tools/wire.py $(ARGS)
 
-faults: .venv/.dev  ## kill runs, fill their disks and resume them, 10 minutes, and write docs/reliability.md
+faults: .venv/.dev  ## kill runs, take their disks, set their clocks, and resume them, 10 minutes, and write docs/reliability.md
 	$(BIN)/python tools/faults.py $(ARGS)
 
 endurance: .venv/.dev  ## watch a machine for 24 simulated hours with a fault a minute, and write docs/reliability.md
