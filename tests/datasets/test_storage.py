@@ -101,8 +101,8 @@ def test_evenly_spaced_times_are_told_by_rate_and_start(drift, tmp_path, suffix)
             np.testing.assert_array_equal(part["time"], thinned["time"])
 
 
-def test_the_times_of_a_huge_record_stay_a_rule(tmp_path) -> None:
-    n = 288_000_000
+def test_the_times_of_a_long_record_stay_a_rule(tmp_path) -> None:
+    n = 3_000_000  # of 60 MB, without any: less than what is refused as out of proportion
     root = zarr.create_group(tmp_path / "raw.zarr", attributes={"sample_rate": 20e3})
     root.create_array("distance", shape=(5, n), chunks=(5, 2**20), dtype="f4", dimension_names=("channel", "time"))
     with load(tmp_path / "raw.zarr") as ds:
