@@ -60,7 +60,9 @@ def test_broken_plugin_is_listed_with_its_error(run: Run, answer: Answer, monkey
     from importlib.metadata import EntryPoint
 
     point = EntryPoint("broken", "nowhere_at_all:Thing", "errormotion.instruments")
-    monkeypatch.setattr(plugins.registry, "_found", lambda: {"instruments": (point,), "methods": (), "datasets": ()})
+    monkeypatch.setattr(
+        plugins.registry, "_found", lambda: {**dict.fromkeys(plugins.GROUPS, ()), "instruments": (point,)}
+    )
     (plugin,) = answer("plugins", "list")["plugins"]
     assert plugin["status"] == "broken"
     assert "ModuleNotFoundError" in run("plugins", "list").stdout
