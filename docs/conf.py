@@ -6,6 +6,7 @@ from typing import Any
 from sphinx.application import Sphinx
 
 import errormotion
+import errormotion.campaign.runner  # its pydantic models are made before autodoc adds annotations to their base class
 
 project = "errormotion"
 author = "the errormotion authors"

@@ -272,7 +272,10 @@ def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
         problem.set_min_objective(cost)
         problem.set_ftol_abs(_TOLERANCE)
         problem.set_maxeval(evaluations)
-        found = np.clip(problem.optimize(x), lower, upper)
+        try:
+            found = np.clip(problem.optimize(x), lower, upper)
+        except nlopt.RoundoffLimited:  # the search has come as far as rounding lets it
+            return x
         return found if cost(found, found) <= cost(x, x) else x
 
     equal = np.full(number, 0.5)
