@@ -34,10 +34,11 @@ def read_bytes(path: str | Path, longest: int) -> bytes:
     OSError
         It cannot be read, is not a regular file, or has more than ``longest`` bytes.
     """
-    if require_regular(path).st_size > longest:
+    size = require_regular(path).st_size
+    if size > longest:
         raise OSError(errno.EFBIG, f"expected at most {longest} bytes; it is larger", str(path))
     with open(path, "rb") as file:
-        return file.read(longest + 1)
+        return file.read(size + 1)[:size]  # what is appended meanwhile is not read; a large bound would be allocated
 
 
 def parse_json(text: str | bytes) -> Any:
