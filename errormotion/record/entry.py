@@ -12,7 +12,7 @@ from typing import Any
 
 from errormotion.datasets.files import events
 from errormotion.datasets.files.events import Event
-from errormotion.datasets.files.reading import require_regular
+from errormotion.datasets.files.reading import read_bytes
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 
@@ -93,13 +93,9 @@ def read_entry(folder: Path) -> Entry:
     """
     file = folder / "run.json"
     try:
-        require_regular(file)
-        with file.open("rb") as stream:
-            raw = stream.read(LARGEST_FILE + 1)
+        raw = read_bytes(file, LARGEST_FILE)
     except OSError as error:
         raise RunError(f"{file}: cannot be read: {error.strerror}") from error
-    if len(raw) > LARGEST_FILE:
-        raise RunError(f"{file}: expected at most {LARGEST_FILE >> 20} MiB; it is larger")
     try:
         data = json.loads(raw)
     except (ValueError, RecursionError) as error:
