@@ -6,6 +6,8 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -27,7 +29,7 @@ from errormotion.plugins import (
     load_object,
 )
 from errormotion.testing import fuzz_checks, wire_checks
-from errormotion.testing.kit import Checks, require
+from errormotion.testing.kit import CheckFailedError, Checks, require
 from errormotion.testing.sessions import Session, first_blocks, leaves, numbers, open_things, require_same, run_session
 
 INSTRUMENT_CHECKS: Checks[InstrumentSubject] = Checks()
@@ -57,6 +59,10 @@ def _no_dropping(subject: InstrumentSubject) -> str:
     if subject.drop_fault not in subject.menu:
         return f"the simulator has no fault '{subject.drop_fault}'"
     return _no_stream(subject)
+
+
+ATTEMPTS = 3
+"""Pairs of sessions that are compared: how far a simulated device measures ahead differs on a busy computer."""
 
 
 @INSTRUMENT_CHECKS.add()
@@ -244,33 +250,49 @@ def monotonic_time(subject: InstrumentSubject) -> str:
     return f"{sum(block.values.shape[1] for block in blocks)} samples without a gap"
 
 
+def _repeated(compare: Callable[[], str]) -> str:
+    """Return the result of a comparison of two sessions; fail where it fails each time."""
+    for _ in range(ATTEMPTS - 1):
+        with suppress(CheckFailedError):
+            return compare()
+    return compare()
+
+
 @INSTRUMENT_CHECKS.add(why_not=_no_splitting)
 def split_reads(subject: InstrumentSubject) -> str:
     """Frames that arrive in pieces give the same values as whole ones."""
-    whole, pieces = (run_session(subject, fault=fault) for fault in ("", subject.split_fault))
-    require(whole.error is None, f"without a fault: {whole.error!r}")
-    require(pieces.error is None, f"split frames raised {pieces.error!r}")
-    one, other = (session.stream if subject.streams else session.read for session in (whole, pieces))
-    require_same(one, other, "split frames changed the values")
-    return f"{one.size} values alike"
+
+    def compare() -> str:
+        whole, pieces = (run_session(subject, fault=fault) for fault in ("", subject.split_fault))
+        require(whole.error is None, f"without a fault: {whole.error!r}")
+        require(pieces.error is None, f"split frames raised {pieces.error!r}")
+        one, other = (session.stream if subject.streams else session.read for session in (whole, pieces))
+        require_same(one, other, "split frames changed the values")
+        return f"{one.size} values alike"
+
+    return _repeated(compare)
 
 
 @INSTRUMENT_CHECKS.add(why_not=_no_dropping)
 def counted_drops(subject: InstrumentSubject) -> str:
     """Samples that the device left out are NaN at their positions, and counted; the others keep their positions."""
     later = f"{subject.drop_fault}&fault_at=10"  # a sample lost before the first one cannot be counted
-    whole, holes = (run_session(subject, fault=fault) for fault in ("", later))
-    if isinstance(holes.error, InstrumentError):
-        return f"the driver stops: {type(holes.error).__name__}"
-    require(holes.error is None, f"{holes.error!r}")
-    missing = int(np.isnan(holes.stream).sum())
-    require(holes.dropped > 0, f"no drop was counted; {missing} values are NaN")
-    require(missing >= holes.dropped, f"{holes.dropped} drops counted, but only {missing} values are NaN")
-    n = min(whole.stream.shape[1], holes.stream.shape[1])
-    seen = np.isfinite(holes.stream[:, :n]) & np.isfinite(whole.stream[:, :n])
-    same = whole.stream[:, :n][seen] == holes.stream[:, :n][seen]
-    require(bool(same.all()), f"{(~same).sum()} of {same.size} values are not where the device counter puts them")
-    return f"{holes.dropped} of {holes.stream.size} values lost and counted"
+
+    def compare() -> str:
+        whole, holes = (run_session(subject, fault=fault) for fault in ("", later))
+        if isinstance(holes.error, InstrumentError):
+            return f"the driver stops: {type(holes.error).__name__}"
+        require(holes.error is None, f"{holes.error!r}")
+        missing = int(np.isnan(holes.stream).sum())
+        require(holes.dropped > 0, f"no drop was counted; {missing} values are NaN")
+        require(missing >= holes.dropped, f"{holes.dropped} drops counted, but only {missing} values are NaN")
+        n = min(whole.stream.shape[1], holes.stream.shape[1])
+        seen = np.isfinite(holes.stream[:, :n]) & np.isfinite(whole.stream[:, :n])
+        same = whole.stream[:, :n][seen] == holes.stream[:, :n][seen]
+        require(bool(same.all()), f"{(~same).sum()} of {same.size} values are not where the device counter puts them")
+        return f"{holes.dropped} of {holes.stream.size} values lost and counted"
+
+    return _repeated(compare)
 
 
 @INSTRUMENT_CHECKS.add(limit=90.0, why_not=_no_faults)

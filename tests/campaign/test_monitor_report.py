@@ -179,6 +179,7 @@ def test_run_folder_of_a_monitor_gets_its_page(tmp_path):
     folder.mkdir()
     save(log(), folder / "raw.zarr")
     run = {
+        "schema": "errormotion.run/1",
         "id": "ab12",
         "test": "monitor",
         "instruments": [

@@ -18,7 +18,8 @@ def test_every_gap_is_marked_and_nothing_comes_twice(tmp_path: Path) -> None:
     assert sum(day.faults.values()) >= MINUTES - 2  # a suspension may take the rest
     assert folder.finished
     assert len(day.resources) > 3
-    assert len({each.descriptors for each in day.resources}) == 1
+    descriptors = [each.descriptors for each in day.resources]
+    assert max(descriptors) - min(descriptors) <= 1  # a connection is being made anew while they are counted
     with datasets.load(folder.raw) as log:
         assert log.time[-1] >= MINUTES * FAULT_INTERVAL - INTERVAL
         assert np.diff(log.time).max() < 100 * INTERVAL

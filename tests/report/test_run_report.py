@@ -14,7 +14,13 @@ def run_folder(tmp_path, make_drift):
     folder = tmp_path / "20260302T081500Z-drift-ab12"
     (folder / "errors" / "spindle_drift-0123").mkdir(parents=True)
     save(make_drift(300), folder / "errors" / "spindle_drift-0123" / "errors.nc")
-    run = {"id": "ab12", "test": "drift", "created": "2026-03-02T08:14:00+00:00", "bench": {"name": "Lab 2"}}
+    run = {
+        "schema": "errormotion.run/1",
+        "id": "ab12",
+        "test": "drift",
+        "created": "2026-03-02T08:14:00+00:00",
+        "bench": {"name": "Lab 2"},
+    }
     (folder / "run.json").write_text(json.dumps(run))
     return folder
 
@@ -47,5 +53,5 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 
 def test_a_broken_run_file_is_named(run_folder):
     (run_folder / "run.json").write_text("{")
-    with pytest.raises(RunError, match=r"run\.json is no JSON"):
+    with pytest.raises(RunError, match=r"run\.json: is not valid JSON"):
         write_run_report(run_folder)

@@ -52,7 +52,7 @@ def test_an_offset_never_leaves_its_limits(course: list[tuple[float, Conditions,
     follower, now = armed(applied=np.full(3, applied)), 0.0
     before = follower.offset.copy()
     for wait, what, order in course:
-        now += wait
+        earlier, now = now, now + wait
         if order == "stop":
             follower.stop()
         if order == "arm" and follower.state in (State.OFF, State.FAULT):
@@ -61,7 +61,7 @@ def test_an_offset_never_leaves_its_limits(course: list[tuple[float, Conditions,
         step = follower.step(now, what)
         assert np.isfinite(step.offset).all()
         assert (np.abs(step.offset) <= LIMITS.limit * (1 + 1e-12)).all()
-        allowed = LIMITS.slew * min(max(wait, 0.0), 2 * LIMITS.period)
+        allowed = LIMITS.slew * min(max(now - earlier, 0.0), 2 * LIMITS.period)  # as rounded
         assert (np.abs(step.offset - before) <= allowed * (1 + 1e-9)).all()
         if what.busy or what.fault or state in (State.OFF, State.FAULT):
             assert (step.offset == before).all()
