@@ -114,6 +114,7 @@ class Line:
     def __init__(self, name: str, clock: Clock, device: Module | str, seed: int) -> None:
         self.name, self._clock, self.device = name, clock, device
         self.fault, self.until = "", 0.0
+        self._next: tuple[str, float] | None = None  # from another thread
         self._random = random.Random(f"{seed} {name}")
         self._held = b""
         self._client: socket.socket | None = None
@@ -123,11 +124,12 @@ class Line:
 
     def disturb(self, fault: str, seconds: float) -> None:
         """Start a fault; ``disconnect`` happens once."""
-        self.until = self._clock.now() + seconds
-        self.fault = fault
+        self._next = fault, self._clock.now() + seconds
 
     def serve(self, selector: selectors.BaseSelector) -> None:
         """Start or end faults."""
+        if self._next is not None:
+            (self.fault, self.until), self._next = self._next, None
         over = self._clock.now() >= self.until
         if self.fault == "disconnect" or (self.fault == "refuse" and not over):
             self._hang_up(selector)

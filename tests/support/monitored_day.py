@@ -127,9 +127,9 @@ class _Choice:
         """Return the time of the wall clock, s."""
         return self._time() + self.wall
 
-    def __call__(self, now: float) -> None:
-        """Start one after the row of a time of the log, s."""
-        chance = self._random
+    def __call__(self, start: float) -> None:
+        """Start one, for a log whose time 0 is a time of the clock, s."""
+        chance, now = self._random, self._clock.now() - start
         line = chance.choice(self._lines)
         kinds = ON_A_MODULE if isinstance(line.device, Module) else ON_A_LINE
         kind = chance.choice([*kinds, *OF_THE_COMPUTER])
@@ -172,7 +172,7 @@ def watch(runs: Path, hours: float, speed: float, seed: int = 1) -> tuple[RunFol
                     day.resources.append(resources(last.time))
                     sample = (last.time // often + 1) * often
                 if last.time >= due:
-                    choice(last.time)
+                    choice(start)
                     due = last.time + FAULT_INTERVAL
         day.duration, day.seconds = last.time, time.monotonic() - began
         day.disturbances = choice.made
