@@ -383,8 +383,16 @@ def test_one_client_controls_and_the_others_read_and_stop(play: Callable[[Test],
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         other = Wire(bridge, client="two")
         assert wire.welcome["result"]["control"] is True
-        assert other.welcome["result"] == {"protocol": 2, "control": False, "controlled_by": "one"}
-        for op in sorted(bridge._work.keys() - {"identify", "state", "elapse", "finish", "stop", "estop"}):
+        expected = {
+            "protocol": 2,
+            "control": False,
+            "controlled_by": "one",
+            "compensate": False,
+            "compensated_by": None,
+        }
+        assert other.welcome["result"] == expected
+        reads = {"identify", "state", "elapse", "finish", "stop", "estop", "offset", "set_offset"}
+        for op in sorted(bridge._work.keys() - reads):
             assert "only reads" in await other.ask(op)
         assert not fake.lines
         assert (await other.ask("state"))["enabled"]
