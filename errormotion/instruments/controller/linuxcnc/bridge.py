@@ -1237,6 +1237,14 @@ async def run(make: Callable[[], Bridge], line: socket.socket, announce: Path | 
     server.close()
 
 
+def _component(hal: Any) -> Any:
+    """Return a component of HAL; the name of a bridge that was killed stays taken until LinuxCNC ends."""
+    try:
+        return hal.component("errormotion-bridge")
+    except Exception:  # noqa: BLE001 - of LinuxCNC's module
+        return hal.component(f"errormotion-bridge-{os.getpid()}")
+
+
 def main(words: list[str]) -> int:
     """Run beside LinuxCNC."""
     parser = argparse.ArgumentParser(prog="bridge.py", description="JSON lines between LinuxCNC and errormotion")
@@ -1265,7 +1273,7 @@ def main(words: list[str]) -> int:
     import hal
     import linuxcnc
 
-    component = hal.component("errormotion-bridge")  # so that LinuxCNC ends this process with the others
+    component = _component(hal)  # so that LinuxCNC ends this process with the others
     component.ready()
     try:
         with tempfile.TemporaryDirectory(prefix="errormotion-") as folder:

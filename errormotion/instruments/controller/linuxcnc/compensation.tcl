@@ -11,7 +11,7 @@
 # request (set by the bridge) -> source: zero unless alive and ready -> limit: bounded, no faster than SLEW -> offset
 #
 # external: the offset is an external offset of LinuxCNC (axis.L.eoffset). Each axis needs
-#           [AXIS_L] OFFSET_AV_RATIO of about SLEW / MAX_VELOCITY, at most twice that.
+#           [AXIS_L] OFFSET_AV_RATIO = SLEW / MAX_VELOCITY, rounded down: its planner keeps the slew limit, too.
 # feedback: the offset is added to joint.N.motor-pos-cmd and subtracted from joint.N.motor-pos-fb. The signals of these
 #           pins are cut open here; only for machines whose joints are their axes (trivkins).
 
@@ -133,14 +133,15 @@ proc errormotion_external {} {
     foreach each [errormotion_names {scale counts}] { addf $each servo-thread }
 }
 
-# Without this, LinuxCNC's planner would be faster than SLEW where it restores an offset after an end of travel.
+# Without this, LinuxCNC's planner would be faster than SLEW where it restores an offset after an end of travel; a
+# slower one would not follow.
 proc errormotion_planner {axis} {
     upvar #0 AXIS_$axis section
-    set fastest [expr {2.0 * [errormotion_setting SLEW] / $section(MAX_VELOCITY)}]
+    set fastest [expr {1.0 * [errormotion_setting SLEW] / $section(MAX_VELOCITY)}]
     set found [expr {[info exists section(OFFSET_AV_RATIO)] ? $section(OFFSET_AV_RATIO) : "none"}]
-    if {![string is double -strict $found] || $found < 0.999 * $fastest / 2 || $found > 1.001 * $fastest} {
-        return -code error [format "compensation.tcl: expected \[AXIS_%s\] OFFSET_AV_RATIO from %.3g to %.3g; found %s" \
-            $axis [expr {$fastest / 2}] $fastest $found]
+    if {![string is double -strict $found] || $found < 0.99 * $fastest || $found > 1.000001 * $fastest} {
+        return -code error "compensation.tcl: expected \[AXIS_$axis\] OFFSET_AV_RATIO = $fastest (SLEW / MAX_VELOCITY,\
+            rounded down by 1 % at most); found $found"
     }
 }
 

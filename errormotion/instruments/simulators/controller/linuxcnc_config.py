@@ -15,7 +15,6 @@ ACCELERATION = 3000.0  # mm/s^2
 SLACK = 1e-3  # mm, so that the ends of travel can be reached
 FAR = 1e9  # mm
 
-WATCHDOG = 2.0  # s
 HOLD = "motion.digital-out-00"
 
 _COMPENSATION = """TWOPASS = ON
@@ -35,7 +34,7 @@ MIN_LIMIT = {low:.6f}
 MAX_LIMIT = {high:.6f}
 MAX_VELOCITY = {speed:.6f}
 MAX_ACCELERATION = {acceleration:g}
-OFFSET_AV_RATIO = {ratio:.6g}
+OFFSET_AV_RATIO = {ratio:.9g}
 
 [JOINT_{joint}]
 TYPE = LINEAR
@@ -104,11 +103,20 @@ MAX_REVERSE_VELOCITY = {top_speed:g}
 
 @dataclass(frozen=True)
 class Compensated:
-    """Compensation of a simulated LinuxCNC: route (``external``, ``feedback``), largest offset, m, and slew, m/s."""
+    """Compensation of a simulated LinuxCNC.
+
+    Attributes
+    ----------
+    route : str
+        ``external`` or ``feedback``.
+    limit, slew, watchdog : float
+        Largest offset, m, its fastest change, m/s, and the time without a sign of life until it goes to zero, s.
+    """
 
     route: str = "external"
     limit: float = 50e-6
     slew: float = 1e-6
+    watchdog: float = 2.0
 
 
 def ini_text(
@@ -143,7 +151,7 @@ def ini_text(
             route=compensated.route,
             limit=unit * compensated.limit,
             slew=unit * compensated.slew,
-            watchdog=WATCHDOG,
+            watchdog=compensated.watchdog,
             hold=HOLD,
         ),
     )
@@ -156,7 +164,7 @@ def ini_text(
             speed=unit * rapid,
             acceleration=scale * ACCELERATION,
             ferror=5 * scale,
-            ratio=0.0 if compensated is None else 1.5 * compensated.slew / rapid,
+            ratio=0.0 if compensated is None else compensated.slew / rapid,
         )
     return text
 
