@@ -27,6 +27,7 @@ DISPLAY = Path(__file__).with_name("linuxcnc_display.py")
 TRAVEL = 0.1  # m, in both directions
 RAPID = 0.1  # m/s
 MICROMETRE = 1e-3  # mm, the unit of the INI file
+SETTLED = 1e-7  # mm; LinuxCNC's planner comes closer than that in some cycles
 DRIVERS = {"external": LinuxCNCOffset, "feedback": LinuxCNCFeedback}
 WATCH = """
 loadrt ddt names=watch-slew,watch-speed
@@ -130,7 +131,9 @@ class Machine:
         self.control.enable()
         if not self.control.state()["homed"]:
             self.control.home()
-        until(lambda: self.offset() == 0)
+        until(lambda: self.offset() == 0 and abs(self.pins("axis.x.eoffset")[0]) < SETTLED)
+        self.control.move_to([0.001, 0.0, 0.0])  # LinuxCNC's interpreter may not know how far an offset was left behind
+        self.control.move_to([0.0, 0.0, 0.0])
 
 
 def until(condition: Callable[[], bool], limit: float = 20.0) -> None:

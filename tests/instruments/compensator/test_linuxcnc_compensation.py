@@ -19,6 +19,8 @@ from errormotion.instruments.simulators.controller.linuxcnc_config import Compen
 if reason := linuxcnc_process.why_not():
     pytest.skip(reason, allow_module_level=True)
 
+pytestmark = pytest.mark.slow
+
 LIMIT, SLEW, WATCHDOG = 20.0, 20.0, 0.5  # um, um/s, s
 EXACT = 1e-6
 """Relative, of numbers that HAL prints with seven digits."""
@@ -72,12 +74,12 @@ def follow(compensator: LinuxCNCOffset, x: float, seconds: float = 5.0) -> float
 
 def test_it_goes_to_the_limit_at_the_slew_limit_and_no_further(machine: Machine, compensator: LinuxCNCOffset) -> None:
     assert follow(compensator, LIMIT) == pytest.approx(LIMIT, abs=0.1)
-    with pytest.raises(InstrumentError, match=r"at most 20 um; found X 20\.1 um"):
+    with pytest.raises(InstrumentError, match=r"at most 20 um; found X 20\.1"):
         compensator.write([20.1e-6, 0.0, 0.0])
     record = machine.record()
     assert record.highest <= LIMIT * (1 + EXACT)
     assert 0.9 * SLEW < record.fastest <= SLEW * (1 + EXACT)
-    assert record.drive_moved == pytest.approx(record.highest, rel=EXACT)
+    assert record.drive_moved == pytest.approx(record.highest, abs=0.1)
     assert record.drive_fastest <= SLEW * (1 + EXACT)
 
 
@@ -86,7 +88,7 @@ def test_the_servo_thread_bounds_what_did_not_pass_the_bridge(machine: Machine) 
     end, sign = time.monotonic() + 1.5 * LIMIT / SLEW, 0
     while time.monotonic() < end:
         sign = 1 - sign
-        machine.hal(f"setp errormotion-alive.in {sign}")
+        machine.hal(f"setp errormotion-sign.in0 {sign}")
         time.sleep(0.05)
     machine.hal("setp errormotion-source-x.in1 0")
     record = machine.record()
@@ -101,7 +103,7 @@ def test_a_jump_is_refused(compensator: LinuxCNCOffset) -> None:
 
 def test_without_a_write_nothing_is_asked_for(machine: Machine, compensator: LinuxCNCOffset) -> None:
     for _ in range(5):
-        assert compensator.read().offset == (0.0, 0.0, 0.0)
+        assert compensator.read().offset == pytest.approx((0.0, 0.0, 0.0), abs=1e-10)
     assert machine.pins("errormotion-alive.time-left", "errormotion-alive.out") == [0.0, 0.0]
     with machine.compensator() as other:  # nobody has the right
         other.write([0.0, 0.0, 0.0])
@@ -159,7 +161,7 @@ def test_a_killed_bridge_is_followed_by_zero(machine: Machine, compensator: Linu
     record = machine.record()
     assert record.drive_fastest <= SLEW * (1 + EXACT)
     compensator.open()
-    assert compensator.read().offset == pytest.approx((0.0, 0.0, 0.0), abs=1e-10)
+    assert compensator.read().offset == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
     follow(compensator, 3.0)
     assert machine.offset() == pytest.approx(3.0, abs=0.1)
 
@@ -186,7 +188,6 @@ def test_after_an_emergency_stop_nothing_moves_and_the_offset_is_zero(
     assert machine.pins("J0_mux.out")[0] == pytest.approx(15e-3, abs=1e-4)  # mm: the motor
     assert machine.control.state()["position"][0] == pytest.approx(15e-6, abs=1e-7)  # and LinuxCNC knows it
     assert machine.record().drive_moved < 1e-4
-    machine.control.move_to([0.0, 0.0, 0.0])
 
 
 def test_the_machine_is_switched_on_again_during_the_ramp(machine: Machine, compensator: LinuxCNCOffset) -> None:
@@ -198,9 +199,9 @@ def test_the_machine_is_switched_on_again_during_the_ramp(machine: Machine, comp
     until(lambda: machine.offset() == 0)
     record = machine.record()
     assert record.drive_fastest <= SLEW * (1 + EXACT)
-    assert abs(compensator.read().offset[0]) < 1e-9
+    assert record.drive_moved < 15.0 * (1 + EXACT)
+    until(lambda: abs(compensator.read().offset[0]) < 1e-9)
     assert compensator.read().fault == ""
-    machine.control.move_to([0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -216,9 +217,10 @@ def test_nothing_changes_while_the_machine_must_not_be_disturbed(
     machine: Machine, compensator: LinuxCNCOffset, program: str, busy: str
 ) -> None:
     follow(compensator, 4.0)
-    end = "" if "G38" in program else "M2\n"
-    machine.control.run_program(f"G21 G90 G94\n{program}{end or 'M2' + chr(10)}")
+    machine.control.run_program(f"G21 G90 G94\n{program}M2\n")
+    end = time.monotonic() + 10
     while compensator.read().busy != busy:
+        assert time.monotonic() < end, (compensator.read(), machine.control.state())
         compensator.write([4e-6, 0.0, 0.0])
     time.sleep(0.05)  # LinuxCNC's planner comes to rest
     machine.watch()
@@ -252,4 +254,3 @@ def test_an_end_of_travel_does_not_add_up(machine: Machine, compensator: LinuxCN
     assert record.fastest <= SLEW * (1 + EXACT)
     assert record.lowest > -0.1
     assert compensator.read().fault == ""
-    machine.control.move_to([0.0, 0.0, 0.0])

@@ -70,7 +70,6 @@ MAX_FEED = 10.0  # m/s, where LinuxCNC states no limit
 MAX_SPINDLE = 1e6  # 1/min, where LinuxCNC states no limit
 AXES = "XYZ"
 MODAL_CODES = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order restores
-THREAD_CODES = (330, 331, 760)  # G33, G33.1, G76
 ORDER_MODES = "G21 G90 G94"  # mm, absolute, mm/min
 
 
@@ -336,7 +335,6 @@ class Offsets:
 
     def __init__(self, hal: Any) -> None:
         self.hal = hal
-        self._sign = self._thread = False
         self._signed = -math.inf  # time of the last sign of life
 
     @property
@@ -388,13 +386,16 @@ class Offsets:
         for each, x in zip("xyz", goal):  # noqa: B905
             self.hal.set_p(f"errormotion-source-{each}.in1", repr(x / unit))
         if time.monotonic() - self._signed > SIGN_INTERVAL:  # two changes in one servo cycle would be none
-            self._sign, self._signed = not self._sign, time.monotonic()
-            self.hal.set_p("errormotion-alive.in", str(int(self._sign)))
+            self._signed = time.monotonic()
+            self.hal.set_p("errormotion-sign.in0", str(int(not self._get("errormotion-sign.in0"))))
 
     def hold(self) -> None:
         """Hold the offset for the next half second: a thread is being cut."""
-        self._thread = not self._thread
-        self.hal.set_p("errormotion-thread.in", str(int(self._thread)))
+        self.hal.set_p("errormotion-thread.in", str(int(not self._get("errormotion-thread.in"))))
+
+    def spindle_leads(self) -> bool:
+        """Whether the axes follow the spindle, or wait for its index: G33, G33.1, G76, G95."""
+        return bool(self._get("motion.debug-float-1") or self._get("spindle.0.index-enable"))
 
     def _get(self, pin: str) -> float:
         return float(self.hal.get_value(pin))
@@ -960,11 +961,10 @@ class Bridge:
         self.offsets.set(offset, self._unit)
 
     async def watch_threads(self) -> None:
-        """Hold the offset while a thread is cut (G33, G33.1, G76)."""
+        """Hold the offset while a thread is cut."""
         while self.offsets.route:
             with contextlib.suppress(Exception):  # LinuxCNC has ended, or is still starting
-                self.stat.poll()
-                if self.stat.gcodes[1] in THREAD_CODES and not self._idle():
+                if self.offsets.spindle_leads():
                     self.offsets.hold()
             await asyncio.sleep(THREAD_INTERVAL)
 

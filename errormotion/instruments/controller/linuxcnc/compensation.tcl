@@ -55,12 +55,13 @@ proc errormotion_cut {pin other} {
 proc errormotion_components {route} {
     loadrt oneshot names=errormotion-alive,errormotion-thread
     loadrt select8 names=errormotion-motion
-    loadrt and2 names=errormotion-on,errormotion-ready,errormotion-held
-    loadrt or2 names=errormotion-hold-1,errormotion-hold-2,errormotion-hold-3
+    loadrt flipflop names=errormotion-asked
+    loadrt not names=errormotion-off
+    loadrt and2 names=errormotion-on,errormotion-fresh,errormotion-ready,errormotion-held
+    loadrt or2 names=errormotion-sign,errormotion-hold-1,errormotion-hold-2,errormotion-hold-3
     loadrt mux2 names=[join [concat errormotion-slew [errormotion_names source]] ,]
     loadrt limit2 names=[join [errormotion_names limit] ,]
     if {$route == "external"} {
-        loadrt not names=errormotion-off
         loadrt scale names=[join [errormotion_names scale] ,]
         loadrt conv_float_s32 names=[join [errormotion_names counts] ,]
     } else {
@@ -79,11 +80,20 @@ proc errormotion_guard {} {
     }
     setp errormotion-alive.width [errormotion_setting WATCHDOG]
     setp errormotion-thread.width 0.5
-    net errormotion-is-alive errormotion-alive.out => errormotion-ready.in0
+    net errormotion-sign errormotion-sign.out => errormotion-alive.in
+    net errormotion-is-alive errormotion-alive.out => errormotion-fresh.in0
     errormotion_join_pin motion.motion-enabled errormotion-on.in0
     errormotion_join_pin motion.is-all-homed errormotion-on.in1
     net errormotion-is-on errormotion-on.out => errormotion-ready.in1
     net errormotion-is-on => errormotion-held.in1
+    net errormotion-is-on => errormotion-off.in
+
+    # What was asked for before the machine was switched off does not come back when it is switched on.
+    setp errormotion-asked.data 1
+    net errormotion-sign => errormotion-asked.clk
+    net errormotion-is-off errormotion-off.out => errormotion-asked.reset
+    net errormotion-is-asked errormotion-asked.out => errormotion-fresh.in1
+    net errormotion-is-fresh errormotion-fresh.out => errormotion-ready.in0
 
     # Hold while the machine probes (motion type 5), while a thread is cut (and 0.5 s after the last change of
     # errormotion-thread.in, by the bridge), while the program says so, and where LinuxCNC cuts off external offsets at an
@@ -109,15 +119,13 @@ proc errormotion_guard {} {
         net errormotion-source-$letter errormotion-source-$letter.out => errormotion-limit-$letter.in
         net errormotion-offset-$letter errormotion-limit-$letter.out
     }
-    foreach each {alive motion thread hold-1 hold-2 hold-3 on held slew ready} { addf errormotion-$each servo-thread }
+    foreach each {sign alive motion thread hold-1 hold-2 hold-3 on off asked fresh held slew ready} { addf errormotion-$each servo-thread }
     foreach each [errormotion_names {source limit}] { addf $each servo-thread }
 }
 
 # LinuxCNC sums up the changes of eoffset-counts, only while the machine is on and homed, and sets its offset to zero
 # when the machine goes off. The offset here goes to zero in that cycle, too: the motors are off, nothing moves.
 proc errormotion_external {} {
-    net errormotion-is-on => errormotion-off.in
-    net errormotion-is-off errormotion-off.out
     errormotion_join_pin motion.eoffset-limited errormotion-hold-3.in1
     foreach letter {x y z} {
         errormotion_planner [string toupper $letter]
@@ -129,7 +137,6 @@ proc errormotion_external {} {
         net errormotion-scaled-$letter errormotion-scale-$letter.out => errormotion-counts-$letter.in
         net errormotion-counts-$letter errormotion-counts-$letter.out => axis.$letter.eoffset-counts
     }
-    addf errormotion-off servo-thread
     foreach each [errormotion_names {scale counts}] { addf $each servo-thread }
 }
 

@@ -63,7 +63,9 @@ class Control:
     def _started(self, address: Address) -> LinuxCNCProcess:
         machine, linger = self.world.machine, address.number("linger", LINGER)
         own = "--socket {folder}/bridge.sock --token {folder}/token --announce {folder}/bridge.json"
-        arguments = f"--compensate --idle {max(linger, LEAST_IDLE):g} --pins {PINS} {own}"  # LinuxCNC reads 255 characters
+        arguments = (
+            f"--compensate --idle {max(linger, LEAST_IDLE):g} --pins {PINS} {own}"  # LinuxCNC reads 255 characters
+        )
         ini = ini_text(
             self.world.name,
             machine.travel,
