@@ -14,11 +14,12 @@ from pydantic import Field
 
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.compensator.door import OffsetDoor
 from errormotion.instruments.controller.linuxcnc import codec
 from errormotion.instruments.controller.linuxcnc.driver import NAME, read_token
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport
-from errormotion.plugins import Applied, Identity, InstrumentInfo, PluginSettings
+from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo, PluginSettings
 
 SIMULATOR = "errormotion.instruments.simulators.controller.linuxcnc:SimulatedLinuxCNC"
 
@@ -36,8 +37,8 @@ class LinuxCNCCompensatorSettings(PluginSettings):
 class LinuxCNCOffset(Driver):
     """Offsets as external offsets of LinuxCNC (``axis.L.eoffset``).
 
-    Opening and reading change nothing. The first `write` asks the bridge for the right to set offsets, which one
-    program at a time has.
+    Opening and reading change nothing. `arm` asks the bridge for the right to set offsets, which one program at a time
+    has; after a lost connection the next `write` does.
 
     Parameters
     ----------
@@ -58,8 +59,21 @@ class LinuxCNCOffset(Driver):
 
     def __init__(self, address: str, settings: Any = None) -> None:
         super().__init__(address, settings)
+        self._door = OffsetDoor(f"{self.info.id} at {address}")
         self._number = 0
         self._may_write = False
+
+    @classmethod
+    def conformance(cls) -> CompensatorSubject:
+        """Return what the conformance kit examines: the machine that runs here, without writing to it."""
+        return CompensatorSubject(
+            cls, address="unix://~/.errormotion/linuxcnc.sock", dead_address="unix:///nonexistent/linuxcnc.sock"
+        )
+
+    def close(self) -> None:
+        """Disconnect and disarm; the offset ramps to zero by the watchdog in the servo thread. Idempotent."""
+        self._door.disarm()
+        super().close()
 
     def identify(self) -> Identity:
         """Return the machine."""
@@ -76,6 +90,27 @@ class LinuxCNCOffset(Driver):
         except (KeyError, TypeError):
             raise ProtocolError(f"Expected the identity of a LinuxCNC; found {str(facts)[:200]}") from None
 
+    def arm(self, limit: float) -> None:
+        """Let offsets be written up to a limit of each axis, m; ask the bridge for the right to set them.
+
+        Raises
+        ------
+        InstrumentError
+            Another program has the right, the bridge gives none, or its limit is below this one.
+        """
+        self._door.arm(limit)
+        try:
+            found = self._state()
+            if found.limit < limit * (1 - 1e-6):
+                raise InstrumentError(
+                    f"{self.address}: expected [ERRORMOTION] LIMIT of at least {1e6 * limit:g} um in LinuxCNC's INI "
+                    f"file; found {1e6 * found.limit:g} um"
+                )
+            self._claim(self.transport)
+        except BaseException:
+            self._door.disarm()
+            raise
+
     def read(self) -> Applied:
         """Return the offset in effect; busy: it is held in the servo thread; fault: LinuxCNC takes none.
 
@@ -84,12 +119,7 @@ class LinuxCNCOffset(Driver):
         InstrumentError
             No answer; the connection is closed, and `open` opens another.
         """
-        found = codec.decode_offset(self._ask("offset"))
-        if found.route != self.route:
-            raise InstrumentError(
-                f"{self.address}: expected ROUTE = {self.route} in LinuxCNC's INI file for {self.info.id}; found "
-                f"{found.route}"
-            )
+        found = self._state()
         fault = found.fault
         if not fault and found.by and not self._may_write:
             fault = f"another program compensates the machine: {found.by}"
@@ -101,18 +131,28 @@ class LinuxCNCOffset(Driver):
         Raises
         ------
         InstrumentError
-            No answer, or the bridge refuses it: another program compensates, the machine is off, the offset is
-            beyond the limit or jumps.
+            Not armed, beyond the limit, not three finite numbers; no answer; or the bridge refuses it: another
+            program compensates, the machine is off, the offset jumps.
         """
+        values, line = self._door.offset(offset), self.transport
         if not self._may_write:
-            self._claim(self.transport)
-        self._ask("set_offset", offset=[float(x) for x in offset])
+            self._claim(line)
+        self._ask("set_offset", offset=list(values))
 
     # ------------------------------------------------------------------ connection
 
     def _start_session(self) -> None:
         self._number, self._may_write = 0, False
         self._hello(self.transport, compensate=False)
+
+    def _state(self) -> codec.Offset:
+        found = codec.decode_offset(self._ask("offset"))
+        if found.route != self.route:
+            raise InstrumentError(
+                f"{self.address}: expected ROUTE = {self.route} in LinuxCNC's INI file for {self.info.id}; found "
+                f"{found.route}"
+            )
+        return found
 
     def _claim(self, line: Transport) -> None:
         given, other = codec.decode_right(self._hello(line, compensate=True))

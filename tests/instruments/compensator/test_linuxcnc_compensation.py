@@ -15,6 +15,9 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator.linuxcnc import LinuxCNCFeedback, LinuxCNCOffset
 from errormotion.instruments.simulators.controller import linuxcnc_process
 from errormotion.instruments.simulators.controller.linuxcnc_config import Compensated
+from errormotion.plugins import CompensatorSubject
+from errormotion.testing.kit import run_check
+from errormotion.testing.run import checks_for
 
 if reason := linuxcnc_process.why_not():
     pytest.skip(reason, allow_module_level=True)
@@ -32,6 +35,7 @@ from errormotion.instruments.compensator import linuxcnc as module
 kind, address, token = sys.argv[1:]
 compensator = getattr(module, kind)(address, module.LinuxCNCCompensatorSettings(token_file=Path(token)))
 compensator.open()
+compensator.arm(20e-6)
 x = 0.0
 while True:
     x = min(x + 1e-6, 16e-6)
@@ -58,6 +62,7 @@ def machine(started: Machine) -> Iterator[Machine]:
 @pytest.fixture
 def compensator(machine: Machine) -> Iterator[LinuxCNCOffset]:
     with machine.compensator() as driver:
+        driver.arm(LIMIT * 1e-6)
         yield driver
 
 
@@ -74,7 +79,7 @@ def follow(compensator: LinuxCNCOffset, x: float, seconds: float = 5.0) -> float
 
 def test_it_goes_to_the_limit_at_the_slew_limit_and_no_further(machine: Machine, compensator: LinuxCNCOffset) -> None:
     assert follow(compensator, LIMIT) == pytest.approx(LIMIT, abs=0.1)
-    with pytest.raises(InstrumentError, match=r"at most 20 um; found X 20\.1"):
+    with pytest.raises(InstrumentError, match="beyond the limit of 20 um"):
         compensator.write([20.1e-6, 0.0, 0.0])
     record = machine.record()
     assert record.highest <= LIMIT * (1 + EXACT)
@@ -101,12 +106,34 @@ def test_a_jump_is_refused(compensator: LinuxCNCOffset) -> None:
         compensator.write([15e-6, 0.0, 0.0])
 
 
-def test_without_a_write_nothing_is_asked_for(machine: Machine, compensator: LinuxCNCOffset) -> None:
-    for _ in range(5):
-        assert compensator.read().offset == pytest.approx((0.0, 0.0, 0.0), abs=1e-10)
+def test_unarmed_and_without_a_write_nothing_is_asked_for(machine: Machine) -> None:
+    until(lambda: machine.pins("errormotion-alive.out") == [0.0])
+    with machine.compensator() as unarmed, machine.compensator() as other:
+        with pytest.raises(InstrumentError, match="is not armed; it reads only"):
+            unarmed.write([1e-6, 0.0, 0.0])
+        other.arm(LIMIT * 1e-6)  # the right is free
+        for _ in range(5):
+            assert other.read().offset == pytest.approx((0.0, 0.0, 0.0), abs=1e-10)
     assert machine.pins("errormotion-alive.time-left", "errormotion-alive.out") == [0.0, 0.0]
-    with machine.compensator() as other:  # nobody has the right
-        other.write([0.0, 0.0, 0.0])
+
+
+def test_a_limit_beyond_that_of_the_machine_is_refused(machine: Machine) -> None:
+    with machine.compensator() as driver:
+        with pytest.raises(InstrumentError, match="LIMIT of at least 50 um in LinuxCNC's INI file; found 20 um"):
+            driver.arm(50e-6)
+        with pytest.raises(InstrumentError, match="is not armed"):
+            driver.write([0.0, 0.0, 0.0])
+
+
+def test_the_kit_finds_nothing_wrong_without_writing(machine: Machine) -> None:
+    kind = type(machine.compensator())
+    dead = kind.conformance().dead_address
+    subject = CompensatorSubject(
+        kind, address=machine.address, settings={"token_file": machine.token}, dead_address=dead
+    )
+    for check in checks_for(subject):
+        result = run_check(check, subject)
+        assert result.ok, f"{check.claim}\n{result.message}\n{result.trace}"
 
 
 def test_a_second_compensator_is_refused(machine: Machine, compensator: LinuxCNCOffset) -> None:
@@ -114,10 +141,11 @@ def test_a_second_compensator_is_refused(machine: Machine, compensator: LinuxCNC
     with machine.compensator() as second:
         assert "another program compensates the machine: errormotion" in second.read().fault
         with pytest.raises(InstrumentError, match="another program has it"):
-            second.write([0.0, 0.0, 0.0])
+            second.arm(LIMIT * 1e-6)
         assert compensator.read().fault == ""
         compensator.close()
         until(lambda: not second.read().fault)
+        second.arm(LIMIT * 1e-6)
         second.write([0.0, 0.0, 0.0])
 
 
@@ -140,6 +168,7 @@ def test_a_killed_program_is_followed_by_zero_and_another_one_goes_on_from_there
         program.wait()
     until(lambda: machine.offset() < 10)  # by the watchdog
     with machine.compensator() as next_one:
+        next_one.arm(LIMIT * 1e-6)
         for _ in range(10):
             next_one.write(next_one.read().offset)
             time.sleep(0.05)
