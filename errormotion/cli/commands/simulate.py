@@ -83,8 +83,9 @@ def _address(plugin_id: str, bench: Path | None, machine: str | None, params: di
         if plan.description is not None:
             describe(plan.description)
             host = NAME
-        parts = [*plan.instruments, *([plan.compensator] if plan.compensator else [])]
-        own = [each.address for each in parts if each.driver.info.id == plugin_id]
+        own = [each.address for each in plan.instruments if each.driver.info.id == plugin_id]
+        if plan.compensator is not None and plan.compensator.driver.info.id == plugin_id:
+            own.append(plan.compensator.address)
         addresses = [each for each in own if each.startswith("sim://")]
         if addresses:
             first = parse_address(addresses[0])

@@ -151,9 +151,8 @@ class ModbusRefusal(InstrumentError):  # noqa: N818 - that is what it is
 
 def _pdu(framing: Framing, data: bytes, unit: int, function: int, number: int) -> bytes | None:
     """Return the function code and what follows; None for the late answer to an earlier request (TCP only)."""
-    if framing == "rtu":
-        found = _unframed_rtu(data)
-    elif (found := _unframed_tcp(data, number)) is None:
+    found = _unframed_rtu(data) if framing == "rtu" else _unframed_tcp(data, number)
+    if found is None:
         return None
     came, pdu = found
     if came != unit:
