@@ -257,11 +257,11 @@ async def _read(client: Client, nodes: Sequence[str]) -> list[dict[str, Any]]:
 
 async def _describe(client: Client, nodes: Sequence[str]) -> list[dict[str, Any]]:
     """Return type and status of the values of nodes, and whether this user can write them."""
-    from asyncua import ua
+    from asyncua.ua.attribute_ids import AttributeIds
 
     found = [_node(client, node) for node in nodes]
     values = await client.read_attributes(found)
-    levels = await client.read_attributes(found, ua.AttributeIds.UserAccessLevel)
+    levels = await client.read_attributes(found, AttributeIds.UserAccessLevel)
     return [
         {
             "type": value.Value.VariantType.name if value.Value is not None else "Null",

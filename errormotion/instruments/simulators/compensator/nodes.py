@@ -13,6 +13,7 @@ from asyncua import ua
 from asyncua.crypto.permission_rules import User, UserRole
 from asyncua.server.address_space import AddressSpace, AttributeService
 from asyncua.ua.attribute_ids import AttributeIds
+from asyncua.ua.status_codes import StatusCodes
 
 from errormotion.instruments.simulators.compensator.machine import MachinePart
 from errormotion.instruments.simulators.controller.opcua.listening import FaultyServer, Outgoing
@@ -149,7 +150,7 @@ class SimulatedNodes:
     def _live(self, space: Space, name: str, kind: ua.VariantType, read: Any) -> None:
         def value() -> ua.DataValue:
             if self.fault.kind == "unavailable" and self._outgoing.reached:
-                return ua.DataValue(StatusCode=ua.StatusCode(ua.StatusCodes.BadNoCommunication))
+                return ua.DataValue(StatusCode=ua.StatusCode(ua.UInt32(StatusCodes.BadNoCommunication)))
             return ua.DataValue(ua.Variant(read(), kind))
 
         title = ua.QualifiedName(name, ua.UInt16(INDEX))
@@ -192,7 +193,7 @@ class _Attributes(AttributeService):
         """Write attributes; return the status of each."""
         own = any(each.NodeId.NamespaceIndex == INDEX for each in params.NodesToWrite)  # others: the server itself
         if own and self._device.fault.kind == "refused":
-            return [ua.StatusCode(ua.StatusCodes.BadUserAccessDenied) for _ in params.NodesToWrite]
+            return [ua.StatusCode(ua.UInt32(StatusCodes.BadUserAccessDenied)) for _ in params.NodesToWrite]
         found = await super().write(params, user)
         if own:
             self._device.write(self._space)
