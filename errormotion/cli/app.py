@@ -250,7 +250,7 @@ def compensate_run(
 @app.command()
 @guarded
 def simulate(
-    plugin: Annotated[str, typer.Argument(help="The id of an instrument plugin.")],
+    plugin: Annotated[str, typer.Argument(help="The id of an instrument or a compensator.")],
     port: Annotated[
         int | None,
         typer.Option(min=0, max=65535, help="Port of the device, the next one for its next line; default: a free one."),
@@ -559,7 +559,9 @@ def plugins_check(
 @plugins_app.command("new")
 @guarded
 def plugins_new(
-    what: Annotated[Literal["instrument", "method"], typer.Argument(help="instrument or method.")],
+    what: Annotated[
+        Literal["instrument", "method", "compensator"], typer.Argument(help="instrument, method or compensator.")
+    ],
     name: Annotated[str, typer.Argument(help="Name of the plugin; its id is made from it.")],
     out: Annotated[Path | None, typer.Option(help="Folder to write; default: errormotion-NAME.")] = None,
     json_: Json = False,
