@@ -651,6 +651,46 @@ def model_check(
     command.check_model(model, errors, report, json_)
 
 
+@compensate_app.command("effect")
+@guarded
+def compensate_effect(
+    before: Annotated[Path, typer.Argument(help="Errors without the compensation: NetCDF, run folder, or runs.")],
+    after: Annotated[Path, typer.Argument(help="Errors of the same machine with it.")],
+    at: Annotated[str | None, typer.Option(help="Functional point 'x,y,z', mm; default: that of BEFORE.")] = None,
+    over: Annotated[
+        str | None, typer.Option(metavar="DIM", help="What the errors are compared over: time, position or target.")
+    ] = None,
+    select: Annotated[
+        list[str] | None, typer.Option(help="One element of another dimension, counted from 0: position=3.")
+    ] = None,
+    freedoms: Annotated[str | None, typer.Option(help="Which are compared: EX,EZ; default: all known ones.")] = None,
+    since: Annotated[float | None, typer.Option(help="Reference state, s after time 0 of both.")] = None,
+    tolerances: Annotated[
+        Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on both, and on the reduction.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
+    json_: Json = False,
+) -> None:
+    """Compare two results of one machine: what a compensation took off, and what is left."""
+    from errormotion.cli.commands import compensation_effect as command
+
+    point = None if at is None else _millimetres("--at", at)
+    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
+    code = command.run(
+        before,
+        after,
+        at=point,
+        over=over,
+        select=select or [],
+        freedoms=chosen,
+        since=since,
+        tolerances=tolerances,
+        report=report,
+        as_json=json_,
+    )
+    raise typer.Exit(code)
+
+
 @compensate_app.command("table")
 @guarded
 def compensate_table(
