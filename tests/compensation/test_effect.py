@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ START = "2026-03-02T07:00:00+00:00"
 LATER = "2026-03-05T06:30:00+00:00"
 
 
-def warm_up(size: float, expansion: str = "", **changes: object) -> xr.Dataset:
+def warm_up(size: float, expansion: str = "", **changes: Any) -> xr.Dataset:
     """Return errors of an exponential warm-up, EZ of this size in um, measured with 0.2 um and a common expansion."""
     shape = 1 - np.exp(-TIMES / 1800.0)
     twist = np.zeros((len(TIMES), 6))
@@ -35,7 +36,7 @@ def warm_up(size: float, expansion: str = "", **changes: object) -> xr.Dataset:
     own = np.broadcast_to(np.diag([0.2 * UM] * 3 + [1e-6] * 3) ** 2, (len(TIMES), 6, 6)).copy()
     influence = np.zeros((1, len(TIMES), 6))
     influence[0, :, 2] = 0.5 * UM * shape
-    attrs: dict[str, object] = {
+    attrs: dict[str, Any] = {
         "component": "tool",
         "machine": "Mill 5",
         "frame": "machine",
@@ -176,7 +177,7 @@ def test_the_command_prints_and_writes_the_effect(files: Path) -> None:
     assert shown.startswith("EZ: ")
     assert "90 % less" in shown
     assert "EB after 120.0 min" in shown
-    assert "Effect of the compensation" in Path("page.html").read_text()
+    assert "Errors before and after" in Path("page.html").read_text()
     assert "exists already" in run("before.nc", "after.nc", "--report", "page.html", code=1)
     plain = json.loads(run("before.nc", "after.nc", "--json"))
     part = next(each for each in plain["parts"] if each["name"] == "EZ")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.compare.ground import Ground, common_ground
@@ -25,6 +25,9 @@ from errormotion.tolerances.table import Tolerances
 
 DISPLACEMENT = "displacement"
 """The part of EX, EY and EZ together: the length of the vector."""
+
+ANY_START = "1970-01-01T00:00:00+00:00"
+"""Start of results that state none; the difference of the starts is not used."""
 
 
 def effect(
@@ -62,10 +65,9 @@ def effect(
     results = {"before": before, "after": after}
     if planned := [name for name, ds in results.items() if is_planned(ds)]:
         raise DatasetError(f"'{planned[0]}': a plan states no errors; expected a measurement")
-    aligned, same_start = _aligned(results)
-    ground = common_ground(aligned, at=at, freedoms=freedoms, since=since, same_start=same_start)
+    ground = common_ground(_aligned(results), at=at, freedoms=freedoms, since=since)
     names = [*ground.freedoms]
-    groups = [((k,), name) for k, name in enumerate(names)]
+    groups: list[tuple[tuple[int, ...], str]] = [((k,), name) for k, name in enumerate(names)]
     linear = tuple(k for k, name in enumerate(names) if name in DOF[:3])
     if len(linear) > 1:
         groups.append((linear, DISPLACEMENT))
@@ -78,22 +80,16 @@ def effect(
     return Effect(parts, figures, ground, judged[0], judged[1], gained, tuple(notes))
 
 
-def _aligned(results: dict[str, xr.Dataset]) -> tuple[dict[str, xr.Dataset], bool]:
+def _aligned(results: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     """Return the results with one start: time 0 of both is the same instant of the warm-up."""
-    start = results["before"].attrs.get("start", "")
-    found = {name: ds.copy() for name, ds in results.items()}
-    if start and results["after"].attrs.get("start", ""):
-        found["after"].attrs["start"] = start
-        return found, False
-    for ds in found.values():
-        ds.attrs.pop("start", None)
-    return found, True
+    start = results["before"].attrs.get("start", "") or ANY_START
+    return {name: ds.assign_attrs(start=start) for name, ds in results.items()}
 
 
 def _part(ground: Ground, columns: tuple[int, ...], name: str, references: set[str]) -> Part:
     """Return one freedom, or several as one vector."""
     before, after = (_columns(each, columns) for each in ground.estimates)
-    known = before.known.all(axis=1) & after.known.all(axis=1)
+    known: NDArray[np.bool_] = np.isfinite(np.sum(before.value + after.value, axis=1))
     if ground.dim == "time":
         known[0] = False  # the reference: 0 by definition
     unit = "rad" if ground.freedoms[columns[0]] in DOF[3:] else "m"

@@ -169,7 +169,7 @@ def displaced(weighted: Sequence[tuple[float, Curve]], target: float) -> list[Te
     most = (1 - 1e-9) / end if end * start < 0 else -1e9 / L[-1] if start > 0 and L[-1] > 0 else 0.0
     if not excess(most) * start < 0:
         return None
-    x = brentq(excess, *sorted((0.0, most)), xtol=1e-12 * abs(most), rtol=1e-10)
+    x = brentq(excess, min(most, 0.0), max(most, 0.0), xtol=1e-12 * abs(most), rtol=1e-10)
     z = x * (Q @ (g / (1 - x * L)))
     return [Term(w, c, s, z) for (w, c), s in zip(weighted, shares, strict=True)]
 
@@ -177,9 +177,9 @@ def displaced(weighted: Sequence[tuple[float, Curve]], target: float) -> list[Te
 def below(q: float, terms: Sequence[Term]) -> float:
     """Return the probability that the sum of weight times y'y is below q. The sources of the curves are the same."""
     k1 = k2 = k3 = 0.0
-    inner = sum(term.weight * term.curve.inner[0] for term in terms)  # F'AF
-    powered = sum(term.weight**2 * term.curve.inner[1] for term in terms)  # F'ADAF
-    g = sum(term.weight * term.along(0) for term in terms)  # F'Am
+    inner: Array = sum((t.weight * t.curve.inner[0] for t in terms), start=np.zeros(()))  # F'AF
+    powered: Array = sum((t.weight**2 * t.curve.inner[1] for t in terms), start=np.zeros(()))  # F'ADAF
+    g: Array = sum((t.weight * t.along(0) for t in terms), start=np.zeros(()))  # F'Am
     for term in terms:
         w, curve = term.weight, term.curve
         _, d2, d3 = curve.noise
