@@ -493,17 +493,20 @@ def _named(code: int) -> str:
 
 def _says(message: str, code: int) -> bool:
     """Whether a message names the error of a disk."""
-    full = {
+    ours = {
         errno.ENOSPC: ("disk is full",),
         errno.EDQUOT: ("disk is full", "quota is used up"),
+        errno.EROFS: ("file system is read-only",),
         errno.EFBIG: ("larger than allowed",),
     }.get(code, ())
-    return any(text in message for text in (os.strerror(code), *full))
+    return any(text in message for text in (os.strerror(code), *ours))
 
 
 def _rows(raw: Path) -> list[str]:
-    """Return what is wrong with the rows of a monitor that was ended."""
+    """Return what is wrong with the rows of a monitor that was ended; it may have none yet."""
     with datasets.load(raw) as found:
+        if not found.sizes["time"]:
+            return []
         datasets.validate(found.load())
         return [] if np.all(np.diff(found["time"].values) > 0) else ["its times do not rise"]
 
