@@ -32,6 +32,10 @@ TRUTH_STEP = 60.0
 LEAST_RISE = 1.0
 """Change of a temperature in the training from which its sensor is used, K: noise and air make no feature."""
 
+SMALL = ModelSettings(variant="dynamics", most_sensors=2, time_constants=(600.0, 3600.0))
+"""At most 10 features: the 19 cycles of one warm-up determine no more, and the prediction of a larger model is so
+uncertain where speeds differ that it is not followed."""
+
 Speeds = Sequence[tuple[float, float]]
 """Times after the start of the warm-up, s, and spindle speeds, 1/min."""
 
@@ -49,14 +53,14 @@ class Duty:
     limits : Limits
         Of the compensation.
     model : ModelSettings
-        Of the fit. The spindle speed is known, so that responses to it need not compete with lagged temperatures.
+        Of the fit; default: `SMALL`.
     """
 
     duration: float = 10800.0
     interval: float = 600.0
     cycle: float = 120.0
     limits: Limits = field(default_factory=Limits)
-    model: ModelSettings = field(default_factory=lambda: ModelSettings(variant="dynamics"))
+    model: ModelSettings = SMALL
 
     @property
     def cycles(self) -> Array:
