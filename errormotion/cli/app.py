@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from errormotion.cli.demo import CONTROLLERS
+from errormotion.cli.demo import COMPENSATED, CONTROLLERS
 from errormotion.cli.guard import ERROR, INVALID, USAGE, guarded
 from errormotion.cli.output import show, show_json, table
 
@@ -82,13 +82,17 @@ def demo(
         str,
         typer.Option(help=f"Controller of the machine: {', '.join(CONTROLLERS)}. All but the first must be installed."),
     ] = next(iter(CONTROLLERS)),
+    compensate: Annotated[
+        bool, typer.Option("--compensate", help="Fit a model to a warm-up, and compensate further ones.")
+    ] = False,
     json_: Json = False,
 ) -> None:
     """Measure a virtual machine and compare the result with the truth."""
-    if controller not in CONTROLLERS:
-        typer.echo(f"--controller {controller}: expected one of {', '.join(CONTROLLERS)}.", err=True)
+    shown = COMPENSATED if compensate else CONTROLLERS
+    if controller not in shown:
+        typer.echo(f"--controller {controller}: expected one of {', '.join(shown)}.", err=True)
         raise typer.Exit(USAGE)
-    import_module(CONTROLLERS[controller]).run(runs, json_)
+    import_module(shown[controller]).run(runs, json_)
 
 
 @app.command()

@@ -25,7 +25,7 @@ def verdict(found: Effect) -> list[str]:
     else:
         lines.append(
             f"{whole.name}: {_size(whole.before.value, whole.unit)} before, {_size(whole.after.value, whole.unit)} "
-            f"after, {_percent(whole.reduction.value)} less (95 %: {span(whole.reduction)})."
+            f"after, {percent(whole.reduction.value)} less (95 %: {span(whole.reduction)})."
         )
     of = {
         outcome: [part.name for part in found.parts if part.outcome == outcome and part.correctable]
@@ -64,7 +64,7 @@ def _row(part: Part) -> list[str]:
         _number(factor * part.before.value),
         _number(factor * part.after.value),
         ends,
-        _percent(part.reduction.value),
+        percent(part.reduction.value),
         span(part.reduction),
         _number(factor * part.perfect),
         unit,
@@ -81,17 +81,18 @@ def _figure_row(pair: FigurePair) -> list[str]:
     factor, unit = FIELD_UNITS.get(pair.unit, (1.0, pair.unit))
     numbers = [_number(factor * each) for each in (*pair.before, *pair.after)]
     known = math.isfinite(pair.reduction.value)
-    return [pair.name, *numbers, unit, _percent(pair.reduction.value), span(pair.reduction) if known else DASH]
+    return [pair.name, *numbers, unit, percent(pair.reduction.value), span(pair.reduction) if known else DASH]
 
 
 def span(interval: Interval) -> str:
     """Return the ends of an interval of shares, %."""
     if interval.low == -math.inf:
-        return "unbounded" if interval.high >= 1 else f"below {_percent(interval.high)}"
-    return f"{_percent(interval.low)} to {_percent(interval.high)}"
+        return "unbounded" if interval.high >= 1 else f"below {percent(interval.high)}"
+    return f"{percent(interval.low)} to {percent(interval.high)}"
 
 
-def _percent(share: float) -> str:
+def percent(share: float) -> str:
+    """Return a share as a person reads it."""
     if math.isnan(share):
         return DASH
     if share < -9.995:
