@@ -99,7 +99,9 @@ class ThermalState:
         twist[:, :3] -= self.correction_at(t) * self.schedule.compensation(t)
         if self.offset is not None:
             times, offsets = self.offset
-            twist[:, :3] += np.column_stack([np.interp(t, times, column) for column in offsets.T])
+            twist[:, :3] += np.column_stack(
+                [np.interp(np.asarray(t, dtype=float), times, column) for column in offsets.T]
+            )
         return twist, turn
 
 
