@@ -62,6 +62,6 @@ def test_the_demo_prints_the_effect_and_keeps_the_results(
 
 def test_a_sensor_that_shows_noise_makes_no_feature(loop: Loop) -> None:
     errors = loop.warm_ups[0].before
-    kept = closed_loop._with_warm_sensors(errors)["sensor"].values.tolist()
+    kept = closed_loop.with_warm_sensors(errors)["sensor"].values.tolist()
     assert "motor" in kept
     assert "ambient" not in kept

@@ -127,7 +127,7 @@ def close(machine: VirtualMachine, training: Speeds, further: Sequence[Speeds], 
     duty = duty or Duty()
     measured = _measured(machine, training, duty, 0, None)
     point = tuple(float(x) for x in measured.attrs["functional_point"])
-    model = fit([_with_warm_sensors(measured)], duty.model)
+    model = fit([with_warm_sensors(measured)], duty.model)
     warm_ups = []
     for number, speeds in enumerate(further, start=1):
         before = _measured(machine, speeds, duty, 2 * number - 1, point)
@@ -160,7 +160,7 @@ def _measured(
     return found
 
 
-def _with_warm_sensors(errors: xr.Dataset) -> xr.Dataset:
+def with_warm_sensors(errors: xr.Dataset) -> xr.Dataset:
     """Return errors with those temperatures alone that changed by `LEAST_RISE`."""
     temperature = errors["temperature"]
     change = (temperature.max("time") - temperature.min("time")).values
