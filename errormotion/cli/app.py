@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from errormotion.cli.demo import CONTROLLERS
+from errormotion.cli.demo import COMPENSATED, CONTROLLERS
 from errormotion.cli.guard import ERROR, INVALID, USAGE, guarded
 from errormotion.cli.output import show, show_json, table
 
@@ -82,13 +82,17 @@ def demo(
         str,
         typer.Option(help=f"Controller of the machine: {', '.join(CONTROLLERS)}. All but the first must be installed."),
     ] = next(iter(CONTROLLERS)),
+    compensate: Annotated[
+        bool, typer.Option("--compensate", help="Fit a model to a warm-up, and compensate further ones.")
+    ] = False,
     json_: Json = False,
 ) -> None:
     """Measure a virtual machine and compare the result with the truth."""
-    if controller not in CONTROLLERS:
-        typer.echo(f"--controller {controller}: expected one of {', '.join(CONTROLLERS)}.", err=True)
+    shown = COMPENSATED if compensate else CONTROLLERS
+    if controller not in shown:
+        typer.echo(f"--controller {controller}: expected one of {', '.join(shown)}.", err=True)
         raise typer.Exit(USAGE)
-    import_module(CONTROLLERS[controller]).run(runs, json_)
+    import_module(shown[controller]).run(runs, json_)
 
 
 @app.command()
@@ -651,6 +655,46 @@ def model_check(
     from errormotion.cli.commands import model as command
 
     command.check_model(model, errors, report, json_)
+
+
+@compensate_app.command("effect")
+@guarded
+def compensate_effect(
+    before: Annotated[Path, typer.Argument(help="Errors without the compensation: NetCDF, run folder, or runs.")],
+    after: Annotated[Path, typer.Argument(help="Errors of the same machine with it.")],
+    at: Annotated[str | None, typer.Option(help="Functional point 'x,y,z', mm; default: that of BEFORE.")] = None,
+    over: Annotated[
+        str | None, typer.Option(metavar="DIM", help="What the errors are compared over: time, position or target.")
+    ] = None,
+    select: Annotated[
+        list[str] | None, typer.Option(help="One element of another dimension, counted from 0: position=3.")
+    ] = None,
+    freedoms: Annotated[str | None, typer.Option(help="Which are compared: EX,EZ; default: all known ones.")] = None,
+    since: Annotated[float | None, typer.Option(help="Reference state, s after time 0 of both.")] = None,
+    tolerances: Annotated[
+        Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on both, and on the reduction.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
+    json_: Json = False,
+) -> None:
+    """Compare two results of one machine: what a compensation took off, and what is left."""
+    from errormotion.cli.commands import compensation_effect as command
+
+    point = None if at is None else _millimetres("--at", at)
+    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
+    code = command.run(
+        before,
+        after,
+        at=point,
+        over=over,
+        select=select or [],
+        freedoms=chosen,
+        since=since,
+        tolerances=tolerances,
+        report=report,
+        as_json=json_,
+    )
+    raise typer.Exit(code)
 
 
 @compensate_app.command("table")
