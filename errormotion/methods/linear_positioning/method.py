@@ -155,6 +155,8 @@ class LinearPositioning:
 
     def plan(self, settings: PositioningSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance. See ``planning``."""
+        from errormotion.methods.linear_positioning.diagonals.plan import plan_diagonals
         from errormotion.methods.linear_positioning.planning.plan import plan
 
-        return plan(settings or PositioningSettings(), self.info)
+        found = settings or PositioningSettings()
+        return plan(found, self.info) if found.diagonals is None else plan_diagonals(found, self.info)

@@ -11,9 +11,6 @@ import xarray as xr
 from errormotion.datasets import provenance
 from errormotion.datasets.units import format_quantity
 from errormotion.kinematics.iso import iso_names
-from errormotion.methods.linear_positioning.diagonals import planning as diagonal_planning
-from errormotion.methods.linear_positioning.diagonals.identification import identify_diagonals
-from errormotion.methods.linear_positioning.diagonals.simulation import simulate_diagonals
 from errormotion.methods.linear_positioning.identification.identify import build, evaluate
 from errormotion.methods.linear_positioning.identification.moving import identify_moving
 from errormotion.methods.linear_positioning.planning.targets import positions, seconds
@@ -32,8 +29,6 @@ def plan(settings: Settings, info: MethodInfo) -> xr.Dataset:
     """Return an error dataset of zeros at the targets, with the covariance to expect."""
     if settings.moving is not None:
         return _plan_moving(settings, info)
-    if settings.diagonals is not None:
-        return _plan_diagonals(settings, info)
     P = positions(settings)
     names = iso_names(settings.axis)
     raw = xr.Dataset(
@@ -44,7 +39,7 @@ def plan(settings: Settings, info: MethodInfo) -> xr.Dataset:
         {"freedom": [names[name] for name in settings.freedoms], "approach": list(APPROACHES)},
         {"schema": SCHEMA, "axis": settings.axis, "machine": "plan"},
     )
-    assumed, scatter, drift = _assumed(settings)
+    assumed, scatter, drift = assumed_scatter(settings)
     notes: list[str] = []
     found = evaluate(raw, assumed, notes, planned=True)
     errors = build(found, raw, info, provenance.make(assumed, None, None, steps=["plan"]), {})
@@ -62,38 +57,13 @@ def plan(settings: Settings, info: MethodInfo) -> xr.Dataset:
     return errors.assign_attrs(reference="planned, not measured", notes=notes)
 
 
-def _assumed(settings: Settings) -> tuple[Settings, float, float]:
+def assumed_scatter(settings: Settings) -> tuple[Settings, float, float]:
     """Return settings that state scatter and drift, and both."""
     stated = settings.uncertainty
     scatter = SCATTER if stated.scatter is None else stated.scatter
     drift = DRIFT if stated.drift is None else stated.drift
     update = {"uncertainty": stated.model_copy(update={"scatter": scatter, "drift": drift})}
     return settings.model_copy(update=update), scatter, drift
-
-
-def _plan_diagonals(settings: Settings, info: MethodInfo) -> xr.Dataset:
-    assumed, scatter, drift = _assumed(settings)
-    raw, _ = simulate_diagonals(settings, 0)
-    still = raw.assign(diagonal_deviation=0.0 * raw["diagonal_deviation"]).assign_attrs(machine="plan")
-    errors = identify_diagonals(
-        still.drop_vars(["length_uncertainty", "alignment_uncertainty"]), assumed, info, planned=True
-    )
-    origin = json.dumps(provenance.make(assumed, None, None, steps=["plan"]))
-    u = np.sqrt(errors["deviation_variance"].values)
-    square = np.sqrt(np.diagonal(errors["squareness_covariance"].values))
-    found = ", ".join(
-        f"{name} {format_quantity(float(each), 'arcsec', 2)}"
-        for name, each in zip(errors["squareness_of"].values, square, strict=True)
-    )
-    least, most = (format_quantity(float(each), "um", 2) for each in (u.min(), u.max()))
-    note = (
-        f"{errors.sizes['diagonal']} diagonals with {errors.sizes['target']} stops, {settings.runs} runs in both "
-        f"directions, about {diagonal_planning.seconds(settings) / 60:.0f} min. With a scatter of "
-        f"{format_quantity(scatter, 'um', 2)} and a drift of {format_quantity(drift, 'um', 2)} the standard "
-        f"uncertainty along a diagonal is {least} to {most}{', that of squareness ' + found if found else ''}."
-    )
-    zero = {name: 0.0 * errors[name] for name in ("deviation", "squareness")}
-    return errors.assign(zero).assign_attrs(reference="planned, not measured", provenance=origin, notes=[note])
 
 
 def _plan_moving(settings: Settings, info: MethodInfo) -> xr.Dataset:

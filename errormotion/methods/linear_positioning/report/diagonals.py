@@ -12,7 +12,7 @@ from errormotion.methods.linear_positioning.report import drawings
 from errormotion.methods.linear_positioning.report.chapter import figure_table, target_tables
 from errormotion.methods.linear_positioning.report.view import View
 from errormotion.report import budget, canvas, provenance, quality
-from errormotion.report.document import Block, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
+from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
 from errormotion.report.text import SECOND_OF_ARC, UM, fixed, listed
 
 HEIGHT = 2.9
@@ -117,7 +117,7 @@ def _together(seen: list[View], key: str) -> Figure:
 
 
 def _table(errors: xr.Dataset, seen: list[View]) -> Table:
-    rows = [
+    rows: list[list[Cell | str]] = [
         [
             view.name,
             fixed(float(errors["distance"].sel(diagonal=view.name)[-1]) * 1e3, 1),
@@ -144,7 +144,7 @@ def _heading(name: str) -> str:
 
 def _squareness(errors: xr.Dataset) -> list[Block]:
     unit, size = SECOND_OF_ARC
-    rows = [
+    rows: list[list[Cell | str]] = [
         [
             name,
             FACES[name],
