@@ -40,6 +40,7 @@ class LinearPositioning:
     chapters = lazy("errormotion.methods.linear_positioning.report:chapters")
     redrawing = lazy("errormotion.methods.linear_positioning.redrawing:redrawing")
     conformance = lazy("errormotion.methods.linear_positioning.conformance:subjects")
+    log_readers = lazy("errormotion.methods.linear_positioning.rtl:LOG_READERS")
     figures = lazy("errormotion.methods.linear_positioning.figures:figures")
 
     def acquire(
