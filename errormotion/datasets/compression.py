@@ -1,4 +1,4 @@
-"""How the large variables of an error dataset are stored: compressed, and the influences with 30 significant bits."""
+"""How the large variables of an error dataset are stored: compressed, and the influences with 28 significant bits."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets.results.checks import error_violations
 from errormotion.datasets.schemas import SCHEMA
 
 LEAST_COMPRESSED = 2**16
@@ -17,8 +18,8 @@ LEAST_COMPRESSED = 2**16
 LEAST_ROUNDED = 2**20
 """Influences are rounded from this size on, bytes."""
 
-SIGNIFICANT_BITS = 30
-"""Of each influence that is stored: a relative change of at most 2^-30, 1e-9."""
+SIGNIFICANT_BITS = 28
+"""Of each influence that is stored: a relative change of at most 2^-28, 4e-9."""
 
 ROUNDED = "_QuantizeBitRoundNumberOfSignificantBits"
 """Attribute that states the significant bits, by the convention of NetCDF."""
@@ -33,12 +34,13 @@ _INFLUENCES = ("influence", "deviation_influence")
 
 
 def as_stored(ds: xr.Dataset) -> xr.Dataset:
-    """Return an error dataset as a file holds it: large influences are rounded to 30 significant bits.
+    """Return an error dataset as a file holds it: large influences are rounded to 28 significant bits.
 
     All other values, the covariance included, stay as they are to the last bit. The influences of a long record are two
     thirds of its size, and their last digits follow the noise of the readings. Rounding changes the covariance between
-    two positions by at most 2e-9 of what each source contributes. The attribute `ROUNDED` states it. Other datasets are
-    returned as they are.
+    two positions by at most 8e-9 of what each source contributes. The attribute `ROUNDED` states it. Other datasets are
+    returned as they are, and so is one whose covariance holds hardly more than its influences, so that rounding would
+    leave a negative rest.
     """
     if ds.attrs.get("schema") != SCHEMA:
         return ds
@@ -46,10 +48,11 @@ def as_stored(ds: xr.Dataset) -> xr.Dataset:
     for name in _INFLUENCES:
         variable = ds.variables.get(name)
         if variable is not None and variable.dtype == np.float64 and variable.nbytes >= LEAST_ROUNDED:
-            kept = variable.copy(data=_round(np.asarray(variable.values)))
+            kept = variable.copy(data=round_significand(np.asarray(variable.values)))
             kept.attrs = {**variable.attrs, ROUNDED: SIGNIFICANT_BITS}
             rounded[name] = kept
-    return ds.assign(rounded)
+    stored = ds.assign(rounded)
+    return ds if rounded and error_violations(stored) else stored
 
 
 def encoding(ds: xr.Dataset) -> dict[Any, dict[str, Any]]:
@@ -78,7 +81,7 @@ def _chunks(variable: xr.Variable, along: tuple[Any, ...]) -> dict[str, Any]:
     return {"chunksizes": tuple(sizes)} if math.prod(sizes) >= LEAST_SERIES else {}
 
 
-def _round(values: Array) -> Array:
+def round_significand(values: Array) -> Array:
     """Return finite numbers with `SIGNIFICANT_BITS` bits of the significand, rounded half to even."""
     dropped = np.uint64(53 - SIGNIFICANT_BITS)  # a significand of 53 bits, the first of which is not stored
     bits = np.ascontiguousarray(values, dtype=np.float64).view(np.uint64)
