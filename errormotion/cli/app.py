@@ -11,12 +11,13 @@ import typer
 from errormotion.cli.demo import CONTROLLERS
 from errormotion.cli.guard import ERROR, INVALID, USAGE, guarded
 from errormotion.cli.output import show, show_json, table
+from errormotion.cli.wording import share
 
 app = typer.Typer(
     name="errormotion",
     help="Measure the error motions of machine tools.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -748,3 +749,6 @@ def compensate_program(
         report=report,
     )
     command.program(part, with_, choice, out, json_)
+
+
+share(app, plugins_app, bench_app, model_app, compensate_app)

@@ -111,4 +111,5 @@ def _columns(coordinate: xr.DataArray, name: str, sizes: dict[str, int]) -> dict
 
 def _spread(variable: xr.Variable, sizes: dict[str, int]) -> Array:
     """Return the values at all places in the order of the dims, repeated along those that the variable lacks."""
-    return np.asarray(variable.set_dims(sizes).transpose(*sizes).values).ravel()
+    spread = variable.set_dims(sizes)  # type: ignore[no-untyped-call]
+    return np.asarray(spread.transpose(*sizes).values).ravel()

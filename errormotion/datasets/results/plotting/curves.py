@@ -67,5 +67,15 @@ def _band(axes: Axes, x: Array, y: Array, half: Array, name: str, colour: str) -
 
 
 def _bars(axes: Axes, x: Array, y: Array, half: Array, name: str, k: int) -> None:
-    style = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)], "markersize": 4, "linestyle": ""}
-    axes.errorbar(x, y, yerr=half if np.nan_to_num(half).any() else None, capsize=2, linewidth=1, label=name, **style)
+    axes.errorbar(
+        x,
+        y,
+        yerr=half if np.nan_to_num(half).any() else None,
+        color=COLOURS[k % len(COLOURS)],
+        marker=MARKERS[k % len(MARKERS)],
+        markersize=4,
+        linestyle="",
+        linewidth=1,
+        capsize=2,
+        label=name,
+    )

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from errormotion.datasets.results.plotting import arrows, curves, maps
@@ -61,7 +61,7 @@ def plot_errors(
     DatasetError
         More than two dims, no such freedom, a form that the dataset does not have, another number of axes.
     """
-    if not (isinstance(k, (int, float, np.number)) and math.isfinite(k) and k >= 0):
+    if not 0 <= k < math.inf:
         raise DatasetError(f"Expected a coverage factor k of 0 or more; found {k!r}")
     if at is not None:
         ds = ds.em.at(at)
@@ -75,22 +75,22 @@ def plot_errors(
     if freedoms is None:
         names = [name for name in names if np.isfinite(ds[name].values).any()] or names
     given = None if ax is None else [ax] if isinstance(ax, Axes) else list(ax)
-    form = _form(ds, names, form, given)
-    panels = _panels(ds, names, form)
-    figure, axes = _axes(panels, form, given)
+    drawn = _form(ds, names, form, given)
+    panels = _panels(ds, names, drawn)
+    figure, axes = _axes(panels, drawn, given)
     band = float(k) * ds.em.expanded(k=1)
     for each, panel in zip(axes, panels, strict=True):
-        if form == "arrows":
+        if drawn == "arrows":
             arrows.draw(each, ds, panel.freedoms, panel.unit, band, k)
-        elif form == "map":
+        elif drawn == "map":
             maps.draw(each, ds, panel.freedoms[0], panel.unit, band, k)
         else:
             curves.draw(each, ds, panel.freedoms, panel.unit, band)
     if given is None:
-        if form != "arrows" and dims:
+        if drawn != "arrows" and dims:
             _share(axes)
         words = f"{ds.attrs['machine']}: {ds.attrs['component']} ({ds.attrs['method']})"
-        if form == "curves" and k:
+        if drawn == "curves" and k:
             words += f", {'bands' if _joined(ds) else 'bars'} k = {k:g}"
         figure.suptitle(words, parse_math=False)
     return figure
@@ -134,15 +134,17 @@ def _joined(ds: xr.Dataset) -> bool:
     return bool(dims) and scale_of(ds, over(ds) if len(dims) == 2 else dims[0]).joined
 
 
-def _axes(panels: list[_Panel], form: str, given: Sequence[Axes] | None) -> tuple[Figure | SubFigure, Sequence[Axes]]:
+def _axes(panels: list[_Panel], form: str, given: Sequence[Axes] | None) -> tuple[Figure, Sequence[Axes]]:
     if given is not None:
         if len(given) != len(panels):
             shown = "; ".join(f"{', '.join(panel.freedoms)} in {panel.unit}" for panel in panels)
             raise DatasetError(f"Expected {len(panels)} axes ({shown}); found {len(given)}")
         if form == "arrows" and any(axes.name != "3d" for axes in given):
             raise DatasetError('Arrows need axes that were made with projection="3d"')
-        figure = given[0].figure
-        return figure, given
+        whole = given[0].get_figure(root=True)
+        if whole is None:
+            raise DatasetError("Expected axes of a figure; found axes that were removed from theirs")
+        return whole, given
     rows, columns = len(panels), 1
     if form == "arrows":
         rows, columns = 1, len(panels)

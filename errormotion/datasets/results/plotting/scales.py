@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
+from matplotlib.axis import Axis, XAxis
 from matplotlib.ticker import MaxNLocator
 
 from errormotion.arrays import Array
@@ -90,7 +90,7 @@ def mark(axis: Axis, scale: Scale) -> None:
     if scale.texts:
         step = -(-len(scale.texts) // MOST_LABELS)
         axis.set_ticks(scale.values[::step].tolist(), scale.texts[::step], parse_math=False)
-        if axis.axis_name == "x" and sum(map(len, scale.texts[::step])) > 50:
+        if isinstance(axis, XAxis) and sum(map(len, scale.texts[::step])) > 50:
             axis.set_tick_params(rotation=30)
     elif not scale.joined:
         axis.set_major_locator(MaxNLocator(integer=True))
