@@ -465,6 +465,39 @@ def runs(
     command.runs(folders or [], machine, method, since, tolerances, json_)
 
 
+@app.command("open")
+@guarded
+def open_(
+    place: Annotated[
+        Path, typer.Argument(help="A run folder, a folder of runs (its newest run with a report), or a page.")
+    ] = Path("runs"),
+    browser: Annotated[bool, typer.Option(help="Open the browser; without, print the path only.")] = True,
+    json_: Json = False,
+) -> None:
+    """Open the last report in the browser, and print its path."""
+    from errormotion.cli.commands.results import show as command
+
+    command.open_report(place, browser=browser, as_json=json_)
+
+
+@app.command()
+@guarded
+def export(
+    result: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
+    out: Annotated[Path, typer.Option(help="The file to write: .csv, .xlsx, .nc or .zarr; it must not exist.")],
+    freedoms: Annotated[str | None, typer.Option(help="Which are written: EX,EZ; default: all.")] = None,
+    at: Annotated[str | None, typer.Option(help="Functional point, mm; default: that of the result.")] = None,
+    k: Annotated[float, typer.Option("-k", min=0, max=10, help="Coverage factor of the uncertainties.")] = 2.0,
+    json_: Json = False,
+) -> None:
+    """Write the tables of a result for a spreadsheet, in field units, or the dataset as NetCDF."""
+    from errormotion.cli.commands.results import export as command
+
+    point = None if at is None else _millimetres("--at", at)
+    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else None
+    command.export(result, out, chosen, point, k, json_)
+
+
 @app.command()
 @guarded
 def note(
