@@ -11,12 +11,13 @@ import typer
 from errormotion.cli.demo import COMPENSATED, CONTROLLERS
 from errormotion.cli.guard import ERROR, INVALID, USAGE, guarded
 from errormotion.cli.output import show, show_json, table
+from errormotion.cli.wording import share
 
 app = typer.Typer(
     name="errormotion",
     help="Measure the error motions of machine tools.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -468,6 +469,39 @@ def runs(
     command.runs(folders or [], machine, method, since, tolerances, json_)
 
 
+@app.command("open")
+@guarded
+def open_(
+    place: Annotated[
+        Path, typer.Argument(help="A run folder, a folder of runs (its newest run with a report), or a page.")
+    ] = Path("runs"),
+    browser: Annotated[bool, typer.Option(help="Open the browser; without, print the path only.")] = True,
+    json_: Json = False,
+) -> None:
+    """Open the last report in the browser, and print its path."""
+    from errormotion.cli.commands.results import show as command
+
+    command.open_report(place, browser=browser, as_json=json_)
+
+
+@app.command()
+@guarded
+def export(
+    result: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
+    out: Annotated[Path, typer.Option(help="The file to write: .csv, .xlsx, .nc or .zarr; it must not exist.")],
+    freedoms: Annotated[str | None, typer.Option(help="Which are written: EX,EZ; default: all.")] = None,
+    at: Annotated[str | None, typer.Option(help="Functional point, mm; default: that of the result.")] = None,
+    k: Annotated[float, typer.Option("-k", min=0, max=10, help="Coverage factor of the uncertainties.")] = 2.0,
+    json_: Json = False,
+) -> None:
+    """Write the tables of a result for a spreadsheet, in field units, or the dataset as NetCDF."""
+    from errormotion.cli.commands.results import export as command
+
+    point = None if at is None else _millimetres("--at", at)
+    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else None
+    command.export(result, out, chosen, point, k, json_)
+
+
 @app.command()
 @guarded
 def note(
@@ -794,3 +828,6 @@ def compensate_program(
         report=report,
     )
     command.program(part, with_, choice, out, json_)
+
+
+share(app, plugins_app, bench_app, model_app, compensate_app)
