@@ -1,0 +1,93 @@
+"""The HTML of a report."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from hashlib import sha256
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+import errormotion
+from errormotion.report import provenance
+from errormotion.report.document import Cell, Part, Source, Table
+from errormotion.report.page import annex
+from errormotion.report.page.head import PAPERS, Head, calibrations, facts
+from errormotion.report.page.verdict import Verdict
+
+
+def page(
+    sources: Sequence[Source],
+    parts: Sequence[Part],
+    title: str | None = None,
+    *,
+    head: Head | None = None,
+    decision: Verdict | None = None,
+) -> str:
+    """Return a report as HTML that needs nothing else."""
+    head = head or Head()
+    first = sources[0]
+    everything = [(s.provenance, s.run, dict(s.raw.attrs) if s.raw is not None else {}) for s in sources]
+    machine = str(first.errors.attrs.get("machine", "unknown machine"))
+    body, appended = annex.divided(parts)
+    identity = head.number or sha256("".join(map(_identity, sources)).encode()).hexdigest()[:12]
+    written = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    measured = next((str(first.run[key]) for key in ("started", "start", "created") if first.run.get(key)), "")
+    return (
+        _templates()
+        .get_template("report.html.j2")
+        .render(
+            title=title or f"{machine}: {parts[0].title[0].lower()}{parts[0].title[1:]}",
+            heading=title or parts[0].title,
+            head=head,
+            facts=facts(first, machine, head, f"{identity}, written {written}"),
+            calibrations=calibrations(head, measured),
+            decision=decision,
+            simulated=provenance.simulated(everything) or _truth(sources),
+            replayed=provenance.replayed(everything),
+            parts=body,
+            annex=[*annex.values(sources), *appended],
+            several=len(parts) > 1,
+            kind=parts[0].kind,
+            stated=any(part.stated for part in parts),
+            identity=identity,
+            foot=_css(f"Report {identity}"),
+            paper=PAPERS.get(head.paper, "A4"),
+            version=errormotion.__version__,
+            written=written,
+        )
+    )
+
+
+def _templates() -> Environment:
+    templates = Environment(
+        loader=PackageLoader("errormotion.report.page"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.tests["table"] = lambda block: isinstance(block, Table)
+    templates.tests["cell"] = lambda value: isinstance(value, Cell)
+    templates.filters["kind"] = lambda block: type(block).__name__.lower()
+    return templates
+
+
+def _css(text: str) -> Markup:
+    """Return a text as a string of a style sheet; every character that could end it is escaped."""
+    return Markup('"' + re.sub(r"[^A-Za-z0-9 ._-]", lambda found: f"\\{ord(found[0]):x} ", text[:200]) + '"')
+
+
+def _identity(source: Source) -> str:
+    attributes = source.errors.attrs
+    if "provenance" in attributes:
+        return str(attributes["provenance"])
+    return f"{source.run.get('id')} {attributes.get('start')} {dict(source.errors.sizes)}"
+
+
+def _truth(sources: Sequence[Source]) -> str:
+    if any(source.errors.attrs.get("method") == "twin" for source in sources):
+        return "the values are the truth of a virtual machine"
+    return ""
