@@ -10,7 +10,7 @@ from typing import Any
 import xarray as xr
 
 from errormotion.report.document import Block, Cell, Source, Table, Text
-from errormotion.report.page import settings
+from errormotion.report.parts import settings
 from errormotion.report.text import DASH
 
 _ATTRIBUTES = ("schema", "method", "method_version", "component", "frame", "functional_point", "reference", "sign")
