@@ -9,8 +9,8 @@ from typing import Any
 
 import xarray as xr
 
+from errormotion.report import settings
 from errormotion.report.document import Block, Cell, Source, Table, Text
-from errormotion.report.parts import settings
 from errormotion.report.text import DASH
 
 _ATTRIBUTES = ("schema", "method", "method_version", "component", "frame", "functional_point", "reference", "sign")

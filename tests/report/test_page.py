@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from errormotion.errors import BenchError
-from errormotion.report import provenance, write_report, write_run_report
+from errormotion.report import provenance, settings, write_report, write_run_report
 from errormotion.report.document import Source
 from errormotion.report.page.head import calibrations, head_of
 from errormotion.report.page.verdict import share, verdict
-from errormotion.report.parts import settings
 from errormotion.tolerances.conformity import Conformity, Row
 from errormotion.tolerances.table import Tolerances
 
