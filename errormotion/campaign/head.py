@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from errormotion.datasets import certificates
 from errormotion.datasets.files import tomlfile
 from errormotion.report.page import logo
-
-if TYPE_CHECKING:
-    from errormotion.campaign.files import CampaignPlan
 
 
 class Laboratory(BaseModel):
@@ -54,14 +51,15 @@ def until_mistakes(until: Mapping[str, date], instruments: Mapping[str, Any]) ->
     ]
 
 
-def stated(plan: CampaignPlan, certified: Mapping[str, str]) -> dict[str, Any]:
+def stated(
+    laboratory: Laboratory | None, report: ReportTable | None, until: Mapping[str, date], certified: Mapping[str, str]
+) -> dict[str, Any]:
     """Return the head of the reports of a campaign for a ``run.json``; without what is not stated."""
-    laboratory, until = plan.bench.laboratory, plan.bench.calibrated_until
     found: dict[str, Any] = {}
     if laboratory is not None:
         found |= {"laboratory": laboratory.name, "address": laboratory.address}
         found["accreditation"] = laboratory.accreditation
-    found |= plan.report.model_dump() if plan.report is not None else {}
+    found |= report.model_dump() if report is not None else {}
     if until:
         found["calibrated_until"] = {name: day.isoformat() for name, day in until.items()}
         found["certificates"] = dict(certified)

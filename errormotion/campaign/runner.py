@@ -269,7 +269,7 @@ class _Session:
                 "tolerances": plan.tolerances.model_dump(mode="json") if plan.tolerances else None,
                 "inputs": {},
                 "operator": plan.operator,
-                "head": head.stated(plan, test.certificates),
+                "head": head.stated(plan.bench.laboratory, plan.report, plan.bench.calibrated_until, test.certificates),
                 "instruments": [answer.record() for answer in self.bench.chosen(test.instruments).answers],
                 "software": provenance.make({}, None, None)["software"],
                 "samples": {},

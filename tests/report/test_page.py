@@ -178,7 +178,7 @@ def test_bench_and_campaign_state_the_head(tmp_path):
         '[test.settings.layout]\nlow = ["0 mm", "0 mm", "0 mm"]\nhigh = ["1 m", "1 m", "1 m"]\n'
     )
     campaign = load_campaign(tmp_path / "campaign.toml")
-    found = head.stated(campaign, {"bar": "K"})
+    found = head.stated(plan.laboratory, campaign.report, plan.calibrated_until, {"bar": "K"})
     assert json.loads(json.dumps(found)) == {
         "laboratory": "Lab",
         "customer": "A",
