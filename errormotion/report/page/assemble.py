@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+from base64 import b64encode
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import cache
 from hashlib import sha256
+from importlib.resources import files
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -27,7 +30,7 @@ def page(
     decision: Verdict | None = None,
 ) -> str:
     """Return a report as HTML that needs nothing else."""
-    head = head or Head()
+    head, script = head or Head(), _script()
     first = sources[0]
     everything = [(s.provenance, s.run, dict(s.raw.attrs) if s.raw is not None else {}) for s in sources]
     machine = str(first.errors.attrs.get("machine", "unknown machine"))
@@ -53,6 +56,8 @@ def page(
             kind=parts[0].kind,
             stated=any(part.stated for part in parts),
             identity=identity,
+            script=Markup(script),
+            script_hash=b64encode(sha256(script.encode()).digest()).decode(),
             foot=_css(f"Report {identity}"),
             paper=PAPERS.get(head.paper, "A4"),
             version=errormotion.__version__,
@@ -73,6 +78,12 @@ def _templates() -> Environment:
     templates.tests["cell"] = lambda value: isinstance(value, Cell)
     templates.filters["kind"] = lambda block: type(block).__name__.lower()
     return templates
+
+
+@cache
+def _script() -> str:
+    """Return the script of the page."""
+    return (files("errormotion.report.page") / "templates" / "report.js").read_text(encoding="utf-8")
 
 
 def _css(text: str) -> Markup:

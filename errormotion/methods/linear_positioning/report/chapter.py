@@ -30,7 +30,7 @@ def part(source: Source, key: str) -> Part:
         Section(
             f"graph-{view.name}",
             f"{_title(view)} {view.name}",
-            [drawings.over_position(view, f"{key}-{view.name}"), *_target_tables(view)],
+            [drawings.over_position(view, f"{key}-{view.name}", source.limits), *_target_tables(view)],
         )
         for view in seen
     ]
