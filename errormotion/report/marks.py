@@ -98,7 +98,7 @@ def _curves(axes: Axes) -> list[Line2D]:
     return [
         line
         for line in axes.get_lines()
-        if line.get_transform() == axes.transData and line.get_label() != "_nolegend_" and len(line.get_xydata())
+        if line.get_transform() == axes.transData and line.get_label() != "_nolegend_" and np.size(line.get_xdata())
     ]
 
 

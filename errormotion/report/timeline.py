@@ -114,11 +114,8 @@ def errors(dataset: xr.Dataset, limits: Mapping[str, tuple[float, float]] | None
                 colour = canvas.COLOURS[i % 3]
                 lines.append(Line(FREEDOMS[i], values / size, 2 * sigma(dataset, i) / size, colour))
         if lines:
-            drawn = [
-                (line.name, *(each / size for each in limits[line.name]))
-                for line in lines
-                if limits is not None and line.name in limits
-            ]
+            stated = [(line.name, *limits[line.name]) for line in lines if limits and line.name in limits]
+            drawn = [(name, lower / size, upper / size) for name, lower, upper in stated]
             panels.append(Panel(title, unit, lines, limits=drawn))
     return panels
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,44 @@ from errormotion.errors import DatasetError, RunError
 from errormotion.report import generic, provenance
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Part, Section, Source, Table
+from errormotion.report.exports import pdf, xlsx
+from errormotion.report.exports.tables import sheet, write_csv
 from errormotion.report.page import logo
 from errormotion.report.page.assemble import page
-from errormotion.report.page.head import head_of, moment
+from errormotion.report.page.head import Head, head_of, moment
 from errormotion.report.page.verdict import verdict
 from errormotion.report.parts import beams
 from errormotion.report.text import DASH
 from errormotion.tolerances.conformity import Conformity, judge
 from errormotion.tolerances.table import Tolerances, from_run
+
+
+@dataclass(frozen=True)
+class Form:
+    """How a report is written.
+
+    ``language`` and ``paper`` replace those of the campaign; ``also`` names what is written beside the page: ``pdf``,
+    ``csv`` (a folder), ``xlsx``.
+    """
+
+    language: str = ""
+    paper: str = ""
+    also: tuple[str, ...] = ()
+
+    def of(self, head: Head) -> Head:
+        """Return a head in this language and for this paper."""
+        return replace(head, language=self.language or head.language, paper=self.paper or head.paper)
+
+    def beside(self, page: Path) -> list[Path]:
+        """Return the files and folders that are written beside a page."""
+        return [
+            page.with_name(f"{page.stem}-tables") if kind == "csv" else page.with_suffix(f".{kind}")
+            for kind in self.also
+        ]
+
+
+PLAIN = Form()
+"""The page alone."""
 
 #: Chapters of components that several methods measure; used where the method brings no chapter of its own.
 COMPONENTS = {"beam": beams.part}
@@ -40,6 +70,7 @@ def write_report(
     raw: xr.Dataset | None = None,
     title: str | None = None,
     run: Mapping[str, Any] | None = None,
+    form: Form = PLAIN,
 ) -> Path:
     """Write the report of one or several error datasets as one HTML file.
 
@@ -55,6 +86,8 @@ def write_report(
         Title of the report; without it, made of the machine and what was tested.
     run : mapping, optional
         What else is known of the measurement, such as the content of ``run.json``: machine, test, operator, start.
+    form : Form, optional
+        Language, paper, and what is written beside the page.
 
     Returns
     -------
@@ -65,6 +98,8 @@ def write_report(
     ------
     DatasetError
         No dataset, or one that is no error dataset.
+    RunError
+        The page was written, and a PDF of it could not be.
     """
     datasets = [errors] if isinstance(errors, xr.Dataset) else list(errors)
     if not datasets:
@@ -79,7 +114,18 @@ def write_report(
     parts = [part for source in sources for part in chapters(source)]
     parts[:1] = [_noted(part, run or {}) for part in parts[:1]]
     decision = verdict(_judged(sources, tolerances)) if tolerances is not None else None
-    return _write(page(sources, parts, title, head=head_of(run or {}), decision=decision), Path(out))
+    head = form.of(head_of(run or {}))
+    found = page(sources, parts, title, head=head, decision=decision)
+    target = _write(found.html, Path(out))
+    sheets = [sheet(table, k, section) for k, (section, table) in enumerate(found.tables, 1)]
+    for path in form.beside(target):
+        if path.suffix == ".pdf":
+            pdf.write(target, path)
+        elif path.suffix == ".xlsx":
+            xlsx.write(sheets, path)
+        else:
+            write_csv(sheets, path, comma=head.language == "de")
+    return target
 
 
 def _limits(tolerances: Tolerances | None) -> dict[str, tuple[float, float]]:
@@ -139,7 +185,7 @@ def write_page(sources: Sequence[Source], parts: Sequence[Part], out: Path, titl
     Path
         ``out``.
     """
-    return _write(page(sources, parts, title), out)
+    return _write(page(sources, parts, title).html, out)
 
 
 def _owner(dataset: xr.Dataset) -> Any:
@@ -193,7 +239,7 @@ def _write(text: str, out: Path) -> Path:
     return out
 
 
-def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
+def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = PLAIN) -> Path:
     """Write the report of a run folder from its error datasets, its raw dataset and ``run.json``.
 
     Parameters
@@ -202,6 +248,8 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
         Of a test, or of a monitor.
     out : Path, optional
         The file; without it, ``report.html`` in the folder.
+    form : Form, optional
+        Language, paper, and what is written beside the page.
 
     Raises
     ------
@@ -231,12 +279,12 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
     run["logo"] = logo.of_folder(folder)
     target = Path(out) if out is not None else folder / "report.html"
     if log is not None:
-        return write_report(log, target, run=run)
+        return write_report(log, target, run=run, form=form)
     parts = []
     for path in files:
         errors = load(path)
         parts += [errors, *belonging(errors, path)]
-    return write_report(parts, target, raw=raw, run=run)
+    return write_report(parts, target, raw=raw, run=run, form=form)
 
 
 def belonging(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:

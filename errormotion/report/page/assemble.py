@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from base64 import b64encode
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from hashlib import sha256
@@ -15,10 +16,18 @@ from markupsafe import Markup
 
 import errormotion
 from errormotion.report import provenance
-from errormotion.report.document import Cell, Part, Source, Table
+from errormotion.report.document import Cell, Part, Section, Source, Table
 from errormotion.report.page import annex
-from errormotion.report.page.head import PAPERS, Head, calibrations, facts
+from errormotion.report.page.head import PAPERS, Head, calibrations, facts, measured
 from errormotion.report.page.verdict import Verdict
+
+
+@dataclass(frozen=True)
+class Page:
+    """A report: its HTML, and its tables in reading order with the titles of their sections."""
+
+    html: str
+    tables: Sequence[tuple[str, Table]]
 
 
 def page(
@@ -28,8 +37,8 @@ def page(
     *,
     head: Head | None = None,
     decision: Verdict | None = None,
-) -> str:
-    """Return a report as HTML that needs nothing else."""
+) -> Page:
+    """Return a report as HTML that needs nothing else, and its tables."""
     head, script = head or Head(), _script()
     first = sources[0]
     everything = [(s.provenance, s.run, dict(s.raw.attrs) if s.raw is not None else {}) for s in sources]
@@ -37,33 +46,39 @@ def page(
     body, appended = annex.divided(parts)
     identity = head.number or sha256("".join(map(_identity, sources)).encode()).hexdigest()[:12]
     written = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    measured = next((str(first.run[key]) for key in ("started", "start", "created") if first.run.get(key)), "")
-    return (
-        _templates()
-        .get_template("report.html.j2")
-        .render(
-            title=title or f"{machine}: {parts[0].title[0].lower()}{parts[0].title[1:]}",
-            heading=title or parts[0].title,
-            head=head,
-            facts=facts(first, machine, head, f"{identity}, written {written}"),
-            calibrations=calibrations(head, measured),
-            decision=decision,
-            simulated=provenance.simulated(everything) or _truth(sources),
-            replayed=provenance.replayed(everything),
-            parts=body,
-            annex=[*annex.values(sources), *appended],
-            several=len(parts) > 1,
-            kind=parts[0].kind,
-            stated=any(part.stated for part in parts),
-            identity=identity,
-            script=Markup(script),
-            script_hash=b64encode(sha256(script.encode()).digest()).decode(),
-            foot=_css(f"Report {identity}"),
-            paper=PAPERS.get(head.paper, "A4"),
-            version=errormotion.__version__,
-            written=written,
-        )
-    )
+    calibrated = calibrations(head, measured(first))
+    appended = [*annex.values(sources), *appended]
+    shown = {
+        "title": title or f"{machine}: {parts[0].title[0].lower()}{parts[0].title[1:]}",
+        "heading": title or parts[0].title,
+        "head": head,
+        "facts": facts(first, machine, head, f"{identity}, written {written}"),
+        "calibrations": calibrated,
+        "decision": decision,
+        "simulated": provenance.simulated(everything) or _truth(sources),
+        "replayed": provenance.replayed(everything),
+        "parts": body,
+        "annex": appended,
+        "several": len(parts) > 1,
+        "kind": parts[0].kind,
+        "stated": any(part.stated for part in parts),
+        "identity": identity,
+        "script": Markup(script),
+        "script_hash": b64encode(sha256(script.encode()).digest()).decode(),
+        "foot": _css(f"Report {identity}"),
+        "paper": PAPERS.get(head.paper, "A4"),
+        "version": errormotion.__version__,
+        "written": written,
+    }
+    tables = [("Calibrations", calibrated[0])] if calibrated else []
+    tables += [(section.title, table) for part in body for section in part.sections for table in _tables(section)]
+    tables += [("Limits", decision.table)] if decision else []
+    tables += [(section.title, table) for section in appended for table in _tables(section)]
+    return Page(_templates().get_template("report.html.j2").render(shown), tables)
+
+
+def _tables(section: Section) -> list[Table]:
+    return [block for block in section.blocks if isinstance(block, Table)]
 
 
 def _templates() -> Environment:

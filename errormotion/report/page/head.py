@@ -79,18 +79,24 @@ def _day(value: Any) -> date | None:
         return None
 
 
+def measured(source: Source) -> str:
+    """Return when the measurement began, as it is stated; a dash where it is unknown."""
+    return _known(source, "started", "start", "created")
+
+
+def _known(source: Source, *names: str) -> str:
+    errors = source.errors
+    time = errors["time"].attrs if "time" in errors.coords else {}
+    for holder in (source.run, source.provenance, errors.attrs, time):
+        for name in names:
+            if name in holder and not isinstance(holder[name], (Mapping, list)) and holder[name] not in (None, ""):
+                return provenance.text(holder[name])
+    return DASH
+
+
 def facts(source: Source, machine: str, head: Head, report: str) -> list[tuple[str, str]]:
     """Return what heads the report, as far as it is known; what is unknown is left out."""
-    errors, run = source.errors, source.run
-
-    def known(*names: str) -> str:
-        for holder in (run, source.provenance, errors.attrs, errors["time"].attrs if "time" in errors.coords else {}):
-            for name in names:
-                if name in holder and not isinstance(holder[name], (Mapping, list)) and holder[name] not in (None, ""):
-                    return provenance.text(holder[name])
-        return DASH
-
-    attributes, test = errors.attrs, known("test", "name")
+    attributes, test = source.errors.attrs, _known(source, "test", "name")
     method = [
         ("Method", f"{attributes.get('method', DASH)}, version {attributes.get('method_version', DASH)}"),
         ("Reference state", str(attributes.get("reference", DASH))),
@@ -101,10 +107,10 @@ def facts(source: Source, machine: str, head: Head, report: str) -> list[tuple[s
         ("Order", head.order),
         ("Machine", machine),
         ("Test", test if test != DASH else str(attributes.get("iso_test", DASH))),
-        ("Measured", moment(known("started", "start", "created"))),
-        ("Operator", known("operator")),
+        ("Measured", moment(measured(source))),
+        ("Operator", _known(source, "operator")),
         *(method if "method" in attributes else []),
-        ("Run", known("id", "run")),
+        ("Run", _known(source, "id", "run")),
         ("Report", report),
         ("Instruments", "; ".join(_instrument(row) for row in instruments)),
     ]
@@ -133,10 +139,13 @@ def calibrations(head: Head, measured: str) -> tuple[Table, Sequence[str]] | Non
         return None
     day = _day(measured)
     rows: list[list[Cell | str]] = []
-    late = []
+    late: list[str] = []
     for item, until in sorted(head.calibrated_until.items()):
         over = day is not None and day > until
         if over:
             late.append(f"The calibration of {item} ended on {until}, before the measurement.")
         rows.append([item, head.certificates.get(item, ""), str(until), "ended" if over else "valid" if day else ""])
-    return Table("Calibrations.", ["of", "certificate", "valid until", "when measured"], rows, numeric=False), late
+    columns = ["of", "certificate", "valid until", "when measured"]
+    shown = [j for j in range(len(columns)) if any(row[j] for row in rows)]
+    kept: list[list[Cell | str]] = [[row[j] for j in shown] for row in rows]
+    return Table("Calibrations.", [columns[j] for j in shown], kept, numeric=False), late
