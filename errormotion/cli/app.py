@@ -44,6 +44,8 @@ Runs = Annotated[
 Tolerances = Annotated[
     Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the campaign.")
 ]
+Paper = Literal["A4", "Letter"]
+Language = Literal["en", "de"]
 Limits = Annotated[Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on each result.")]
 
 
@@ -354,12 +356,18 @@ def report(
     run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
     out: Annotated[Path | None, typer.Option(help="The page to write; default: report.html in the run folder.")] = None,
     tolerances: Tolerances = None,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Print the page as PDF beside it.")] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="Write every table as CSV into a folder beside the page.")] = False,
+    xlsx: Annotated[bool, typer.Option("--xlsx", help="Write every table into a workbook beside the page.")] = False,
+    paper: Annotated[Paper | None, typer.Option(help="Paper; default: that of the campaign, else A4.")] = None,
+    language: Annotated[Language | None, typer.Option(help="Language; default: that of the campaign, else en.")] = None,
     json_: Json = False,
 ) -> None:
     """Write the report of a run."""
     from errormotion.cli.commands import data
 
-    data.report(run, out, tolerances, json_)
+    also = tuple(name for name, wanted in (("xlsx", xlsx), ("csv", csv), ("pdf", pdf)) if wanted)
+    data.report(run, out, tolerances, json_, language=language or "", paper=paper or "", also=also)
 
 
 @app.command()
