@@ -466,6 +466,26 @@ def runs(
 
 @app.command()
 @guarded
+def dashboard(
+    runs: Annotated[Path, typer.Argument(help="The folder of runs.")] = Path("runs"),
+    host: Annotated[
+        str, typer.Option(help="Address to listen on. Others than 127.0.0.1 are open to the network: with a token.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to listen on.")] = 5006,
+    name: Annotated[
+        list[str] | None, typer.Option(help="A further name by which browsers reach this computer; repeatable.")
+    ] = None,
+    cert: Annotated[Path | None, typer.Option(help="Certificate (PEM) of an encrypted connection.")] = None,
+    key: Annotated[Path | None, typer.Option(help="Key (PEM) of the certificate.")] = None,
+) -> None:
+    """Show runs in a browser, until Ctrl-C."""
+    from errormotion.cli.commands import dashboard as command
+
+    command.run(runs, host, port, name or [], cert, key)
+
+
+@app.command()
+@guarded
 def note(
     folder: Annotated[Path, typer.Argument(help="A run folder; or a folder of runs, with --machine and --at.")],
     text: Annotated[str, typer.Argument(help="What happened, on one line.")],
