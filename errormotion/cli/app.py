@@ -468,6 +468,8 @@ def runs(
 @guarded
 def dashboard(
     runs: Annotated[Path, typer.Argument(help="The folder of runs.")] = Path("runs"),
+    bench: Annotated[Path | None, typer.Option(help="A bench file: its thermometers and controller are read.")] = None,
+    interval: Annotated[str, typer.Option(help="Of the readings of the bench, such as '1 s'.")] = "1 s",
     host: Annotated[
         str, typer.Option(help="Address to listen on. Others than 127.0.0.1 are open to the network: with a token.")
     ] = "127.0.0.1",
@@ -478,10 +480,10 @@ def dashboard(
     cert: Annotated[Path | None, typer.Option(help="Certificate (PEM) of an encrypted connection.")] = None,
     key: Annotated[Path | None, typer.Option(help="Key (PEM) of the certificate.")] = None,
 ) -> None:
-    """Show runs in a browser, until Ctrl-C."""
+    """Show runs, and the instruments of a bench, in a browser, until Ctrl-C."""
     from errormotion.cli.commands import dashboard as command
 
-    command.run(runs, host, port, name or [], cert, key)
+    command.run(runs, bench, interval, host, port, name or [], cert, key)
 
 
 @app.command()

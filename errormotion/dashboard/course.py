@@ -116,18 +116,22 @@ def thin(values: Array, most: int = MOST_POINTS) -> NDArray[np.intp]:
     ndarray of int
         Increasing.
     """
-    n = len(values)
+    n, bins = len(values), max(1, (most - 2) // 3)
     if n <= most:
         return np.arange(n)
-    kept = [0, n - 1]
-    for part in np.array_split(np.arange(n), max(1, most // 3)):
-        known = np.isfinite(values[part])
-        if known.any():
-            own = part[known]
-            kept += [int(own[np.argmin(values[own])]), int(own[np.argmax(values[own])])]
-        if not known.all():
-            kept.append(int(part[np.argmin(known)]))
-    return np.unique(np.array(kept, dtype=np.intp))
+    width = -(-n // bins)
+    rows = np.full(bins * width, np.nan)
+    rows[:n] = values
+    rows = rows.reshape(bins, width)
+    start, known = np.arange(bins) * width, np.isfinite(rows)
+    some = known.any(axis=1)
+    kept = [
+        (start + np.where(known, rows, np.inf).argmin(axis=1))[some],
+        (start + np.where(known, rows, -np.inf).argmax(axis=1))[some],
+        (start + known.argmin(axis=1))[~known.all(axis=1)],
+    ]
+    indices: NDArray[np.intp] = np.unique(np.concatenate([[0, n - 1], *kept]))
+    return indices[indices < n]
 
 
 def as_csv(found: Course) -> str:

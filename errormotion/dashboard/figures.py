@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,32 @@ def errors_item(found: Course, freedoms: Sequence[str] = ()) -> dict[str, Any]:
         plot = _panel(found, unit, _reach(own), last=unit == units[-1])
         for curve in own:
             _draw(plot, found, curve, looks[curve.freedom])
+        _legend(plot)
+        if panels:
+            plot.x_range = panels[0].x_range
+        panels.append(plot)
+    rows = [[panel] for panel in panels]
+    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+
+
+def live_item(units: Mapping[str, str]) -> dict[str, Any]:
+    """Return a figure over time without data: one panel for each unit; the browser fills the source of each name.
+
+    ``units`` holds the unit of each quantity by its name.
+    """
+    panels: list[figure] = []
+    kinds = list(dict.fromkeys(units.values()))
+    for unit in kinds:
+        plot = _axes(unit, None, last=unit == kinds[-1], x_axis_type="datetime")
+        for number, name in enumerate(name for name, own in units.items() if own == unit):
+            colour, dash = _look(number)
+            source = ColumnDataSource({"x": [], "y": []}, name=name)
+            line = plot.line(
+                "x", "y", source=source, color=colour, line_width=1.8, line_dash=list(dash), legend_label=plain(name)
+            )
+            tips = [("time", "@x{%H:%M:%S}"), (plain(name), f"@y{{0.000}} {unit}")]
+            plot.add_tools(HoverTool(renderers=[line], tooltips=tips, formatters={"@x": "datetime"}, mode="mouse"))
+        _legend(plot)
         if panels:
             plot.x_range = panels[0].x_range
         panels.append(plot)
@@ -59,21 +85,26 @@ def _reach(curves: Sequence[Curve]) -> Range1d:
 
 
 def _panel(found: Course, unit: str, reach: Range1d, *, last: bool) -> figure:
-    plot = figure(
-        height=HEIGHT + 30 * last,
-        sizing_mode="stretch_width",
-        tools="pan,box_zoom,wheel_zoom,reset,save",
-        active_drag="box_zoom",
-        y_range=reach,
-        x_axis_label=plain(found.label) if last else None,
-        y_axis_label=unit,
-        output_backend="canvas",
-    )
+    plot = _axes(unit, plain(found.label) if last else None, last=last, y_range=reach)
     if found.names:
         ticks = np.unique(np.linspace(0, len(found.names) - 1, min(len(found.names), 12)).astype(int))
         plot.xaxis.ticker = [int(k) for k in ticks]
         plot.xaxis.major_label_overrides = {int(k): plain(found.names[k]) for k in ticks}
         plot.x_range = Range1d(-0.6, len(found.names) - 0.4)
+    return plot
+
+
+def _axes(unit: str, label: str | None, *, last: bool, **options: Any) -> figure:
+    plot = figure(
+        height=HEIGHT + 30 * last,
+        sizing_mode="stretch_width",
+        tools="pan,box_zoom,wheel_zoom,reset,save",
+        active_drag="box_zoom",
+        x_axis_label=label,
+        y_axis_label=unit,
+        output_backend="canvas",
+        **options,
+    )
     for axis in plot.axis:
         axis.axis_label_text_font, axis.major_label_text_font = FONT, FONT
         axis.axis_label_text_font_style, axis.axis_label_text_font_size = "normal", "13px"
@@ -84,8 +115,23 @@ def _panel(found: Course, unit: str, reach: Range1d, *, last: bool) -> figure:
     return plot
 
 
+def _look(number: int) -> tuple[str, tuple[float, ...]]:
+    """Return colour and dashes of a curve by its number."""
+    return COLOURS[number % len(COLOURS)], DASHES[number // len(COLOURS) % len(DASHES)] or ()
+
+
+def _legend(plot: figure) -> None:
+    """Put the legend above the axes, where it hides no curve."""
+    legend = plot.legend[0]
+    plot.center.remove(legend)
+    plot.add_layout(legend, "above")
+    legend.orientation, legend.border_line_color, legend.padding = "horizontal", None, 2
+    legend.ncols, legend.label_text_font, legend.label_text_font_size = 8, FONT, "13px"
+    legend.label_text_color = INK
+
+
 def _draw(plot: figure, found: Course, curve: Curve, number: int) -> None:
-    colour, dash = COLOURS[number % len(COLOURS)], DASHES[number // len(COLOURS) % len(DASHES)]
+    colour, dash = _look(number)
     kept = thin(curve.values)
     values, expanded = curve.values[kept], curve.expanded[kept]
     data: dict[str, Any] = {"x": found.places[kept], "y": values, "U": expanded}
@@ -106,12 +152,6 @@ def _draw(plot: figure, found: Course, curve: Curve, number: int) -> None:
     else:
         plot.varea("x", "low", "high", source=source, color=colour, alpha=0.18)
         drawn = plot.line(
-            "x", "y", source=source, color=colour, line_width=1.8, line_dash=list(dash or ()), legend_label=curve.name
+            "x", "y", source=source, color=colour, line_width=1.8, line_dash=list(dash), legend_label=curve.name
         )
     plot.add_tools(HoverTool(renderers=[drawn], tooltips=tips, mode="mouse" if found.names else "vline"))
-    legend = plot.legend[0]
-    if legend not in plot.above:
-        plot.center.remove(legend)
-        plot.add_layout(legend, "above")
-        legend.orientation, legend.border_line_color, legend.padding = "horizontal", None, 2
-        legend.label_text_font, legend.label_text_font_size, legend.label_text_color = FONT, "13px", INK

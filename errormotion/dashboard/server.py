@@ -14,11 +14,13 @@ from tornado.httpserver import HTTPServer
 from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, StaticFileHandler
 
+from errormotion.campaign.files import load_bench
 from errormotion.dashboard.access import LOOPBACK, Access, access_for
 from errormotion.dashboard.lab import Lab
-from errormotion.dashboard.pages import results
+from errormotion.dashboard.pages import now, results
 from errormotion.dashboard.pages.login import Login
 from errormotion.dashboard.pages.page import Context, Guarded, note_request
+from errormotion.dashboard.watch import Watch
 from errormotion.errors import RunError
 
 HERE = Path(__file__).parent
@@ -44,6 +46,8 @@ class Options:
     names: tuple[str, ...] = ()
     cert: Path | None = None
     key: Path | None = None
+    bench: Path | None = None
+    interval: float = 1.0
 
 
 class Start(Guarded):
@@ -87,12 +91,16 @@ def application(context: Context) -> Application:
         [
             (r"/", Start, one),
             (r"/login", Login, one),
+            (r"/now", now.Now, one),
+            (r"/now/values\.json", now.Values, one),
+            (r"/now/figure\.json", now.Figure, one),
+            (r"/now/history\.json", now.History, one),
             (r"/results", results.Results, one),
             (r"/run", results.Run, one),
             (r"/run/figure\.json", results.Figure, one),
             (r"/run/values\.csv", results.Values, one),
             (r"/run/file", results.File, one),
-            (r"/static/(dashboard\.css|dashboard\.js|icon\.svg)", Static, {**one, "path": str(HERE / "static")}),
+            (r"/static/(dashboard\.css|[a-z]+\.js|icon\.svg)", Static, {**one, "path": str(HERE / "static")}),
             (rf"/static/({scripts})", Static, {**one, "path": str(bokehjs_path() / "js")}),
         ],
         default_handler_class=Missing,
@@ -116,8 +124,11 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
     ------
     RunError
         The address cannot be listened on, or certificate and key cannot be used.
+    BenchError
+        The bench file has mistakes, or nothing that a monitor reads.
     """
     context_of_tls = _encryption(options)
+    watch = Watch(load_bench(options.bench), options.runs, options.interval) if options.bench is not None else None
     access = access_for(options.host, options.names, secure=context_of_tls is not None)
     with ThreadPoolExecutor(WORKERS, thread_name_prefix="errormotion-dashboard") as workers:
         try:
@@ -125,7 +136,8 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
         except OSError as error:
             raise RunError(f"{options.host}, port {options.port}: cannot be listened on: {error.strerror}") from error
         port = int(sockets[0].getsockname()[1])
-        context = Context(access, Lab(options.runs), port, workers, (("/results", "Results"),))
+        pages = ((("/now", "Now"),) if watch is not None else ()) + (("/results", "Results"),)
+        context = Context(access, Lab(options.runs), port, workers, pages, watch)
         server = HTTPServer(
             application(context),
             ssl_options=context_of_tls,
@@ -136,11 +148,15 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
             max_header_size=LARGEST_HEAD,
         )
         server.add_sockets(sockets)
+        if watch is not None:
+            watch.start()
         try:
             started(_address(options, port), access)
             await (end or asyncio.Event()).wait()
         finally:
             server.stop()
+            if watch is not None:
+                await asyncio.to_thread(watch.stop)
             await server.close_all_connections()
 
 

@@ -15,6 +15,7 @@ from tornado.web import HTTPError, RequestHandler
 from errormotion import __version__
 from errormotion.dashboard.access import Access
 from errormotion.dashboard.lab import Lab
+from errormotion.dashboard.watch import Watch
 from errormotion.errors import ErrormotionError
 
 T = TypeVar("T")
@@ -42,8 +43,8 @@ class Context:
     workers: Executor
     pages: tuple[tuple[str, str], ...]
     """Paths and titles of the pages in the bar."""
-    title: str = ""
-    """The machine, where a bench names one."""
+    watch: Watch | None = None
+    """Of the bench, where one was given."""
     environment: Environment = field(
         default_factory=lambda: Environment(
             loader=PackageLoader("errormotion.dashboard"),
@@ -117,7 +118,8 @@ class Guarded(RequestHandler):
 
     def show(self, template: str, **values: Any) -> None:
         """Write a page; every value is shown as text."""
-        common = {"pages": self.context.pages, "here": self.request.path, "machine": self.context.title}
+        machine = self.context.watch.plan.machine if self.context.watch is not None else ""
+        common: dict[str, Any] = {"pages": self.context.pages, "here": self.request.path, "machine": machine}
         common |= {"version": __version__, "guarded": bool(self.context.access.token)}
         self.finish(self.context.environment.get_template(template).render(**common, **values))
 
