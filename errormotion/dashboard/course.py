@@ -120,9 +120,9 @@ def thin(values: Array, most: int = MOST_POINTS) -> NDArray[np.intp]:
     if n <= most:
         return np.arange(n)
     width = -(-n // bins)
-    rows = np.full(bins * width, np.nan)
-    rows[:n] = values
-    rows = rows.reshape(bins, width)
+    padded = np.full(bins * width, np.nan)
+    padded[:n] = values
+    rows = padded.reshape(bins, width)
     start, known = np.arange(bins) * width, np.isfinite(rows)
     some = known.any(axis=1)
     kept = [

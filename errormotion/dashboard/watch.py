@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.campaign.files import BenchPlan
@@ -100,7 +101,7 @@ class _History:
         self.times = np.full(self.size, np.nan)
         self.rows = np.full((self.size, len(self.names)), np.nan)
 
-    def put(self, time: float, row: Sequence[float]) -> None:
+    def put(self, time: float, row: ArrayLike) -> None:
         at = self.count % self.size
         self.times[at], self.rows[at] = time, row
         self.count += 1

@@ -18,7 +18,7 @@ from errormotion.dashboard.access import Access
 from errormotion.datasets import provenance
 from errormotion.datasets.results.build import build_errors
 
-MARKUP = "<script>document.title='taken'</script>&amp;\"'"
+MARKUP = "<script>window.taken='yes'</script>&amp;\"'"
 """What stands in each name that comes from a file."""
 
 
@@ -28,6 +28,7 @@ class Served:
 
     address: str
     access: Access
+    stop: Callable[[], None]
 
     def ask(self, path: str, method: str = "GET", body: str = "", **headers: str) -> tuple[int, dict[str, str], str]:
         """Return status, headers and text of an answer."""
@@ -81,21 +82,26 @@ def serving() -> Iterator[Callable[..., Served]]:
     """Return a function that serves a folder of runs in a thread until the tests end."""
     from errormotion.dashboard.server import Options, serve
 
-    ends: list[tuple[asyncio.AbstractEventLoop, asyncio.Event, threading.Thread]] = []
+    stops: list[Callable[[], None]] = []
 
     def start(runs: Path, **options: Any) -> Served:
         found: list[Served] = []
         ready = threading.Event()
 
         async def work() -> None:
-            end = asyncio.Event()
-            ends.append((asyncio.get_running_loop(), end, thread))
+            loop, end = asyncio.get_running_loop(), asyncio.Event()
+
+            def stop() -> None:
+                if thread.is_alive():
+                    loop.call_soon_threadsafe(end.set)
+                    thread.join(20)
 
             def started(address: str, access: Access) -> None:
-                found.append(Served(address, access))
+                found.append(Served(address, access, stop))
+                stops.append(stop)
                 ready.set()
 
-            await serve(Options(runs, port=0, **options), started, end)
+            await serve(Options(runs, **{"port": 0, **options}), started, end)
 
         thread = threading.Thread(target=lambda: asyncio.run(work()), daemon=True)
         thread.start()
@@ -103,9 +109,8 @@ def serving() -> Iterator[Callable[..., Served]]:
         return found[0]
 
     yield start
-    for loop, end, thread in ends:
-        loop.call_soon_threadsafe(end.set)
-        thread.join(20)
+    for stop in stops:
+        stop()
 
 
 @pytest.fixture(scope="session")

@@ -31,7 +31,9 @@ function show(found) {
   byId("parameters-card").hidden = !found.parameters.length;
   byId("parameters").replaceChildren(...found.parameters.map((each) => {
     const row = element("div");
-    row.append(element("dt", each.name), element("dd", number(each.value, each.unit === "mm" ? 3 : 0)), element("span", each.unit, "unit"));
+    const value = element("dd", number(each.value, each.unit === "mm" ? 3 : 0));
+    value.append(element("span", each.unit, "unit"));
+    row.append(element("dt", each.name), value);
     return row;
   }));
   byId("program").textContent = [found.mode && `mode ${found.mode}`, found.program && `program ${found.program}`].filter(Boolean).join(", ");
