@@ -215,7 +215,10 @@ class Compensation:
         )
         self.folder.data["compensation"] = {"armed": self.armed, "model": self._model_hash, "audit": AUDIT}
         self.folder.save()
-        applied = np.asarray(self._output.read().offset) if self.armed else np.zeros(3)
+        applied = np.zeros(3)
+        if self.armed:
+            self._output.arm(self.limits.limit)
+            applied = np.asarray(self._output.read().offset)
         self._follower.arm(applied)
 
     def stop(self) -> None:

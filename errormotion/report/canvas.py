@@ -49,6 +49,7 @@ _STYLE: Any = {
     "ytick.labelsize": 7.5,
     "axes.formatter.useoffset": False,
     "axes.grid": True,
+    "axes.axisbelow": True,
     "grid.color": "#e4e4e4",
     "grid.linewidth": 0.5,
     "lines.linewidth": 1.1,
@@ -203,7 +204,7 @@ def inline(svg: str, key: str) -> Markup:
             name = attributes.pop("id")
             if name in wanted:
                 attributes["id"] = f"{key}-{name}"
-        if "href" in attributes:
+        if attributes.get("href", "").startswith("#"):
             attributes["href"] = f"#{key}-{attributes['href'].lstrip('#')}"
         if "d" in attributes:
             attributes["d"] = _short(attributes["d"])

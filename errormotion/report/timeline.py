@@ -164,16 +164,22 @@ def temperatures(names: Sequence[str], values: Array) -> list[Panel]:
     return [Panel("Temperatures", "°C", lines, height, legend=True)]
 
 
-def working(dataset: xr.Dataset, *, held: bool) -> list[Panel]:
-    """Return spindle speed and feed as strips, if known; the feed only if it is not always 0."""
+def working(dataset: xr.Dataset, *, held: bool, commanded: Array | None = None) -> list[Panel]:
+    """Return spindle speed and feed as strips, if known; the feed only if it is not always 0.
+
+    ``commanded`` (time,) in 1/min is drawn in place of the recorded speed, which is a mean over each interval if
+    ``held``.
+    """
     panels = []
-    for name, title, unit, size in (
-        ("spindle_speed", "Spindle speed", "1/min", 1.0),
-        ("feed", "Feed", "m/min", 1 / 60),
+    for name, quantity, unit, size in (
+        ("spindle_speed", "spindle speed", "1/min", 1.0),
+        ("feed", "feed", "m/min", 1 / 60),
     ):
-        if name not in dataset or dataset[name].dims != ("time",):
+        told = commanded if name == "spindle_speed" else None
+        if told is None and (name not in dataset or dataset[name].dims != ("time",)):
             continue
-        values = np.asarray(dataset[name].values, float) / size
+        title = f"Commanded {quantity}" if told is not None else f"Mean {quantity}" if held else quantity.capitalize()
+        values = told if told is not None else np.asarray(dataset[name].values, float) / size
         if np.isfinite(values).any() and (name == "spindle_speed" or np.nanmax(np.abs(values)) > 0):
             panels.append(Panel(title, unit, [Line(title, values, None, "#bbbbbb")], 0.3, strip=True, held=held))
     return panels

@@ -152,8 +152,25 @@ def _is_log(dataset: xr.Dataset) -> bool:
     return isinstance(getattr(owner, "info", None), plugins.DatasetInfo) and hasattr(owner, "chapters")
 
 
+def _kind_without_errors(dataset: xr.Dataset) -> str:
+    """Return what a stored dataset is that has no report, and the command that shows it; empty for others."""
+    owner = plugins.owner_of_schema(str(dataset.attrs.get("schema")))
+    if not isinstance(getattr(owner, "info", None), plugins.DatasetInfo):
+        return ""
+    if hasattr(owner, "predictor"):
+        return (
+            "a model, which states no errors. Compare it with a measured campaign: errormotion model check MODEL "
+            "ERRORS --report page.html; or predict errors and report these: errormotion model predict MODEL DATA"
+        )
+    if hasattr(owner, "chapters"):
+        return ""
+    return f"another kind of data: {owner.info.summary.rstrip('.')} ({dataset.attrs['schema']})"
+
+
 def _check_reportable(dataset: xr.Dataset) -> None:
     missing = [name for name in (*FREEDOMS, "covariance") if name not in dataset]
+    if missing and (kind := _kind_without_errors(dataset)):
+        raise DatasetError(f"A report is made from error datasets, or from a log; this is {kind}")
     if missing and not _is_log(dataset):
         raise DatasetError(
             f"A report is made from error datasets, or from a log; this dataset lacks {', '.join(missing)}. "

@@ -69,6 +69,7 @@ class Machine:
     busy = fault = ""
     silent = deaf = False
     written: tuple[tuple[float, ...], ...] = ()
+    armed = False
 
     def __init__(self, address: str, settings: Any) -> None:
         del address, settings
@@ -83,10 +84,15 @@ class Machine:
     def identify(self) -> Identity:
         return Identity("tests", "machine", "1", simulated=True)
 
+    def arm(self, limit: float) -> None:
+        assert limit == LIMITS.limit
+        self.armed = True
+
     def read(self) -> Applied:
         return Applied(Machine.offset, Machine.busy, Machine.fault)
 
     def write(self, offset: list[float]) -> None:
+        assert self.armed
         if Machine.deaf:
             raise InstrumentError("not taken")
         Machine.offset = tuple(offset)  # type: ignore[assignment]

@@ -71,3 +71,13 @@ def test_svg_has_no_address_and_no_loose_identifier():
     assert set(ids) <= used
     assert not set(ids) & set(re.findall(r' id="([^"]+)"', other))
     ElementTree.fromstring(one)
+
+
+def test_a_picture_inside_a_drawing_is_kept_in_it():
+    def paint(figure):
+        axes = figure.subplots()
+        figure.colorbar(axes.scatter([0, 1], [0, 1], c=[0, 1]))  # many colours: matplotlib embeds a picture
+
+    svg = str(canvas.draw(paint, "k", 2.0))
+    assert re.findall(r'href="(data:image/png;base64,|#k-)', svg).count("data:image/png;base64,") == 1
+    assert "#k-data:" not in svg

@@ -10,6 +10,8 @@ import xarray as xr
 from errormotion.datasets import build_errors
 from errormotion.errors import DatasetError
 from errormotion.report import provenance, write_report
+from errormotion.report.document import Source
+from errormotion.report.series import commanded_speed
 
 VOID = {"meta", "br", "hr", "img", "link", "input", "col", "wbr"}
 
@@ -319,3 +321,19 @@ def test_what_is_no_error_dataset_is_refused(tmp_path):
     with pytest.raises(DatasetError, match="at least one"):
         write_report([], tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_is_refused_with_the_commands_that_show_it(tmp_path):
+    model = xr.Dataset(attrs={"schema": "errormotion.model.thermal/1"})
+    with pytest.raises(DatasetError, match="errormotion model check MODEL ERRORS"):
+        write_report(model, tmp_path / "report.html")
+
+
+def test_the_speed_over_time_is_the_commanded_one_of_the_schedule(drift):
+    schedule = [{"at": 600.0, "spindle_speed": 12000.0}, {"at": 3000.0, "spindle_speed": 0.0}, {"at": 10.0}]
+    source = Source(drift, provenance={"settings": {"schedule": schedule}})
+    time, speed = drift["time"].values, commanded_speed(source)
+    assert (speed[time <= 600] == 0).all()
+    assert (speed[(time > 600) & (time <= 3000)] == 12000).all()
+    assert (speed[time > 3000] == 0).all()
+    assert commanded_speed(Source(drift)) is None

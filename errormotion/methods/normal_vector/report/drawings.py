@@ -200,12 +200,12 @@ def normals(seen: Probing, key: str) -> Block:
             ]
             if lines:
                 panels.append(timeline.Panel(f"Normals minus fit, {title}", unit, lines, 1.1))
-    cost = [
+    ratios = [
         timeline.Line(FREEDOMS[i], seen.loss[:, i], None, canvas.COLOURS[i % 3], None if i < 3 else (4, 2))
         for i in shown
     ]
     panels.append(
-        timeline.Panel("Standard uncertainty by the normals over that of the fit", "", cost, 1.1, legend=True)
+        timeline.Panel("Standard uncertainty by the normals over that of the fit", "", ratios, 1.1, legend=True)
     )
     spans = "; ".join(panel.in_words() for panel in panels)
     caption = (
