@@ -22,6 +22,10 @@ FILES = {"report": "report.html", "run": FILE, "log": "log.jsonl"}
 """Files of a run folder that may be fetched, by the word for them; the error dataset is the fourth, ``errors``."""
 
 
+class NotFoundError(RunError):
+    """There is no such run, or it has no such file."""
+
+
 @dataclass(frozen=True)
 class Choice:
     """A selection of runs; an empty text selects every run."""
@@ -88,8 +92,8 @@ class Lab:
         return Table(
             tuple(_row(self.key(path), entry) for path, entry in chosen),
             len(found.runs),
-            found.machines,
-            found.methods,
+            _values(found.machines),
+            _values(found.methods),
             _values(entry.status for _, entry in found.runs),
             _values(entry.verdict for _, entry in found.runs),
             (*remarks, *(f"Not read: {reason}" for reason in found.skipped)),
@@ -104,7 +108,7 @@ class Lab:
 
         Raises
         ------
-        RunError
+        NotFoundError
             The key names no run in the folder of runs.
         """
         parts = key.split("/")
@@ -113,7 +117,7 @@ class Lab:
             path = root.joinpath(*parts)
             if not any(part in ("", ".", "..") for part in parts) and _inside(path / FILE, root):
                 return path
-        raise RunError(f"There is no run {key[:LONGEST_KEY]!r} in {self.runs}.")
+        raise NotFoundError(f"There is no run {key[:LONGEST_KEY]!r} in {self.runs}.")
 
     def entry(self, key: str) -> Entry:
         """Return what a run states.
@@ -137,7 +141,7 @@ class Lab:
         name = read_entry(folder).errors if word == "errors" else FILES.get(word, "")
         if name and _inside(folder / name, folder):
             return folder / name
-        raise RunError(f"Run {key!r} has no file '{word[:20]}'.")
+        raise NotFoundError(f"Run {key!r} has no file '{word[:20]}'.")
 
     def files(self, key: str) -> tuple[str, ...]:
         """Return the words of the files that a run has."""

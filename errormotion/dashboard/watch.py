@@ -67,9 +67,9 @@ class Quantity:
     change: float = math.nan
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Present:
-    """Everything that a bench says now.
+    """Everything that a bench says now; the same object until something has changed.
 
     ``running`` is False once the monitor has stopped, for the reason ``error``; ``rows`` counts those of its log.
     """
@@ -141,6 +141,7 @@ class Watch:
         self._extremes = np.full((3, len(self.units)), np.nan)  # first, lowest, highest
         self._lock, self._end = threading.Lock(), threading.Event()
         self._last: Snapshot | None = None
+        self._known: tuple[tuple[Any, ...], Present] | None = None
         self._since: dict[str, tuple[str, datetime]] = {}
         self._began, self._error, self._running = _now(), "", False
         self._thread = threading.Thread(target=self._work, name="errormotion-watch", daemon=True)
@@ -157,16 +158,22 @@ class Watch:
 
     def present(self) -> Present:
         """Return what the bench says now."""
+        errors = tuple(source.error for source in self._monitor.sources)
         with self._lock:
-            last, extremes, run = self._last, self._extremes.copy(), self._run_name()
-            instruments = tuple(self._instrument(source) for source in self._monitor.sources)
-            running, error = self._running, self._error
+            revision = (self._running, self._error, self._last.logged if self._last else 0, *errors)
+            if self._known is None or self._known[0] != revision:
+                self._known = (revision, self._present())
+            return self._known[1]
+
+    def _present(self) -> Present:
+        last, running, error, run = self._last, self._running, self._error, self._run_name()
+        instruments = tuple(self._instrument(source) for source in self._monitor.sources)
         if last is None:
             return Present(_now(), running, error, 0, run, instruments)
         values = dict(zip(self.units, _row(last, self.units), strict=True))
         quantities = {
             name: Quantity(name, value, self.units[name], last.flags.get(name, ""), low, high, value - first)
-            for (name, value), first, low, high in zip(values.items(), *extremes, strict=True)
+            for (name, value), first, low, high in zip(values.items(), *self._extremes, strict=True)
         }
         alarms = last.state.get("alarms") or ()
         return Present(

@@ -1,9 +1,5 @@
-"""The dashboard in Chromium: what a person sees, without a request to anybody else and without an error in the console.
+"""The dashboard in Chromium: what a person sees, without a request to others or an error in the console."""
 
-With ``SCREENSHOTS=folder`` the pictures of the docs are written.
-"""
-
-import os
 import re
 import shutil
 import time
@@ -67,11 +63,6 @@ def page(browser: Any) -> Iterator[Any]:
     assert asked
 
 
-def picture(page: Any, name: str) -> None:
-    if folder := os.environ.get("SCREENSHOTS"):
-        page.screenshot(path=str(Path(folder) / f"{name}.png"))
-
-
 def accessible(page: Any) -> None:
     """Refuse what axe-core finds wrong by WCAG 2.2 AA."""
     page.evaluate(AXE.read_text())
@@ -98,7 +89,7 @@ def test_results_and_a_run_at_another_functional_point(page: Any, open_to_this_c
     page.wait_for_selector("#figure[data-drawn='2']")
     assert page.inner_text("#figure-note") == "At the functional point X 0, Y 0, Z -200 mm."
     page.fill("input[name=z]", "1e9")
-    page.expected_errors = ("404",)
+    page.expected_errors = ("400",)
     sync_api.expect(page.locator("#figure-note")).to_contain_text("expected three numbers in mm")
     report = page.frame_locator("iframe")
     page.locator("iframe").scroll_into_view_if_needed()

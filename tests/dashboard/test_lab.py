@@ -19,6 +19,7 @@ def test_every_run_is_listed_newest_first_with_its_first_figure(lab: Lab) -> Non
     finished = next(row for row in table.rows if row.status == "finished")
     assert (finished.figure, finished.value, finished.unit) == ("EX after 60.0 min", "0.00", "µm")
     assert table.statuses == ("failed", "finished")
+    assert "" not in (*table.machines, *table.methods, *table.verdicts)
     assert {lab.folder(row.key) for row in table.rows} == {
         path.resolve() for path in lab.runs.iterdir() if path.is_dir()
     }

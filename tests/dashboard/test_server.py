@@ -10,6 +10,9 @@ from typing import Any
 from urllib.parse import urlencode
 
 import pytest
+
+pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
+
 from tornado.web import Application
 
 from errormotion.dashboard.access import access_for
@@ -112,7 +115,7 @@ def test_the_figure_follows_the_functional_point(open_to_this_computer: Any, key
     assert found["item"]["doc"]["roots"]
     for wrong in ({"x": "far"}, {"x": "1e9", "y": "0", "z": "0"}, {"x": "1", "y": "", "z": "0"}, {"at": "time:-1"}):
         status, found = figure(**wrong)
-        assert status == 404
+        assert status == 400
         assert "expected" in found["error"]
 
 

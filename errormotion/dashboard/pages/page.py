@@ -14,7 +14,7 @@ from tornado.web import HTTPError, RequestHandler
 
 from errormotion import __version__
 from errormotion.dashboard.access import Access
-from errormotion.dashboard.lab import Lab
+from errormotion.dashboard.lab import Lab, NotFoundError
 from errormotion.dashboard.watch import Watch
 from errormotion.errors import ErrormotionError
 
@@ -128,7 +128,7 @@ class Guarded(RequestHandler):
         error = kwargs.get("exc_info", (None, None, None))[1]
         message = self._reason
         if isinstance(error, ErrormotionError):
-            self.set_status(404 if self.request.method == "GET" else 400)
+            self.set_status(404 if isinstance(error, NotFoundError) else 400)
             message = str(error)
         elif not isinstance(error, HTTPError):
             message = "Internal error; the traceback is in the log of the commands."
