@@ -34,6 +34,8 @@ driver = "dcon_temperature"
 address = "tcp://127.0.0.1:9"
 channels = ["hall north"]
 """
+COMPARED = ("drift", "balls")
+"""Tests of the demonstration that state the same errors."""
 SECONDS = 40
 """Time that the bench is watched before the picture is taken, s: as many minutes of the virtual machine."""
 
@@ -76,6 +78,14 @@ def main(made: Path) -> None:
         page.wait_for_timeout(500)
         clip = {"x": 0, "y": 0, "width": 1280, "height": 1090}
         page.screenshot(path=pictures / "dashboard_run.png", clip=clip, full_page=True)
+        page.goto(address + "compare")
+        for test in COMPARED:
+            page.check(f"tr:has(label:text-is('{test}')) >> nth=0 >> input")
+        page.check("input[name=same_start]")
+        page.click("button:has-text('Compare')")
+        page.wait_for_selector("#figure[data-drawn] canvas")
+        page.wait_for_timeout(500)
+        page.screenshot(path=pictures / "dashboard_compare.png", clip=clip, full_page=True)
         browser.close()
 
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from bokeh.embed import json_item
 from bokeh.layouts import gridplot
 from bokeh.models import ColumnDataSource, HoverTool, Range1d, Whisker
 from bokeh.plotting import figure
 
+from errormotion.compare.pairs import COVERAGE_FACTOR
+from errormotion.compare.report.picture import abscissa, common, field
 from errormotion.dashboard.course import Course, Curve, thin
 from errormotion.report.canvas import COLOURS, DASHES
 
@@ -36,6 +40,35 @@ def errors_item(found: Course, freedoms: Sequence[str] = ()) -> dict[str, Any]:
         plot = _panel(found, unit, _reach(own), last=unit == units[-1])
         for curve in own:
             _draw(plot, found, curve, looks[curve.freedom])
+        _legend(plot)
+        if panels:
+            plot.x_range = panels[0].x_range
+        panels.append(plot)
+    rows = [[panel] for panel in panels]
+    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+
+
+def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
+    """Return the figure of a comparison: one panel for each freedom, with every dataset and its band."""
+    names = [plain(str(name)) for name in ds["dataset"].values]
+    places, label, joined = abscissa(ds) if common(ds) else (np.zeros(1), "", False)
+    texts = () if joined else tuple(f"{each + 1:.0f}" if common(ds) else "" for each in places)
+    expanded = COVERAGE_FACTOR * np.sqrt(np.maximum(np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1), 0.0))
+    freedoms, panels = [str(name) for name in ds["dof"].values], list[figure]()
+    for k, freedom in enumerate(freedoms):
+        factor, unit = field(freedom)
+        unit = unit.replace("um", "µm")
+        values = factor * ds["value"].values[..., k].reshape(len(names), -1)
+        bands = factor * expanded[..., k].reshape(len(names), -1)
+        curves = [Curve(freedom, *each) for each in zip(names, [unit] * len(names), values, bands, strict=True)]
+        known = [(i, each) for i, each in enumerate(curves) if np.isfinite(each.values).any()]
+        if not known:
+            continue
+        found = Course(label, np.asarray(places, dtype=float), texts, tuple(curves), np.zeros(3), {})
+        plot = _panel(found, f"{freedom} / {unit}", _reach([each for _, each in known]), last=freedom == freedoms[-1])
+        for i, curve in known:
+            beside = 0.0 if joined else 0.12 * (i - (len(names) - 1) / 2)
+            _draw(plot, replace(found, places=found.places + beside), curve, i)
         _legend(plot)
         if panels:
             plot.x_range = panels[0].x_range

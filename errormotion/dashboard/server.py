@@ -17,7 +17,7 @@ from tornado.web import Application, HTTPError, StaticFileHandler
 from errormotion.campaign.files import load_bench
 from errormotion.dashboard.access import LOOPBACK, Access, access_for
 from errormotion.dashboard.lab import Lab
-from errormotion.dashboard.pages import now, results
+from errormotion.dashboard.pages import compare, now, results
 from errormotion.dashboard.pages.login import Login
 from errormotion.dashboard.pages.page import Context, Guarded, note_request
 from errormotion.dashboard.watch import Watch
@@ -95,6 +95,10 @@ def application(context: Context) -> Application:
             (r"/now/values\.json", now.Values, one),
             (r"/now/figure\.json", now.Figure, one),
             (r"/now/history\.json", now.History, one),
+            (r"/compare", compare.Compare, one),
+            (r"/compare/figure\.json", compare.Figure, one),
+            (r"/compare/report\.html", compare.Report, one),
+            (r"/compare/history\.html", compare.History, one),
             (r"/results", results.Results, one),
             (r"/run", results.Run, one),
             (r"/run/figure\.json", results.Figure, one),
@@ -136,7 +140,7 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
         except OSError as error:
             raise RunError(f"{options.host}, port {options.port}: cannot be listened on: {error.strerror}") from error
         port = int(sockets[0].getsockname()[1])
-        pages = ((("/now", "Now"),) if watch is not None else ()) + (("/results", "Results"),)
+        pages = ((("/now", "Now"),) if watch is not None else ()) + (("/results", "Results"), ("/compare", "Compare"))
         context = Context(access, Lab(options.runs), port, workers, pages, watch)
         server = HTTPServer(
             application(context),

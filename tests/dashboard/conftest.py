@@ -48,26 +48,42 @@ def markup() -> str:
     return MARKUP
 
 
-@pytest.fixture(scope="session")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a finished run, whose names and report hold markup, and a failed one."""
-    root = tmp_path_factory.mktemp("runs")
+def finished(root: Path, number: str, bias: float = 0.0) -> RunFolder:
+    """Write a finished run whose names hold markup: an hour of drift, in the end too large by ``bias`` along Z, m."""
     base = {"bench": {"machine": f"Mill {MARKUP}"}, "method": {"id": "spindle_drift"}, "steps": []}
-    folder = RunFolder.create(root, "drift", "00000001", {**base, "status": "finished", "errors": "errors.nc"})
+    folder = RunFolder.create(root, "drift", number, {**base, "status": "finished", "errors": "errors.nc"})
     t = np.linspace(0.0, 3600.0, 5000)
     twist = np.zeros((t.size, 6))
-    twist[:, 2], twist[:, 4] = 20e-6 * (1 - np.exp(-t / 900)), 5e-5 * (1 - np.exp(-t / 900))
+    warm = 1 - np.exp(-t / 900)
+    twist[:, 2], twist[:, 4] = (20e-6 + bias) * warm, 5e-5 * warm
     covariance = np.broadcast_to(np.diag([1e-7] * 3 + [1e-6] * 3) ** 2, (t.size, 6, 6)).copy()
     ds = build_errors(
         twist, covariance, dims=("time",), coords={"time": t}, machine=f"Mill {MARKUP}", component="spindle",
         frame=f"machine {MARKUP}", functional_point=np.zeros(3), method="spindle_drift", method_version="1",
         reference="mean of the first second", notes=[f"a note {MARKUP}"], provenance=provenance.make({}, None, None),
+        start="2026-01-01T08:00:00+00:00",
     )  # fmt: skip
     datasets.save(ds, folder.path / "errors.nc")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def pair_of_runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+    """Return a folder with two runs that contradict each other, and their keys."""
+    root = tmp_path_factory.mktemp("pair")
+    return root, [finished(root, number, bias).path.name for number, bias in (("00000003", 0.0), ("00000004", 5e-6))]
+
+
+@pytest.fixture(scope="session")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a finished run, whose names and report hold markup, and a failed one."""
+    root = tmp_path_factory.mktemp("runs")
+    folder = finished(root, "00000001")
     (folder.path / "report.html").write_text(f"<!DOCTYPE html><p id=written>Report</p><p>{MARKUP}</p>")
     (folder.path / "log.jsonl").write_text("{}\n")
     folder.save(test=f"drift {MARKUP}", campaign={"name": MARKUP})
-    RunFolder.create(root, "broken", "00000002", {**base, "status": "failed", "method": {"id": MARKUP}})
+    base = {"bench": {"machine": f"Mill {MARKUP}"}, "method": {"id": MARKUP}, "steps": []}
+    RunFolder.create(root, "broken", "00000002", {**base, "status": "failed"})
     return root
 
 

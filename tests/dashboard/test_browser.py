@@ -143,3 +143,14 @@ def test_values_live_and_a_sensor_that_is_unplugged(
         tmp_path / "runs", bench=bench, interval=0.5, port=int(served.address.rstrip("/").rpartition(":")[2])
     )
     page.wait_for_selector("body:not(.lost) .tiles li.answers >> nth=1")
+
+
+def test_two_results_are_compared(page: Any, serving: Callable[..., Any], pair_of_runs: tuple[Path, list[str]]) -> None:
+    page.goto(serving(pair_of_runs[0]).address + "compare")
+    for box in page.locator("input[name=run]").all():
+        box.check()
+    page.click("button:has-text('Compare')")
+    page.wait_for_selector("#figure[data-drawn] canvas")
+    assert "contradict each other" in page.inner_text("h2.bad")
+    accessible(page)
+    assert page.evaluate("window.taken") is None

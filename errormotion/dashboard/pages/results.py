@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import threading
-from collections import OrderedDict
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from tornado.web import HTTPError
 from errormotion import datasets
 from errormotion.dashboard.course import Course, as_csv, course
 from errormotion.dashboard.figures import errors_item
+from errormotion.dashboard.kept import Kept, stamp
 from errormotion.dashboard.lab import Choice, figure_text
 from errormotion.dashboard.pages.page import Guarded
 from errormotion.datasets.results.merit import figures_of
@@ -96,7 +95,7 @@ class Figure(Guarded):
             A coordinate or an index is no number.
         """
         texts = [self.word(axis) for axis in "xyz"]
-        point = None if not any(texts) else tuple(_millimetres(text) for text in texts)
+        point = None if not any(texts) else tuple(millimetres(text) for text in texts)
         others = [text.partition(":") for text in self.get_query_arguments("at")[:10]]
         return point, {dim: _whole(index, 0, 10**9) for dim, _, index in others}
 
@@ -134,46 +133,34 @@ class File(Guarded):
                     raise HTTPError(408, reason="The client does not take the file") from None
 
 
-class Loaded:
-    """The results that were asked for last, so that another functional point does not read the file again."""
-
-    MOST = 4
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._kept: OrderedDict[tuple[str, int, int], xr.Dataset] = OrderedDict()
-
-    def get(self, path: Path) -> xr.Dataset:
-        """Return a checked error dataset.
-
-        Raises
-        ------
-        DatasetError
-            The file cannot be read, or holds no error dataset.
-        """
-        state = path.stat()
-        key = (str(path), state.st_mtime_ns, state.st_size)
-        with self._lock:  # HDF5 reads one file at a time anyhow
-            if key not in self._kept:
-                with reading(path), datasets.load(path) as found:
-                    datasets.validate(found)
-                    self._kept[key] = found.load()
-                while len(self._kept) > self.MOST:
-                    self._kept.popitem(last=False)
-            self._kept.move_to_end(key)
-            return self._kept[key]
+LOADED: Kept[xr.Dataset] = Kept(6)
+"""Results that were asked for last, so that another functional point does not read the file again."""
 
 
-LOADED = Loaded()
+def loaded(path: Path) -> xr.Dataset:
+    """Return a checked error dataset.
+
+    Raises
+    ------
+    DatasetError
+        The file cannot be read, or holds no error dataset.
+    """
+
+    def load() -> xr.Dataset:
+        with reading(path), datasets.load(path) as found:
+            datasets.validate(found)
+            return found.load()
+
+    return LOADED.get(stamp(path), load)
 
 
 def _course(path: Path, point: tuple[float, ...] | None, select: dict[str, int]) -> Course:
-    return course(LOADED.get(path), point, select)
+    return course(loaded(path), point, select)
 
 
 def _stated(path: Path) -> dict[str, Any]:
     """Return what the page of a run says of its result: freedoms, functional point (mm), further dimensions, notes."""
-    ds = LOADED.get(path)
+    ds = loaded(path)
     found = course(ds)
     names = [(each.freedom, each.name, each.unit) for each in found.curves]
     point = [f"{1e3 * each:.10g}" for each in found.point]
@@ -189,7 +176,14 @@ def _stated(path: Path) -> dict[str, Any]:
     }
 
 
-def _millimetres(text: str) -> float:
+def millimetres(text: str) -> float:
+    """Return a coordinate of a functional point that a browser states in mm, m.
+
+    Raises
+    ------
+    DatasetError
+        It is no number, or too far away.
+    """
     try:
         value = float(text) / 1e3
     except ValueError:
