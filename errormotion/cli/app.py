@@ -512,6 +512,28 @@ def export(
 
 @app.command()
 @guarded
+def dashboard(
+    runs: Annotated[Path, typer.Argument(help="The folder of runs.")] = Path("runs"),
+    bench: Annotated[Path | None, typer.Option(help="A bench file: its thermometers and controller are read.")] = None,
+    interval: Annotated[str, typer.Option(help="Of the readings of the bench, such as '1 s'.")] = "1 s",
+    host: Annotated[
+        str, typer.Option(help="Address to listen on. Others than 127.0.0.1 are open to the network: with a token.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to listen on.")] = 5006,
+    name: Annotated[
+        list[str] | None, typer.Option(help="A further name by which browsers reach this computer; repeatable.")
+    ] = None,
+    cert: Annotated[Path | None, typer.Option(help="Certificate (PEM) of an encrypted connection.")] = None,
+    key: Annotated[Path | None, typer.Option(help="Key (PEM) of the certificate.")] = None,
+) -> None:
+    """Show runs, and the instruments of a bench, in a browser, until Ctrl-C."""
+    from errormotion.cli.commands import dashboard as command
+
+    command.run(runs, bench, interval, host, port, name or [], cert, key)
+
+
+@app.command()
+@guarded
 def note(
     folder: Annotated[Path, typer.Argument(help="A run folder; or a folder of runs, with --machine and --at.")],
     text: Annotated[str, typer.Argument(help="What happened, on one line.")],
