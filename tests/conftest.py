@@ -11,6 +11,7 @@ from collections.abc import Generator
 
 import hypothesis
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 for _library in ("OPENBLAS", "OMP", "MKL"):  # before anything imports numpy
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
@@ -26,6 +27,25 @@ hypothesis.settings.load_profile("errormotion")
 def pytest_xdist_auto_num_workers() -> int:
     """Use two workers for each processor: many tests wait for a device that is late, silent or slow on purpose."""
     return 2 * (os.cpu_count() or 1)
+
+
+class _ByFile(LoadFileScheduling):  # type: ignore[misc]
+    """Gives whole files to the workers, all those of LinuxCNC to one: a computer runs one at a time."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file: str = super()._split_scope(nodeid)
+        return "linuxcnc" if "linuxcnc" in file else file
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
+    """Return the scheduler of all runs with several workers."""
+    return _ByFile(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files of slow tests, those of LinuxCNC first, so that no worker has a long file at the end."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: ("linuxcnc" not in item.nodeid.partition("::")[0], item.path not in slow))
 
 
 def _refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:
