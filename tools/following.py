@@ -128,6 +128,7 @@ class Following:
     def kill_bridge(self) -> None:
         """Kill it; it is started again, and the program connects again."""
         self.machine.kill_bridge()
+        self.machine.control.state()  # connects again
         self._again()
 
     def estop(self) -> None:
@@ -231,11 +232,11 @@ def section(courses: list[Course], interval: float, seed: int) -> str:
     hours = SPEEDUP * sum(course.seconds for course in courses) / 3600
     slowest = 1e6 * LIMITS.slew
     lines = [
-        "The code of `errormotion compensate run` followed a thermometer that drifts, jumps and falls silent, and wrote "
-        "to the real LinuxCNC on simulated joints. All times are "
+        "The code of `errormotion compensate run` followed a thermometer that drifts, jumps and falls silent, and "
+        "wrote to the real LinuxCNC on simulated joints. All times are "
         f"{SPEEDUP:g} times shorter than by default, and the slew limit is as much higher ({slowest:g} um/s; watchdog "
-        f"{WATCHDOG:g} s, interval of offsets {LIMITS.period:g} s): {hours:.1f} hours at that scale, with a fault every "
-        f"{SPEEDUP * interval / 60:g} minutes. "
+        f"{WATCHDOG:g} s, interval of offsets {LIMITS.period:g} s): {hours:.1f} hours at that scale, with a fault "
+        f"every {SPEEDUP * interval / 60:g} minutes. "
         "The servo thread ran at its real rate, and recorded the extremes of the offset and of its change of all its "
         "cycles. After a fault that needs a person, the program was started again.",
         "",

@@ -119,7 +119,9 @@ proc errormotion_guard {} {
         net errormotion-source-$letter errormotion-source-$letter.out => errormotion-limit-$letter.in
         net errormotion-offset-$letter errormotion-limit-$letter.out
     }
-    foreach each {sign alive motion thread hold-1 hold-2 hold-3 on off asked fresh held slew ready} { addf errormotion-$each servo-thread }
+    foreach each {sign alive motion thread hold-1 hold-2 hold-3 on off asked fresh held slew ready} {
+        addf errormotion-$each servo-thread
+    }
     foreach each [errormotion_names {source limit}] { addf $each servo-thread }
 }
 
