@@ -200,6 +200,7 @@ class Following:
                     order = self.random.sample(sorted(NAMES), len(NAMES))
                 kind = order.pop()
                 act: Callable[[], None] = getattr(self, kind)
+                print(f"{self.course.route}, {time.monotonic() - begin:.0f} s: {NAMES[kind]}", flush=True)
                 act()
                 self.course.faults[kind] += 1
             self.end()

@@ -28,6 +28,7 @@ TRAVEL = 0.1  # m, in both directions
 RAPID = 0.1  # m/s
 LONGEST_WAIT = 600.0  # s, for another simulated LinuxCNC on this computer
 MICROMETRE = 1e-3  # mm, the unit of the INI file
+LONGEST_ANSWER = 20.0  # s, on a computer with other work
 SETTLED = 1e-7  # mm; LinuxCNC's planner comes closer than that in some cycles
 DRIVERS = {"external": LinuxCNCOffset, "feedback": LinuxCNCFeedback}
 WATCH = """
@@ -79,7 +80,7 @@ class Machine:
         self.process = LinuxCNCProcess(files, DISPLAY, wait=LONGEST_WAIT)
         self.address = f"unix://{self.process.socket}"
         self.token = self.process.folder / "token"
-        self.control = LinuxCNC(self.address, LinuxCNCSettings(arm=True, token_file=self.token))
+        self.control = LinuxCNC(self.address, LinuxCNCSettings(arm=True, token_file=self.token, timeout=LONGEST_ANSWER))
 
     def compensator(self) -> LinuxCNCOffset:
         """Return another compensator, not yet open."""
