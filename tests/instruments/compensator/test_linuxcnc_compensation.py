@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from linuxcnc_watch import Machine, until
+from linuxcnc_watch import TRAVEL, Machine, until
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator.linuxcnc import LinuxCNCFeedback, LinuxCNCOffset
@@ -285,18 +285,22 @@ def test_nothing_changes_while_the_machine_must_not_be_disturbed(
 
 @one_route
 def test_an_end_of_travel_does_not_add_up(machine: Machine, compensator: LinuxCNCOffset) -> None:
-    top = 0.1
-    follow(compensator, 10.0)
-    machine.control.move_to([top, 0.0, 0.0])
-    for _ in range(10):
+    machine.control.move_to([TRAVEL, 0.0, 0.0])
+    machine.watch()
+    for _ in range(10):  # LinuxCNC's planner gets no further
         compensator.write([10e-6, 0.0, 0.0])
         time.sleep(0.05)
     assert compensator.read().busy == "LinuxCNC limits the offset at an end of travel"
-    machine.control.move_to([top - 0.01, 0.0, 0.0])
+    machine.control.move_to([TRAVEL - 0.01, 0.0, 0.0])
+    follow(compensator, 10.0)
+    assert machine.offset() == pytest.approx(10.0, abs=0.1)
+    machine.control.move_to([TRAVEL, 0.0, 0.0])
+    until(lambda: machine.offset() == 0)  # by the watchdog, there as well
+    machine.control.move_to([TRAVEL - 0.01, 0.0, 0.0])
     machine.watch()
     follow(compensator, 10.0)
     follow(compensator, 0.0)
+    assert compensator.read().fault == ""
     record = machine.record()
     assert record.fastest <= SLEW * (1 + EXACT)
     assert record.lowest > -0.1
-    assert compensator.read().fault == ""
