@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from linuxcnc_watch import Machine, until
+from linuxcnc_watch import TRAVEL, Machine, until
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator.linuxcnc import LinuxCNCFeedback, LinuxCNCOffset
@@ -27,6 +27,9 @@ pytestmark = pytest.mark.slow
 LIMIT, SLEW, WATCHDOG = 20.0, 20.0, 0.5  # um, um/s, s
 EXACT = 1e-6
 """Relative, of numbers that HAL prints with seven digits."""
+
+one_route = pytest.mark.parametrize("started", ["external"], indirect=True)
+"""For what is the same on both routes, or only on this one."""
 
 FOLLOWER = """
 import sys, time
@@ -88,6 +91,15 @@ def test_it_goes_to_the_limit_at_the_slew_limit_and_no_further(machine: Machine,
     assert record.drive_fastest <= SLEW * (1 + EXACT)
 
 
+def test_positions_are_those_without_the_offset(machine: Machine, compensator: LinuxCNCOffset) -> None:
+    follow(compensator, 10.0)
+    machine.control.move_to([0.001, 0.0, 0.0])
+    for name in ("position", "commanded_position"):
+        assert machine.control.state()[name] == pytest.approx([1e-3, 0.0, 0.0], abs=1e-8)
+    assert machine.pins("J0_mux.out")[0] > 1.001  # mm: the motor
+
+
+@one_route
 def test_the_servo_thread_bounds_what_did_not_pass_the_bridge(machine: Machine) -> None:
     machine.hal("setp errormotion-source-x.in1 -1000")
     end, sign = time.monotonic() + 1.5 * LIMIT / SLEW, 0
@@ -101,11 +113,13 @@ def test_the_servo_thread_bounds_what_did_not_pass_the_bridge(machine: Machine) 
     assert record.fastest <= SLEW * (1 + EXACT)
 
 
+@one_route
 def test_a_jump_is_refused(compensator: LinuxCNCOffset) -> None:
     with pytest.raises(InstrumentError, match="is a jump of 15 um; the slew limit allows 11 um"):
         compensator.write([15e-6, 0.0, 0.0])
 
 
+@one_route
 def test_unarmed_and_without_a_write_nothing_is_asked_for(machine: Machine) -> None:
     until(lambda: machine.pins("errormotion-alive.out") == [0.0])
     with machine.compensator() as unarmed, machine.compensator() as other:
@@ -117,6 +131,7 @@ def test_unarmed_and_without_a_write_nothing_is_asked_for(machine: Machine) -> N
     assert machine.pins("errormotion-alive.time-left", "errormotion-alive.out") == [0.0, 0.0]
 
 
+@one_route
 def test_a_limit_beyond_that_of_the_machine_is_refused(machine: Machine) -> None:
     with machine.compensator() as driver:
         with pytest.raises(InstrumentError, match="LIMIT of at least 50 um in LinuxCNC's INI file; found 20 um"):
@@ -136,6 +151,7 @@ def test_the_kit_finds_nothing_wrong_without_writing(machine: Machine) -> None:
         assert result.ok, f"{check.claim}\n{result.message}\n{result.trace}"
 
 
+@one_route
 def test_a_second_compensator_is_refused(machine: Machine, compensator: LinuxCNCOffset) -> None:
     compensator.write([1e-6, 0.0, 0.0])
     with machine.compensator() as second:
@@ -195,6 +211,7 @@ def test_a_killed_bridge_is_followed_by_zero(machine: Machine, compensator: Linu
     assert machine.offset() == pytest.approx(3.0, abs=0.1)
 
 
+@one_route
 def test_a_silent_link_is_followed_by_zero(machine: Machine, compensator: LinuxCNCOffset) -> None:
     follow(compensator, 10.0)
     until(lambda: machine.offset() == 0)  # the connection is still open
@@ -233,6 +250,7 @@ def test_the_machine_is_switched_on_again_during_the_ramp(machine: Machine, comp
     assert compensator.read().fault == ""
 
 
+@one_route
 @pytest.mark.parametrize(
     ("program", "busy"),
     [
@@ -265,21 +283,24 @@ def test_nothing_changes_while_the_machine_must_not_be_disturbed(
     assert machine.offset() == pytest.approx(12.0, abs=0.1)
 
 
+@one_route
 def test_an_end_of_travel_does_not_add_up(machine: Machine, compensator: LinuxCNCOffset) -> None:
-    if machine.compensated.route == "feedback":
-        pytest.skip("LinuxCNC does not know an offset in the feedback path")
-    top = 0.1
-    follow(compensator, 10.0)
-    machine.control.move_to([top, 0.0, 0.0])
-    for _ in range(10):
+    machine.control.move_to([TRAVEL, 0.0, 0.0])
+    machine.watch()
+    for _ in range(10):  # LinuxCNC's planner gets no further
         compensator.write([10e-6, 0.0, 0.0])
         time.sleep(0.05)
     assert compensator.read().busy == "LinuxCNC limits the offset at an end of travel"
-    machine.control.move_to([top - 0.01, 0.0, 0.0])
+    machine.control.move_to([TRAVEL - 0.01, 0.0, 0.0])
+    follow(compensator, 10.0)
+    assert machine.offset() == pytest.approx(10.0, abs=0.1)
+    machine.control.move_to([TRAVEL, 0.0, 0.0])
+    until(lambda: machine.offset() == 0)  # by the watchdog, there as well
+    machine.control.move_to([TRAVEL - 0.01, 0.0, 0.0])
     machine.watch()
     follow(compensator, 10.0)
     follow(compensator, 0.0)
+    assert compensator.read().fault == ""
     record = machine.record()
     assert record.fastest <= SLEW * (1 + EXACT)
     assert record.lowest > -0.1
-    assert compensator.read().fault == ""

@@ -58,7 +58,7 @@ proc errormotion_components {route} {
     loadrt flipflop names=errormotion-asked
     loadrt not names=errormotion-off
     loadrt and2 names=errormotion-on,errormotion-fresh,errormotion-ready,errormotion-held
-    loadrt or2 names=errormotion-sign,errormotion-hold-1,errormotion-hold-2,errormotion-hold-3
+    loadrt or2 names=errormotion-sign,errormotion-hold-1,errormotion-hold-2
     loadrt mux2 names=[join [concat errormotion-slew [errormotion_names source]] ,]
     loadrt limit2 names=[join [errormotion_names limit] ,]
     if {$route == "external"} {
@@ -96,14 +96,12 @@ proc errormotion_guard {} {
     net errormotion-is-fresh errormotion-fresh.out => errormotion-ready.in0
 
     # Hold while the machine probes (motion type 5), while a thread is cut (and 0.5 s after the last change of
-    # errormotion-thread.in, by the bridge), while the program says so, and where LinuxCNC cuts off external offsets at an
-    # end of travel; only while the machine is on.
+    # errormotion-thread.in, by the bridge), and while the program says so; only while the machine is on.
     errormotion_join_pin motion.motion-type errormotion-motion.sel
     net errormotion-probes errormotion-motion.out5 => errormotion-hold-1.in0
     net errormotion-threads errormotion-thread.out => errormotion-hold-1.in1
     net errormotion-hold-1 errormotion-hold-1.out => errormotion-hold-2.in0
-    net errormotion-hold-2 errormotion-hold-2.out => errormotion-hold-3.in0
-    net errormotion-hold-3 errormotion-hold-3.out => errormotion-held.in0
+    net errormotion-hold-2 errormotion-hold-2.out => errormotion-held.in0
     net errormotion-held errormotion-held.out => errormotion-slew.sel
     if {[info exists ::ERRORMOTION(HOLD)]} { errormotion_join_pin $::ERRORMOTION(HOLD) errormotion-hold-2.in1 }
     setp errormotion-slew.in0 $slew
@@ -119,14 +117,15 @@ proc errormotion_guard {} {
         net errormotion-source-$letter errormotion-source-$letter.out => errormotion-limit-$letter.in
         net errormotion-offset-$letter errormotion-limit-$letter.out
     }
-    foreach each {sign alive motion thread hold-1 hold-2 hold-3 on off asked fresh held slew ready} { addf errormotion-$each servo-thread }
+    foreach each {sign alive motion thread hold-1 hold-2 on off asked fresh held slew ready} {
+        addf errormotion-$each servo-thread
+    }
     foreach each [errormotion_names {source limit}] { addf $each servo-thread }
 }
 
 # LinuxCNC sums up the changes of eoffset-counts, only while the machine is on and homed, and sets its offset to zero
 # when the machine goes off. The offset here goes to zero in that cycle, too: the motors are off, nothing moves.
 proc errormotion_external {} {
-    errormotion_join_pin motion.eoffset-limited errormotion-hold-3.in1
     foreach letter {x y z} {
         errormotion_planner [string toupper $letter]
         net errormotion-is-off => errormotion-limit-$letter.load

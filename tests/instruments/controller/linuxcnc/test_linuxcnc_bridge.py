@@ -972,3 +972,22 @@ def test_no_client_sets_the_pins_of_the_compensation_directly(tmp_path: Path) ->
         await wire.disconnect()
 
     asyncio.run(test())
+
+
+def test_positions_are_those_without_an_external_offset(tmp_path: Path) -> None:
+    async def test() -> None:
+        fake, hal = FakeLinuxCNC(), FakeHAL()
+        hal.pins |= {"axis.x.eoffset": 0.02, "axis.y.eoffset": -0.01, "axis.z.eoffset": 0.0}
+        wire = Wire(made(fake, tmp_path, hal=hal))
+        fake.on_mdi = moving_to(fake, (10.02, 19.99, 30.0))
+        fake.values.actual_position = (10.02, 19.99, 30.0, *(0.0,) * 6)
+        fake.values.probe_tripped, fake.values.probed_position = True, (5.02, 4.99, 3.0, *(0.0,) * 6)
+        assert "duration" in await wire.ask("move_to", position=[0.01, 0.02, 0.03])
+        state = await wire.ask("state")
+        assert state["position"] == pytest.approx([0.01, 0.02, 0.03])
+        assert state["commanded_position"] == pytest.approx([0.01, 0.02, 0.03])
+        touch = await wire.ask("probe", target=[0.0, 0.0, 0.0], feed=0.001)
+        assert touch["position"] == pytest.approx([0.005, 0.005, 0.003])
+        await wire.disconnect()
+
+    asyncio.run(test())
