@@ -217,7 +217,7 @@ class Hours:
             case "stop":
                 self.plc.machine.fault = "emergency stop"
             case "suspended":
-                self._clock.sleep(self._random.uniform(10.0, 10 * self.interval))
+                self._clock.sleep(self._random.uniform(10.0, 900.0))
             case "killed":
                 return True
         return False
