@@ -159,7 +159,7 @@ def hours_with_faults(hours: float, seed: int) -> None:
 
 def main() -> None:
     busy, cores = os.getloadavg()[0], os.cpu_count()
-    print(f"{CYCLES} cycles of one reading and one write each, beside the bare client; load {busy:.1f} on {cores} cores")
+    print(f"{CYCLES} cycles of one reading and one write each; load of this computer {busy:.1f} on {cores} cores")
     print(f"{'':24} median     99 %  longest")
     predict = prediction()
     print(f"{'prediction':24} {timed(predict)}")
