@@ -2,9 +2,13 @@
 
 Beside it, what a bare client of the same protocol takes for the same reads and writes. The machines are simulated, in
 this process; a line or a control adds its own time.
+
+``python benchmarks/compensation.py [HOURS [SEED]]``: also so many simulated hours of following with a simulated PLC,
+with a fault every 10 minutes.
 """
 
 import asyncio
+import os
 import statistics
 import sys
 import tempfile
@@ -21,6 +25,8 @@ from errormotion.compensation.online.prediction import predictor
 from errormotion.compensation.thermal_model import Settings, fit
 from errormotion.instruments.transports import load_simulator, parse_address
 from errormotion.twin import Event, VirtualMachine
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 
 CYCLES = 1000
 WANTED = 5e-3
@@ -135,8 +141,25 @@ def bare_file() -> None:
         print(f"{'  a file alone':24} {timed(cycle)}")
 
 
+def hours_with_faults(hours: float, seed: int) -> None:
+    """Print the extremes of simulated hours with a fault every 10 minutes."""
+    from compensated_hours import LIMITS, SLEW, follow, limits_kept
+
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_STATE_HOME"] = folder
+        found = follow(Path(folder), hours, 600.0, seed)
+    print(f"{found.hours:.1f} h, seed {seed}: {found.rows} decisions, {found.orders} orders, {found.starts} starts")
+    print(f"  faults: {dict(found.faults)}")
+    print(f"  states: {dict(found.states)}")
+    print(f"  in effect: {found.largest * 1e6:.3f} um (limit {LIMITS.limit * 1e6:g}),", end=" ")
+    print(f"{found.fastest * 1e6:.3f} um/s (limit of the PLC {SLEW * 1e6:g})")
+    print(f"  ordered: {found.largest_order * 1e6:.3f} um, {found.longest_step:.3f} periods at the slew limit (2)")
+    print(f"  beyond a limit: {', '.join(limits_kept(found)) or 'nothing'}")
+
+
 def main() -> None:
-    print(f"{CYCLES} cycles of one reading and one write each, beside the bare client")
+    busy, cores = os.getloadavg()[0], os.cpu_count()
+    print(f"{CYCLES} cycles of one reading and one write each; load of this computer {busy:.1f} on {cores} cores")
     print(f"{'':24} median     99 %  longest")
     predict = prediction()
     print(f"{'prediction':24} {timed(predict)}")
@@ -145,6 +168,8 @@ def main() -> None:
     modbus_client()
     with suppress(ImportError):
         opcua_client()
+    if len(sys.argv) > 1:
+        hours_with_faults(float(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 1)
 
 
 if __name__ == "__main__":

@@ -168,6 +168,8 @@ class CompensatorSubject:
         An error must have come by then, s.
     dead_address : str
         An address at which nothing answers.
+    mutants : int
+        As of `InstrumentSubject`, for a compensator whose class takes ``record``.
     """
 
     plugin: Any
@@ -184,6 +186,7 @@ class CompensatorSubject:
     lost_fault: str = "disconnect"
     time_limit: float = 10.0
     dead_address: str = "tcp://127.0.0.1:9"
+    mutants: int = 100
 
     def build(self, address: str, settings: Mapping[str, Any] | None = None) -> Any:
         """Return a new compensator, not yet opened; ``settings`` are those of a simulated machine."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import time
@@ -22,9 +23,11 @@ from errormotion.plugins import (
     kind_registry,
     load_object,
 )
+from errormotion.testing import fuzz_checks
 from errormotion.testing.compensator_sessions import (
     POLL,
     armed,
+    as_instrument,
     follow,
     made,
     near,
@@ -49,6 +52,17 @@ PAUSE = 0.05
 
 def _no_machine(subject: CompensatorSubject) -> str:
     return "" if subject.simulated else "nothing is written to a real machine"
+
+
+def _no_recording(subject: CompensatorSubject) -> str:
+    if not subject.mutants:
+        return "the subject asks for no mutants"
+    recorded = "record" in inspect.signature(subject.plugin).parameters
+    return _no_machine(subject) or ("" if recorded else "the compensator records no sessions")
+
+
+def _mutants_limit(subject: CompensatorSubject) -> float:
+    return fuzz_checks.LIMIT if subject.mutants <= fuzz_checks.MUTANTS else math.inf
 
 
 def _no_faults(subject: CompensatorSubject) -> str:
@@ -374,6 +388,12 @@ def _complaint(subject: CompensatorSubject, fault: str, error: Exception | None,
     if (error is not None) == (fault in subject.harmless):
         return "passed unnoticed" if error is None else f"should do no harm: {error}"
     return ""
+
+
+@COMPENSATOR_CHECKS.add(limit=_mutants_limit, why_not=_no_recording)
+def mutants(subject: CompensatorSubject) -> str:
+    """Whatever bytes answer readings and writes, only the project's errors come out, within bounded time and memory."""
+    return fuzz_checks.mutants(as_instrument(subject))
 
 
 @COMPENSATOR_CHECKS.add()

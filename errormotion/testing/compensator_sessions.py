@@ -6,10 +6,11 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from pathlib import Path
 from typing import Any
 
 from errormotion.instruments.transports import load_simulator, parse_address
-from errormotion.plugins import CompensatorSubject
+from errormotion.plugins import CompensatorSubject, InstrumentSubject
 from errormotion.plugins.subjects import with_query
 from errormotion.testing.kit import require
 
@@ -109,3 +110,41 @@ def require_ramp(device: Any, what: str) -> None:
         require(change <= machine.slew * (step + 1.0), f"{what}: the offset jumped by {change * 1e6:.4f} um")
         before = now
     require(not any(before), f"{what}: expected a ramp to zero within {slowest:g} s, found {um(before)}")
+
+
+class Written:
+    """A compensator as an instrument: armed when it is opened, each of its readings is followed by a write.
+
+    Parameters
+    ----------
+    subject : CompensatorSubject
+    compensator : Compensator
+    """
+
+    def __init__(self, subject: CompensatorSubject, compensator: Any) -> None:
+        self._subject, self._compensator = subject, compensator
+        self.identify, self.close = compensator.identify, compensator.close
+
+    def open(self) -> None:
+        """Open and arm."""
+        self._compensator.open()
+        self._compensator.arm(self._subject.limit)
+
+    def read(self) -> Any:
+        """Return a reading, and write the offset of the subject."""
+        found = self._compensator.read()
+        self._compensator.write(self._subject.offset)
+        return found
+
+
+def as_instrument(subject: CompensatorSubject) -> InstrumentSubject:
+    """Return a subject for the checks of instruments that record a session."""
+    with started(subject) as device:
+        settings = subject.plugin.Settings(**{**getattr(device, "driver_settings", {}), **subject.settings})
+
+    def make(address: str, record: Path | None) -> Written:
+        return Written(subject, subject.plugin(address, settings, record=record))
+
+    return InstrumentSubject(
+        subject.plugin, subject.address, make=make, time_limit=subject.time_limit, mutants=subject.mutants
+    )

@@ -33,7 +33,7 @@ def check_plugin(
     address : str, optional
         Where to find the instrument or the machine; default: its own simulator.
     mutants : int, optional
-        How many changed frames an instrument has to stand; default: as its subject states.
+        How many changed frames a driver has to stand; default: as its subject states.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def check_plugin(
     """
     results = []
     for subject in subjects_of(group, plugin_id, address=address):
-        if mutants is not None and isinstance(subject, InstrumentSubject):
+        if mutants is not None and isinstance(subject, InstrumentSubject | CompensatorSubject):
             subject = replace(subject, mutants=mutants)
         for result in run_checks(subject):
             results.append(replace(result, name=f"{result.name}[{subject.name}]") if subject.name else result)

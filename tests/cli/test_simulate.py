@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from errormotion import plugins
+from errormotion.campaign.files import parse_bench
 from errormotion.cli.app import app
 from errormotion.cli.commands import simulate
 from errormotion.cli.commands.plugins import group_of
@@ -133,6 +134,19 @@ def test_a_bench_file_states_machine_and_device(monkeypatch: pytest.MonkeyPatch,
     address = parse_address(json.loads(result.stdout)["simulator"])
     assert (address.host, address.path) == ("gantry", "air")
     assert {name: address.params[name] for name in ("seed", "unit", "pace")} == {"seed": "6", "unit": "7", "pace": "1"}
+
+
+def test_a_machine_that_takes_offsets_states_the_settings_of_a_bench_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    shown = run(monkeypatch, "modbus_registers", "--set", "type=i16").stdout.splitlines()
+    assert shown[0].startswith("modbus_registers: modbus+tcp://127.0.0.1:")
+    head = 'schema = "errormotion.bench/1"\nname = "b"\nmachine = "m"\n[compensator]\ndriver = "modbus_registers"\n'
+    address = shown[0].partition(" ")[2]
+    text = "\n".join([f'{head}address = "{address}"', *[line for line in shown if " = " in line]])
+    compensator = parse_bench(text, tmp_path / "bench.toml").compensator
+    assert compensator is not None
+    assert (compensator.settings.applied, compensator.settings.type) == ((4, 5, 6), "i16")
 
 
 @pytest.mark.parametrize(

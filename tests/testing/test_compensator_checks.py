@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from errormotion.errors import InstrumentError
+from errormotion.instruments.compensator.modbus_registers import ModbusRegisters
 from errormotion.instruments.compensator.offset_file import OffsetFile
 from errormotion.plugins import Applied, CompensatorSubject
 from errormotion.testing import CompensatorConformance
@@ -142,6 +143,21 @@ def test_it_fails(cls: type, check: str, text: str, monkeypatch: pytest.MonkeyPa
     assert re.search(text, result.message), result.message
 
 
+class TrustsTheWire(ModbusRegisters):
+    def read(self) -> Applied:
+        try:
+            return super().read()
+        except InstrumentError as error:
+            raise ValueError(str(error)) from None
+
+
+def test_an_error_of_another_kind_is_found_by_changed_frames() -> None:
+    (check,) = [check for check in COMPENSATOR_CHECKS if check.name == "mutants"]
+    result = run_check(check, replace(ModbusRegisters.conformance()[0], plugin=TrustsTheWire))
+    assert not result.ok
+    assert "expected an InstrumentError, found ValueError" in result.message
+
+
 def test_nothing_is_written_to_a_real_machine(tmp_path) -> None:
     address = str(tmp_path / "offset.json")
     results = [
@@ -158,5 +174,5 @@ class TestAsAClass(CompensatorConformance):
 
 
 def test_a_class_has_one_test_for_each_check_that_applies() -> None:
-    names = {check.name for check in COMPENSATOR_CHECKS} - {"lost_connection"}
+    names = {check.name for check in COMPENSATOR_CHECKS} - {"lost_connection", "mutants"}
     assert {name for name in vars(TestAsAClass) if name.startswith("test_")} == {f"test_{name}" for name in names}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 from collections.abc import Mapping
@@ -112,8 +113,10 @@ def _print(plugin_id: str, simulator: str, device: Any, as_json: bool) -> None:
         sys.stdout.flush()
         return
     show(f"{plugin_id}: {address or device.url}")
-    for name, value in (lines | dict(getattr(device, "driver_settings", {}))).items():
-        show(f"{name}: {value}")
+    for name, url in lines.items():
+        show(f"{name}: {url}")
+    for name, value in getattr(device, "driver_settings", {}).items():
+        show(f"{name} = {json.dumps(value)}")  # as a bench file has it
     show("Ctrl-C ends it.")
 
 

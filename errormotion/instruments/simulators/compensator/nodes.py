@@ -94,7 +94,7 @@ class SimulatedNodes:
             "applied": tuple(self._id(f"Applied.{axis}").to_string() for axis in AXES),
             "stop": self._id("Stop").to_string(),
             "busy": self._id("Busy").to_string(),
-            "scale": MM,
+            "scale": "1 mm",
         }
 
     def write(self, space: AddressSpace) -> None:

@@ -123,7 +123,7 @@ def _settings(address: Address) -> dict[str, object]:
     first = address.whole("first", 0, 60000)
     state = first + 3 * size + 1
     given |= {
-        "scale": address.number("scale", 1e-9),
+        "scale": f"{address.number('scale', 1e-9)!r} m",
         "function": address.whole("function", 16, 16),
         "offset": tuple(first + i * size for i in range(3)),
         "heartbeat": state - 1,
@@ -132,6 +132,7 @@ def _settings(address: Address) -> dict[str, object]:
         "busy": state + 3 * size + 1,
     }
     try:
-        return RegisterSettings.model_validate(given).model_dump(include=set(given))
+        RegisterSettings.model_validate(given)
     except ValidationError as error:
         raise InstrumentError(f"The registers in '{address.url}' cannot be: {error.errors()[0]['msg']}") from None
+    return given
