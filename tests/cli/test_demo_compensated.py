@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
-from errormotion.cli.demo import closed_loop, compensated
+from errormotion.campaign.files import load_campaign
+from errormotion.cli.demo import closed_loop, compensated, compensated_probing
 from errormotion.cli.demo.closed_loop import Duty, Loop, close
 from errormotion.compensation.online.settings import Limits
 from errormotion.compensation.thermal_model import Settings
@@ -65,3 +66,11 @@ def test_a_sensor_that_shows_noise_makes_no_feature(loop: Loop) -> None:
     kept = closed_loop.with_warm_sensors(errors)["sensor"].values.tolist()
     assert "motor" in kept
     assert "ambient" not in kept
+
+
+def test_the_demo_with_linuxcnc_compensates_the_machine_that_it_probes() -> None:
+    """One LinuxCNC runs on a computer: all addresses state the same one."""
+    bench = load_campaign(compensated_probing.CAMPAIGN).bench
+    assert bench.compensator is not None
+    probing = {each.address for each in bench.instruments if "linuxcnc" in each.address}
+    assert probing == {bench.compensator.address}

@@ -64,7 +64,7 @@ def _key_figures(found: Effect) -> list[KeyFigure]:
     shown = []
     for row, each in zip(text.rows(found), found.parts, strict=True):
         if each.correctable:
-            shown.append(KeyFigure(each.name, Cell(row[4].removesuffix(" %")), "%", f"less; 95 %: {row[5]}"))
+            shown.append(KeyFigure(each.name, Cell(row[4].removesuffix(" %")), "%", f"reduction; 95 %: {row[5]}"))
     return shown
 
 

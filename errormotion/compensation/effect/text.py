@@ -23,9 +23,11 @@ def verdict(found: Effect) -> list[str]:
     if not math.isfinite(whole.reduction.value):
         lines.append("Nothing can be said: the errors before the compensation are not told from 0.")
     else:
+        gained = whole.reduction.value
+        change = f"{percent(gained)} less" if gained >= 0 else f"{percent(-gained)} more"
         lines.append(
             f"{whole.name}: {_size(whole.before.value, whole.unit)} before, {_size(whole.after.value, whole.unit)} "
-            f"after, {percent(whole.reduction.value)} less (95 %: {span(whole.reduction)})."
+            f"after, {change} (95 % of the reduction: {span(whole.reduction)})."
         )
     of = {
         outcome: [part.name for part in found.parts if part.outcome == outcome and part.correctable]
