@@ -30,7 +30,7 @@ def part(source: Source, key: str) -> Part:
         Section(
             f"graph-{view.name}",
             f"{_title(view)} {view.name}",
-            [drawings.over_position(view, f"{key}-{view.name}"), *target_tables(view)],
+            [drawings.over_position(view, f"{key}-{view.name}", source.limits), *target_tables(view)],
         )
         for view in seen
     ]
