@@ -1,5 +1,6 @@
 """Compensation tables: written, read as a control reads them, applied to the twin, and measured again."""
 
+import re
 import sys
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint
@@ -152,6 +153,19 @@ def test_types_of_linuxcnc_say_the_same(machine: VirtualMachine) -> None:
         table_readers.linuxcnc(texts(export(table, form, form.Settings(type=k))), k)(y, d) for k in (1, 0)
     )
     assert np.abs(trims - reached).max() < 1e-9
+
+
+def test_siemens_table_as_a_part_program(machine: VirtualMachine) -> None:
+    table, written = axis_table(measured(machine), "Y", component="Z", step=0.1), get("siemens")
+    file, program = texts(export(table, written)), texts(export(table, written, written.Settings(program=True)))
+    ((_, ini),), ((name, mpf),) = file.items(), program.items()
+    assert name.endswith(".MPF")
+    lines = mpf.splitlines()
+    assert lines[0] == f"%_N_{name.removesuffix('.MPF')}_MPF"
+    assert re.fullmatch(r"%_N_[A-Z0-9_]{1,24}_MPF", lines[0])
+    assert lines[1] == ";$PATH=/_N_MPF_DIR"
+    assert lines[-1] == "M30"
+    assert lines[2:-1] == ini.splitlines()[2:-1]
 
 
 def test_signs_from_memory_can_be_turned(machine: VirtualMachine) -> None:

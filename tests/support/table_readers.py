@@ -60,7 +60,7 @@ def siemens(files: Mapping[str, str]) -> Control:
 
 
 def heidenhain(files: Mapping[str, str]) -> Control:
-    """Values are added to the nominal position of the column's axis; BACKLASH is for the negative direction."""
+    """Values are errors, taken off the position of the column's axis; BACKLASH is for the negative direction."""
     tables = {}
     for name, text in files.items():
         head, columns, *rows = text.split("[END]")[0].splitlines()
@@ -73,7 +73,7 @@ def heidenhain(files: Mapping[str, str]) -> Control:
     (key,) = set(values) - {"NR", "AXISPOS", "BACKLASH"}
     forward = np.array(values[key], dtype=float)
     backward = np.array(values.get("BACKLASH", values[key]), dtype=float)
-    return lambda y, d: np.where(d > 0, np.interp(1e3 * y, x, forward), np.interp(1e3 * y, x, backward)) / 1e3
+    return lambda y, d: -np.where(d > 0, np.interp(1e3 * y, x, forward), np.interp(1e3 * y, x, backward)) / 1e3
 
 
 def fanuc(files: Mapping[str, str]) -> Control:

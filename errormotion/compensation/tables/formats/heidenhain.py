@@ -1,8 +1,10 @@
 """HEIDENHAIN: a compensation value table (.COM), and the assignment of tables to axes (.CMA).
 
-The columns are those of the newer controls: AXISPOS, BACKLASH, and the key of the axis that is corrected. The frame of
-the text (``BEGIN``, ``[END]``) is that of other tables of these controls, and the sign is that of a value that is added
-to the nominal position; both are from memory.
+The columns are those of the newer controls: AXISPOS, BACKLASH, and the key of the axis that is corrected. A value is
+the error with its own sign, the actual less the nominal position, which the control takes off: so the manuals of the
+TNC 306, 360 and 407 call it, and so a published converter from laser measurements writes it. No manual of a newer
+control that states the sign was found. The first line of the text (``BEGIN``) is that of the same converter; the last
+(``[END]``) is from memory.
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ class HeidenhainTable:
     title: ClassVar[str] = "HEIDENHAIN, .COM and .CMA tables"
     source: ClassVar[str] = (
         "HEIDENHAIN, Technical Manual MANUALplus 620, pages 716 to 718 (columns, assignment); Technical Manual TNC "
-        "407, page 153 and module 9095 (limits); frame of the text, resolution and sign from memory"
+        "407, page 153 and module 9095 (limits, sign: error); Technical Manual TNC 306, page 121 (sign: error); "
+        "resolution and last line of the text from memory"
     )
     Settings: ClassVar[type[TableSettings]] = HeidenhainSettings
 
@@ -59,7 +62,7 @@ class HeidenhainTable:
         position = np.round(1e3 * table.positions, DECIMALS)
         if (np.diff(position) <= 0).any():
             raise DatasetError("HEIDENHAIN needs positions that increase; state a larger step (--step)")
-        turn = -1.0 if settings.inverted else 1.0
+        turn = 1.0 if settings.inverted else -1.0
         values = [np.round(1e3 * offset, DECIMALS) + 0.0 for offset in (table.forward, table.backward)]
         axis, corrected = settings.axis_key or table.axis, settings.component_key or table.component
         both = table.reversal >= 1e-9
@@ -67,7 +70,8 @@ class HeidenhainTable:
         columns[corrected] = _cells(turn * values[0])
         name = table.name.lower()
         sign = (
-            f"sign: value = {'-' if settings.inverted else ''}correction, added to the nominal position (from memory)"
+            f"sign: value = {'-' if settings.inverted else ''}error, actual less nominal (manuals of TNC 306 and 407; "
+            "not stated for newer controls)"
         )
         comments = [*table.comments, sign, "unit: mm, positions from the machine datum"]
         tables: dict[str, FileText] = {

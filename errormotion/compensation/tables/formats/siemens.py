@@ -3,25 +3,30 @@
 * ``$AA_ENC_COMP[e, N, axis]``: the axis by its own position. The value is added to the actual position, so that a
   positive one moves the axis in the negative direction: it is the error with its own sign. One direction.
 * ``$AN_CEC[t, N]``: another axis by the position of a base axis, for both directions or for each. The value changes the
-  setpoint of the output axis: a positive one moves it in the positive direction (from memory).
+  setpoint of the output axis: a positive one moves it in the positive direction (from memory; a comment of the example
+  in the manual of 802D sl agrees).
 
 Values are in mm in double precision, at equal steps, linear in between, held outside of the table.
 """
 
 from __future__ import annotations
 
+import re
 from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from errormotion.arrays import Array
-from errormotion.compensation.tables.contract import TableSettings, Written
+from errormotion.compensation.tables.contract import FileText, TableSettings, Written
 from errormotion.compensation.tables.formats.checks import CHECK_SIGN, check_even, check_points, one_direction
 from errormotion.compensation.tables.table import AxisTable
 
 DECIMALS = 6
 """Of a value in mm."""
+
+MOST_CHARACTERS = 24
+"""Of the name of a program (from memory)."""
 
 
 class SiemensSettings(TableSettings):
@@ -39,6 +44,7 @@ class SiemensSettings(TableSettings):
         default=5000, ge=2, description="MD38000 MM_ENC_COMP_MAX_POINTS or MD18342 MM_CEC_MAX_POINTS; 200 on 808D, 828D"
     )
     inverted: bool = Field(default=False, description="write the values of a sag table with opposite sign")
+    program: bool = Field(default=False, description="write a part program NAME.MPF that assigns the table, ending M30")
 
 
 class SiemensTable:
@@ -86,7 +92,7 @@ def _leadscrew(table: AxisTable, settings: SiemensSettings, axis: str) -> Writte
         "The value at the reference point should be 0, so that the axis does not jump when the table acts.",
         *one_direction(table, "This table"),
     )
-    return Written({f"{table.name}.INI": _file("AX_EEC_INI", table, sign, lines)}, held, held, remarks=remarks)
+    return Written(_file("AX_EEC_INI", table, sign, lines, settings.program), held, held, remarks=remarks)
 
 
 def _sag(table: AxisTable, settings: SiemensSettings, base: str, output: str) -> Written:
@@ -118,9 +124,13 @@ def _sag(table: AxisTable, settings: SiemensSettings, base: str, output: str) ->
         f"MD18342 MM_CEC_MAX_POINTS[{numbers}] must be at least {table.positions.size}; enable with SD41300 "
         f"CEC_TABLE_ENABLE[{numbers}] and MD32710 CEC_ENABLE of {output}.",
     )
-    return Written({f"{table.name}.INI": _file("NC_CEC_INI", table, sign, lines)}, held[0], held[-1], remarks=remarks)
+    return Written(_file("NC_CEC_INI", table, sign, lines, settings.program), held[0], held[-1], remarks=remarks)
 
 
-def _file(name: str, table: AxisTable, sign: str, lines: list[str]) -> str:
+def _file(name: str, table: AxisTable, sign: str, lines: list[str], program: bool) -> dict[str, FileText]:
+    file, head, end = f"{table.name}.INI", [f"%_N_{name}", "CHANDATA(1)"], "M17"
+    if program:
+        own = re.sub("[^A-Z0-9_]", "_", table.name.upper())[:MOST_CHARACTERS]
+        file, head, end = f"{own}.MPF", [f"%_N_{own}_MPF", ";$PATH=/_N_MPF_DIR"], "M30"
     comments = [*table.comments, sign, "unit: mm"]
-    return "\n".join([f"%_N_{name}", "CHANDATA(1)", *(f"; {text}" for text in comments), *lines, "M17"]) + "\n"
+    return {file: "\n".join([*head, *(f"; {text}" for text in comments), *lines, end]) + "\n"}
