@@ -372,7 +372,7 @@ def validate(
         show_json({"ok": not mistakes, "file": str(file), "violations": mistakes})
     else:
         count = f"{len(mistakes)} violation" + ("s" if len(mistakes) != 1 else "")
-        show("\n  - ".join([f"{file}: {count}", *mistakes]) if mistakes else f"{file}: valid")
+        show("\n  - ".join([f"{file}: {count}", *data.alike(mistakes)]) if mistakes else f"{file}: valid")
     if mistakes:
         raise typer.Exit(INVALID)
 

@@ -294,6 +294,13 @@ def validate(file: Path) -> list[str]:
         return [str(error)]
 
 
+def alike(mistakes: list[str]) -> list[str]:
+    """Return violations for a person: those that are alike in one line."""
+    from errormotion.datasets.files.tomlfile import grouped
+
+    return grouped(mistakes)
+
+
 def _of_toml(file: Path) -> list[str]:
     from errormotion.campaign.files import load_bench, load_campaign
     from errormotion.datasets.files.tomlfile import read_toml
@@ -313,11 +320,13 @@ def _of_toml(file: Path) -> list[str]:
 
 def _mistakes(message: str, file: Path) -> list[str]:
     """Return the single mistakes of a message; those of another file, such as the bench of a campaign, name it."""
-    found, source = [], str(file)
+    from errormotion.datasets.files.tomlfile import single
+
+    found, source = list[str](), str(file)
     for line in message.splitlines():
         if line.startswith("  - "):
             text = line.removeprefix("  - ")
-            found.append(text if source == str(file) else f"{source}: {text}")
+            found += [each if source == str(file) else f"{source}: {each}" for each in single(text)]
         elif re.fullmatch(r".*: \d+ mistakes?", line):
             source = line.rpartition(": ")[0]
         elif found and line.startswith(" "):
