@@ -15,7 +15,7 @@ MOST_POINTS = 240
 
 MOST_CURVES = 8
 
-_VALUES = re.compile(r"\b([A-Za-z]\w{0,11}) ([+-]?\d+(?:\.\d+)?)(?![\w.])")
+_VALUES = re.compile(r"\b([A-Za-z]\w{0,11}) ([+-]\d+(?:\.\d+)?)(?![\w.])")
 _UNIT = re.compile(r"\s*([A-Za-z/]+)?(?:,|$)")
 
 
@@ -43,7 +43,7 @@ class Curves:
         self._units: dict[str, str] = {}
 
     def take(self, note: str) -> None:
-        """Add the values of a note."""
+        """Add the values of a note: signed numbers, each after its name."""
         waiting = []
         for found in _VALUES.finditer(note):
             name, value = found[1], float(found[2])
@@ -55,6 +55,11 @@ class Curves:
             if unit is not None:  # one unit for all values since the last
                 self._units |= dict.fromkeys(waiting, unit[1] or "")
                 waiting = []
+
+    @property
+    def shown(self) -> bool:
+        """Whether there is a curve."""
+        return bool(self._courses)
 
     def lines(self, width: int) -> Iterator[Text]:
         """Yield a line for each curve: name, blocks, last value, and the range."""

@@ -138,6 +138,26 @@ def events(source: Source) -> list[Event]:
     return sorted((event for event in found if event.minute <= end), key=lambda event: event.minute)
 
 
+def commanded_speed(source: Source) -> np.ndarray | None:
+    """Return the spindle speed that the schedule commands until each instant, 1/min (time,); None without a schedule.
+
+    A machine that stands still while it is measured turns more slowly on average than it was commanded to.
+    """
+    schedule = source.settings.get("schedule")
+    zero = float(source.errors.attrs.get("reference_time", 0.0))
+    found = [
+        (_seconds(entry.get("at", entry.get("time"))) - zero, float(entry["spindle_speed"]))
+        for entry in (schedule if isinstance(schedule, (list, tuple)) else ())
+        if isinstance(entry, Mapping) and isinstance(entry.get("spindle_speed"), (int, float))
+    ]
+    found = sorted(each for each in found if math.isfinite(each[0]))
+    if not found:
+        return None
+    time = np.asarray(source.errors["time"].values, float)
+    last = np.searchsorted([at for at, _ in found], time, side="left") - 1
+    return np.where(last >= 0, np.array([speed for _, speed in found])[last], 0.0)
+
+
 def _seconds(value: Any) -> float:
     if isinstance(value, (int, float)):
         return float(value)

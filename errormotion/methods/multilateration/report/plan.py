@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
+from matplotlib import colormaps
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.arrays import Array
-from errormotion.report import canvas
+from errormotion.report import canvas, maps
 from errormotion.report.document import Block, Cell, Figure, Table, Text, or_dash
 from errormotion.report.text import finite, fixed, integer
 
@@ -44,18 +45,18 @@ def _map(position: Array, sigma: Array, chosen: np.ndarray, key: str) -> Block:
     top, low = finite(np.max, um), finite(np.min, um)
     if not np.isfinite(top):
         return Text("The uncertainty is unknown everywhere, and no map is drawn.", "note")
+    scale = maps.scale_of(um, 12, colormaps["viridis_r"])
 
     def paint(figure: Canvas) -> None:
         panels = figure.subplots(2, len(levels), sharex=True, sharey=True, squeeze=False)
         figure.subplots_adjust(left=0.085, right=0.87, top=0.94, bottom=0.1, wspace=0.08, hspace=0.22)
-        drawn = None
         for row, (name, values) in enumerate(zip(("as set", "best"), um, strict=True)):
             for axes, z in zip(panels[row], levels, strict=True):
                 here = np.abs(position[:, 2] - z) < _SAME
                 x, y = 1e3 * position[here, 0], 1e3 * position[here, 1]
-                drawn = axes.scatter(x, y, c=values[here], vmin=low, vmax=top, cmap="viridis_r", s=90, marker="s",
-                                     linewidths=0)  # fmt: skip
                 lost = ~np.isfinite(values[here])
+                colours = scale.to_rgba(values[here][~lost])
+                axes.scatter(x[~lost], y[~lost], c=colours, s=90, marker="s", linewidths=0)
                 axes.plot(x[lost], y[lost], "x", color=canvas.BLACK, markersize=4)
                 if row == 1:
                     mark = here & chosen
@@ -67,9 +68,7 @@ def _map(position: Array, sigma: Array, chosen: np.ndarray, key: str) -> Block:
             axes.set_xlabel("X / mm")
         for axes in panels[:, 0]:
             axes.set_ylabel("Y / mm")
-        bar = figure.add_axes((0.89, 0.1, 0.018, 0.84))
-        if drawn is not None:
-            figure.colorbar(drawn, cax=bar, label="standard uncertainty / µm")
+        maps.colour_bar(panels[0, -1], scale, (0.89, 0.1, 0.018, 0.8), "u / µm")
 
     height = 4.4
     marks = " Circles: targets to measure." if chosen.any() else ""

@@ -36,7 +36,7 @@ from errormotion.report.document import (
 )
 from errormotion.report.generic import unit_at
 from errormotion.report.parts import sensors
-from errormotion.report.series import events
+from errormotion.report.series import commanded_speed, events
 from errormotion.report.text import finite, fixed, integer, listed, significant
 
 __all__ = ["is_normal_vector", "part"]
@@ -64,7 +64,7 @@ def part(source: Source, key: str) -> Part:
     return Part(
         "Thermal errors by probing of balls",
         _key_figures(seen),
-        _summary(errors, seen, found),
+        _summary(source, seen, found),
         [
             Section("errors", "Errors and temperatures", errors_over_time(source, f"{key}-errors", seen)),
             Section("balls", "Balls", [drawings.balls(seen, f"{key}-balls"), _balls(seen)]),
@@ -104,11 +104,10 @@ def _key_figures(seen: Probing) -> list[KeyFigure]:
     if math.isfinite(rms):
         note = f"rms; noise of a touch: {fixed(1e6 * seen.noise, 2)} µm" if seen.by_touch else "rms"
         figures.append(KeyFigure("residual", Cell(fixed(1e6 * rms, 2)), "µm", note))
-    cost = finite(np.median, seen.loss)
-    if math.isfinite(cost):
-        figures.append(
-            KeyFigure("uncertainty of the normals", Cell(fixed(cost, 2)), "×", "relative to the fit, median")
-        )
+    ratio = finite(np.median, seen.loss)
+    if math.isfinite(ratio):
+        note = "times that of the fit, median"
+        figures.append(KeyFigure("uncertainty by the published normals", Cell(fixed(ratio, 2)), "", note))
     return figures
 
 
@@ -116,7 +115,8 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(finite(np.mean, values**2)))
 
 
-def _summary(errors: xr.Dataset, seen: Probing, found: list[sensors.Sensor]) -> list[str]:
+def _summary(source: Source, seen: Probing, found: list[sensors.Sensor]) -> list[str]:
+    errors = source.errors
     cycles, known = len(seen.time), int(np.isfinite(seen.values).any(axis=1).sum())
     words = [
         f"{integer(cycles)} cycles over {integer(len(seen.balls))} balls in "
@@ -128,11 +128,15 @@ def _summary(errors: xr.Dataset, seen: Probing, found: list[sensors.Sensor]) -> 
         if strongest is not None:
             k, length = strongest
             words.append(f"The largest {what} is {fixed(length / size, 2)} {unit}, {_when(seen, k)}.")
-    speed = errors["spindle_speed"].values if "spindle_speed" in errors else np.array([])
-    if np.isfinite(speed).any():
-        words.append(
-            f"The highest mean spindle speed between two cycles was {integer(finite(np.max, np.abs(speed)))} /min."
-        )
+    speed, commanded = np.array([]), commanded_speed(source)
+    if "spindle_speed" in errors:
+        speed = np.abs(np.asarray(errors["spindle_speed"].values, float))
+    if commanded is not None and commanded.any():
+        mean = f"; the highest mean between two cycles was {integer(finite(np.max, speed))} /min"
+        known = np.isfinite(speed).any()
+        words.append(f"Commanded spindle speed: up to {integer(commanded.max())} /min{mean if known else ''}.")
+    elif np.isfinite(speed).any():
+        words.append(f"The highest mean spindle speed between two cycles was {integer(finite(np.max, speed))} /min.")
     if found:
         words.append(sensors.warmest(found))
     out = {name: int((seen.left_out == kind).sum()) for kind, name in _KINDS}
@@ -150,12 +154,13 @@ def _summary(errors: xr.Dataset, seen: Probing, found: list[sensors.Sensor]) -> 
 def errors_over_time(source: Source, key: str, seen: Probing) -> list[Block]:
     """Return errors, temperatures and working parameters on one time axis, and the table of the errors."""
     errors = source.errors
+    commanded = commanded_speed(source)
     names = timeline.sensor_names(errors)
     values = errors["temperature"].transpose("time", "sensor").values if names else np.empty((len(seen.time), 0))
     panels = [
-        *timeline.errors(errors),
+        *timeline.errors(errors, source.limits),
         *timeline.temperatures(names, np.asarray(values, float)),
-        *timeline.working(errors, held=True),
+        *timeline.working(errors, held=True, commanded=commanded),
     ]
     if not panels:
         return [Text("The errors are unknown at all times.", "warning"), _table(errors, seen)]
@@ -163,8 +168,8 @@ def errors_over_time(source: Source, key: str, seen: Probing) -> list[Block]:
     point = ", ".join(fixed(1e3 * float(value), 1) for value in np.atleast_1d(errors.attrs["functional_point"]))
     caption = (
         f"Errors of the tool side relative to the workpiece side at ({point}) mm since the cold cycle, temperatures "
-        "and spindle speed on one time axis. Bands: expanded uncertainty, k = 2 (about 95 %). Speed and feed are means "
-        f"since the previous cycle.{timeline.events_in_words(done)}"
+        "and spindle speed on one time axis. Bands: expanded uncertainty, k = 2 (about 95 %). Means are those since "
+        f"the previous cycle; the spindle stands still for probing.{timeline.events_in_words(done)}"
     )
     words = ". ".join(panel.in_words() for panel in panels)
     figure = Figure(timeline.draw(seen.time, panels, key, done), caption, f"Over time: {words}.")

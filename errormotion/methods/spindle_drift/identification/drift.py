@@ -144,8 +144,8 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         frame=str(raw.attrs.get("frame", "machine")),
         functional_point=point,
         reference=(
-            f"mean of the record from {averages.time[reference[0]]:.3f} s to {averages.time[reference[-1]]:.3f} s "
-            f"(middles of {reference.size} mean{'s' if reference.size > 1 else ''} of {settings.average:g} s)"
+            f"mean of the record from {averages.time[reference[0]] - settings.average / 2:.3f} s to "
+            f"{averages.time[reference[-1]] + settings.average / 2:.3f} s"
         ),
         method=method,
         method_version=version,
