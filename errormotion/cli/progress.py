@@ -27,12 +27,12 @@ class _Display(Progress):
     """Bars, and curves below them."""
 
     def __init__(self, curves: Callable[[], Curves], *columns: ProgressColumn, console: Console, disable: bool) -> None:
-        self._curves, self._width = curves, lambda: console.width
+        self._curves, self._own = curves, console
         super().__init__(*columns, console=console, disable=disable)
 
     def get_renderables(self) -> Iterator[RenderableType]:
         yield from super().get_renderables()
-        yield from self._curves().lines(self._width())
+        yield from self._curves().lines(self._own.width)
 
 
 class Bars:
