@@ -42,9 +42,9 @@ def init(
     travel : sequence of str
         ``AXIS=LOW,HIGH``, with units.
     instruments : sequence of str
-        ``NAME=DRIVER@ADDRESS``.
+        ``NAME=ID@ADDRESS``.
     tests : sequence of str
-        ``NAME=METHOD``.
+        ``NAME=ID``.
     assignments : sequence of str
         ``NAME.KEY=VALUE``: one setting of an instrument or a test.
     ask : callable, optional
@@ -102,15 +102,13 @@ def _stated(
         name, _, rest = text.partition("=")
         driver, _, address = rest.partition("@")
         if not name.strip() or not driver.strip():
-            raise BenchError(
-                f"--instrument {text}: expected NAME=DRIVER@ADDRESS, such as oil=scpi_temperature@tcp://10.0.0.5:5025"
-            )
+            raise BenchError(f"--instrument {text}: expected NAME=ID@ADDRESS, ID of an instrument plugin")
         plugins.get("instruments", driver.strip())
         answers.instruments[name.strip()] = Instrument(driver.strip(), address.strip())
     for text in tests:
         name, _, method = text.partition("=")
         if not name.strip() or not method.strip():
-            raise BenchError(f"--test {text}: expected NAME=METHOD, such as drift=spindle_drift")
+            raise BenchError(f"--test {text}: expected NAME=ID, ID of a method plugin")
         plugins.get("methods", method.strip())
         answers.tests[name.strip()] = Test(method.strip())
     owners: dict[str, Any] = {**answers.instruments, **answers.tests}
