@@ -7,7 +7,9 @@ import math
 import shutil
 import sys
 import textwrap
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import zip_longest
 from typing import Any
 
@@ -15,6 +17,10 @@ import typer
 
 LEAST_WIDTH = 12
 """Characters; a column of text is not made narrower."""
+
+
+NOTICE_DELAY = 1.0
+"""Time after which a line states what takes so long, s."""
 
 
 def show(text: str = "") -> None:
@@ -25,6 +31,19 @@ def show(text: str = "") -> None:
 def show_json(value: Any) -> None:
     """Print one JSON document; NaN and infinite numbers become null."""
     sys.stdout.write(json.dumps(_strict(value), indent=2, ensure_ascii=False, default=str) + "\n")
+
+
+@contextmanager
+def working(what: str) -> Iterator[None]:
+    """Print on a terminal, after `NOTICE_DELAY`, what takes its time."""
+    timer = threading.Timer(NOTICE_DELAY, lambda: typer.echo(f"{what} ...", err=True))
+    timer.daemon = True
+    if sys.stderr.isatty():
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -3,9 +3,11 @@
 import os
 import shutil
 import sys
+import time
 
 import pytest
 
+from errormotion.cli import output
 from errormotion.cli.output import table
 
 HEAD = ("name", "value", "what it is")
@@ -40,3 +42,17 @@ def test_numbers_and_a_pipe_are_not_wrapped(width) -> None:
     assert max(map(len, table(HEAD, ROWS).splitlines())) == len("second  12.5   " + ROWS[0][2]) - 1 + 1
     width(80)
     assert table(HEAD, ROWS).splitlines()[3] == "second      3  short"
+
+
+def test_what_takes_long_is_stated_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def work(seconds: float) -> str:
+        with output.working("Writing the report"):
+            time.sleep(seconds)
+        return capsys.readouterr().err
+
+    monkeypatch.setattr(output, "NOTICE_DELAY", 0.02)
+    assert work(0.2) == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert work(0.2) == "Writing the report ...\n"
+    monkeypatch.setattr(output, "NOTICE_DELAY", 60.0)
+    assert work(0.0) == ""

@@ -13,7 +13,7 @@ import typer
 from errormotion import datasets, plugins
 from errormotion.campaign.raw_paths import is_runs_folder, raw_of
 from errormotion.cli.guard import ERROR, INTERNAL, log_file
-from errormotion.cli.output import show, show_json
+from errormotion.cli.output import show, show_json, working
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.cli.summary import as_printed, figure_table, notes_of
@@ -269,14 +269,14 @@ def report(
                 datasets.validate(errors)
                 found = judge(errors, stored)
             folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
-        with reading(run):
+        with working("Writing the report"), reading(run):
             path = write_run_report(run, out, form=form)
         if out is None:
             folder.data["report"] = path.relative_to(folder.path).as_posix()
             folder.step("report", "done")
             folder.save()
     else:
-        with reading(run), datasets.load(run) as errors, explained(run, errors):
+        with working("Writing the report"), reading(run), datasets.load(run) as errors, explained(run, errors):
             state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
             page = out or run.with_suffix(".html")
             path = write_report([errors, *belonging(errors, run)], page, run=state, form=form)
