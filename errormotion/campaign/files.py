@@ -231,7 +231,7 @@ def load_bench(path: str | Path) -> BenchPlan:
         The file cannot be read, or contains errors; all in one message.
     """
     path = Path(path)
-    tomlfile.read_toml(path, error=BenchError)
+    _refuse_other(path, tomlfile.read_toml(path, error=BenchError), "bench")
     plan = parse_bench(path.read_text(encoding="utf-8-sig"), path)
     if mistakes := head.logo_mistakes(plan.laboratory, path.parent):
         raise BenchError(tomlfile.report(path, mistakes))
@@ -248,6 +248,7 @@ def load_campaign(path: str | Path) -> CampaignPlan:
     """
     path = Path(path)
     data = tomlfile.read_toml(path, error=BenchError)
+    _refuse_other(path, data, "campaign")
     bench = data.get("bench")
     plan, bench_error = None, None
     if isinstance(bench, str):
@@ -264,6 +265,21 @@ def load_campaign(path: str | Path) -> CampaignPlan:
     if mistakes := list(_missing(campaign)):
         raise BenchError(tomlfile.report(path, mistakes))
     return campaign
+
+
+_KINDS = {
+    "bench": "It holds the instruments of a machine; name the file of the campaign that uses it",
+    "campaign": "It holds the tests of a campaign; name the file of its bench",
+    "tolerances": "It holds limits; name it with --tolerances",
+}
+"""What other files hold, and what to do, by the name in their schema."""
+
+
+def _refuse_other(path: Path, data: Mapping[str, Any], expected: str) -> None:
+    """Refuse a file of another kind in one sentence, before all its keys are called unknown."""
+    found = str(data.get("schema", "")).removeprefix("errormotion.").partition("/")[0]
+    if found != expected and found in _KINDS:
+        raise BenchError(f"{path}: expected a {expected} file; found a file of kind '{found}'. {_KINDS[found]}")
 
 
 def _missing(campaign: CampaignPlan) -> Iterator[str]:

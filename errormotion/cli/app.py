@@ -100,6 +100,37 @@ def demo(
 
 @app.command()
 @guarded
+def init(
+    folder: Annotated[Path, typer.Argument(help="The folder for bench.toml and campaign.toml.")] = Path(),
+    machine: Annotated[str, typer.Option(help="Name of the machine.")] = "",
+    chain: Annotated[str, typer.Option(help="Its kinematic chain, such as workpiece-X-Y-bed-Z-spindle-tool.")] = "",
+    travel: Annotated[
+        list[str] | None,
+        typer.Option(metavar="AXIS=LOW,HIGH", help="Travel of an axis of the chain, such as X=-300mm,300mm."),
+    ] = None,
+    instrument: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=ID@ADDRESS", help="An instrument of the bench; may be repeated.")
+    ] = None,
+    test: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=ID", help="A test of the campaign; may be repeated.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME.KEY=VALUE", help="One setting of an instrument or of a test."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that exist.")] = False,
+    json_: Json = False,
+) -> None:
+    """Write a bench and a campaign for the instruments at hand; on a terminal, ask for what is not stated."""
+    from errormotion.cli.commands.init import command
+
+    command.init(
+        folder, machine, chain, travel or [], instrument or [], test or [], set_ or [], force=force, as_json=json_
+    )
+
+
+@app.command()
+@guarded
 def run(
     campaign: Annotated[
         Path | None, typer.Argument(help="A campaign file; optional with --resume.", show_default=False)
@@ -384,7 +415,7 @@ def validate(
         show_json({"ok": not mistakes, "file": str(file), "violations": mistakes})
     else:
         count = f"{len(mistakes)} violation" + ("s" if len(mistakes) != 1 else "")
-        show("\n  - ".join([f"{file}: {count}", *mistakes]) if mistakes else f"{file}: valid")
+        show("\n  - ".join([f"{file}: {count}", *data.alike(mistakes)]) if mistakes else f"{file}: valid")
     if mistakes:
         raise typer.Exit(INVALID)
 

@@ -7,13 +7,20 @@ import math
 import shutil
 import sys
 import textwrap
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import zip_longest
 from typing import Any
 
 import typer
 
-LEAST_WIDTH = 20
-"""Characters; a narrower last column is not wrapped."""
+LEAST_WIDTH = 12
+"""Characters; a column of text is not made narrower."""
+
+
+NOTICE_DELAY = 1.0
+"""Time after which a line states what takes so long, s."""
 
 
 def show(text: str = "") -> None:
@@ -26,26 +33,75 @@ def show_json(value: Any) -> None:
     sys.stdout.write(json.dumps(_strict(value), indent=2, ensure_ascii=False, default=str) + "\n")
 
 
+@contextmanager
+def working(what: str) -> Iterator[None]:
+    """Print on a terminal, after `NOTICE_DELAY`, what takes its time."""
+    timer = threading.Timer(NOTICE_DELAY, lambda: typer.echo(f"{what} ...", err=True))
+    timer.daemon = True
+    if sys.stderr.isatty():
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return rows in columns under a head, numbers to the right; on a terminal the last column is wrapped."""
+    """Return rows in columns under a head, numbers to the right.
+
+    On a terminal the table keeps to its width: the widest columns of text are wrapped. Where that is not enough, each
+    row becomes a block with a line for each column.
+    """
     cells = [[str(cell) for cell in row] for row in (head, *rows)]
     widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
     right = [bool(rows) and all(_numeric(row[k]) for row in rows) for k in range(len(head))]
-    room = shutil.get_terminal_size().columns - sum(widths[:-1]) - 2 * len(widths[:-1]) if sys.stdout.isatty() else 0
-    if room >= LEAST_WIDTH:
-        widths[-1] = min(widths[-1], room)
+    if sys.stdout.isatty():
+        room = shutil.get_terminal_size().columns
+        fitting = _fit(widths, right, room)
+        if fitting is None:
+            return _blocks(cells, room)
+        widths = fitting
     lines = []
     for row in cells:
-        last = (textwrap.wrap(row[-1], widths[-1]) if room >= LEAST_WIDTH else [row[-1]]) or [""]
-        for number, piece in enumerate(last):
-            shown = [*(row[:-1] if number == 0 else [""] * (len(row) - 1)), piece]
+        columns = [_wrap(cell, width) for cell, width in zip(row, widths, strict=True)]
+        for pieces in zip_longest(*columns, fillvalue=""):
             parts = [
-                cell.rjust(width) if side else cell.ljust(width)
-                for cell, width, side in zip(shown, widths, right, strict=True)
+                piece.rjust(width) if side else piece.ljust(width)
+                for piece, width, side in zip(pieces, widths, right, strict=True)
             ]
             lines.append("  ".join(parts).rstrip())
-    lines.insert(1, "  ".join("-" * width for width in widths))
+        if row is cells[0]:
+            lines.append("  ".join("-" * width for width in widths))
     return "\n".join(lines)
+
+
+def _fit(widths: Sequence[int], right: Sequence[bool], room: int) -> list[int] | None:
+    """Return widths that fit into the room, the widest columns of text reduced first; None where there are none."""
+    found = list(widths)
+    while sum(found) + 2 * (len(found) - 1) > room:
+        wide = [k for k, width in enumerate(found) if not right[k] and width > LEAST_WIDTH]
+        if not wide:
+            return None
+        found[max(wide, key=lambda k: found[k])] -= 1
+    return found
+
+
+def _blocks(cells: Sequence[Sequence[str]], room: int) -> str:
+    """Return the rows below each other, a line for each column that is not empty."""
+    head, *rows = cells
+    label = max(map(len, head)) + 2
+    blocks = []
+    for row in rows:
+        lines = []
+        for name, cell in zip(head, row, strict=True):
+            pieces = _wrap(cell, max(room - label, LEAST_WIDTH)) if cell.strip() else []
+            lines += [f"{name if n == 0 else '':<{label}}{piece}" for n, piece in enumerate(pieces)]
+        blocks.append("\n".join(lines))
+    return "\n\n".join(blocks)
+
+
+def _wrap(cell: str, width: int) -> list[str]:
+    return [cell] if len(cell) <= width else textwrap.wrap(cell, width) or [""]
 
 
 def _numeric(cell: str) -> bool:

@@ -3,20 +3,36 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import (
     BarColumn,
     Progress,
+    ProgressColumn,
     TaskID,
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from errormotion.cli.curves import Curves
+
+
+class _Display(Progress):
+    """Bars, and curves below them."""
+
+    def __init__(self, curves: Callable[[], Curves], *columns: ProgressColumn, console: Console, disable: bool) -> None:
+        self._curves, self._own = curves, console
+        super().__init__(*columns, console=console, disable=disable)
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        yield from super().get_renderables()
+        yield from self._curves().lines(self._own.width)
 
 
 class Bars:
@@ -34,7 +50,9 @@ class Bars:
         self._announcing = announcing
         self._console = Console(stderr=True, highlight=False)
         self._shown = not quiet and sys.stderr.isatty()
-        self._progress = Progress(
+        self._curves = Curves()
+        self._progress = _Display(
+            lambda: self._curves,
             TextColumn("{task.description}"),
             BarColumn(),
             TaskProgressColumn(),
@@ -73,6 +91,7 @@ class Bars:
     def stage(self, name: str, total: float | None = None) -> None:
         """Start a stage of a test."""
         self._finish()
+        self._curves = Curves()
         self._task = self._progress.add_task(self._name + name, total=total, note="")
 
     def advance(self, done: float) -> None:
@@ -86,7 +105,8 @@ class Bars:
         return self._shown
 
     def note(self, text: str) -> None:
-        """Show an intermediate result behind the bar."""
+        """Show an intermediate result behind the bar, and the course of its values as curves below."""
+        self._curves.take(text)
         if self._task is not None:
             self._progress.update(self._task, note=text)
 

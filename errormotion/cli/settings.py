@@ -39,14 +39,15 @@ def read_settings(model: Any, file: Path | None, assignments: Sequence[str]) -> 
             place = place.setdefault(table, {})
             if not isinstance(place, dict):
                 raise MethodError(f"--set {assignment}: '{table}' is a value, not a table")
-        place[name] = _value(text.strip())
+        place[name] = value_of(text.strip())
     settings, mistakes = tomlfile.check(data, model)
     if settings is None:
         raise MethodError(tomlfile.report(file or "--set", mistakes))
     return settings
 
 
-def _value(text: str) -> Any:
+def value_of(text: str) -> Any:
+    """Return a value in TOML, or the text where it is none."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from difflib import get_close_matches
 from fractions import Fraction
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
@@ -26,6 +27,18 @@ if TYPE_CHECKING:
 
 EDGE = {"edge": True}
 """Validation context of everything that a person writes: units are compulsory."""
+
+_USUAL = {
+    "m": ("mm", "um", "nm", "m", "inch"),
+    "rad": ("arcsec", "arcmin", "deg", "rad", "mrad", "urad"),
+    "s": ("s", "min", "h", "ms", "us"),
+    "1/min": ("/min", "rpm", "1/min", "rev/min", "/s"),
+    "degC": ("degC", "K", "degF"),
+    "Hz": ("Hz", "kHz", "MHz", "1/s"),
+    "m/s": ("mm/min", "m/min", "mm/s", "m/s"),
+    "m/K": ("um/K", "nm/K", "mm/K", "m/K"),
+}
+"""Units that are suggested, by the inside unit."""
 
 ArrayLike = float | np.ndarray
 
@@ -81,10 +94,17 @@ class Quantity:
             factor, offset = _linear(unit, self.unit)
             return float(Fraction(match[0]) * factor + offset)
         except DatasetError as error:
-            hint = " (the decimal sign is a point)" if re.match(r",[0-9]", unit) else f": {error}"
+            hint = " (the decimal sign is a point)" if re.match(r",[0-9]", unit) else f": {error}{self._near(unit)}"
             raise ValueError(expected + hint) from error
         except OverflowError:
             raise ValueError(f"{expected}: the number is too large") from None
+
+    def _near(self, unit: str) -> str:
+        """Return a question for a unit that is not known or of another kind; empty where none is near."""
+        usual = _USUAL.get(self.unit, ())
+        plain = unit.replace(" ", "")
+        found = [known for known in usual if known.lower() == plain.lower()] or get_close_matches(plain, usual, 3, 0.5)
+        return f"; did you mean {' or '.join(repr(each) for each in found)}?" if found else ""
 
     def _validate(self, value: Any, info: core_schema.ValidationInfo) -> Any:
         if isinstance(value, str):

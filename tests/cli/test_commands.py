@@ -1,6 +1,7 @@
 """Every command answers a person in words, a program in JSON, and ends with the exit code that the reference states."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -307,3 +308,44 @@ def test_validate_counts_the_mistakes_of_a_campaign_and_of_its_bench(answer: Ans
     found = answer("validate", "campaign.toml", code=3)["violations"]
     assert [line.partition(":")[0] for line in found] == ["colour", "bench.toml", "bench.toml"]
     assert answer("validate", "bench.toml", code=3)["violations"][0].startswith("machine.chain: expected every axis")
+
+
+def test_every_command_has_h_o_and_words_of_the_field(run: Run) -> None:
+    import typer
+
+    from errormotion.cli.app import app
+
+    commands: list[Any] = [typer.main.get_command(app)]
+    for command in commands:
+        commands += getattr(command, "commands", {}).values()
+        for parameter in command.params:
+            assert ("--out" in parameter.opts) == ("-o" in parameter.opts), command.name
+    text = run("compare", "-h").stdout
+    assert re.search(r"^ +RESULT  Error datasets", text, re.MULTILINE)
+    assert re.search(r"-o, --out FILE +Write the comparison", text)
+    assert "<path>" not in text + run("plan", "-h").stdout + run("program", "-h").stdout
+    assert "-o, --out FOLDER" in run("program", "-h").stdout
+
+
+def test_settings_are_shown_with_their_units(run: Run) -> None:
+    text = run("plugins", "show", "spindle_drift").stdout
+    assert re.search(r"^average +0\.5 s +averaging time", text, re.MULTILINE)
+    assert re.search(r"^reference_time +- \(a time\)", text, re.MULTILINE)
+
+
+def test_doctor_says_how_to_install_what_is_missing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    from importlib.metadata import PackageNotFoundError
+
+    from errormotion.cli.commands import doctor
+
+    def version(name: str) -> str:
+        if name in ("asyncua", "zarr"):
+            raise PackageNotFoundError(name)
+        return "1"
+
+    monkeypatch.setattr(doctor, "version", version)
+    found = {finding.name: finding for finding in doctor.examine()}
+    assert re.search(r"not installed: zarr>=\S+\. Install: \S+ -m pip install 'zarr>=", found["packages"].message)
+    assert not found["packages"].ok
+    assert found["optional: opcua"].ok
+    assert found["optional: opcua"].message.endswith("-m pip install 'errormotion[opcua]'")

@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 
 from errormotion.campaign.monitor.watch import Snapshot
 from errormotion.cli.app import app
-from errormotion.cli.commands.monitor import Screen, bars, clock
+from errormotion.cli.commands.monitor import LEAST_SPAN, Screen, clock
+from errormotion.cli.curves import bars
 
 BENCH = """\
 schema = "errormotion.bench/1"
@@ -102,7 +103,7 @@ def test_the_page_shows_temperatures_parameters_alarms_and_who_is_silent() -> No
 
 def test_bars_leave_a_blank_for_what_is_not_known() -> None:
     assert bars([20.0, math.nan, 28.0]) == "▁ █"
-    assert bars([20.0, 20.001]) == "▁▁"  # a thousandth of a kelvin is no mountain
+    assert bars([20.0, 20.001], LEAST_SPAN) == "▁▁"  # a thousandth of a kelvin is no mountain
     assert bars([math.nan]) == ""
 
 

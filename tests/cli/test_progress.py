@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from errormotion.cli.curves import MOST_CURVES, MOST_POINTS, Curves
 from errormotion.cli.progress import Bars
 
 
@@ -69,3 +70,31 @@ def test_operator_is_asked_between_the_bars(terminal: Callable[[], Terminal], mo
         bars.ask("Mount the bar [10 mm].")
         bars.advance(5.0)
     assert "Mount the bar [10 mm]." in stderr.getvalue()
+
+
+def test_values_of_notes_become_curves_on_a_terminal_only(terminal: Callable[[], Terminal]) -> None:
+    stderr = terminal()
+    with Bars() as bars:
+        bars.stage("measuring", 100.0)
+        for k in range(9):
+            bars.note(f"EX {k:+.2f} EZ {-k:+.2f} um, EA {0.5 * k:+.1f} arcsec")
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", stderr.getvalue())
+    assert re.search(r"EX  ▁▂▃▄▄?▅▅?▆▇█  \+8 um  \(\+0 to \+8\)", text)
+    assert re.search(r"EZ  █.*▁  -8 um  \(-8 to [+-]0\)", text)
+    assert "+4 arcsec  (+0 to +4)" in text
+
+
+def test_a_long_curve_keeps_its_course_in_bounded_memory() -> None:
+    curves = Curves()
+    for k in range(100_000):
+        curves.take(f"EX {k:+} um")
+    (line,) = curves.lines(80)
+    assert len(line.plain) <= 80
+    assert re.search(r"▁▁?▂.*▇▇*█", line.plain)
+    assert len(curves._courses["EX"].points) < MOST_POINTS
+    for k in range(100):
+        curves.take(f"name{k} +1 um")
+    assert len(list(curves.lines(80))) == MOST_CURVES
+    plain = Curves()
+    plain.take("12 of 300 values undecided, v1.2.3")
+    assert not plain.shown

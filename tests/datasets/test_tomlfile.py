@@ -106,8 +106,7 @@ def test_every_mistake_is_told_with_file_key_expected_and_found(write) -> None:
         "test[1].repeats: expected a whole number; found 1.5",
         "origin[1]: expected a length with its unit, such as '5 mm'; found 2",
         "origin[2]: expected a length with its unit, such as '5 mm'; found '3 s': 's' is not convertible to 'm'",
-        "sensors.left.name: missing; expected a string",
-        "link.host: missing; expected a string",
+        "sensors.left.name, link.host: missing; expected a string",
         "link.hosts: unknown key; did you mean 'host'? Known here: host, kind",
         'note: expected at most 5 letters; found "far too long"',
     ]

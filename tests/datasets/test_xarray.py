@@ -45,10 +45,12 @@ def test_the_engine_opens_what_load_opens(errors, drift, tmp_path) -> None:
 
 def test_a_table_has_field_units_and_a_row_for_each_place(errors) -> None:
     ds = errors(unseen=(5,), coords={"time": 60.0 * np.arange(7), "sensor": ["frame"],
-        "temperature": (("time", "sensor"), np.full((7, 1), 20.5), {"units": "degC"})})  # fmt: skip
+        "temperature": (("time", "sensor"), np.full((7, 1), 20.5), {"units": "degC"}),
+        "spindle_speed": ("time", np.full(7, 5e3), {"units": "1/min"})})  # fmt: skip
     table = ds.em.to_dataframe(["EXC", "EC", "EB"], k=3)
     assert list(table.columns) == [
-        "time / min", "temperature frame / degC", "EXC / um", "U(EXC) / um", "ECC / arcsec", "U(ECC) / arcsec",
+        "time / min", "temperature frame / degC", "spindle_speed / (1/min)",
+        "EXC / um", "U(EXC) / um", "ECC / arcsec", "U(ECC) / arcsec",
         "EBC / arcsec", "U(EBC) / arcsec",
     ]  # fmt: skip
     np.testing.assert_allclose(table["time / min"], np.arange(7))

@@ -79,3 +79,8 @@ def test_links_between_pages_lead_somewhere() -> None:
             if "://" not in target and not (page.parent / target).exists():
                 broken.append(f"{page.relative_to(ROOT)}: {target}")
     assert not broken
+
+
+def test_every_example_has_a_readme() -> None:
+    folders = [path for path in sorted((ROOT / "examples").iterdir()) if path.is_dir()]
+    assert [path.name for path in folders if not (path / "README.md").is_file()] == []

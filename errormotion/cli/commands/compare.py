@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.cli.output import show, show_json, table
+from errormotion.cli.output import show, show_json, table, working
 from errormotion.cli.results import load
 from errormotion.compare import compare as compared
 from errormotion.compare.repeats import labels
@@ -58,7 +58,8 @@ def compare(
     results = _completed(results, stated)
     results = {name: over_one(name, ds, stated) for name, ds in results.items()}
     groups = _groups(results, stated.by)
-    found = compared(results, at=at, freedoms=freedoms, since=since, same_start=same_start, groups=groups)
+    with working(f"Comparing {len(results)} results"):
+        found = compared(results, at=at, freedoms=freedoms, since=since, same_start=same_start, groups=groups)
     if stated.over is not None and stated.over not in found["value"].dims:
         raise DatasetError(f"--over {stated.over}: the results are compared over {_common(found) or 'nothing'}")
     if left_out:

@@ -13,7 +13,7 @@ import typer
 from errormotion import datasets, plugins
 from errormotion.campaign.raw_paths import is_runs_folder, raw_of
 from errormotion.cli.guard import ERROR, INTERNAL, log_file
-from errormotion.cli.output import show, show_json
+from errormotion.cli.output import show, show_json, working
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.cli.summary import as_printed, figure_table, notes_of
@@ -269,14 +269,14 @@ def report(
                 datasets.validate(errors)
                 found = judge(errors, stored)
             folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
-        with reading(run):
+        with working("Writing the report"), reading(run):
             path = write_run_report(run, out, form=form)
         if out is None:
             folder.data["report"] = path.relative_to(folder.path).as_posix()
             folder.step("report", "done")
             folder.save()
     else:
-        with reading(run), datasets.load(run) as errors, explained(run, errors):
+        with working("Writing the report"), reading(run), datasets.load(run) as errors, explained(run, errors):
             state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
             page = out or run.with_suffix(".html")
             path = write_report([errors, *belonging(errors, run)], page, run=state, form=form)
@@ -307,6 +307,13 @@ def validate(file: Path) -> list[str]:
         return [str(error)]
 
 
+def alike(mistakes: list[str]) -> list[str]:
+    """Return violations for a person: those that are alike in one line."""
+    from errormotion.datasets.files.tomlfile import grouped
+
+    return grouped(mistakes)
+
+
 def _of_toml(file: Path) -> list[str]:
     from errormotion.campaign.files import load_bench, load_campaign
     from errormotion.datasets.files.tomlfile import read_toml
@@ -326,11 +333,13 @@ def _of_toml(file: Path) -> list[str]:
 
 def _mistakes(message: str, file: Path) -> list[str]:
     """Return the single mistakes of a message; those of another file, such as the bench of a campaign, name it."""
-    found, source = [], str(file)
+    from errormotion.datasets.files.tomlfile import single
+
+    found, source = list[str](), str(file)
     for line in message.splitlines():
         if line.startswith("  - "):
             text = line.removeprefix("  - ")
-            found.append(text if source == str(file) else f"{source}: {text}")
+            found += [each if source == str(file) else f"{source}: {each}" for each in single(text)]
         elif re.fullmatch(r".*: \d+ mistakes?", line):
             source = line.rpartition(": ")[0]
         elif found and line.startswith(" "):

@@ -5,11 +5,14 @@ from __future__ import annotations
 import importlib
 import os
 import platform
+import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import requires, version
+from functools import partial
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from pathlib import Path
 
 from errormotion.cli.guard import log_file
@@ -38,6 +41,7 @@ def examine() -> list[Finding]:
         ("simulators", _loopback),
         ("serial ports", _serial),
         *_checks_of_plugins(),
+        *_checks_of_extras(),
         ("disk here", _disk),
         ("temporary folder", _temporary),
         ("log file", _log),
@@ -77,8 +81,55 @@ def _packages() -> str:
         except ImportError as error:
             missing.append(f"{name} ({error})")
     if missing:
-        raise _FailedError(f"cannot import {', '.join(missing)}; install errormotion again in this environment")
+        raise _FailedError(f"cannot import {', '.join(missing)}. Install: {_pip('--force-reinstall errormotion')}")
+    lacking = _lacking("")
+    if lacking:
+        raise _FailedError(f"not installed: {', '.join(lacking)}. Install: {_pip(' '.join(lacking))}")
     return f"errormotion {version('errormotion')}, {len(requires('errormotion') or [])} requirements, all import"
+
+
+def _checks_of_extras() -> list[tuple[str, Callable[[], str]]]:
+    """Return a check for each optional part of the distribution; a part that is not installed is no failure."""
+    return [
+        (f"optional: {name}", partial(_extra, name)) for name in metadata("errormotion").get_all("Provides-Extra") or ()
+    ]
+
+
+def _extra(name: str) -> str:
+    lacking = _lacking(name)
+    return f"not installed ({', '.join(lacking)}). Install: {_pip(f'errormotion[{name}]')}" if lacking else "installed"
+
+
+def _lacking(extra: str) -> list[str]:
+    """Return the packages that the distribution, or one of its optional parts, requires and that are not installed."""
+    found = []
+    for requirement in requires("errormotion") or ():
+        text, _, marker = requirement.partition(";")
+        asked = re.search(r"extra *== *['\"]([^'\"]+)['\"]", marker)
+        if (asked[1] if asked else "") != extra or not _applies(marker):
+            continue
+        name = re.match(r"[A-Za-z0-9._-]+", text.strip())
+        try:
+            if name is not None:
+                version(name[0])
+        except PackageNotFoundError:
+            found.append(text.strip())
+    return found
+
+
+def _applies(marker: str) -> bool:
+    """Whether a requirement is one for this version of Python."""
+    limit = re.search(r"python_version *(<|>=) *['\"](\d+)\.(\d+)['\"]", marker)
+    if limit is None:
+        return True
+    below = sys.version_info[:2] < (int(limit[2]), int(limit[3]))
+    return below if limit[1] == "<" else not below
+
+
+def _pip(what: str) -> str:
+    """Return the command that installs something into this environment."""
+    quoted = f"'{what}'" if any(sign in what for sign in "[<>=") and " " not in what else what
+    return f"{sys.executable} -m pip install {quoted}"
 
 
 def _kernels() -> str:
@@ -127,8 +178,19 @@ def _serial() -> str:
     ports = [str(path) for pattern in ("ttyUSB*", "ttyACM*") for path in sorted(Path("/dev").glob(pattern))]
     closed = [port for port in ports if not os.access(port, os.R_OK | os.W_OK)]
     if closed:
-        raise _FailedError(f"no permission for {', '.join(closed)}; join the group that owns them (often 'dialout')")
+        owner = _group(closed[0])
+        raise _FailedError(
+            f"no permission for {', '.join(closed)}. Join the group that owns them, then log in again: "
+            f"sudo usermod -aG {owner} {os.environ.get('USER', 'USER')}"
+        )
     return ", ".join(ports) or "no USB serial adapter plugged in"
+
+
+def _group(port: str) -> str:
+    try:
+        return Path(port).group()
+    except (KeyError, OSError, NotImplementedError):
+        return "dialout"
 
 
 def _disk() -> str:

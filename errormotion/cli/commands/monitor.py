@@ -16,13 +16,16 @@ from rich.text import Text
 
 from errormotion.campaign.files import load_bench
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
+from errormotion.cli.curves import bars
 from errormotion.cli.output import show
 from errormotion.datasets.units import TIME
 from errormotion.errors import BenchError
 
-BARS = "▁▂▃▄▅▆▇█"
 TREND = 30
 """Characters of the course of a temperature."""
+
+LEAST_SPAN = 0.1
+"""Height of the course of a temperature at least, K: a tenth of a kelvin is no mountain."""
 
 SPAN = 1800.0
 """Time that the course and the rate of change look back, s."""
@@ -127,7 +130,7 @@ class Screen:
                 _number(self.rate(name, snapshot), "+.2f"),
                 _number(low, ".2f"),
                 _number(high, ".2f"),
-                bars([value for _, value in self._course[name]]),
+                bars([value for _, value in self._course[name]], LEAST_SPAN),
             )
         return table
 
@@ -149,16 +152,6 @@ def _parameters(state: dict[str, Any] | Any) -> Table:
     for alarm in state.get("alarms") or ():
         table.add_row("alarm", Text(str(alarm), style="bold red"))
     return table
-
-
-def bars(values: list[float]) -> str:
-    """Return the course of values as one line of bars; a value that is not known is a blank."""
-    known = [value for value in values if not math.isnan(value)]
-    if not known:
-        return ""
-    low, span = min(known), max(max(known) - min(known), 0.1)  # a tenth of a kelvin is no mountain
-    top = len(BARS) - 1
-    return "".join(" " if math.isnan(v) else BARS[round((v - low) / span * top)] for v in values)
 
 
 def clock(seconds: float) -> str:

@@ -10,7 +10,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.campaign.files import load_campaign
-from errormotion.cli.output import show, show_json, table
+from errormotion.cli.output import show, show_json, table, working
 from errormotion.cli.summary import FIELD_UNITS, notes_of
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.errors import BenchError
@@ -32,7 +32,7 @@ def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) ->
         )
     if out is not None and len(chosen) > 1:
         raise BenchError(f"{campaign}: one file holds the plan of one test; name it with --test")
-    with looking_beside(plan.folder):
+    with working("Computing the uncertainty to expect"), looking_beside(plan.folder):
         planned = [(entry, entry.method().plan(entry.settings)) for entry in chosen]
     if out is not None:
         datasets.save(planned[0][1], out)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import asdict
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from errormotion import plugins
 from errormotion.cli.output import show, show_json, table
+from errormotion.datasets.units import Quantity, format_quantity
 from errormotion.errors import PluginError
 
 
@@ -35,8 +36,14 @@ def list_plugins(as_json: bool) -> None:
     if as_json:
         show_json({"plugins": found})
         return
-    rows = [[p["group"], p["id"], p["kind"], p["status"], p["distribution"], p["error"] or p["summary"]] for p in found]
-    show(table(["group", "id", "kind", "status", "from", "summary"], rows))
+    several = len({p["distribution"] for p in found}) > 1
+    for group in plugins.GROUPS:
+        own = [p for p in found if p["group"] == group]
+        columns = ["id", *(["kind"] if any(p["kind"] for p in own) else []), "status"]
+        columns += ["distribution"] if several else []
+        rows = [[*(p[column] for column in columns), p["error"] or p["summary"]] for p in own]
+        show(f"{group.replace('_', ' ')} ({len(own)})\n")
+        show(table(["from" if column == "distribution" else column for column in [*columns, "summary"]], rows) + "\n")
 
 
 def show_plugin(plugin_id: str, as_json: bool) -> None:
@@ -48,24 +55,67 @@ def show_plugin(plugin_id: str, as_json: bool) -> None:
         schema = settings.model_json_schema() if settings else {}
         show_json({"group": group, "info": asdict(cls.info), "settings": schema})
         return
-    for key, value in asdict(cls.info).items():
-        if value not in (None, "", ()):
-            show(f"{key:>10}  {', '.join(value) if isinstance(value, tuple) else value}")
+    stated = [
+        [key.replace("_", " "), ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)]
+        for key, value in asdict(cls.info).items()
+        if key != "id" and value not in (None, "", ())
+    ]
     if hasattr(cls, "needs"):
-        show(f"{'needs':>10}  {', '.join(cls.needs.instruments)}; raw schema {cls.needs.raw_schema}")
+        stated.append(["needs", f"{', '.join(cls.needs.instruments)}; raw schema {cls.needs.raw_schema}"])
+    show(table(["plugin", plugin_id], stated))
     fields = settings.model_fields if settings else {}
     rows = [[name, _default(field), str(field.description or "")] for name, field in fields.items()]
     show()
-    show(table(["setting", "default (SI)", "meaning"], rows) if rows else "This plugin has no settings.")
+    show(table(["setting", "default", "meaning"], rows) if rows else "This plugin has no settings.")
+
+
+_FIELD_UNITS = {"m": ("mm", "um", "m"), "rad": ("arcsec", "deg"), "s": ("s", "min", "h", "ms"), "Hz": ("Hz", "kHz")}
+"""Units that people use, by the inside unit; of two alike the first."""
 
 
 def _default(field: FieldInfo) -> str:
+    """Return the default of a setting as a person writes it in a campaign, with its unit; else what is expected."""
+    quantity = _quantity(field)
+    kind = f" ({quantity.kind})" if quantity is not None else ""
     if field.is_required():
-        return "required"
+        return f"required{kind}"
     default = field.get_default(call_default_factory=True)
+    if default in (None, (), [], {}):
+        return f"-{kind}"
     if isinstance(default, BaseModel):
         default = default.model_dump()
-    return textwrap.shorten("-" if default is None else str(default), 30, placeholder=" ...")
+    if quantity is not None and isinstance(default, (int, float)) and not isinstance(default, bool):
+        return _written(float(default), quantity)
+    if (
+        quantity is not None
+        and isinstance(default, (tuple, list))
+        and all(isinstance(x, (int, float)) for x in default)
+    ):
+        return textwrap.shorten(", ".join(_written(float(x), quantity) for x in default), 30, placeholder=" ...")
+    shown = str(default).lower() if isinstance(default, bool) else str(default)
+    return textwrap.shorten(shown, 30, placeholder=" ...")
+
+
+def _written(value: float, quantity: Quantity) -> str:
+    """Return a value in the unit in which it is a short number."""
+    units = _FIELD_UNITS.get(quantity.unit, ())
+    texts = [format_quantity(value, unit, 6) for unit in units] if value and units else []
+    short = min(texts, key=lambda text: (len(text.split()[0].strip("-")), texts.index(text)), default="")
+    unit = {"1/min": "/min"}.get(quantity.unit, quantity.unit)
+    return short or f"{value:g} {unit}"
+
+
+def _quantity(field: FieldInfo) -> Quantity | None:
+    """Return the quantity of a setting, or that of its elements."""
+    found = [note for note in field.metadata if isinstance(note, Quantity)]
+    pending = [field.annotation]
+    while pending and not found:
+        each = pending.pop()
+        if isinstance(each, type) and issubclass(each, BaseModel):
+            continue
+        found += [note for note in getattr(each, "__metadata__", ()) if isinstance(note, Quantity)]
+        pending += [argument for argument in get_args(each) if argument is not Ellipsis]
+    return found[0] if found else None
 
 
 def check_plugin(plugin_id: str, address: str | None, mutants: int | None, as_json: bool) -> bool:

@@ -32,6 +32,9 @@ Key = str | int
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DOTTED = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST},}}")
 
+_KEY = re.compile(r"[\w.\[\]-]+")
+"""A dotted key, as `dotted` writes it."""
+
 _EXPECTED = {
     "model_type": "a table",
     "model_attributes_type": "a table",
@@ -162,7 +165,24 @@ def check(
 def report(source: str | Path, mistakes: Sequence[str]) -> str:
     """Return the one message for all mistakes of one file."""
     count = "1 mistake" if len(mistakes) == 1 else f"{len(mistakes)} mistakes"
-    return "\n  - ".join([f"{source}: {count}", *mistakes])
+    return "\n  - ".join([f"{source}: {count}", *grouped(mistakes)])
+
+
+def grouped(mistakes: Sequence[str]) -> list[str]:
+    """Return mistakes for a person: those that are alike in one line with all their keys."""
+    keys: dict[str, list[str]] = {}
+    for mistake in mistakes:
+        key, sign, text = mistake.partition(": ")
+        keys.setdefault(text if sign and _KEY.fullmatch(key) else mistake, []).append(key)
+    return [f"{', '.join(where)}: {text}" if text != where[0] and _KEY.fullmatch(where[0]) else text
+            for text, where in keys.items()]  # fmt: skip
+
+
+def single(line: str) -> list[str]:
+    """Return the mistakes of a line that `grouped` has made."""
+    keys, sign, text = line.partition(": ")
+    found = keys.split(", ")
+    return [f"{key}: {text}" for key in found] if sign and all(map(_KEY.fullmatch, found)) else [line]
 
 
 def dotted(keys: Iterable[Key]) -> str:

@@ -106,7 +106,8 @@ def _columns(coordinate: xr.DataArray, name: str, sizes: dict[str, int]) -> dict
     unit = _COORDINATES.get(inside, inside)
     if unit in ("", "1"):
         return {name: values}
-    return {f"{name} / {unit}": np.asarray(convert(values.astype(float), inside, unit) if unit != inside else values)}
+    shown = f"({unit})" if "/" in unit else unit
+    return {f"{name} / {shown}": np.asarray(convert(values.astype(float), inside, unit) if unit != inside else values)}
 
 
 def _spread(variable: xr.Variable, sizes: dict[str, int]) -> Array:

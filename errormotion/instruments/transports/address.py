@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from errormotion.errors import InstrumentError
@@ -102,7 +103,9 @@ def parse_address(url: str) -> Address:
     """
     scheme, mark, rest = url.partition("://")
     if not mark or scheme not in SCHEMES:
-        raise InstrumentError(f"Expected an address such as {_EXAMPLES}; found '{url}'")
+        near = get_close_matches(scheme.lower(), SCHEMES, n=1) if mark else []
+        hint = f"; did you mean {near[0]}://{rest}?" if near else ""
+        raise InstrumentError(f"Expected an address such as {_EXAMPLES}; found '{url}'{hint}")
     if scheme == "replay":  # the rest is a file name; it may contain any characters
         if not rest:
             raise InstrumentError(f"Expected the file of a recording, as in replay://FILE; found '{url}'")

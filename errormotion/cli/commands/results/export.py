@@ -16,10 +16,14 @@ from errormotion import datasets
 from errormotion.cli.output import show, show_json
 from errormotion.cli.results import load
 from errormotion.cli.summary import as_printed
-from errormotion.datasets.files.workbook import Cell, Sheet, workbook
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.results.tables import to_dataframe
 from errormotion.errors import DatasetError
+from errormotion.report.exports import xlsx
+from errormotion.report.exports.tables import Entry, Sheet
+
+MOST_ROWS = 2**20 - 2
+"""Rows of one table of a workbook, by its format, less caption and head."""
 
 FORMS = (".csv", ".xlsx", ".nc", ".zarr")
 
@@ -59,41 +63,58 @@ def export(
     else:
         sheets = [_errors(errors, freedoms, k), _figures(errors), _about(errors, k)]
         rows = len(sheets[0].rows)
-        content = _csv(sheets[0]) if out.suffix.lower() == ".csv" else workbook(sheets)
-        with out.open("xb") as file:
-            file.write(content)
+        if out.suffix.lower() == ".csv":
+            with out.open("xb") as file:
+                file.write(_csv(sheets[0]))
+        elif rows > MOST_ROWS:
+            raise DatasetError(f"{out}: a workbook holds {MOST_ROWS} rows; found {rows}. Write .csv or .nc")
+        else:
+            xlsx.write(sheets, out)
     if as_json:
         show_json({"ok": True, "file": str(out), "rows": rows, "columns": list(sheets[0].head) if sheets else []})
         return
-    tables = f"; tables {', '.join(sheet.name for sheet in sheets)}" if out.suffix.lower() == ".xlsx" else ""
+    tables = f"; tables {', '.join(sheet.section for sheet in sheets)}" if out.suffix.lower() == ".xlsx" else ""
     show(f"{out}: {rows} row{'' if rows == 1 else 's'}{tables}")
 
 
 def _errors(errors: xr.Dataset, freedoms: Sequence[str] | None, k: float) -> Sheet:
     table = to_dataframe(errors, freedoms, k)
-    return Sheet("errors", tuple(table.columns), [tuple(row) for row in table.itertuples(index=False)])
+    caption = f"{errors.attrs['machine']}: errors of {errors.attrs['component']}, U with k = {k:g}"
+    return _sheet(1, "errors", caption, list(table.columns), [list(row) for row in table.itertuples(index=False)])
 
 
 def _figures(errors: xr.Dataset) -> Sheet:
-    rows: list[tuple[Cell, ...]] = [
-        (each["name"], each["value"], each["expanded_uncertainty"], each["unit"])
+    rows = [
+        [each["name"], each["value"], each["expanded_uncertainty"], each["unit"]]
         for each in (as_printed(figure) for figure in figures_of(errors))
     ]
-    return Sheet("figures of merit", ("figure", "value", "U (k = 2)", "unit"), rows)
+    return _sheet(2, "figures of merit", "Figures of merit", ["figure", "value", "U (k = 2)", "unit"], rows)
 
 
 def _about(errors: xr.Dataset, k: float) -> Sheet:
-    rows: list[tuple[Cell, ...]] = [("coverage factor of the errors", k)]
+    rows: list[list[Any]] = [["coverage factor of the errors", k]]
     for name, value in errors.attrs.items():
         if name == "functional_point":
-            rows.append(("functional point / mm", ", ".join(f"{1e3 * each:.6g}" for each in np.asarray(value, float))))
+            rows.append(["functional point / mm", ", ".join(f"{1e3 * each:.6g}" for each in np.asarray(value, float))])
         elif name == "provenance":
             software = json.loads(value).get("software", {})
-            rows += [(f"software {key}", str(version)) for key, version in software.items()]
+            rows += [[f"software {key}", str(version)] for key, version in software.items()]
         else:
             listed = value.tolist() if isinstance(value, np.ndarray) else value
-            rows.append((str(name), ". ".join(map(str, listed)) if isinstance(listed, list) else str(listed)))
-    return Sheet("about", ("item", "value"), rows)
+            rows.append([str(name), ". ".join(map(str, listed)) if isinstance(listed, list) else str(listed)])
+    return _sheet(3, "about", "What the result is", ["item", "value"], rows)
+
+
+def _sheet(number: int, section: str, caption: str, head: list[str], rows: list[list[Any]]) -> Sheet:
+    cells: list[list[Entry]] = [[_entry(value) for value in row] for row in rows]
+    return Sheet(number, section, caption, head, cells, [[None] * len(row) for row in cells], [])
+
+
+def _entry(value: Any) -> Entry:
+    """Return a cell: a number, a text, or nothing for what is not known."""
+    if isinstance(value, (int, float, np.number)) and not isinstance(value, bool):
+        return float(f"{value:.15g}") if np.isfinite(value) else None
+    return None if value is None else str(value)
 
 
 def _csv(sheet: Sheet) -> bytes:
@@ -105,10 +126,8 @@ def _csv(sheet: Sheet) -> bytes:
     return stream.getvalue().encode("utf-8")
 
 
-def _text(cell: Any) -> Any:
+def _text(entry: Entry) -> str:
     """Return a cell; a text that a spreadsheet would take as a formula begins with an apostrophe."""
-    if isinstance(cell, str):
-        return f"'{cell}" if cell[:1] in ("=", "+", "-", "@", "\t", "\r") else cell
-    if isinstance(cell, (float, np.floating)):
-        return f"{cell:.12g}" if np.isfinite(cell) else ""
-    return cell
+    if isinstance(entry, str):
+        return f"'{entry}" if entry[:1] in ("=", "+", "-", "@", "\t", "\r") else entry
+    return "" if entry is None else f"{entry:.12g}"

@@ -1,0 +1,1 @@
+"""``errormotion init``: a bench and a campaign for the instruments at hand."""

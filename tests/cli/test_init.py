@@ -1,0 +1,86 @@
+"""``errormotion init``: bench and campaign from options and from answers, checked by the code that reads them."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import Result
+
+from errormotion.campaign.files import load_bench, load_campaign
+from errormotion.cli.commands.init import command
+from errormotion.cli.commands.init.writing import key, value
+from errormotion.datasets.files.tomlfile import parse_toml
+
+Run = Callable[..., Result]
+CHAIN = "workpiece-X-Y-bed-Z-spindle-tool"
+TRAVEL = ("--chain", CHAIN, "--travel", "X=-300mm,300mm", "--travel", "Y=-200 mm, 200 mm", "--travel", "Z=0 mm,400 mm")
+FRAME = ("--instrument", "frame=five_sensor_frame@sim://cframe?seed=3")
+
+
+def test_options_alone_write_a_bench_and_a_campaign(run: Run, tmp_path: Path) -> None:
+    options = (
+        "--machine",
+        'VM "1"',
+        *TRAVEL,
+        *FRAME,
+        "--test",
+        "a=spindle_drift",
+    )
+    said = run("init", "new", *options, "--set", "a.duration=2 min", "--set", "frame.levels=['10 mm', '50 mm']").stdout
+    campaign = load_campaign(tmp_path / "new" / "campaign.toml")
+    assert (campaign.bench.machine, campaign.bench.instruments[0].address) == ('VM "1"', "sim://cframe?seed=3")
+    assert (campaign.tests[0].name, campaign.tests[0].settings.duration) == ("a", 120.0)
+    assert "errormotion bench probe new/bench.toml" in said
+    before = (tmp_path / "new" / "bench.toml").read_bytes()
+    assert "exists already" in run("init", "new", *options, code=1).stderr
+    assert (tmp_path / "new" / "bench.toml").read_bytes() == before
+    run("init", "new", "--machine", "Other", *FRAME, "--force")
+    assert load_bench(tmp_path / "new" / "bench.toml").machine == "Other"
+
+
+def test_mistakes_are_those_of_the_files_and_nothing_is_written(run: Run, tmp_path: Path) -> None:
+    stated = ("--machine", "M", *FRAME, "--test", "a=spindle_drift", "--set", "a.duration=2 mins.")
+    said = run("init", "new", *stated, code=1).stderr
+    assert "new/campaign.toml: 1 mistake\n  - test[0].settings.duration: expected a time" in said
+    assert said.rstrip().endswith("Nothing was written.")
+    assert "Did you mean 'spindle_drift'" in run("init", *FRAME, "--test", "a=spindle_drft", code=1).stderr
+    assert "name of an instrument or a test (frame)" in run("init", *FRAME, "--set", "b.c=1", code=1).stderr
+    assert "no terminal to ask" in run("init", "new", code=2).stderr
+    assert not list(tmp_path.glob("*.toml"))
+    assert not (tmp_path / "new").exists()
+
+
+def test_questions_lead_to_the_same_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = iter([
+        "VM 1", "X-X", CHAIN, "300 mm, -300 mm", "-300 mm, 300 mm", "-200 mm, 200 mm", "0 mm, 400 mm",
+        "five_sensor_frme", "five_sensor_frame", "no name", "frame", "sim://cframe?seed=3", "",
+        "normal_vector", "spindle_drift", "", "",
+    ])  # fmt: skip
+    command.init(
+        tmp_path, "", "", [], [], [], [], force=False, as_json=False, ask=lambda question, default: next(given)
+    )
+    assert next(given, None) is None
+    plan = load_campaign(tmp_path / "campaign.toml")
+    assert plan.bench.description is not None
+    assert [test.name for test in plan.tests] == ["spindle_drift"]
+    said = capsys.readouterr().out
+    wrongs = ["expected a chain", "the lowest position first", "did you mean 'five_sensor_frame'", "found 'no name'"]
+    for wrong in (*wrongs, "'normal_vector' is not known"):
+        assert wrong in said
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "plain",
+        'a "quote" \\ and \x7f \n line',
+        "ünïcode 𝄞",
+        True,
+        3,
+        2.5,
+        ["1 mm", "2 mm"],
+        {"a b": [1], "c": {"d": False}},
+    ],
+)
+def test_values_come_back_from_toml(content: object) -> None:
+    assert parse_toml(f"{key('a b')} = {value(content)}", "x")["a b"] == content
