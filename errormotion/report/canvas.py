@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from errormotion.report.marks import Marks, marks, name_parts, state_uncertainty
+from errormotion.report.text import typographic
 
 #: After Okabe and Ito, distinguishable with any colour vision; light colours are darkened so that text is legible.
 BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE, BLACK = (
@@ -196,7 +197,7 @@ def limit_lines(axes: Axes, limits: Sequence[tuple[str, float, float]]) -> None:
         )  # fmt: skip
     if near:
         axes.set_ylim(min(low, min(near) - 0.06 * span), max(high, max(near) + 0.12 * span))
-    far = [f"{', '.join(names)} {value:.4g}".replace("-", "−") for value, names in named.items() if value not in near]
+    far = [f"{', '.join(names)} {typographic(f'{value:.4g}')}" for value, names in named.items() if value not in near]
     if far:
         text = f"limits outside of the graph: {'; '.join(far)}"
         axes.annotate(

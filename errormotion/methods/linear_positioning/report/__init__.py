@@ -5,6 +5,7 @@ from __future__ import annotations
 from errormotion.datasets.results.merit import is_planned
 from errormotion.methods.linear_positioning.report import chapter, moving
 from errormotion.report.document import Part, Source
+from errormotion.report.page.language import texts_of
 
 
 def chapters(source: Source) -> list[Part]:
@@ -14,3 +15,8 @@ def chapters(source: Source) -> list[Part]:
     if "distortion" in source.errors:
         return [moving.part(source, source.key)]
     return [chapter.part(source, source.key)]
+
+
+def texts(language: str) -> dict[str, str]:
+    """Return the catalogue of this chapter: English text = text in the language."""
+    return texts_of(__name__, language)
