@@ -7,6 +7,7 @@ from matplotlib.patches import FancyBboxPatch
 
 LAYERS = [
     [("cli", "the command errormotion")],
+    [("dashboard", "pages in a browser")],
     [("record", "runs of a machine")],
     [("campaign", "benches, tests, runs")],
     [("compensation", "thermal models")],

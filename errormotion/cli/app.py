@@ -8,15 +8,16 @@ from typing import Annotated, Literal
 
 import typer
 
-from errormotion.cli.demo import CONTROLLERS
+from errormotion.cli.demo import COMPENSATED, CONTROLLERS
 from errormotion.cli.guard import ERROR, INVALID, USAGE, guarded
 from errormotion.cli.output import show, show_json, table
+from errormotion.cli.wording import share
 
 app = typer.Typer(
     name="errormotion",
     help="Measure the error motions of machine tools.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -84,13 +85,17 @@ def demo(
         str,
         typer.Option(help=f"Controller of the machine: {', '.join(CONTROLLERS)}. All but the first must be installed."),
     ] = next(iter(CONTROLLERS)),
+    compensate: Annotated[
+        bool, typer.Option("--compensate", help="Fit a model to a warm-up, and compensate further ones.")
+    ] = False,
     json_: Json = False,
 ) -> None:
     """Measure a virtual machine and compare the result with the truth."""
-    if controller not in CONTROLLERS:
-        typer.echo(f"--controller {controller}: expected one of {', '.join(CONTROLLERS)}.", err=True)
+    shown = COMPENSATED if compensate else CONTROLLERS
+    if controller not in shown:
+        typer.echo(f"--controller {controller}: expected one of {', '.join(shown)}.", err=True)
         raise typer.Exit(USAGE)
-    import_module(CONTROLLERS[controller]).run(runs, json_)
+    import_module(shown[controller]).run(runs, json_)
 
 
 @app.command()
@@ -252,7 +257,7 @@ def compensate_run(
 @app.command()
 @guarded
 def simulate(
-    plugin: Annotated[str, typer.Argument(help="The id of an instrument plugin.")],
+    plugin: Annotated[str, typer.Argument(help="The id of an instrument or a compensator.")],
     port: Annotated[
         int | None,
         typer.Option(min=0, max=65535, help="Port of the device, the next one for its next line; default: a free one."),
@@ -472,6 +477,61 @@ def runs(
     command.runs(folders or [], machine, method, since, tolerances, json_)
 
 
+@app.command("open")
+@guarded
+def open_(
+    place: Annotated[
+        Path, typer.Argument(help="A run folder, a folder of runs (its newest run with a report), or a page.")
+    ] = Path("runs"),
+    browser: Annotated[bool, typer.Option(help="Open the browser; without, print the path only.")] = True,
+    json_: Json = False,
+) -> None:
+    """Open the last report in the browser, and print its path."""
+    from errormotion.cli.commands.results import show as command
+
+    command.open_report(place, browser=browser, as_json=json_)
+
+
+@app.command()
+@guarded
+def export(
+    result: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
+    out: Annotated[Path, typer.Option(help="The file to write: .csv, .xlsx, .nc or .zarr; it must not exist.")],
+    freedoms: Annotated[str | None, typer.Option(help="Which are written: EX,EZ; default: all.")] = None,
+    at: Annotated[str | None, typer.Option(help="Functional point, mm; default: that of the result.")] = None,
+    k: Annotated[float, typer.Option("-k", min=0, max=10, help="Coverage factor of the uncertainties.")] = 2.0,
+    json_: Json = False,
+) -> None:
+    """Write the tables of a result for a spreadsheet, in field units, or the dataset as NetCDF."""
+    from errormotion.cli.commands.results import export as command
+
+    point = None if at is None else _millimetres("--at", at)
+    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else None
+    command.export(result, out, chosen, point, k, json_)
+
+
+@app.command()
+@guarded
+def dashboard(
+    runs: Annotated[Path, typer.Argument(help="The folder of runs.")] = Path("runs"),
+    bench: Annotated[Path | None, typer.Option(help="A bench file: its thermometers and controller are read.")] = None,
+    interval: Annotated[str, typer.Option(help="Of the readings of the bench, such as '1 s'.")] = "1 s",
+    host: Annotated[
+        str, typer.Option(help="Address to listen on. Others than 127.0.0.1 are open to the network: with a token.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to listen on.")] = 5006,
+    name: Annotated[
+        list[str] | None, typer.Option(help="A further name by which browsers reach this computer; repeatable.")
+    ] = None,
+    cert: Annotated[Path | None, typer.Option(help="Certificate (PEM) of an encrypted connection.")] = None,
+    key: Annotated[Path | None, typer.Option(help="Key (PEM) of the certificate.")] = None,
+) -> None:
+    """Show runs, and the instruments of a bench, in a browser, until Ctrl-C."""
+    from errormotion.cli.commands import dashboard as command
+
+    command.run(runs, bench, interval, host, port, name or [], cert, key)
+
+
 @app.command()
 @guarded
 def note(
@@ -567,7 +627,9 @@ def plugins_check(
 @plugins_app.command("new")
 @guarded
 def plugins_new(
-    what: Annotated[Literal["instrument", "method"], typer.Argument(help="instrument or method.")],
+    what: Annotated[
+        Literal["instrument", "method", "compensator"], typer.Argument(help="instrument, method or compensator.")
+    ],
     name: Annotated[str, typer.Argument(help="Name of the plugin; its id is made from it.")],
     out: Annotated[Path | None, typer.Option(help="Folder to write; default: errormotion-NAME.")] = None,
     json_: Json = False,
@@ -657,6 +719,46 @@ def model_check(
     from errormotion.cli.commands import model as command
 
     command.check_model(model, errors, report, json_)
+
+
+@compensate_app.command("effect")
+@guarded
+def compensate_effect(
+    before: Annotated[Path, typer.Argument(help="Errors without the compensation: NetCDF, run folder, or runs.")],
+    after: Annotated[Path, typer.Argument(help="Errors of the same machine with it.")],
+    at: Annotated[str | None, typer.Option(help="Functional point 'x,y,z', mm; default: that of BEFORE.")] = None,
+    over: Annotated[
+        str | None, typer.Option(metavar="DIM", help="What the errors are compared over: time, position or target.")
+    ] = None,
+    select: Annotated[
+        list[str] | None, typer.Option(help="One element of another dimension, counted from 0: position=3.")
+    ] = None,
+    freedoms: Annotated[str | None, typer.Option(help="Which are compared: EX,EZ; default: all known ones.")] = None,
+    since: Annotated[float | None, typer.Option(help="Reference state, s after time 0 of both.")] = None,
+    tolerances: Annotated[
+        Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on both, and on the reduction.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
+    json_: Json = False,
+) -> None:
+    """Compare two results of one machine: what a compensation took off, and what is left."""
+    from errormotion.cli.commands import compensation_effect as command
+
+    point = None if at is None else _millimetres("--at", at)
+    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
+    code = command.run(
+        before,
+        after,
+        at=point,
+        over=over,
+        select=select or [],
+        freedoms=chosen,
+        since=since,
+        tolerances=tolerances,
+        report=report,
+        as_json=json_,
+    )
+    raise typer.Exit(code)
 
 
 @compensate_app.command("table")
@@ -756,3 +858,6 @@ def compensate_program(
         report=report,
     )
     command.program(part, with_, choice, out, json_)
+
+
+share(app, plugins_app, bench_app, model_app, compensate_app)

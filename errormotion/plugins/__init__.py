@@ -43,7 +43,7 @@ from errormotion.plugins.registry import (
     owner_of_schema,
     refresh,
 )
-from errormotion.plugins.subjects import InstrumentSubject, MethodSubject
+from errormotion.plugins.subjects import CompensatorSubject, InstrumentSubject, MethodSubject
 
 __all__ = [
     "ERRORS_SCHEMA",
@@ -52,6 +52,7 @@ __all__ = [
     "Bench",
     "Calibration",
     "Compensator",
+    "CompensatorSubject",
     "Contact",
     "DatasetInfo",
     "Environment",

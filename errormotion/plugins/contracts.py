@@ -339,26 +339,40 @@ class Compensator(Protocol):
     """Writes offsets into a machine for ``errormotion compensate run``; group ``errormotion.compensators``.
 
     The machine's side keeps a slew limit of its own, and ramps to zero when `write` is not called for the time that
-    its watchdog allows. ``open`` and `read` change nothing.
+    its watchdog allows. ``open`` and `read` change nothing. After a lost connection ``open`` connects again.
+
+    ``conformance()`` (optional) returns the `CompensatorSubject` that the conformance kit examines.
     """
 
     info: ClassVar[InstrumentInfo]
     Settings: ClassVar[type[PluginSettings]]
+    address: str
+    settings: Any
 
     def open(self) -> None:
         """Connect; idempotent. InstrumentError where nothing answers."""
 
     def close(self) -> None:
-        """Disconnect; idempotent. Offsets that were written ramp to zero by the watchdog of the machine."""
+        """Disconnect and disarm; idempotent. Offsets that were written ramp to zero by the machine's watchdog."""
 
     def identify(self) -> Identity:
         """Return what answers at the address."""
+
+    def arm(self, limit: float) -> None:
+        """Let `write` pass offsets up to a limit of each axis, m, until `close`; nothing is sent.
+
+        InstrumentError where the machine cannot be given such offsets.
+        """
 
     def read(self) -> Applied:
         """Return the offsets in effect, and whether they may change."""
 
     def write(self, offset: Sequence[float]) -> None:
-        """Write the offset of X, Y, Z, m, and with it the sign of life that the machine's watchdog expects."""
+        """Write the offset of X, Y, Z, m, and with it the sign of life that the machine's watchdog expects.
+
+        InstrumentError, and nothing is sent, where it is not armed, or unless there are three finite numbers within
+        the limit.
+        """
 
 
 @runtime_checkable

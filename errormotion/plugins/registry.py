@@ -46,7 +46,7 @@ _REQUIRED: Mapping[Group, tuple[type[InstrumentInfo | MethodInfo | DatasetInfo],
     "instruments": (InstrumentInfo, ("Settings", "open", "close", "identify", "read")),
     "methods": (MethodInfo, ("Settings", "needs", "acquire", "append_dim", "progress", "identify", "plan")),
     "datasets": (DatasetInfo, ()),
-    "compensators": (InstrumentInfo, ("Settings", "open", "close", "identify", "read", "write")),
+    "compensators": (InstrumentInfo, ("Settings", "open", "close", "identify", "arm", "read", "write")),
 }
 
 

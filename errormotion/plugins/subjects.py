@@ -128,6 +128,84 @@ class InstrumentSubject:
 
 
 @dataclass(frozen=True)
+class CompensatorSubject:
+    """A compensator plugin, and a simulated machine that takes its offsets.
+
+    A simulated machine is what ``start(address)`` returns: it has ``driver_url`` (or ``url``), where the compensator
+    finds it; ``driver_settings``, a mapping of the settings that it needs there (optional); ``close()``; and
+    ``machine``, the machine's part: ``offset`` (X, Y, Z in effect, m), ``orders`` (how many it got), ``slew`` (m/s),
+    ``watchdog`` (s), ``busy`` and ``fault`` (texts, to be set), and ``elapse(seconds)``, which lets time pass.
+    `errormotion.instruments.simulators.compensator.machine.MachinePart` is one.
+
+    Attributes
+    ----------
+    plugin : type
+        The class.
+    address : str
+        Parameters of the simulated machine, as a ``sim://`` address; another address is that of a real machine, to
+        which nothing is written.
+    settings : mapping
+        What the ``Settings`` are made from.
+    name : str
+        Distinguishes several subjects of one plugin.
+    start : callable, optional
+        ``start(address)`` starts the simulated machine; default: the simulator that ``info`` names.
+    offset : (3,) tuple of float
+        An offset that is written, m.
+    limit : float
+        The limit for which it is armed, m.
+    resolution : float
+        Largest difference of the offset in effect from the one written, m.
+    states : tuple of str
+        What the compensator can report of a machine: ``busy``, ``fault``.
+    faults : tuple of str, optional
+        Names of the faults to try; default: what the simulator's class offers in its ``faults``.
+    harmless : tuple of str
+        Faults that it must get over without an error.
+    lost_fault : str
+        Fault that breaks the connection.
+    time_limit : float
+        An error must have come by then, s.
+    dead_address : str
+        An address at which nothing answers.
+    """
+
+    plugin: Any
+    address: str = "sim://cframe?clock=0&watchdog=2&slew=2e-6&limit=50e-6"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""
+    start: Callable[[str], Any] | None = None
+    offset: tuple[float, float, float] = (6e-6, -4e-6, 2e-6)
+    limit: float = 20e-6
+    resolution: float = 10e-9
+    states: tuple[str, ...] = ("busy", "fault")
+    faults: tuple[str, ...] | None = None
+    harmless: tuple[str, ...] = ("split",)
+    lost_fault: str = "disconnect"
+    time_limit: float = 10.0
+    dead_address: str = "tcp://127.0.0.1:9"
+
+    def build(self, address: str, settings: Mapping[str, Any] | None = None) -> Any:
+        """Return a new compensator, not yet opened; ``settings`` are those of a simulated machine."""
+        return self.plugin(address, self.plugin.Settings(**{**(settings or {}), **self.settings}))
+
+    @property
+    def menu(self) -> tuple[str, ...]:
+        """Names of the faults to try; a real machine is spared them."""
+        if not self.simulated:
+            return ()
+        if self.faults is not None:
+            return self.faults
+        simulator = self.plugin.info.simulator
+        return tuple(getattr(load_object(simulator), "faults", ())) if simulator else ()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the machine is simulated."""
+        return self.address.startswith("sim://")
+
+
+@dataclass(frozen=True)
 class MethodSubject:
     """A method plugin and a source of raw data whose truth is known.
 

@@ -1,7 +1,8 @@
-"""The conformance kit: what every instrument and every method plugin has to show, ours and others'.
+"""The conformance kit: what every instrument, method and compensator plugin has to show, ours and others'.
 
 ``check_plugin(group, plugin_id)`` runs it on a plugin of the registry. In a plugin's own tests, subclass
-``InstrumentConformance`` or ``MethodConformance`` and state the subject; pytest then collects one test a check.
+``InstrumentConformance``, ``MethodConformance`` or ``CompensatorConformance`` and state the subject; pytest then
+collects one test a check.
 """
 
 from __future__ import annotations
@@ -9,16 +10,17 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from errormotion.plugins import InstrumentSubject, MethodSubject
+from errormotion.plugins import CompensatorSubject, InstrumentSubject, MethodSubject
 
 if TYPE_CHECKING:
     from errormotion.testing.kit import Check, CheckResult
-    from errormotion.testing.pytest_classes import InstrumentConformance, MethodConformance
+    from errormotion.testing.pytest_classes import CompensatorConformance, InstrumentConformance, MethodConformance
     from errormotion.testing.run import check_plugin, run_checks
 
 _HOME = {
     "Check": "kit",
     "CheckResult": "kit",
+    "CompensatorConformance": "pytest_classes",
     "InstrumentConformance": "pytest_classes",
     "MethodConformance": "pytest_classes",
     "check_plugin": "run",
@@ -35,6 +37,8 @@ def __getattr__(name: str) -> Any:
 __all__ = [
     "Check",
     "CheckResult",
+    "CompensatorConformance",
+    "CompensatorSubject",
     "InstrumentConformance",
     "InstrumentSubject",
     "MethodConformance",

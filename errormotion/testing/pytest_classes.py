@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-from errormotion.plugins import InstrumentSubject, MethodSubject
+from errormotion.plugins import CompensatorSubject, InstrumentSubject, MethodSubject
 from errormotion.testing.kit import Check, CheckFailedError, run_check
 from errormotion.testing.run import checks_for
 
@@ -42,6 +42,16 @@ class MethodConformance:
     """One test for every check that applies to the method which a subclass states as its ``subject``."""
 
     subject: ClassVar[MethodSubject]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        _give_tests(cls, cls.subject)
+
+
+class CompensatorConformance:
+    """One test for every check that applies to the compensator which a subclass states as its ``subject``."""
+
+    subject: ClassVar[CompensatorSubject]
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()

@@ -8,10 +8,17 @@ from typing import Any
 
 from errormotion import plugins
 from errormotion.errors import PluginError
-from errormotion.plugins import Group, InstrumentSubject, MethodSubject, load_object
+from errormotion.plugins import CompensatorSubject, Group, InstrumentSubject, MethodSubject, load_object
 from errormotion.testing.kit import Check, CheckResult, run_check
 
 SIMULATED = "sim://cframe?seed=3"
+
+Subject = InstrumentSubject | MethodSubject | CompensatorSubject
+_EXPECTED = {
+    "instruments": "InstrumentSubject",
+    "methods": "MethodSubject",
+    "compensators": "CompensatorSubject",
+}
 
 
 def check_plugin(
@@ -21,10 +28,10 @@ def check_plugin(
 
     Parameters
     ----------
-    group : "instruments" or "methods"
+    group : "instruments", "methods" or "compensators"
     plugin_id : str
     address : str, optional
-        Where to find the instrument; default: its own simulator.
+        Where to find the instrument or the machine; default: its own simulator.
     mutants : int, optional
         How many changed frames an instrument has to stand; default: as its subject states.
 
@@ -47,30 +54,32 @@ def check_plugin(
     return results
 
 
-def run_checks(subject: InstrumentSubject | MethodSubject) -> list[CheckResult]:
+def run_checks(subject: Subject) -> list[CheckResult]:
     """Run every check of the kit on one subject."""
     return [run_check(check, subject) for check in checks_for(subject)]
 
 
-def checks_for(subject: InstrumentSubject | MethodSubject) -> Sequence[Check[Any]]:
+def checks_for(subject: Subject) -> Sequence[Check[Any]]:
     """Return the checks for a subject of this kind, in the order in which they run."""
     if isinstance(subject, InstrumentSubject):
         from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
 
         return INSTRUMENT_CHECKS
+    if isinstance(subject, CompensatorSubject):
+        from errormotion.testing.compensator_checks import COMPENSATOR_CHECKS
+
+        return COMPENSATOR_CHECKS
     from errormotion.testing.method_checks import METHOD_CHECKS
 
     return METHOD_CHECKS
 
 
-def subjects_of(
-    group: Group, plugin_id: str, *, address: str | None = None
-) -> Sequence[InstrumentSubject | MethodSubject]:
+def subjects_of(group: Group, plugin_id: str, *, address: str | None = None) -> Sequence[Subject]:
     """Return what the kit examines of one plugin.
 
     A plugin states its subjects by the attribute ``conformance``: a function that returns one subject or a tuple of
-    them, or the text ``module:name`` of such subjects. An instrument without it is examined at ``sim://`` (or at
-    ``address``) with its default settings.
+    them, or the text ``module:name`` of such subjects. An instrument or a compensator without it is examined at
+    ``sim://`` (or at ``address``) with its default settings.
 
     Raises
     ------
@@ -82,15 +91,19 @@ def subjects_of(
     if hasattr(cls, "conformance"):
         stated = load_object(cls.conformance) if isinstance(cls.conformance, str) else cls.conformance()
         subjects = stated if isinstance(stated, tuple) else (stated,)
-        if not all(isinstance(subject, InstrumentSubject | MethodSubject) for subject in subjects):
-            raise PluginError(f"The attribute conformance of '{plugin_id}' gives no InstrumentSubject or MethodSubject")
+        if not all(isinstance(subject, Subject) for subject in subjects):
+            raise PluginError(f"The attribute conformance of '{plugin_id}' gives no {_EXPECTED.get(group, 'subject')}")
     if not subjects and group == "methods":
         raise PluginError(
             f"The method '{plugin_id}' does not say how to check it; give its class an attribute "
             "conformance = 'module:name' that names a MethodSubject."
         )
     if not subjects:
+        if group == "datasets":
+            raise PluginError(f"'{plugin_id}' is a kind of dataset; the kit has no checks for these.")
         if address is None and not cls.info.simulator:
-            raise PluginError(f"The instrument '{plugin_id}' has no simulator; give the address of a real one.")
-        subjects = (InstrumentSubject(cls, address or SIMULATED),)
+            raise PluginError(
+                f"The {group.rstrip('s')} '{plugin_id}' has no simulator; give the address of a real one."
+            )
+        subjects = (CompensatorSubject(cls) if group == "compensators" else InstrumentSubject(cls, SIMULATED),)
     return subjects if address is None else tuple(replace(subject, address=address) for subject in subjects)

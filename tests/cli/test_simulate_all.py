@@ -55,6 +55,7 @@ class Case:
 
 
 CASES = {
+    "attocube_ids": Case(),
     "can_temperature": Case(("--set", "bus=udp_multicast"), settings="timeout = '5 s'"),
     "capancdt": Case(lines=1),
     "confocaldt": Case(lines=1),

@@ -16,6 +16,7 @@ from errormotion.instruments.controller import virtual
 from errormotion.instruments.controller.linuxcnc import codec as linuxcnc
 from errormotion.instruments.controller.mtconnect import xml
 from errormotion.instruments.controller.shdr.codec import MOST_LINE_BYTES
+from errormotion.instruments.interferometer.attocube_ids import codec as ids
 from errormotion.instruments.laser_tracker import table_reader
 from errormotion.instruments.laser_tracker.leica_emscon import codec as emscon
 from errormotion.instruments.laser_tracker.leica_geocom import codec as geocom
@@ -153,12 +154,14 @@ def emscon_points() -> list[bytes]:
 
 
 def modbus_answers(framing: modbus.Framing) -> list[bytes]:
-    return [modbus.encode_answer(framing, 1, 3, words, 1) for words in ([555, 1], [0, 100, 7, 65535])]
+    one = modbus.encode_write(framing, 1, modbus.WRITE_ONE, 7, [3], 1)  # is its own confirmation
+    return [one, *(modbus.encode_answer(framing, 1, 3, words, 1) for words in ([555, 1], [0, 100, 7, 65535]))]
 
 
 def modbus_requests(framing: modbus.Framing) -> list[bytes]:
     one = modbus.encode_request(framing, 1, 3, 0, 2, 1)
-    return [one, one + modbus.encode_request(framing, 1, 4, 5, 100, 2), one[:1] + one]
+    written = [modbus.encode_write(framing, 1, 16, 5, [1, 2, 3], 3), modbus.encode_write(framing, 1, 6, 5, [9], 4)]
+    return [one, one + modbus.encode_request(framing, 1, 4, 5, 100, 2), one[:1] + one, *written]
 
 
 def can_frames() -> list[bytes]:
@@ -235,6 +238,15 @@ def geocom_values(data: bytes) -> None:
                 take(index)
 
 
+def ids_values(data: bytes) -> None:
+    """Read a reply and take each of its values for a length, true or false, and a text."""
+    reply = ids.reply(data)
+    for index in range(len(reply.values)):
+        for take in (reply.length, reply.flag, reply.text):
+            with suppress(ProtocolError):
+                take(index)
+
+
 def tables() -> list[bytes]:
     text = "station,target,length [mm],temperature [degC],pressure [hPa],humidity [%]\n"
     return [(text + "S1,1,1500.5,20.1,1013,40\nS1,2,,20.2,1013,40\nS2,1,900,20.3,1012,41\nS1,1,1500.6,,,\n").encode()]
@@ -292,6 +304,7 @@ CODECS: Sequence[Codec] = (
         emscon.MAX_PACKET_BYTES,
     ),
     Codec("leica_geocom", "replies", geocom_values, lambda: rows("leica_geocom", "reply"), geocom.LONGEST_REPLY),
+    Codec("attocube_ids", "replies", ids_values, lambda: rows("attocube_ids", "reply"), ids.LONGEST_REPLY),
     Codec(
         "tracker_table", "files", readers.tracker_table, tables, table_reader.LONGEST_TABLE, tried=4096, per_byte=128
     ),

@@ -19,7 +19,8 @@ from pydantic import Field
 
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError
-from errormotion.plugins import Applied, Identity, InstrumentInfo, PluginSettings
+from errormotion.instruments.compensator.door import OffsetDoor
+from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo, PluginSettings
 
 SCHEMA = "errormotion.offset/1"
 LONGEST = 1 << 16
@@ -50,14 +51,22 @@ class OffsetFile:
         kind="compensator",
         summary="Offsets in a file, for a control that reads one.",
         status="simulated_only",
+        simulator="errormotion.instruments.simulators.compensator.offset_reader:SimulatedReader",
     )
     Settings: ClassVar[type[PluginSettings]] = OffsetFileSettings
+
+    @classmethod
+    def conformance(cls) -> CompensatorSubject:
+        """Return what the conformance kit examines."""
+        return CompensatorSubject(cls, dead_address="/nonexistent/offset.json")
 
     def __init__(self, address: str, settings: Any = None) -> None:
         self.address = address
         self.settings: Any = self.Settings() if settings is None else settings
         self.path = Path(address.removeprefix("file://"))
+        self._door = OffsetDoor(f"{self.info.id} at {address}")
         self._number = 0
+        self._open = False
 
     def open(self) -> None:
         """Check that the folder is there.
@@ -67,22 +76,34 @@ class OffsetFile:
         InstrumentError
             No folder, or the file is not one of offsets.
         """
+        if self._open:
+            return
         if not self.path.parent.is_dir():
             raise InstrumentError(f"{self.address}: expected a folder {self.path.parent}; found none")
         if self.path.exists():
             found = self._content(self.path)
             number = found.get("number", 0)
             self._number = number if isinstance(number, int) and not isinstance(number, bool) else 0
+        self._open = True
 
     def close(self) -> None:
-        """Do nothing: the file keeps the last offset, whose time to live ends."""
+        """Write nothing further: the file keeps the last offset, whose time to live ends. Idempotent."""
+        self._open = False
+        self._door.disarm()
 
     def identify(self) -> Identity:
         """Return the file."""
+        self._require_open()
         return Identity("errormotion", "offset file", self.path.name)
+
+    def arm(self, limit: float) -> None:
+        """Let offsets be written up to a limit of each axis, m; nothing is written."""
+        self._require_open()
+        self._door.arm(limit)
 
     def read(self) -> Applied:
         """Return the offset that the reader reports, or the last one written; zero before the first."""
+        self._require_open()
         source = Path(self.settings.state) if self.settings.state else self.path
         if not source.exists():
             if self.settings.state:
@@ -98,10 +119,11 @@ class OffsetFile:
         Raises
         ------
         InstrumentError
-            It cannot be written.
+            It is not armed, an offset is beyond the limit or not finite, or the file cannot be written.
         """
+        self._require_open()
+        values = dict(zip("XYZ", self._door.offset(offset), strict=True))
         self._number += 1
-        values = dict(zip("XYZ", map(float, offset), strict=True))
         content = {"schema": SCHEMA, "number": self._number, "unit": "m", "valid": self.settings.valid, **values}
         new = self.path.with_name(f".{self.path.name}.new")
         try:
@@ -111,6 +133,10 @@ class OffsetFile:
             with suppress(OSError):
                 new.unlink()
             raise InstrumentError(f"{self.address}: the offset cannot be written: {error}") from None
+
+    def _require_open(self) -> None:
+        if not self._open:
+            raise InstrumentError(f"The {self.info.id} at {self.address} is not open: call open() first")
 
     def _content(self, path: Path) -> dict[str, Any]:
         try:

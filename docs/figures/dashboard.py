@@ -1,0 +1,93 @@
+"""Draw docs/figures/dashboard_*.png: the pages of the dashboard in Chromium.
+
+Argument: a folder of runs, as ``errormotion demo`` makes it.
+"""
+
+import asyncio
+import os
+import shutil
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import sync_playwright
+
+from errormotion.campaign.files import load_bench
+from errormotion.dashboard.server import Options, serve
+
+BENCH = """\
+schema = "errormotion.bench/1"
+name = "Virtual C-frame"
+machine = "C-frame (virtual)"
+[instruments.modules]
+driver = "dcon_temperature"
+address = "sim://cframe/thermometer?seed=3&sensors=spindle_front,column,ambient"
+channels = ["spindle front", "column", "ambient"]
+[instruments.control]
+driver = "virtual_controller"
+arm = true
+address = "sim://cframe/controller?seed=3&clock=60"
+[instruments.hall]
+driver = "dcon_temperature"
+address = "tcp://127.0.0.1:9"
+channels = ["hall north"]
+"""
+COMPARED = ("drift", "balls")
+"""Tests of the demonstration that state the same errors."""
+SECONDS = 40
+"""Time that the bench is watched before the picture is taken, s: as many minutes of the virtual machine."""
+
+
+def start(runs: Path, bench: Path) -> str:
+    """Serve in a thread that ends with this program; return the address."""
+    found: list[str] = []
+    ready = threading.Event()
+
+    def started(address: str, _: Any) -> None:
+        found.append(address)
+        ready.set()
+
+    options = Options(runs, port=0, bench=bench, interval=0.5)
+    threading.Thread(target=lambda: asyncio.run(serve(options, started)), daemon=True).start()
+    ready.wait()
+    return found[0]
+
+
+def main(made: Path) -> None:
+    """Take the pictures."""
+    with tempfile.TemporaryDirectory() as place, sync_playwright() as playwright:
+        runs, bench, pictures = Path("runs"), Path("bench.toml"), Path(__file__).resolve().parent
+        shutil.copytree(made, Path(place) / runs)
+        os.chdir(place)
+        bench.write_text(BENCH)
+        address = start(runs, bench)
+        control = next(each for each in load_bench(bench).instruments if each.name == "control")
+        with control.driver(control.address, control.settings) as machine:
+            machine.spindle(15000)
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.goto(address + "now")
+        page.wait_for_timeout(1000 * SECONDS)
+        page.screenshot(path=pictures / "dashboard_now.png", full_page=True)
+        page.goto(address + "results")
+        page.screenshot(path=pictures / "dashboard_results.png")
+        page.click("tbody a:text-is('drift')")
+        page.wait_for_selector("#figure[data-drawn] canvas")
+        page.wait_for_timeout(500)
+        clip = {"x": 0, "y": 0, "width": 1280, "height": 1090}
+        page.screenshot(path=pictures / "dashboard_run.png", clip=clip, full_page=True)
+        page.goto(address + "compare")
+        for test in COMPARED:
+            page.check(f"tr:has(label:text-is('{test}')) >> nth=0 >> input")
+        page.check("input[name=same_start]")
+        page.click("button:has-text('Compare')")
+        page.wait_for_selector("#figure[data-drawn] canvas")
+        page.wait_for_timeout(500)
+        page.screenshot(path=pictures / "dashboard_compare.png", clip=clip, full_page=True)
+        browser.close()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

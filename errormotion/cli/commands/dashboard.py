@@ -1,0 +1,58 @@
+"""``errormotion dashboard``: runs and instruments in a browser."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+from errormotion.cli.output import show
+from errormotion.datasets.units import TIME
+from errormotion.errors import BenchError, RunError
+
+SHORTEST_INTERVAL = 0.1
+"""Of the rows of the monitor, s."""
+
+
+def run(
+    runs: Path,
+    bench: Path | None,
+    interval: str,
+    host: str,
+    port: int,
+    names: list[str],
+    cert: Path | None,
+    key: Path | None,
+) -> None:
+    """Serve the dashboard until Ctrl-C.
+
+    Raises
+    ------
+    RunError
+        The extra is not installed, or the address cannot be listened on.
+    BenchError
+        The bench or the interval has mistakes.
+    """
+    if find_spec("bokeh") is None:
+        raise RunError("The dashboard needs the package bokeh: pip install 'errormotion[dashboard]'")
+    try:
+        step = TIME.parse(interval)
+    except ValueError as error:
+        raise BenchError(f"--interval: {error}") from None
+    if not step >= SHORTEST_INTERVAL:
+        raise BenchError(f"--interval: expected {SHORTEST_INTERVAL:g} s or more; found '{interval}'")
+    from errormotion.dashboard.access import Access
+    from errormotion.dashboard.server import Options, run
+
+    def started(address: str, access: Access) -> None:
+        show(f"The dashboard is at {address}  (Ctrl-C ends it)")
+        if access.token:
+            show(f"Token, shown only here: {access.token}")
+            if not access.secure:
+                show("The connection is not encrypted: anyone on the network can read it. Give --cert and --key.")
+        sys.stdout.flush()
+
+    try:
+        run(Options(runs, host, port, tuple(names), cert, key, bench, step), started)
+    except KeyboardInterrupt:  # the way to end it
+        show()

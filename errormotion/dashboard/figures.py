@@ -1,0 +1,190 @@
+"""Figures for the browser: curves with bands of U (k = 2), hover and zoom, as JSON that BokehJS draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from bokeh.embed import json_item
+from bokeh.layouts import gridplot
+from bokeh.models import ColumnDataSource, HoverTool, Range1d, Whisker
+from bokeh.plotting import figure
+
+from errormotion.compare.pairs import COVERAGE_FACTOR
+from errormotion.compare.report.picture import abscissa, common, field
+from errormotion.dashboard.course import Course, Curve, thin
+from errormotion.report.canvas import COLOURS, DASHES
+
+HEIGHT = 300
+"""Height of one panel, pixels."""
+LONGEST = 40
+"""Characters of a name at an axis."""
+FONT = "system-ui, 'Segoe UI', 'Liberation Sans', Arial, sans-serif"
+INK, SOFT, LINE = "#1b252d", "#44525c", "#dfe5e9"
+
+
+def errors_item(found: Course, freedoms: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the figure of a result: one panel for each unit, with the freedoms that are chosen; all without a choice.
+
+    Each freedom keeps its colour and its dashes whatever is chosen.
+    """
+    looks = {each.freedom: k for k, each in enumerate(found.curves)}
+    chosen = [each for each in found.curves if not freedoms or each.freedom in freedoms]
+    units = list(dict.fromkeys(each.unit for each in chosen))
+    panels: list[figure] = []
+    for unit in units:
+        own = [each for each in chosen if each.unit == unit]
+        plot = _panel(found, unit, _reach(own), last=unit == units[-1])
+        for curve in own:
+            _draw(plot, found, curve, looks[curve.freedom])
+        _legend(plot)
+        if panels:
+            plot.x_range = panels[0].x_range
+        panels.append(plot)
+    rows = [[panel] for panel in panels]
+    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+
+
+def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
+    """Return the figure of a comparison: one panel for each freedom, with every dataset and its band."""
+    names = [plain(str(name)) for name in ds["dataset"].values]
+    places, label, joined = abscissa(ds) if common(ds) else (np.zeros(1), "", False)
+    texts = () if joined else tuple(f"{each + 1:.0f}" if common(ds) else "" for each in places)
+    expanded = COVERAGE_FACTOR * np.sqrt(np.maximum(np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1), 0.0))
+    freedoms, panels = [str(name) for name in ds["dof"].values], list[figure]()
+    for k, freedom in enumerate(freedoms):
+        factor, unit = field(freedom)
+        unit = unit.replace("um", "µm")
+        values = factor * ds["value"].values[..., k].reshape(len(names), -1)
+        bands = factor * expanded[..., k].reshape(len(names), -1)
+        curves = [Curve(freedom, *each) for each in zip(names, [unit] * len(names), values, bands, strict=True)]
+        known = [(i, each) for i, each in enumerate(curves) if np.isfinite(each.values).any()]
+        if not known:
+            continue
+        found = Course(label, np.asarray(places, dtype=float), texts, tuple(curves), np.zeros(3), {})
+        plot = _panel(found, f"{freedom} / {unit}", _reach([each for _, each in known]), last=freedom == freedoms[-1])
+        for i, curve in known:
+            beside = 0.0 if joined else 0.12 * (i - (len(names) - 1) / 2)
+            _draw(plot, replace(found, places=found.places + beside), curve, i)
+        _legend(plot)
+        if panels:
+            plot.x_range = panels[0].x_range
+        panels.append(plot)
+    rows = [[panel] for panel in panels]
+    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+
+
+def live_item(units: Mapping[str, str]) -> dict[str, Any]:
+    """Return a figure over time without data: one panel for each unit; the browser fills the source of each name.
+
+    ``units`` holds the unit of each quantity by its name.
+    """
+    panels: list[figure] = []
+    kinds = list(dict.fromkeys(units.values()))
+    for unit in kinds:
+        plot = _axes(unit, None, last=unit == kinds[-1], x_axis_type="datetime")
+        for number, name in enumerate(name for name, own in units.items() if own == unit):
+            colour, dash = _look(number)
+            source = ColumnDataSource({"x": [], "y": []}, name=name)
+            line = plot.line(
+                "x", "y", source=source, color=colour, line_width=1.8, line_dash=list(dash), legend_label=plain(name)
+            )
+            tips = [("time", "@x{%H:%M:%S}"), (plain(name), f"@y{{0.000}} {unit}")]
+            plot.add_tools(HoverTool(renderers=[line], tooltips=tips, formatters={"@x": "datetime"}, mode="mouse"))
+        _legend(plot)
+        if panels:
+            plot.x_range = panels[0].x_range
+        panels.append(plot)
+    rows = [[panel] for panel in panels]
+    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+
+
+def plain(text: str) -> str:
+    """Return a name that is drawn as it is: short, printable, and never taken for mathematics (``$$``)."""
+    shown = "".join(each if each.isprintable() else "?" for each in text[:LONGEST])
+    return shown.replace("$$", "$\N{ZERO WIDTH SPACE}$") + ("…" if len(text) > LONGEST else "")
+
+
+def _reach(curves: Sequence[Curve]) -> Range1d:
+    """Return the range of the ordinate: all values with their bands."""
+    ends = [each.values + sign * np.nan_to_num(each.expanded) for each in curves for sign in (-1.0, 1.0)]
+    known = np.concatenate(ends)[np.isfinite(np.concatenate(ends))]
+    low, high = float(known.min()), float(known.max())
+    margin = 0.06 * (high - low) or 1.0
+    return Range1d(low - margin, high + margin)
+
+
+def _panel(found: Course, unit: str, reach: Range1d, *, last: bool) -> figure:
+    plot = _axes(unit, plain(found.label) if last else None, last=last, y_range=reach)
+    if found.names:
+        ticks = np.unique(np.linspace(0, len(found.names) - 1, min(len(found.names), 12)).astype(int))
+        plot.xaxis.ticker = [int(k) for k in ticks]
+        plot.xaxis.major_label_overrides = {int(k): plain(found.names[k]) for k in ticks}
+        plot.x_range = Range1d(-0.6, len(found.names) - 0.4)
+    return plot
+
+
+def _axes(unit: str, label: str | None, *, last: bool, **options: Any) -> figure:
+    plot = figure(
+        height=HEIGHT + 30 * last,
+        sizing_mode="stretch_width",
+        tools="pan,box_zoom,wheel_zoom,reset,save",
+        active_drag="box_zoom",
+        x_axis_label=label,
+        y_axis_label=unit,
+        output_backend="canvas",
+        **options,
+    )
+    for axis in plot.axis:
+        axis.axis_label_text_font, axis.major_label_text_font = FONT, FONT
+        axis.axis_label_text_font_style, axis.axis_label_text_font_size = "normal", "13px"
+        axis.major_label_text_font_size, axis.major_label_text_color = "12px", SOFT
+        axis.axis_label_text_color, axis.axis_line_color = INK, SOFT
+        axis.minor_tick_line_color, axis.major_tick_line_color = None, SOFT
+    plot.grid.grid_line_color, plot.outline_line_color = LINE, None
+    return plot
+
+
+def _look(number: int) -> tuple[str, tuple[float, ...]]:
+    """Return colour and dashes of a curve by its number."""
+    return COLOURS[number % len(COLOURS)], DASHES[number // len(COLOURS) % len(DASHES)] or ()
+
+
+def _legend(plot: figure) -> None:
+    """Put the legend above the axes, where it hides no curve."""
+    legend = plot.legend[0]
+    plot.center.remove(legend)
+    plot.add_layout(legend, "above")
+    legend.orientation, legend.border_line_color, legend.padding = "horizontal", None, 2
+    legend.ncols, legend.label_text_font, legend.label_text_font_size = 8, FONT, "13px"
+    legend.label_text_color = INK
+
+
+def _draw(plot: figure, found: Course, curve: Curve, number: int) -> None:
+    colour, dash = _look(number)
+    kept = thin(curve.values)
+    values, expanded = curve.values[kept], curve.expanded[kept]
+    data: dict[str, Any] = {"x": found.places[kept], "y": values, "U": expanded}
+    data |= {"low": values - expanded, "high": values + expanded}
+    tips = [(curve.name, f"@y{{0.000}} {curve.unit}"), ("U (k=2)", f"@U{{0.000}} {curve.unit}")]
+    if found.names:
+        data["place"] = [plain(found.names[k]) for k in kept]
+        tips.insert(0, (plain(found.label), "@place"))
+    else:
+        tips.insert(0, (plain(found.label), "@x{0.000}"))
+    source = ColumnDataSource(data)
+    if found.names:
+        whisker = Whisker(source=source, base="x", lower="low", upper="high", line_color=colour, line_width=1.2)
+        for head in (whisker.upper_head, whisker.lower_head):
+            head.size, head.line_color = 6, colour
+        plot.add_layout(whisker)
+        drawn = plot.scatter("x", "y", source=source, size=7, color=colour, legend_label=curve.name)
+    else:
+        plot.varea("x", "low", "high", source=source, color=colour, alpha=0.18)
+        drawn = plot.line(
+            "x", "y", source=source, color=colour, line_width=1.8, line_dash=list(dash), legend_label=curve.name
+        )
+    plot.add_tools(HoverTool(renderers=[drawn], tooltips=tips, mode="mouse" if found.names else "vline"))

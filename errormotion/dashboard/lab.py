@@ -1,0 +1,203 @@
+"""The runs of one folder as the dashboard shows them, and the files of a run that may be fetched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from errormotion.datasets.files.runfile import FILE
+from errormotion.errors import RunError
+from errormotion.plugins import FigureOfMerit
+from errormotion.record.entry import Entry, read_entry
+from errormotion.record.listing import DEEPEST, list_runs
+from errormotion.record.text import FIELD, LONG
+from errormotion.report.text import DASH, rounded
+
+LONGEST_KEY = 600
+"""Characters of the key of a run."""
+FILES = {"report": "report.html", "run": FILE, "log": "log.jsonl"}
+"""Files of a run folder that may be fetched, by the word for them; the error dataset is the fourth, ``errors``."""
+
+
+class NotFoundError(RunError):
+    """There is no such run, or it has no such file."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A selection of runs; an empty text selects every run."""
+
+    machine: str = ""
+    method: str = ""
+    status: str = ""
+    verdict: str = ""
+    text: str = ""
+    since: str = ""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run in the table, as text."""
+
+    key: str
+    started: str
+    machine: str
+    test: str
+    method: str
+    figure: str
+    value: str
+    uncertainty: str
+    unit: str
+    verdict: str
+    status: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Runs that were selected, newest first, the values that filters may have, and what a reader should know."""
+
+    rows: tuple[Row, ...]
+    total: int
+    machines: tuple[str, ...]
+    methods: tuple[str, ...]
+    statuses: tuple[str, ...]
+    verdicts: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Lab:
+    """A folder of runs."""
+
+    runs: Path
+
+    def table(self, choice: Choice) -> Table:
+        """Return the runs of a selection.
+
+        Raises
+        ------
+        RunError
+            A date that is none, or too many runs.
+        """
+        if not self.runs.is_dir():
+            return Table((), 0, (), (), (), (), (f"There is no folder {self.runs} yet.",))
+        found = list_runs([self.runs], since=_date(choice.since))
+        chosen = [(path, entry) for path, entry in found.runs if _fits(entry, choice)]
+        remarks = [f"{found.undated} runs have no known date."] if found.undated else []
+        if found.waiting:
+            remarks.append(f"The figures of {found.waiting} runs are not read yet; load the page again.")
+        return Table(
+            tuple(_row(self.key(path), entry) for path, entry in chosen),
+            len(found.runs),
+            _values(found.machines),
+            _values(found.methods),
+            _values(entry.status for _, entry in found.runs),
+            _values(entry.verdict for _, entry in found.runs),
+            (*remarks, *(f"Not read: {reason}" for reason in found.skipped)),
+        )
+
+    def key(self, folder: Path) -> str:
+        """Return the key of a run: its path in the folder of runs."""
+        return folder.resolve().relative_to(self.runs.resolve()).as_posix()
+
+    def folder(self, key: str) -> Path:
+        """Return the folder of a run.
+
+        Raises
+        ------
+        NotFoundError
+            The key names no run in the folder of runs.
+        """
+        parts = key.split("/")
+        if len(key) <= LONGEST_KEY and key.isprintable() and "\\" not in key and 0 < len(parts) <= DEEPEST + 1:
+            root = self.runs.resolve()
+            path = root.joinpath(*parts)
+            if not any(part in ("", ".", "..") for part in parts) and _inside(path / FILE, root):
+                return path
+        raise NotFoundError(f"There is no run {key[:LONGEST_KEY]!r} in {self.runs}.")
+
+    def entry(self, key: str) -> Entry:
+        """Return what a run states.
+
+        Raises
+        ------
+        RunError
+            There is no such run, or its ``run.json`` cannot be read.
+        """
+        return read_entry(self.folder(key))
+
+    def file(self, key: str, word: str) -> Path:
+        """Return a file of a run: ``report``, ``run``, ``log`` or ``errors``.
+
+        Raises
+        ------
+        RunError
+            There is no such run or file, or a link leads out of the folder.
+        """
+        folder = self.folder(key)
+        name = read_entry(folder).errors if word == "errors" else FILES.get(word, "")
+        if name and _inside(folder / name, folder):
+            return folder / name
+        raise NotFoundError(f"Run {key!r} has no file '{word[:20]}'.")
+
+    def files(self, key: str) -> tuple[str, ...]:
+        """Return the words of the files that a run has."""
+        found = []
+        for word in (*FILES, "errors"):
+            try:
+                self.file(key, word)
+            except RunError:
+                continue
+            found.append(word)
+        return tuple(found)
+
+
+def figure_text(figure: FigureOfMerit) -> tuple[str, str, str]:
+    """Return value, expanded uncertainty (k = 2) and unit of a figure of merit in the field's unit."""
+    factor, unit = FIELD.get(figure.unit, (1.0, figure.unit))
+    if figure.unit == "m" and abs(figure.value) >= LONG:
+        factor, unit = 1e3, "mm"
+    value, expanded = rounded(factor * figure.value, factor * figure.expanded_uncertainty)
+    return value, expanded, unit.replace("um", "µm")
+
+
+def _row(key: str, entry: Entry) -> Row:
+    started = f"{entry.time:%Y-%m-%d %H:%M}" if entry.time is not None else "unknown"
+    name, texts = "", ("", "", "")
+    if entry.figures:
+        name, texts = entry.figures[0].name, figure_text(entry.figures[0])
+        if not math.isfinite(entry.figures[0].value):
+            texts = (DASH, DASH, texts[2])
+    return Row(key, started, entry.machine, entry.test, entry.method, name, *texts, entry.verdict, entry.status)
+
+
+def _fits(entry: Entry, choice: Choice) -> bool:
+    exact = ((choice.machine, entry.machine), (choice.method, entry.method), (choice.status, entry.status))
+    if any(wanted and wanted != found for wanted, found in (*exact, (choice.verdict, entry.verdict))):
+        return False
+    texts = (entry.test, entry.machine, entry.campaign, entry.folder, *(note.text for note in entry.notes))
+    return all(any(word in text.casefold() for text in texts) for word in choice.text.casefold().split())
+
+
+def _values(texts: Iterable[str]) -> tuple[str, ...]:
+    return tuple(sorted({text for text in texts if text}))
+
+
+def _date(text: str) -> datetime | None:
+    if not text:
+        return None
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError:
+        raise RunError(f"since: expected a date, as in 2026-03-31; found {text[:40]!r}") from None
+
+
+def _inside(path: Path, folder: Path) -> bool:
+    """Return whether a path is a file in a folder, and no link leads out of it."""
+    try:
+        return path.is_file() and path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):
+        return False

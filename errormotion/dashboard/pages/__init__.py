@@ -1,0 +1,1 @@
+"""Handlers of the dashboard's pages."""

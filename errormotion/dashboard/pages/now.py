@@ -1,0 +1,104 @@
+"""Now: what the instruments of the bench say, and the last hours."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from datetime import datetime
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from tornado.web import HTTPError
+
+from errormotion.dashboard.figures import live_item
+from errormotion.dashboard.pages.page import Guarded
+from errormotion.dashboard.watch import SPAN, Present, Watch
+
+SPANS = (("10 min", 600), ("1 h", 3600), ("8 h", int(SPAN)))
+"""Lengths of the history that a reader chooses from, s."""
+SHOWN = 8
+"""Curves that are chosen at first."""
+_SENT: WeakKeyDictionary[Present, str] = WeakKeyDictionary()
+
+
+class _OfTheBench(Guarded):
+    def watch(self) -> Watch:
+        """Return the watch of this server; there are no such pages without a bench."""
+        if self.context.watch is None:
+            raise HTTPError(404, reason="The dashboard was started without a bench")
+        return self.context.watch
+
+
+class Now(_OfTheBench):
+    """The page; its values come from `Values`."""
+
+    def get(self) -> None:
+        """Show the frame."""
+        watch = self.watch()
+        names = list(watch.units.items())
+        groups: dict[str, list[str]] = {}
+        for name, unit in names:
+            groups.setdefault(unit, []).append(name)
+        self.show("now.html.j2", bench=watch.plan.name, groups=groups, spans=SPANS, shown=SHOWN)
+
+
+class Values(_OfTheBench):
+    """Everything that the bench says now, as JSON."""
+
+    def get(self) -> None:
+        """Send it; computed once for all clients that ask between two rows."""
+        present = self.watch().present()
+        if present not in _SENT:
+            _SENT[present] = json.dumps(_plain(present), ensure_ascii=False)
+        self.set_header("Content-Type", "application/json")
+        self.finish(_SENT[present])
+
+
+class Figure(_OfTheBench):
+    """The axes of the history, as JSON for BokehJS; `History` fills them."""
+
+    async def get(self) -> None:
+        """Send axes for the quantities that are chosen."""
+        units, names = self.watch().units, self.get_query_arguments("name")
+        chosen = {name: units[name] for name in dict.fromkeys(names) if name in units}
+        if not chosen:
+            raise HTTPError(400, reason="None of these quantities is known")
+        self.finish({"item": await self.apart(live_item, chosen)})
+
+
+class History(_OfTheBench):
+    """The last hours of some quantities, as JSON: reduced, with nulls where they are unknown."""
+
+    async def get(self) -> None:
+        """Send the curves."""
+        watch, names = self.watch(), self.get_query_arguments("name")
+        text = self.word("span") or str(SPANS[0][1])
+        if text not in {str(span) for _, span in SPANS} or len(names) > len(watch.units):
+            raise HTTPError(400, reason="Unknown span, or too many names")
+        found = await self.apart(watch.history, names, float(text))
+        curves = {
+            name: {"x": [round(1e3 * each) for each in times], "y": [_known(each) for each in values]}
+            for name, (times, values) in found.items()
+        }
+        self.set_header("Content-Type", "application/json")
+        self.finish(json.dumps(curves, ensure_ascii=False))
+
+
+def _plain(present: Present) -> dict[str, Any]:
+    """Return the present for a JSON document: NaN becomes null, a time ISO 8601."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(each) for key, each in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(each) for each in value]
+        if isinstance(value, datetime):
+            return value.isoformat(timespec="milliseconds")
+        return _known(value) if isinstance(value, float) else value
+
+    return dict(plain(asdict(present)))
+
+
+def _known(value: float) -> float | None:
+    return round(float(value), 6) if math.isfinite(value) else None

@@ -1,0 +1,204 @@
+"""Results: the table of runs, and one run with its report, its figure and its files."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+import xarray as xr
+from tornado.web import HTTPError
+
+from errormotion import datasets
+from errormotion.dashboard.course import Course, as_csv, course
+from errormotion.dashboard.figures import errors_item
+from errormotion.dashboard.kept import Kept, stamp
+from errormotion.dashboard.lab import Choice, figure_text
+from errormotion.dashboard.pages.page import Guarded
+from errormotion.datasets.results.merit import figures_of
+from errormotion.datasets.storage import reading
+from errormotion.errors import DatasetError
+from errormotion.record.entry import MOST_FIGURES
+
+PAGE = 100
+"""Runs on one page of the table."""
+CHUNK = 1 << 18
+"""Bytes that are sent at a time."""
+SEND_TIMEOUT = 30.0
+"""Time within which a client takes a chunk, s."""
+FARTHEST = 20.0
+"""Coordinates of a functional point, m."""
+REPORT_POLICY = (
+    "sandbox allow-scripts allow-downloads; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    "img-src data:; font-src data:; form-action 'none'; base-uri 'none'; frame-ancestors 'self'"
+)
+"""Of a report, on top of its own: it reaches neither the network nor the dashboard, whoever wrote the file."""
+TYPES = {"report": "text/html; charset=utf-8", "run": "application/json", "log": "application/x-ndjson"}
+
+
+class Results(Guarded):
+    """The table of runs with filters."""
+
+    async def get(self) -> None:
+        """Show the runs that fit."""
+        choice = Choice(**{each.name: self.word(each.name) for each in fields(Choice)})
+        table = await self.apart(self.context.lab.table, choice)
+        first = PAGE * (_whole(self.word("page") or "1", 1, 10**6) - 1)
+        kept = {name: value for name, value in asdict(choice).items() if value}
+        last = max(1, math.ceil(len(table.rows) / PAGE))
+        links = {number: "?" + urlencode({**kept, "page": number}) for number in range(1, last + 1)}
+        self.show(
+            "results.html.j2",
+            table=table,
+            rows=table.rows[first : first + PAGE],
+            choice=choice,
+            number=first // PAGE + 1,
+            links=links,
+            runs=self.context.lab.runs,
+        )
+
+
+class Run(Guarded):
+    """One run."""
+
+    async def get(self) -> None:
+        """Show its figures of merit, its figure, its report and its files."""
+        key = self.word("run", 600)
+        entry = await self.apart(self.context.lab.entry, key)
+        files = self.context.lab.files(key)
+        shown = await self.apart(_stated, self.context.lab.file(key, "errors")) if "errors" in files else None
+        merit = entry.figures if entry.figures is not None or shown is None else shown["figures"]
+        figures = [(each.name, *figure_text(each)) for each in merit or ()]
+        self.show("run.html.j2", key=key, entry=entry, files=files, figures=figures, result=shown)
+
+
+class Figure(Guarded):
+    """The figure of a run, as JSON for BokehJS."""
+
+    async def get(self) -> None:
+        """Compute the errors at the functional point that is asked for, and draw them."""
+        found = await self.apart(_course, self.context.lab.file(self.word("run", 600), "errors"), *self.wanted())
+        freedoms = [text for text in self.get_query_arguments("freedom") if len(text) < 20]
+        item = await self.apart(errors_item, found, freedoms)
+        point = [1e3 * float(each) if math.isfinite(each) else None for each in found.point]
+        self.finish({"item": item, "point": point})
+
+    def wanted(self) -> tuple[tuple[float, ...] | None, dict[str, int]]:
+        """Return functional point (m) and indices of the query.
+
+        Raises
+        ------
+        DatasetError
+            A coordinate or an index is no number.
+        """
+        texts = [self.word(axis) for axis in "xyz"]
+        point = None if not any(texts) else tuple(millimetres(text) for text in texts)
+        others = [text.partition(":") for text in self.get_query_arguments("at")[:10]]
+        return point, {dim: _whole(index, 0, 10**9) for dim, _, index in others}
+
+
+class Values(Figure):
+    """The values of a run at a functional point, as comma-separated text."""
+
+    async def get(self) -> None:
+        """Send the table."""
+        key = self.word("run", 600)
+        found = await self.apart(_course, self.context.lab.file(key, "errors"), *self.wanted())
+        self.set_header("Content-Type", "text/csv; charset=utf-8")
+        self.set_header("Content-Disposition", f'attachment; filename="{_safe(key)}.csv"')
+        self.finish(await self.apart(as_csv, found))
+
+
+class File(Guarded):
+    """A file of a run folder."""
+
+    async def get(self) -> None:
+        """Send it; a report is shown in a sandbox, everything else is saved."""
+        key, word = self.word("run", 600), self.word("file")
+        path = await self.apart(self.context.lab.file, key, word)
+        self.set_header("Content-Type", TYPES.get(word, "application/octet-stream"))
+        if word == "report" and not self.word("save"):
+            self.set_header("Content-Security-Policy", REPORT_POLICY)
+        else:
+            self.set_header("Content-Disposition", f'attachment; filename="{_safe(key)}-{_safe(path.name)}"')
+        with path.open("rb") as file:
+            while chunk := await self.apart(file.read, CHUNK):
+                self.write(chunk)
+                try:
+                    await asyncio.wait_for(self.flush(), SEND_TIMEOUT)
+                except TimeoutError:
+                    raise HTTPError(408, reason="The client does not take the file") from None
+
+
+LOADED: Kept[xr.Dataset] = Kept(6)
+"""Results that were asked for last, so that another functional point does not read the file again."""
+
+
+def loaded(path: Path) -> xr.Dataset:
+    """Return a checked error dataset.
+
+    Raises
+    ------
+    DatasetError
+        The file cannot be read, or holds no error dataset.
+    """
+
+    def load() -> xr.Dataset:
+        with reading(path), datasets.load(path) as found:
+            datasets.validate(found)
+            return found.load()
+
+    return LOADED.get(stamp(path), load)
+
+
+def _course(path: Path, point: tuple[float, ...] | None, select: dict[str, int]) -> Course:
+    return course(loaded(path), point, select)
+
+
+def _stated(path: Path) -> dict[str, Any]:
+    """Return what the page of a run says of its result: freedoms, functional point (mm), further dimensions, notes."""
+    ds = loaded(path)
+    found = course(ds)
+    names = [(each.freedom, each.name, each.unit) for each in found.curves]
+    point = [f"{1e3 * each:.10g}" for each in found.point]
+    others = {dim: size - 1 for dim, size in found.others.items()}
+    return {
+        "figures": figures_of(ds)[:MOST_FIGURES],
+        "freedoms": names,
+        "point": point,
+        "movable": ds.attrs.get("component") != "beam",
+        "others": others,
+        "notes": ds.em.notes,
+        "frame": str(ds.attrs.get("frame", "")),
+    }
+
+
+def millimetres(text: str) -> float:
+    """Return a coordinate of a functional point that a browser states in mm, m.
+
+    Raises
+    ------
+    DatasetError
+        It is no number, or too far away.
+    """
+    try:
+        value = float(text) / 1e3
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= FARTHEST:
+        raise DatasetError(f"functional point: expected three numbers in mm, as in 0, 0, -150; found {text[:40]!r}")
+    return value
+
+
+def _whole(text: str, low: int, high: int) -> int:
+    if text.isascii() and text.isdigit() and len(text) <= 9 and low <= int(text) <= high:
+        return int(text)
+    raise DatasetError(f"expected a whole number from {low} to {high}; found {text[:40]!r}")
+
+
+def _safe(text: str) -> str:
+    """Return a name for a file that is safe in a header and on every system."""
+    return "".join(each if each.isascii() and (each.isalnum() or each in "-_.") else "_" for each in text)[-150:]

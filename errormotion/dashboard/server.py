@@ -1,0 +1,197 @@
+"""The server: handlers, access, connection; it runs until it is interrupted."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from bokeh.util.paths import bokehjs_path
+from tornado.httpserver import HTTPServer
+from tornado.netutil import bind_sockets
+from tornado.web import Application, HTTPError, StaticFileHandler
+
+from errormotion.campaign.files import load_bench
+from errormotion.dashboard.access import LOOPBACK, Access, access_for
+from errormotion.dashboard.lab import Lab
+from errormotion.dashboard.pages import compare, now, results
+from errormotion.dashboard.pages.login import Login
+from errormotion.dashboard.pages.page import Context, Guarded, note_request
+from errormotion.dashboard.watch import Watch
+from errormotion.errors import RunError
+
+HERE = Path(__file__).parent
+BOKEH = ("bokeh.min.js",)
+"""Scripts of the package bokeh that pages load."""
+WORKERS = 4
+"""Threads that read and compute."""
+LARGEST_REQUEST = 1 << 20
+"""Bytes of a request."""
+LARGEST_HEAD = 1 << 15
+"""Bytes of the head of a request."""
+IDLE = 60.0
+"""Time after which a silent connection is closed, s."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How the dashboard is served."""
+
+    runs: Path
+    host: str = LOOPBACK
+    port: int = 5006
+    names: tuple[str, ...] = ()
+    cert: Path | None = None
+    key: Path | None = None
+    bench: Path | None = None
+    interval: float = 1.0
+
+
+class Start(Guarded):
+    """The address without a path."""
+
+    def get(self) -> None:
+        """Lead to the first page."""
+        self.redirect(self.context.pages[0][0])
+
+
+class Missing(Guarded):
+    """Any address that there is not."""
+
+    def prepare(self) -> None:
+        """Refuse, after the rules of access."""
+        super().prepare()
+        if not self._finished:
+            raise HTTPError(404, reason="There is no such page")
+
+
+class Static(Guarded, StaticFileHandler):
+    """Style, scripts and BokehJS, from the packages."""
+
+    public = True
+
+    def initialize(self, context: Context, path: str) -> None:  # type: ignore[override]
+        """Take what the server knows, and the folder."""
+        Guarded.initialize(self, context)
+        StaticFileHandler.initialize(self, path)
+
+    def set_extra_headers(self, path: str) -> None:  # noqa: ARG002 - as tornado calls it
+        """Let browsers keep the file, and ask whether it has changed."""
+        self.set_header("Cache-Control", "no-cache")
+
+
+def application(context: Context) -> Application:
+    """Return the handlers of a server."""
+    one = {"context": context}
+    scripts = "|".join(name.replace(".", r"\.") for name in BOKEH)
+    return Application(
+        [
+            (r"/", Start, one),
+            (r"/login", Login, one),
+            (r"/now", now.Now, one),
+            (r"/now/values\.json", now.Values, one),
+            (r"/now/figure\.json", now.Figure, one),
+            (r"/now/history\.json", now.History, one),
+            (r"/compare", compare.Compare, one),
+            (r"/compare/figure\.json", compare.Figure, one),
+            (r"/compare/report\.html", compare.Report, one),
+            (r"/compare/history\.html", compare.History, one),
+            (r"/results", results.Results, one),
+            (r"/run", results.Run, one),
+            (r"/run/figure\.json", results.Figure, one),
+            (r"/run/values\.csv", results.Values, one),
+            (r"/run/file", results.File, one),
+            (r"/static/(dashboard\.css|[a-z]+\.js|icon\.svg)", Static, {**one, "path": str(HERE / "static")}),
+            (rf"/static/({scripts})", Static, {**one, "path": str(bokehjs_path() / "js")}),
+        ],
+        default_handler_class=Missing,
+        default_handler_args=one,
+        log_function=note_request,
+        compress_response=True,
+    )
+
+
+async def serve(options: Options, started: Callable[[str, Access], None], end: asyncio.Event | None = None) -> None:
+    """Serve until cancelled, or until an event.
+
+    Parameters
+    ----------
+    options : Options
+    started : callable
+        Called with address and access once the server listens: the only place where the token is given away.
+    end : asyncio.Event, optional
+
+    Raises
+    ------
+    RunError
+        The address cannot be listened on, or certificate and key cannot be used.
+    BenchError
+        The bench file has mistakes, or nothing that a monitor reads.
+    """
+    context_of_tls = _encryption(options)
+    watch = Watch(load_bench(options.bench), options.runs, options.interval) if options.bench is not None else None
+    access = access_for(options.host, options.names, secure=context_of_tls is not None)
+    with ThreadPoolExecutor(WORKERS, thread_name_prefix="errormotion-dashboard") as workers:
+        try:
+            sockets = bind_sockets(options.port, options.host)
+        except OSError as error:
+            raise RunError(f"{options.host}, port {options.port}: cannot be listened on: {error.strerror}") from error
+        port = int(sockets[0].getsockname()[1])
+        pages = ((("/now", "Now"),) if watch is not None else ()) + (("/results", "Results"), ("/compare", "Compare"))
+        context = Context(access, Lab(options.runs), port, workers, pages, watch)
+        server = HTTPServer(
+            application(context),
+            ssl_options=context_of_tls,
+            idle_connection_timeout=IDLE,
+            body_timeout=IDLE,
+            max_body_size=LARGEST_REQUEST,
+            max_buffer_size=LARGEST_REQUEST,
+            max_header_size=LARGEST_HEAD,
+        )
+        server.add_sockets(sockets)
+        if watch is not None:
+            watch.start()
+        try:
+            started(_address(options, port), access)
+            await (end or asyncio.Event()).wait()
+        finally:
+            server.stop()
+            if watch is not None:
+                await asyncio.to_thread(watch.stop)
+            await server.close_all_connections()
+
+
+def run(options: Options, started: Callable[[str, Access], None]) -> None:
+    """Serve until Ctrl-C.
+
+    Raises
+    ------
+    RunError
+        As `serve`.
+    """
+    asyncio.run(serve(options, started))
+
+
+def _encryption(options: Options) -> ssl.SSLContext | None:
+    if options.cert is None and options.key is None:
+        return None
+    if options.cert is None or options.key is None:
+        raise RunError("--cert and --key: expected both, or neither")
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    try:
+        context.load_cert_chain(options.cert, options.key, password=_no_password)
+    except (OSError, ssl.SSLError, ValueError) as error:
+        raise RunError(f"{options.cert}, {options.key}: cannot be used as certificate and key: {error}") from error
+    return context
+
+
+def _no_password() -> str:
+    raise ValueError("the key is encrypted; store it without a password, readable by its owner only")
+
+
+def _address(options: Options, port: int) -> str:
+    host = f"[{options.host}]" if ":" in options.host else options.host
+    return f"http{'s' if options.cert else ''}://{host}:{port}/"

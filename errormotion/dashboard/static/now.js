@@ -1,0 +1,113 @@
+// The page "Now": asks for values every second and for curves when they have changed visibly. Text is only set as text.
+"use strict";
+
+const INTERVAL = 1000; // ms
+const byId = (id) => document.getElementById(id);
+
+function element(name, text, className) {
+  const made = document.createElement(name);
+  if (text !== undefined) made.textContent = text;
+  if (className) made.className = className;
+  return made;
+}
+
+const number = (value, digits) => (value === null ? "—" : value.toFixed(digits).replace("-", "−"));
+const signed = (value, digits) => (value > 0 ? "+" : "") + number(value, digits);
+const clock = (text) => new Date(text).toLocaleTimeString("en-GB");
+
+function show(found) {
+  byId("clock").textContent = found.error ? `The monitor has stopped: ${found.error}`
+    : !found.running ? "The monitor has stopped."
+    : found.rows ? `${clock(found.time)}, ${found.rows} rows in ${found.run}` : "Waiting for the first readings.";
+  byId("alarms").replaceChildren(...found.alarms.map((text) => element("li", `Alarm: ${text}`)));
+  byId("instruments").replaceChildren(...found.instruments.map((each) => {
+    const tile = element("li", undefined, each.state);
+    const words = { answers: "● answers", waiting: "○ waiting", silent: `■ silent since ${clock(each.since)}` };
+    tile.append(element("strong", each.name), element("span", words[each.state], "said"), element("small", each.model || each.kind));
+    if (each.why) tile.append(element("small", each.why));
+    if (each.missed) tile.append(element("small", `${each.missed} rows without a reading`));
+    return tile;
+  }));
+  byId("parameters-card").hidden = !found.parameters.length;
+  byId("parameters").replaceChildren(...found.parameters.map((each) => {
+    const row = element("div");
+    const value = element("dd", number(each.value, each.unit === "mm" ? 3 : 0));
+    value.append(element("span", each.unit, "unit"));
+    row.append(element("dt", each.name), value);
+    return row;
+  }));
+  byId("program").textContent = [found.mode && `mode ${found.mode}`, found.program && `program ${found.program}`].filter(Boolean).join(", ");
+  byId("temperatures-card").hidden = !found.temperatures.length;
+  byId("temperatures").replaceChildren(...found.temperatures.map((each) => {
+    const row = element("tr"), name = element("th", each.name);
+    name.scope = "row";
+    const value = element("td", each.flag || number(each.value, 2), each.flag ? "number flagged" : "number");
+    row.append(name, value, element("td", signed(each.change, 2), "number"), element("td", number(each.low, 2), "number soft"), element("td", number(each.high, 2), "number soft"));
+    return row;
+  }));
+}
+
+async function ask(path) {
+  const answer = await fetch(path, { headers: { Accept: "application/json" }, signal: AbortSignal.timeout(10000) });
+  if (answer.status === 403) location.assign("/login");
+  if (!answer.ok) throw new Error((await answer.json()).error);
+  return answer.json();
+}
+
+async function values() {
+  try {
+    show(await ask("/now/values.json"));
+    document.body.classList.remove("lost");
+  } catch (error) {
+    document.body.classList.add("lost");
+    byId("clock").textContent = "The dashboard does not answer; the values below are the last ones.";
+  }
+  setTimeout(values, INTERVAL);
+}
+
+const form = byId("history");
+const PAUSES = { 600: 2000, 3600: 5000, 28800: 20000 }; // ms between curves, by span
+let drawn = null, asked = 0, timer = 0;
+
+async function frame(names) { // the axes, without data; drawn anew only when other quantities are chosen
+  const key = names.join("\n");
+  if (drawn && drawn.key === key) return;
+  const found = await ask(`/now/figure.json?${new URLSearchParams(names.map((name) => ["name", name]))}`);
+  const place = element("div");
+  place.id = `curves-${Date.now()}`;
+  byId("curves").replaceChildren(place);
+  if (drawn) {
+    drawn.views.clear();
+    Bokeh.documents.splice(Bokeh.documents.indexOf(drawn.document), 1);
+  }
+  const views = await Bokeh.embed.embed_item(found.item, place.id);
+  drawn = { key, views, document: Bokeh.documents.at(-1) };
+}
+
+async function curves() {
+  clearTimeout(timer);
+  const question = new URLSearchParams(new FormData(form));
+  const names = question.getAll("name"), own = ++asked;
+  byId("curves").hidden = !names.length;
+  byId("history-note").textContent = names.length ? "" : "Nothing is chosen.";
+  try {
+    if (names.length) {
+      const found = await ask(`/now/history.json?${question}`);
+      if (own !== asked) return;
+      await frame(names);
+      for (const [name, curve] of Object.entries(found)) { // local time, as at the machine
+        const x = curve.x.map((t) => t - 60000 * new Date(t).getTimezoneOffset());
+        drawn.document.get_model_by_name(name).data = { x, y: curve.y.map((y) => y ?? NaN) };
+      }
+      byId("curves").dataset.drawn = String(own);
+    }
+  } catch (error) {
+    byId("history-note").textContent = error.name === "Error" ? error.message : "The dashboard does not answer.";
+  }
+  if (own === asked) timer = setTimeout(curves, PAUSES[question.get("span")]);
+}
+
+form.addEventListener("input", curves);
+form.addEventListener("submit", (event) => event.preventDefault());
+values();
+curves();

@@ -1,0 +1,73 @@
+"""The last check of an offset before it reaches a machine: armed, three finite numbers, within the limit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from errormotion.errors import InstrumentError
+
+ROUNDING = 1e-9
+"""Share of the limit by which an offset may exceed it."""
+
+
+class OffsetDoor:
+    """Lets offsets pass once it is armed.
+
+    Parameters
+    ----------
+    where : str
+        Compensator and address, for messages.
+
+    Attributes
+    ----------
+    limit : float
+        Largest offset of each axis, m; 0: not armed.
+    """
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self.limit = 0.0
+
+    def arm(self, limit: float) -> None:
+        """Let offsets pass up to a limit of each axis, m.
+
+        Raises
+        ------
+        InstrumentError
+            The limit is not above 0, or not finite.
+        """
+        if not (math.isfinite(limit) and limit > 0):
+            raise InstrumentError(f"{self._where}: expected a limit of the offsets above 0; found {limit!r}")
+        self.limit = float(limit)
+
+    def disarm(self) -> None:
+        """Let nothing pass."""
+        self.limit = 0.0
+
+    def offset(self, values: Sequence[float]) -> tuple[float, float, float]:
+        """Return the offset of X, Y, Z, m.
+
+        Raises
+        ------
+        InstrumentError
+            It is not armed, or these are not three finite numbers within the limit.
+        """
+        if not self.limit:
+            raise InstrumentError(f"{self._where} is not armed; it reads only. Nothing was sent")
+        try:
+            found = [float(value) for value in values]
+        except (TypeError, ValueError, OverflowError):
+            found = []
+        if len(found) != 3 or not all(map(math.isfinite, found)):
+            raise InstrumentError(
+                f"{self._where}: expected offsets of three finite numbers X, Y, Z; found {str(values)[:80]}. Nothing "
+                "was sent"
+            )
+        if max(map(abs, found)) > self.limit * (1 + ROUNDING):
+            texts = ", ".join(f"{value * 1e6:.6g}" for value in found)
+            raise InstrumentError(
+                f"{self._where}: an offset of {texts} um is beyond the limit of {self.limit * 1e6:g} um. Nothing was "
+                "sent"
+            )
+        return found[0], found[1], found[2]

@@ -1,0 +1,132 @@
+"""Requests and replies of an IDS3010: JSON-RPC 2.0 objects, a reply ends in CR LF. Lengths are in picometres."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from errormotion.errors import ProtocolError
+
+LINE_END = b"\r\n"
+LONGEST_REPLY = 4096
+"""Bytes, line end included; a reply with three lengths has some 100."""
+PICOMETRE = 1e-12  # m
+API = 2
+"""Version of the interface: every result starts with the number of an error or a warning."""
+
+DISPLACEMENT = "com.attocube.ids.displacement."
+SYSTEM = "com.attocube.ids.system."
+AXIS = "com.attocube.ids.axis."
+UNIT = "com.attocube.ecu."
+SERVICE = "com.attocube.system."
+
+
+@dataclass(frozen=True)
+class Reply:
+    """One reply.
+
+    Attributes
+    ----------
+    number : int or None
+        Of the request; None where the device could not read it.
+    code : int
+        Error or warning of the function; 0: none.
+    values : tuple
+        What follows the code, as it came.
+    refusal : str
+        Why the request was not executed; empty where it was.
+    """
+
+    number: int | None
+    code: int = 0
+    values: tuple[Any, ...] = ()
+    refusal: str = ""
+
+    def length(self, index: int) -> float:
+        """Return a value in picometres as m; ProtocolError where there is none."""
+        return self.quantity(index) * PICOMETRE
+
+    def quantity(self, index: int) -> float:
+        """Return a finite number; ProtocolError where there is none."""
+        value = self._value(index)
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            try:
+                number = float(value)
+            except OverflowError:
+                number = math.inf
+            if math.isfinite(number):
+                return number
+        raise ProtocolError(f"Value {index + 1} of a reply: expected a number; found {str(value)[:40]!r}")
+
+    def flag(self, index: int) -> bool:
+        """Return true or false; ProtocolError where there is neither."""
+        value = self._value(index)
+        if not isinstance(value, bool):
+            raise ProtocolError(f"Value {index + 1} of a reply: expected true or false; found {str(value)[:40]!r}")
+        return value
+
+    def text(self, index: int) -> str:
+        """Return a text of at most 200 printable characters; ProtocolError where there is none."""
+        value = self._value(index)
+        if not isinstance(value, str) or len(value) > 200 or not value.isprintable():
+            raise ProtocolError(f"Value {index + 1} of a reply: expected a short text; found {str(value)[:40]!r}")
+        return value
+
+    def _value(self, index: int) -> Any:
+        if index >= len(self.values):
+            raise ProtocolError(f"A reply has {len(self.values)} values; expected at least {index + 1}")
+        return self.values[index]
+
+
+def request(method: str, number: int, *parameters: bool | int | str) -> bytes:
+    """Return a request, in the form in which the maker's client writes it: without an end."""
+    found: dict[str, Any] = {"jsonrpc": "2.0", "method": method, "id": number, "api": API}
+    if parameters:
+        found["params"] = list(parameters)
+    return json.dumps(found).encode("ascii")
+
+
+def reply(line: bytes) -> Reply:
+    """Return one reply, given with or without its line end.
+
+    Raises
+    ------
+    ProtocolError
+        No reply of an IDS3010, or a longer one than ``LONGEST_REPLY``.
+    """
+    if len(line) > LONGEST_REPLY:
+        raise ProtocolError(f"A reply of {len(line)} bytes; expected at most {LONGEST_REPLY}")
+    try:
+        found = json.loads(line, parse_constant=_refuse)
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict) or found.get("jsonrpc") != "2.0":
+        raise ProtocolError(
+            f'Expected a reply such as \'{{"jsonrpc":"2.0","id":1,"result":[0]}}\'; found {line[:60]!r}. Is this '
+            "port 9090 of an IDS3010?"
+        )
+    number, result, error = found.get("id"), found.get("result"), found.get("error")
+    if not (number is None or (isinstance(number, int) and not isinstance(number, bool))):
+        raise ProtocolError(f"The number of a reply: expected a whole number; found {str(number)[:40]!r}")
+    if isinstance(error, dict):
+        return Reply(number, refusal=f"{str(error.get('message', ''))[:120]} ({str(error.get('code', ''))[:12]})")
+    if not isinstance(result, list) or not result or number is None:
+        raise ProtocolError(f"Expected a reply with a number and a result; found {line[:60]!r}")
+    return Reply(number, _code(result[0]), tuple(result[1:]))
+
+
+def _code(value: Any) -> int:
+    if value is None or value == "null":  # as the maker's client takes it
+        return 0
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise ProtocolError(
+            f"The first value of a reply: expected the number of an error or a warning; found {str(value)[:40]!r}. A "
+            f"firmware before version {API} of the interface states none: update it"
+        )
+    return value
+
+
+def _refuse(text: str) -> NoReturn:
+    raise ValueError(f"no JSON: {text}")

@@ -1,0 +1,280 @@
+"""Driver of an attocube IDS3010."""
+
+from __future__ import annotations
+
+import math
+import time
+from contextlib import suppress
+from typing import ClassVar
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.instruments import simulators
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.interferometer.attocube_ids import codec
+from errormotion.instruments.interferometer.attocube_ids.settings import IdsSettings, axis_name
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
+from errormotion.plugins.readings import Environment
+
+IDLE, STARTING, RUNNING = "system idle", "measurement starting", "measurement running"
+ALL_AXES = -1
+"""Axis of the requests for the refraction index: the device takes no other yet."""
+POLL_INTERVAL = 0.2
+"""Between two looks at the mode of the device, s."""
+PASSES = ("single", "dual")
+HECTOPASCAL = 100.0  # Pa
+
+GOOD = ""
+
+
+class AttocubeIds(Driver):
+    """An attocube IDS3010, a fibre interferometer with three beams.
+
+    Each axis is a channel, ``axis1`` to ``axis3``, with its displacement in m; two parallel beams make a channel of an
+    angle. Until `zero` a reading counts from where the device counts from. A beam that was broken has lost its count:
+    its channels are NaN until the next `zero`, with the reason in ``flags``.
+
+    Parameters
+    ----------
+    address : str
+        ``tcp://192.168.1.1:9090``, ``sim://cframe/ids?seed=3``, ``replay://file``.
+    settings : IdsSettings, optional
+    record : Path, optional
+        Recording of the session.
+
+    Attributes
+    ----------
+    flags : dict of str to str
+        Of the last reading, by channel: why it has no value; empty where it has one.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="attocube_ids",
+        kind="interferometer",
+        summary="attocube IDS3010, a fibre interferometer with three beams, by JSON-RPC over TCP",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.interferometer.attocube_ids:SimulatedIds",
+    )
+    Settings: ClassVar[type[IdsSettings]] = IdsSettings
+    settings: IdsSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        return InstrumentSubject(cls, "sim://cframe/ids?seed=3", vary=simulators.in_steps(seed=3))
+
+    _number = 0
+
+    @property
+    def channels(self) -> dict[str, str]:
+        """Unit of each channel, ``m`` or ``rad``, by its name."""
+        return {**{axis_name(axis): "m" for axis in self.settings.axes}, **dict.fromkeys(self.settings.angles, "rad")}
+
+    # ------------------------------------------------------------------ requests
+
+    def _call(self, method: str, *parameters: bool | int | str) -> codec.Reply:
+        """Return the reply to one request, whatever its code; late replies to earlier requests are discarded."""
+        self._number += 1
+        limit = self.settings.timeout
+        with self.exchange() as line:
+            line.write(codec.request(method, self._number, *parameters))
+            deadline = time.monotonic() + limit
+            while True:
+                left = deadline - time.monotonic()
+                if left <= 0.0:
+                    raise InstrumentTimeoutError(f"{self.address}: no answer to '{method}' within {limit:g} s")
+                found = codec.reply(line.read_until(codec.LINE_END, limit=codec.LONGEST_REPLY, timeout=left))
+                if found.number == self._number or (found.number is None and found.refusal):
+                    break
+        if found.refusal:
+            raise InstrumentError(f"{self.address} refuses '{method}': {found.refusal}")
+        return found
+
+    def _ask(self, method: str, *parameters: bool | int | str) -> codec.Reply:
+        """Return the reply to a request that must succeed."""
+        found = self._call(method, *parameters)
+        if found.code:
+            raise InstrumentError(f"{self.address} refuses '{method}': {self._meaning(found.code)}")
+        return found
+
+    def _meaning(self, code: int) -> str:
+        """Return number and text of an error, the text as the device states it."""
+        with suppress(InstrumentError):
+            return f"{code}, {self._call(codec.SERVICE + 'errorNumberToString', 1, code).text(0)}"
+        return str(code)
+
+    # ------------------------------------------------------------------ session
+
+    def _start_session(self) -> None:
+        self.flags: dict[str, str] = dict.fromkeys(self.channels, GOOD)
+        self._zero = dict.fromkeys(self.settings.axes, 0.0)
+        self._lost: dict[int, str] = {}  # reasons by axis, until the next zero
+        model = self._ask(codec.SYSTEM + "getDeviceType").text(0)
+        if not model.startswith("IDS"):
+            raise InstrumentError(f"{self.address}: expected an IDS3010; found '{model}'")
+        passes = self._passes()
+        if self.settings.passes not in ("as_set", passes):
+            raise InstrumentError(
+                f"{self.address}: expected a device that is set to {self.settings.passes} pass (passes); it is set to "
+                f"{passes} pass"
+            )
+        self._prepare()
+
+    def _passes(self) -> str:
+        mode = self._ask(codec.AXIS + "getPassMode").quantity(0)
+        return PASSES[int(mode)] if mode in (0.0, 1.0) else f"mode {mode:g}"
+
+    def _prepare(self) -> None:
+        """Set the averaging, and see to it that the device measures."""
+        mode = self._mode()
+        if mode not in (IDLE, STARTING, RUNNING):
+            raise InstrumentError(
+                f"{self.address}: expected a device that measures or is idle; its mode is '{mode}'. End the alignment "
+                "of the optics first"
+            )
+        if mode == IDLE:
+            if not self.settings.start:
+                raise InstrumentError(
+                    f"{self.address} does not measure. Start the measurement at the device, or set 'start = true'"
+                )
+            self._start()
+        elif mode == STARTING:
+            self._await(RUNNING)
+        if (parameter := self.settings.average_parameter) is not None:
+            self._ask(codec.DISPLACEMENT + "setAverageN", parameter)
+
+    def _start(self) -> None:
+        if self.settings.initialisation != "as_set":
+            self._ask(codec.SYSTEM + "setInitMode", int(self.settings.initialisation == "quick"))
+        self._ask(codec.SYSTEM + "startMeasurement")
+        self._await(RUNNING)
+
+    def _mode(self) -> str:
+        return self._ask(codec.SYSTEM + "getCurrentMode").text(0)
+
+    def _await(self, goal: str) -> None:
+        """Wait until the device is in a mode.
+
+        Raises
+        ------
+        InstrumentError
+            It reports an error, or takes longer than ``start_timeout``.
+        """
+        deadline = time.monotonic() + self.settings.start_timeout
+        while (mode := self._mode()) != goal:
+            if goal == RUNNING and mode == IDLE:
+                code = self._call(codec.SYSTEM + "getSystemError").code
+                raise InstrumentError(
+                    f"{self.address} has not started to measure: {self._meaning(code)}. Are all beams aligned?"
+                )
+            if time.monotonic() > deadline:
+                raise InstrumentTimeoutError(
+                    f"{self.address}: expected the mode '{goal}' within {self.settings.start_timeout:g} s; found "
+                    f"'{mode}'"
+                )
+            time.sleep(POLL_INTERVAL)
+
+    def identify(self) -> Identity:
+        """Return maker, model, serial number and firmware, and how the device is set."""
+        average = self._ask(codec.DISPLACEMENT + "getAverageN").quantity(0)
+        return Identity(
+            manufacturer="attocube",
+            model=self._ask(codec.SYSTEM + "getDeviceType").text(0),
+            serial_number=self._ask(codec.SERVICE + "getSerialNumber").text(0),
+            firmware=self._ask(codec.SERVICE + "getFirmwareVersion").text(0),
+            simulated=self.transport.simulated,
+            details={
+                "address": self.address,
+                "passes": self._passes(),
+                "average_parameter": average,
+                "air_compensation": self._has_unit(),
+            },
+        )
+
+    def configure(self, settings: IdsSettings) -> None:
+        """Use other settings from now on; other axes count from where the device counts from."""
+        self.settings = settings
+        self._zero = {axis: self._zero.get(axis, 0.0) for axis in settings.axes}
+        self.flags = dict.fromkeys(self.channels, GOOD)
+        self._prepare()
+
+    # ------------------------------------------------------------------ measuring
+
+    def read(self) -> dict[str, float]:
+        """Return displacement (m) or angle (rad) of each channel since `zero`; NaN from a broken beam until `zero`.
+
+        Raises
+        ------
+        InstrumentError
+            The device does not answer, or does not measure any more.
+        """
+        found = self._displacements()
+        lengths = {axis: found[axis] - self._zero[axis] for axis in self.settings.axes}
+        values = {axis_name(axis): value for axis, value in lengths.items()}
+        self.flags = {axis_name(axis): self._lost.get(axis, GOOD) for axis in self.settings.axes}
+        for name, angle in self.settings.angles.items():
+            values[name] = math.atan((lengths[angle.plus] - lengths[angle.minus]) / angle.base)
+            self.flags[name] = self._lost.get(angle.plus, GOOD) or self._lost.get(angle.minus, GOOD)
+        return values
+
+    def _displacements(self) -> dict[int, float]:
+        """Return the device's counts by axis, m; NaN for an axis that has lost its count."""
+        found = self._call(codec.DISPLACEMENT + "getAxesDisplacement")
+        if found.code == 0:
+            counts = {axis: found.length(axis - 1) for axis in self.settings.axes}
+        else:  # one warning for three axes, also for those that are not used
+            counts = {axis: self._displacement(axis) for axis in self.settings.axes}
+        return {axis: math.nan if axis in self._lost else count for axis, count in counts.items()}
+
+    def _displacement(self, axis: int) -> float:
+        found = self._call(codec.DISPLACEMENT + "getAxisDisplacement", axis - 1)
+        if found.code == 0:
+            return found.length(0)
+        if (mode := self._mode()) != RUNNING:
+            raise InstrumentError(f"{self.address} does not measure any more; its mode is '{mode}'")
+        if axis not in self._lost:
+            self._lost[axis] = f"count lost: {self._meaning(found.code)}"
+        return math.nan
+
+    def zero(self) -> None:
+        """Count from the present position on.
+
+        After a broken beam the measurement is started again first, or its error cleared (``after_break``).
+
+        Raises
+        ------
+        InstrumentError
+            A beam is broken; the device does not answer.
+        """
+        if self._lost:
+            if self.settings.after_break == "restart":
+                self._ask(codec.SYSTEM + "stopMeasurement")
+                self._await(IDLE)
+                self._start()
+            else:
+                self._ask(codec.SYSTEM + "resetError", False)
+            self._lost = {}
+        found = self._displacements()
+        if self._lost:
+            broken = ", ".join(f"{axis_name(axis)} ({reason})" for axis, reason in self._lost.items())
+            raise InstrumentError(f"{self.address}: no zero while a beam is broken: {broken}. Align its reflector")
+        self._zero = found
+
+    # ------------------------------------------------------------------ air
+
+    def environment(self) -> Environment:
+        """Return the air as the environmental unit measures it; NaN without one."""
+        if not self._has_unit():
+            return Environment()
+        return Environment(
+            self._ask(codec.UNIT + "getTemperatureInDegrees").quantity(0),
+            self._ask(codec.UNIT + "getPressureInHPa").quantity(0) * HECTOPASCAL,
+            self._ask(codec.UNIT + "getHumidityInPercent").quantity(0),
+        )
+
+    def refraction(self) -> float:
+        """Return the refraction index with which the device computes lengths."""
+        return self._ask(codec.UNIT + "getRefractiveIndexForCompensation", ALL_AXES).quantity(0)
+
+    def _has_unit(self) -> bool:
+        """Whether an environmental unit is connected; the device tells this while the unit is enabled."""
+        return self._ask(codec.UNIT + "getEnabled").flag(0) and self._ask(codec.UNIT + "getConnected").flag(0)

@@ -1,0 +1,81 @@
+"""Settings of an IDS3010."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from errormotion.datasets.units import Length, Time
+from errormotion.plugins import PluginSettings
+
+AXES = 3
+AVERAGE_STEP = 40e-9
+"""Averaging time of the parameter 0, s; each step doubles it."""
+LARGEST_AVERAGE = 24
+
+
+class AngleChannel(PluginSettings):
+    """An angle from the difference of two parallel beams."""
+
+    plus: int = Field(ge=1, le=AXES, description="axis whose displacement increases with the angle")
+    minus: int = Field(ge=1, le=AXES, description="axis whose displacement decreases with it")
+    base: Length = Field(gt=0, description="distance of the two beams from one another")
+
+
+class IdsSettings(PluginSettings):
+    """Settings of ``attocube_ids``."""
+
+    axes: tuple[int, ...] = Field(
+        default=(1,), min_length=1, description="axes with a reflector, 1 to 3, as they are labelled on the device"
+    )
+    angles: dict[str, AngleChannel] = Field(
+        default_factory=dict, description="channels of angles, by name: two axes and the distance of their beams"
+    )
+    passes: Literal["as_set", "single", "dual"] = Field(
+        default="as_set",
+        description="how often the light travels to the reflector; a device that is set otherwise is refused",
+    )
+    averaging: Time | None = Field(
+        default=None, gt=0, le=1.0, description="averaging time, 40 ns times a power of 2; default as the device is set"
+    )
+    initialisation: Literal["as_set", "accurate", "quick"] = Field(
+        default="as_set", description="initialisation when the driver starts a measurement"
+    )
+    start: bool = Field(default=True, description="start the measurement where the device is idle; else refuse it")
+    start_timeout: Time = Field(default=90.0, gt=0, description="time limit of starting and stopping a measurement")
+    after_break: Literal["restart", "clear"] = Field(
+        default="restart",
+        description="what the zero after a broken beam does: start the measurement again, as the maker recommends, or "
+        "clear the error",
+    )
+    timeout: Time = Field(default=3.0, gt=0, description="time limit of an answer")
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if unknown := [axis for axis in self.axes if not 1 <= axis <= AXES]:
+            raise ValueError(f"axes: expected numbers from 1 to {AXES}; found {unknown[0]}")
+        if len(set(self.axes)) < len(self.axes):
+            raise ValueError(f"axes: expected each once; found {', '.join(map(str, self.axes))}")
+        for name, angle in self.angles.items():
+            if angle.plus == angle.minus or not {angle.plus, angle.minus} <= set(self.axes):
+                raise ValueError(
+                    f"angles.{name}: expected two of the axes {', '.join(map(str, self.axes))}; found {angle.plus} and "
+                    f"{angle.minus}"
+                )
+            if name in map(axis_name, self.axes):
+                raise ValueError(f"angles.{name}: this is the name of an axis")
+        return self
+
+    @property
+    def average_parameter(self) -> int | None:
+        """The parameter of the low pass whose averaging time is the longest within ``averaging``; None: as set."""
+        if self.averaging is None:
+            return None
+        return min(max(math.floor(math.log2(self.averaging / AVERAGE_STEP) + 1e-9), 0), LARGEST_AVERAGE)
+
+
+def axis_name(axis: int) -> str:
+    """Return the name of the channel of an axis, counted from 1."""
+    return f"axis{axis}"

@@ -1,0 +1,1 @@
+"""Simulated machines that take offsets, with the part that a machine must have: bound, slew limit, watchdog."""

@@ -1,0 +1,106 @@
+"""The machine's part of online compensation: a bound, a slew limit, and a watchdog on the sign of life.
+
+It is what a program in a PLC or a control has to do, and is shared by the simulated machines. Its clock is that of this
+computer unless the address has ``clock=0``; then time passes by `MachinePart.elapse` alone.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Sequence
+
+from errormotion.instruments.transports import Address
+
+Offset = tuple[float, float, float]
+
+
+class MachinePart:
+    """Takes offsets as a machine should.
+
+    Parameters
+    ----------
+    address : Address
+        With the parameters ``watchdog`` (default 3 s), ``slew`` (2e-6 m/s), ``limit`` (50e-6 m) and ``clock`` (1: its
+        time is that of this computer, 0: it stands).
+
+    Attributes
+    ----------
+    limit : float
+        Largest offset of each axis, m; an order beyond it is taken as far as the limit.
+    slew : float
+        Fastest change of each axis, m/s.
+    watchdog : float
+        Time without a sign of life after which the offset ramps to zero, s.
+    orders : int
+        Number of orders so far, whatever they said.
+    busy, fault : str
+        Why the offset must not change, and why the machine takes none. With a fault the offset ramps to zero.
+    """
+
+    def __init__(self, address: Address) -> None:
+        self.limit = address.number("limit", 50e-6)
+        self.slew = address.number("slew", 2e-6)
+        self.watchdog = address.number("watchdog", 3.0)
+        self.orders = 0
+        self.busy = self.fault = ""
+        self._rate = address.number("clock", 1.0)
+        self._elapsed = 0.0
+        self._lock = threading.RLock()
+        self._offset: Offset = (0.0, 0.0, 0.0)
+        self._target: Offset = (0.0, 0.0, 0.0)
+        self._at = self._now()
+        self._alive_until = -math.inf
+
+    @property
+    def offset(self) -> Offset:
+        """Offset of X, Y, Z in effect now, m."""
+        with self._lock:
+            self._advance(self._now())
+            return self._offset
+
+    def order(self, offset: Sequence[float], *, alive: bool = True) -> None:
+        """Take an order.
+
+        Parameters
+        ----------
+        offset : (3,)
+            m; an axis that is not finite keeps the last order.
+        alive : bool
+            Whether the sign of life has changed.
+        """
+        with self._lock:
+            now = self._now()
+            self._advance(now)
+            self.orders += 1
+            wanted = [x if math.isfinite(x) else old for x, old in zip(offset, self._target, strict=True)]
+            x, y, z = (min(max(value, -self.limit), self.limit) for value in wanted)
+            self._target = x, y, z
+            if alive:
+                self._alive_until = now + self.watchdog
+
+    def elapse(self, seconds: float) -> None:
+        """Let time pass on the machine, s, beyond that of the clock."""
+        with self._lock:
+            self._elapsed += seconds
+            self._advance(self._now())
+
+    def _now(self) -> float:
+        return (time.monotonic() * self._rate if self._rate else 0.0) + self._elapsed
+
+    def _advance(self, now: float) -> None:
+        """Move towards the target while the sign of life holds, then towards zero."""
+        if self.fault:
+            self._alive_until = -math.inf
+        if self._at < self._alive_until:
+            middle = min(self._alive_until, now)
+            self._move(self._target, middle - self._at)
+            self._at = middle
+        self._move((0.0, 0.0, 0.0), now - self._at)
+        self._at = now
+
+    def _move(self, goal: Offset, seconds: float) -> None:
+        most = self.slew * max(seconds, 0.0)
+        x, y, z = (have + min(max(want - have, -most), most) for want, have in zip(goal, self._offset, strict=True))
+        self._offset = x, y, z

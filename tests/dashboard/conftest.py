@@ -1,0 +1,143 @@
+"""A folder of runs with markup in every name, and a dashboard that serves it in this process."""
+
+import asyncio
+import http.client
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from errormotion import datasets
+from errormotion.campaign.folder import RunFolder
+from errormotion.dashboard.access import Access
+from errormotion.datasets import provenance
+from errormotion.datasets.results.build import build_errors
+
+MARKUP = "<script>window.taken='yes'</script>&amp;\"'"
+"""What stands in each name that comes from a file."""
+
+
+@dataclass
+class Served:
+    """A dashboard at an address."""
+
+    address: str
+    access: Access
+    stop: Callable[[], None]
+
+    def ask(self, path: str, method: str = "GET", body: str = "", **headers: str) -> tuple[int, dict[str, str], str]:
+        """Return status, headers and text of an answer."""
+        where = urlsplit(self.address)
+        connection = http.client.HTTPConnection(str(where.hostname), where.port, timeout=20)
+        try:
+            connection.request(method, path, body or None, {"Accept": "text/html", **headers})
+            answer = connection.getresponse()
+            return answer.status, dict(answer.getheaders()), answer.read().decode()
+        finally:
+            connection.close()
+
+
+@pytest.fixture(scope="session")
+def markup() -> str:
+    """Return what stands in each name."""
+    return MARKUP
+
+
+def finished(root: Path, number: str, bias: float = 0.0) -> RunFolder:
+    """Write a finished run whose names hold markup: an hour of drift, in the end too large by ``bias`` along Z, m."""
+    base = {"bench": {"machine": f"Mill {MARKUP}"}, "method": {"id": "spindle_drift"}, "steps": []}
+    folder = RunFolder.create(root, "drift", number, {**base, "status": "finished", "errors": "errors.nc"})
+    t = np.linspace(0.0, 3600.0, 5000)
+    twist = np.zeros((t.size, 6))
+    warm = 1 - np.exp(-t / 900)
+    twist[:, 2], twist[:, 4] = (20e-6 + bias) * warm, 5e-5 * warm
+    covariance = np.broadcast_to(np.diag([1e-7] * 3 + [1e-6] * 3) ** 2, (t.size, 6, 6)).copy()
+    ds = build_errors(
+        twist, covariance, dims=("time",), coords={"time": t}, machine=f"Mill {MARKUP}", component="spindle",
+        frame=f"machine {MARKUP}", functional_point=np.zeros(3), method="spindle_drift", method_version="1",
+        reference="mean of the first second", notes=[f"a note {MARKUP}"], provenance=provenance.make({}, None, None),
+        start="2026-01-01T08:00:00+00:00",
+    )  # fmt: skip
+    datasets.save(ds, folder.path / "errors.nc")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def pair_of_runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+    """Return a folder with two runs that contradict each other, and their keys."""
+    root = tmp_path_factory.mktemp("pair")
+    return root, [finished(root, number, bias).path.name for number, bias in (("00000003", 0.0), ("00000004", 5e-6))]
+
+
+@pytest.fixture(scope="session")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a finished run, whose names and report hold markup, and a failed one."""
+    root = tmp_path_factory.mktemp("runs")
+    folder = finished(root, "00000001")
+    (folder.path / "report.html").write_text(f"<!DOCTYPE html><p id=written>Report</p><p>{MARKUP}</p>")
+    (folder.path / "log.jsonl").write_text("{}\n")
+    folder.save(test=f"drift {MARKUP}", campaign={"name": MARKUP})
+    base = {"bench": {"machine": f"Mill {MARKUP}"}, "method": {"id": MARKUP}, "steps": []}
+    RunFolder.create(root, "broken", "00000002", {**base, "status": "failed"})
+    return root
+
+
+@pytest.fixture(scope="session")
+def key(runs: Path) -> str:
+    """Return the key of the finished run."""
+    return next(path.name for path in runs.iterdir() if "drift" in path.name)
+
+
+@pytest.fixture(scope="session")
+def serving() -> Iterator[Callable[..., Served]]:
+    """Return a function that serves a folder of runs in a thread until the tests end."""
+    from errormotion.dashboard.server import Options, serve
+
+    stops: list[Callable[[], None]] = []
+
+    def start(runs: Path, **options: Any) -> Served:
+        found: list[Served] = []
+        ready = threading.Event()
+
+        async def work() -> None:
+            loop, end = asyncio.get_running_loop(), asyncio.Event()
+
+            def stop() -> None:
+                if thread.is_alive():
+                    loop.call_soon_threadsafe(end.set)
+                    thread.join(20)
+
+            def started(address: str, access: Access) -> None:
+                found.append(Served(address, access, stop))
+                stops.append(stop)
+                ready.set()
+
+            await serve(Options(runs, **{"port": 0, **options}), started, end)
+
+        thread = threading.Thread(target=lambda: asyncio.run(work()), daemon=True)
+        thread.start()
+        assert ready.wait(20)
+        return found[0]
+
+    yield start
+    for stop in stops:
+        stop()
+
+
+@pytest.fixture(scope="session")
+def open_to_this_computer(serving: Callable[..., Served], runs: Path) -> Served:
+    """Return a dashboard without a token."""
+    return serving(runs)
+
+
+@pytest.fixture(scope="session")
+def open_to_the_network(serving: Callable[..., Served], runs: Path) -> Served:
+    """Return a dashboard that listens on every address, and requires a token."""
+    served = serving(runs, host="0.0.0.0")
+    served.address = served.address.replace("0.0.0.0", "127.0.0.1")
+    return served

@@ -1,0 +1,40 @@
+"""Who may ask: names, token, origin."""
+
+import pytest
+
+from errormotion.dashboard.access import Access, access_for
+
+NETWORK = access_for("0.0.0.0", ["Lab-PC.example"])
+
+
+def test_only_loopback_needs_no_token() -> None:
+    assert not any(access_for(host).token for host in ("127.0.0.1", "::1", "localhost", "127.9.9.9"))
+    tokens = [access_for(host).token for host in ("0.0.0.0", "::", "192.168.1.5", "lab-pc", "0.0.0.0")]
+    assert len(set(tokens)) == len(tokens)
+    assert min(map(len, tokens)) >= 32
+
+
+@pytest.mark.parametrize("host", ["localhost:5006", "127.0.0.1", "[::1]:5006", "192.168.1.5:80", "LAB-pc.example:5006"])
+def test_own_names_and_addresses_are_admitted(host: str) -> None:
+    assert NETWORK.admits(host)
+
+
+@pytest.mark.parametrize("host", ["", "evil.example", "localhost.evil.example", "evil@", "[", "1.2.3.4.evil:80"])
+def test_a_page_under_a_foreign_name_is_refused(host: str) -> None:
+    assert not NETWORK.admits(host)
+
+
+def test_origin_is_that_of_the_page_itself() -> None:
+    assert NETWORK.same_origin("https://lab-pc.example:5006", "Lab-PC.example:5006")
+    for origin in (None, "null", "https://evil.example", "https://lab-pc.example:5007", "https://[", ""):
+        assert not NETWORK.same_origin(origin, "lab-pc.example:5006")
+    assert not NETWORK.same_origin("", "")
+
+
+def test_token_opens_and_session_is_another_secret() -> None:
+    assert NETWORK.opens(NETWORK.token)
+    assert not any(NETWORK.opens(text) for text in ("", NETWORK.token[:-1], NETWORK.session, "é\ud800"))
+    assert NETWORK.knows(NETWORK.session)
+    assert not any(NETWORK.knows(text) for text in (None, "", NETWORK.token))
+    assert not Access(frozenset()).opens("")
+    assert Access(frozenset()).knows(None)

@@ -1,0 +1,67 @@
+"""The page Compare over HTTP: verdict, causes and messages are those of the functions."""
+
+import json
+from collections.abc import Callable
+from html import escape
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+import pytest
+
+pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
+
+from errormotion import datasets
+from errormotion.compare import compare
+from errormotion.compare.text import verdict
+
+
+@pytest.fixture(scope="module")
+def served(serving: Callable[..., Any], pair_of_runs: tuple[Path, list[str]]) -> Any:
+    return serving(pair_of_runs[0])
+
+
+def _query(keys: list[str], **more: str) -> str:
+    return urlencode([*(("run", key) for key in keys), *more.items()])
+
+
+def test_the_verdict_is_that_of_the_function(served: Any, pair_of_runs: tuple[Path, list[str]]) -> None:
+    root, keys = pair_of_runs
+    status, _, text = served.ask(f"/compare?{_query(keys)}")
+    expected = verdict(compare({name: datasets.load(root / name / "errors.nc") for name in keys}))[0]
+    assert "contradict each other" in expected
+    assert status == 200
+    assert escape(expected) in text
+    assert "Most likely cause" in text
+    assert "<script>window" not in text
+    status, _, text = served.ask(f"/compare/figure.json?{_query(keys)}")
+    assert (status, bool(json.loads(text)["item"]["doc"]["roots"])) == (200, True)
+
+
+def test_the_report_of_a_comparison_is_in_a_sandbox(served: Any, pair_of_runs: tuple[Path, list[str]]) -> None:
+    _, headers, text = served.ask(f"/compare/report.html?{_query(pair_of_runs[1])}")
+    assert headers["Content-Security-Policy"].startswith("sandbox")
+    assert "Comparison of" in text
+    assert "<script>window" not in text
+
+
+def test_what_cannot_be_compared_is_said_beside_the_choice(served: Any, pair_of_runs: tuple[Path, list[str]]) -> None:
+    keys = pair_of_runs[1]
+    for query, message in (
+        (_query(keys[:1]), "Choose one more result"),
+        (_query([*keys, "nowhere"]), "There is no run"),
+        (urlencode({"history_machine": "nobody", "figure": "EZ"}), 'role="alert"'),
+    ):
+        status, _, text = served.ask(f"/compare?{query}")
+        assert status == 200
+        assert message in text
+        assert text.count('type="checkbox" name="run"') == 2
+    assert served.ask("/compare?" + _query([f"r{k}" for k in range(21)]))[0] == 400
+
+
+def test_a_figure_over_time(served: Any, markup: str) -> None:
+    query = urlencode({"machine": f"Mill {markup}", "figure": "EZ"})
+    status, headers, text = served.ask(f"/compare/history.html?{query}")
+    assert (status, headers["Content-Security-Policy"][:7]) == (200, "sandbox")
+    assert "over time" in text
+    assert "<script>window" not in text

@@ -1,0 +1,65 @@
+"""A result as curves, and their reduction."""
+
+import csv
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from errormotion import datasets
+from errormotion.dashboard.course import Course, Curve, as_csv, course, thin
+from errormotion.dashboard.lab import Lab
+from errormotion.errors import DatasetError
+
+
+@given(st.lists(st.one_of(st.floats(-1e6, 1e6), st.just(float("nan"))), min_size=1, max_size=4000), st.integers(6, 300))
+def test_reduction_keeps_ends_extremes_and_gaps(values: list[float], most: int) -> None:
+    array = np.array(values)
+    kept = thin(array, most)
+    assert (np.diff(kept) > 0).all()
+    assert (kept[0], kept[-1]) == (0, len(array) - 1)
+    assert len(kept) <= max(most, 3 * (most // 3) + 2)
+    if np.isfinite(array).any():
+        assert np.nanmin(array[kept]) == np.nanmin(array)
+        assert np.nanmax(array[kept]) == np.nanmax(array)
+    assert np.isnan(array[kept]).any() == np.isnan(array).any()
+
+
+def test_one_outlier_in_a_million_stays() -> None:
+    values = np.zeros(10**6)
+    values[654321] = 1.0
+    assert 654321 in thin(values)
+
+
+def test_the_course_at_another_point_is_that_of_the_accessor(runs: object, key: str) -> None:
+    ds = datasets.load(Lab(runs).file(key, "errors"))  # type: ignore[arg-type]
+    point = (0.0, 0.0, -0.2)
+    here, there = course(ds), course(ds, point)
+    assert here.label == "time / min"
+    assert {each.freedom: each.unit for each in here.curves}["EB"] == "arcsec"
+    moved = ds.em.at(point)
+    for curve in there.curves:
+        size = 1e-6 if curve.unit == "µm" else np.pi / 648000
+        np.testing.assert_allclose(curve.values * size, moved[curve.freedom].values, rtol=1e-12, atol=0)
+        np.testing.assert_allclose(curve.expanded * size, moved.em.expanded().sel(dof=curve.freedom).values, rtol=1e-12)
+    assert np.abs(there.curves[0].values - here.curves[0].values).max() > 1.0
+
+
+def test_of_two_dimensions_one_index_is_shown(runs: object, key: str) -> None:
+    ds = datasets.load(Lab(runs).file(key, "errors"))  # type: ignore[arg-type]
+    both = ds.isel(time=slice(10)).expand_dims(speed=[1000.0, 2000.0], axis=1)
+    both["covariance"] = both["covariance"].transpose("time", "speed", "dof", "dof_")
+    both["EZ"] = both["EZ"].transpose("time", "speed") * [1.0, 3.0]
+    first, second = course(both), course(both, select={"speed": 1})
+    assert first.others == {"speed": 2}
+    np.testing.assert_allclose(second.curves[2].values, 3 * first.curves[2].values)
+    with pytest.raises(DatasetError, match="speed: expected an index from 0 to 1; found 2"):
+        course(both, select={"speed": 2})
+
+
+def test_text_in_a_table_is_no_formula() -> None:
+    curve = Curve("EX", "EX", "µm", np.array([1.0, np.nan]), np.array([0.1, np.nan]))
+    found = Course("target", np.arange(2.0), ("=1+1", 'a,"b'), (curve,), np.zeros(3), {})
+    rows = list(csv.reader(as_csv(found).splitlines()))
+    assert rows == [["target", "EX / µm", "U (k=2) of EX / µm"], ["'=1+1", "1", "0.1"], ['a,"b', "", ""]]

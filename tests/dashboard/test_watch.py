@@ -1,0 +1,107 @@
+"""What a bench says now, and its history in memory."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from errormotion.campaign.files import load_bench
+from errormotion.campaign.monitor.watch import Snapshot
+from errormotion.dashboard.watch import Present, Watch
+from errormotion.errors import BenchError
+
+MODULES = """\
+schema = "errormotion.bench/1"
+name = "Shop <script>"
+machine = "Mill <b>5</b>"
+[instruments.modules]
+driver = "dcon_temperature"
+address = "sim://cframe/t?seed=21&sensors=spindle_front,column&open=1"
+channels = ["spindle <i>", "column"]
+"""
+SILENT = """\
+[instruments.absent]
+driver = "dcon_temperature"
+address = "tcp://127.0.0.1:9"
+channels = ["hall"]
+"""
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Iterator[Callable[..., Watch]]:
+    made: list[Watch] = []
+
+    def build(text: str = MODULES, start: bool = True, interval: float = 0.2) -> Watch:
+        file = tmp_path / "bench.toml"
+        file.write_text(text)
+        made.append(Watch(load_bench(file), tmp_path / "runs", interval))
+        if start:
+            made[-1].start()
+        return made[-1]
+
+    yield build
+    for watch in made:
+        if watch.present().running:
+            watch.stop()
+
+
+def wait(watch: Watch, wanted: Callable[[Present], bool]) -> Present:
+    end = time.monotonic() + 15
+    while not wanted(present := watch.present()):
+        assert time.monotonic() < end, present
+        time.sleep(0.05)
+    return present
+
+
+def test_values_states_and_gaps_of_a_bench(make: Callable[..., Watch], tmp_path: Path) -> None:
+    watch = make(MODULES + SILENT)
+    present = wait(watch, lambda now: now.rows >= 3)
+    states = {each.name: each for each in present.instruments}
+    assert (states["modules"].state, states["modules"].model) == ("answers", "DCON 7018")
+    assert states["absent"].state == "silent"
+    assert "127.0.0.1:9" in states["absent"].why
+    values = {each.name: each for each in present.temperatures}
+    assert 15 < values["spindle <i>"].value < 25
+    assert (math.isnan(values["column"].value), values["column"].flag) == (True, "open")
+    assert math.isnan(values["hall"].value)
+    times, curve = watch.history(["spindle <i>", "hall", "other"], 600)["spindle <i>"]
+    assert (np.diff(times) > 0).all()
+    assert abs(times[-1] - time.time()) < 5
+    assert np.isfinite(curve).all()
+    watch.stop()
+    (run,) = (tmp_path / "runs").glob("*-monitor-*")
+    assert '"status": "finished"' in (run / "run.json").read_text()
+    assert watch.present().running is False
+
+
+def test_a_monitor_that_ends_says_why(make: Callable[..., Watch], tmp_path: Path) -> None:
+    (tmp_path / "runs").write_text("a file, where the folder of runs should be")
+    present = wait(make(), lambda now: not now.running)
+    assert present.error
+    assert present.rows == 0
+
+
+def test_memory_is_a_ring_and_reduction_keeps_a_peak(make: Callable[..., Watch]) -> None:
+    watch = make(start=False, interval=1.0)
+    for k in range(40_000):  # more than eight hours
+        value = 50.0 if k == 35_000 else math.nan if 36_000 <= k < 36_500 else 20.0
+        temperatures = {"spindle <i>": value, "column": 20.0}
+        watch._history.put(float(k), [temperatures[name] for name in watch.units])
+    watch._take(Snapshot(40_000.0, {"spindle <i>": 20.0, "column": 20.0}, {}, {}, {}, 1))
+    times, values = watch.history(["spindle <i>"], 8 * 3600)["spindle <i>"]
+    assert len(watch._history.times) == 28_800
+    assert len(values) <= 2000
+    assert np.nanmax(values) == 50.0
+    assert np.isnan(values).any()
+    assert times[-1] - times[0] == pytest.approx(28_799)
+
+
+def test_a_bench_without_anything_to_read_is_refused(make: Callable[..., Watch]) -> None:
+    with pytest.raises(BenchError, match="expected thermometers, a controller, or both"):
+        make(
+            MODULES.partition("[instruments")[0]
+            + '[instruments.lds]\ndriver = "keyence_lk"\naddress = "sim://cframe"\n'
+        )
