@@ -30,6 +30,7 @@ LONGEST = 4000
 _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-ZÄÖÜ(|±])")
 _DECIMAL = re.compile(r"[+−-]?\d+\.\d+")
 _WORD = re.compile(r"[a-z]{3}")
+_LETTERS = re.compile(r"[a-z]{2}")
 _UNITS = re.compile(r"\b(?:arcsec|min|rad|days)\b")
 _SVG_TEXT = re.compile(r"(?<=>)([^<>]*[^<>\s][^<>]*)(?=</text>)")
 _SVG_NAME = re.compile(r'(?<= data-(?:x-name)=")([^"]+)(?=")')
@@ -98,7 +99,7 @@ class Catalogue:
             return plain.replace(".", ",") if self.language in COMMA else plain
         if plain in self._exact:
             return self._exact[plain]
-        if not _WORD.search(_UNITS.sub("", plain)):
+        if not _LETTERS.search(_UNITS.sub("", plain)):
             return text  # a symbol, a number, a unit
         pieces = plain.split("; ")
         found = [self._found(each) for each in pieces] if len(pieces) > 1 else []
@@ -108,6 +109,8 @@ class Catalogue:
             match = pattern.fullmatch(plain)
             if match is not None:
                 return _filled(made, [str(self.word(each)) for each in match.groups()])
+        if not _WORD.search(_UNITS.sub("", plain)):
+            return text
         if any(each is not None and each != piece for each, piece in zip(found, pieces, strict=False)):
             return "; ".join(each or piece for each, piece in zip(found, pieces, strict=True))
         return None
