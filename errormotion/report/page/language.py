@@ -8,6 +8,7 @@ sentences may be listed by sentence. What no catalogue lists stays English. Plug
 
 from __future__ import annotations
 
+import itertools
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -101,16 +102,14 @@ class Catalogue:
             return self._exact[plain]
         if not _LETTERS.search(_UNITS.sub("", plain)):
             return text  # a symbol, a number, a unit
-        pieces = plain.split("; ")
-        found = [self._found(each) for each in pieces] if len(pieces) > 1 else []
-        if found and all(each is not None for each in found):
-            return "; ".join(str(each) for each in found)
         for pattern, made in self._patterns:
             match = pattern.fullmatch(plain)
             if match is not None:
                 return _filled(made, [str(self.word(each)) for each in match.groups()])
         if not _WORD.search(_UNITS.sub("", plain)):
             return text
+        pieces = plain.split("; ")
+        found = [self._found(each) for each in pieces] if len(pieces) > 1 else []
         if any(each is not None and each != piece for each, piece in zip(found, pieces, strict=False)):
             return "; ".join(each or piece for each, piece in zip(found, pieces, strict=True))
         return None
@@ -172,8 +171,15 @@ class Catalogue:
 
 
 def _pattern(key: str) -> re.Pattern[str]:
-    value = r"((?:(?!\. [A-Z]).)+?)"  # within one sentence
-    return re.compile(value.join(re.escape(part) for part in key.split("{}")), re.DOTALL)
+    parts = key.split("{}")
+    made = re.escape(parts[0])
+    for before, after in itertools.pairwise(parts):
+        listing = before.endswith(": ") and after in ("", ".")  # the end of a sentence may be an enumeration
+        made += rf"((?:(?!{_SENTENCE_END if listing else _PIECE_END}).)+?)" + re.escape(after)
+    return re.compile(made, re.DOTALL)
+
+
+_SENTENCE_END, _PIECE_END = r"\. [A-Z]", r"\. [A-Z]|; "
 
 
 def _filled(text: str, values: Sequence[str]) -> str:

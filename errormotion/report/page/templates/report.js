@@ -107,7 +107,8 @@
     tell(found) {
       const [left, right, top, bottom] = this.view;
       const { xName, xUnit } = this.group.dataset;
-      const lines = [["", `${xName} ${this.across.words(found[0].qx, [left, right])} ${xUnit}`.trim()]];
+      const at = `${xName} ${this.across.words(found[0].qx, [left, right])} ${xUnit}`.trim();
+      const lines = this.across.kind === "fixed" ? [] : [["", at]];
       for (const { curve, best, qy } of found) {
         const value = this.up.words(qy, [bottom, top]);
         const U = curve.expanded && Number.isFinite(curve.expanded[best]) && curve.expanded[best] > 0
