@@ -383,6 +383,8 @@ class Method(Protocol):
 
     ``raw_schemas`` : tuple of `errormotion.datasets.schemas.RawSchema`
         The tables that validation, CSV reading, import and the reference pages follow.
+    ``texts(language)`` : mapping of str to str
+        Catalogue of the texts of its chapters, English to this language (``de``).
     ``chapters(source)`` : list of `errormotion.report.document.Part`
         The report of one of its error datasets; without it, the generic chapter.
     ``figures(errors)`` : list of `FigureOfMerit`

@@ -15,8 +15,10 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from errormotion.report.marks import Marks, marks, name_parts, state_uncertainty
+from errormotion.report.text import typographic
 
 #: After Okabe and Ito, distinguishable with any colour vision; light colours are darkened so that text is legible.
 BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE, BLACK = (
@@ -77,11 +79,32 @@ def draw(paint: Callable[[Figure], None], key: str, height: float, width: float 
     with style():
         figure = Figure(figsize=(width, height))
         paint(figure)
+        _spread_ticks(figure)
         name_parts(figure)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
         found = marks(figure)
     return inline(buffer.getvalue(), key, found)
+
+
+def _spread_ticks(figure: Figure) -> None:
+    """Take fewer ticks where the numbers of an abscissa would touch."""
+    for axes in figure.axes:
+        if not isinstance(axes.xaxis.get_major_locator(), MaxNLocator) or axes.get_xscale() != "linear":
+            continue
+        points = 72 * figure.get_figwidth() * axes.get_position().width
+        low, high = sorted(axes.get_xlim())
+        for most in (8, 6, 5, 4, 3, 2):
+            ticks = [each for each in axes.xaxis.get_major_locator()() if low <= each <= high]
+            texts = axes.xaxis.get_major_formatter().format_ticks(ticks)
+            room = points * float(np.diff(ticks).min()) / (high - low) if len(ticks) > 1 else points
+            if len(ticks) < 2 or _LETTER * max(map(len, texts)) + 4.0 <= room:
+                break
+            axes.xaxis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
+
+
+_LETTER = 4.6
+"""Width of a digit of a tick, points."""
 
 
 def stack(figure: Figure, heights: Sequence[float], right: float = RIGHT) -> list[Axes]:
@@ -196,7 +219,7 @@ def limit_lines(axes: Axes, limits: Sequence[tuple[str, float, float]]) -> None:
         )  # fmt: skip
     if near:
         axes.set_ylim(min(low, min(near) - 0.06 * span), max(high, max(near) + 0.12 * span))
-    far = [f"{', '.join(names)} {value:.4g}".replace("-", "−") for value, names in named.items() if value not in near]
+    far = [f"{', '.join(names)} {typographic(f'{value:.4g}')}" for value, names in named.items() if value not in near]
     if far:
         text = f"limits outside of the graph: {'; '.join(far)}"
         axes.annotate(

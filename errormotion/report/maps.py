@@ -113,4 +113,4 @@ def colour_bar(axes: Axes, scale: ScalarMappable, place: tuple[float, float, flo
     bar.set_ticks([float(bounds[i]) for i in range(bounds.size) if (i - zero) % every == 0])
     bar.minorticks_off()
     bar.ax.tick_params(labelsize=7, width=0.4, length=2)
-    bar.ax.set_title(label, fontsize=7.5, fontweight="normal", loc="left", pad=3)
+    bar.ax.set_title(label, fontsize=7.5, fontweight="normal", loc="left", pad=5.5)

@@ -90,17 +90,14 @@ def instruments(provenance: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def instrument_table(provenance: Mapping[str, Any]) -> Table | None:
-    """Return the table of instruments; None if the provenance has none."""
+    """Return the table of instruments with what is known of any; None if the provenance has none."""
     rows = instruments(provenance)
     if not rows:
         return None
     none = Cell(DASH, reason="not recorded")
-    return Table(
-        "Instruments.",
-        ["instrument", "manufacturer", "model", "serial number", "firmware", "address", "calibration"],
-        [[row[name] or none for name in _INSTRUMENT] for row in rows],
-        numeric=False,
-    )
+    shown = [name for name in _INSTRUMENT if any(row[name] for row in rows)]
+    head = ["instrument" if name == "name" else name.replace("_", " ") for name in shown]
+    return Table("Instruments.", head, [[row[name] or none for name in shown] for row in rows], numeric=False)
 
 
 def blocks(source: Source) -> list[Block]:

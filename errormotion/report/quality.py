@@ -88,7 +88,7 @@ def sentences(errors: xr.Dataset, raw: xr.Dataset | None) -> list[Block]:
         step = np.diff(time)
         interval = float(np.median(step))
         missing = np.flatnonzero(step > 1.5 * interval)
-        words = f"{integer(time.size)} instants, one every {fixed(interval, 3).rstrip('0').rstrip('.')} s"
+        words = f"{integer(time.size)} instants, one every {fixed(interval, 3).rstrip('0').rstrip('.,')} s"
         if missing.size:
             words += f"; the time axis has {len(missing)} gap(s), the longest {minutes(float(step[missing].max()))}"
         blocks.append(Text(f"{words}."))

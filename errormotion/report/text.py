@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from decimal import ROUND_HALF_UP, Decimal
 
 import numpy as np
@@ -16,6 +18,24 @@ UM = ("µm", 1e-6)
 MM = ("mm", 1e-3)
 SECOND_OF_ARC = ("arcsec", ARCSEC)
 MINUTE = ("min", 60.0)
+
+_AND = {"en": "and", "de": "und"}
+_LANGUAGE: ContextVar[str] = ContextVar("language", default="en")
+
+
+@contextmanager
+def written_in(language: str) -> Iterator[None]:
+    """Write numbers and enumerations in this language inside of the block: in German with a decimal comma."""
+    before = _LANGUAGE.set(language if language in _AND else "en")
+    try:
+        yield
+    finally:
+        _LANGUAGE.reset(before)
+
+
+def typographic(text: str) -> str:
+    """Return a number with a typographic minus and the decimal sign of the language."""
+    return text.replace("-", "−").replace(".", "," if _LANGUAGE.get() == "de" else ".")
 
 
 def rounded(value: float, expanded: float, *, signed: bool = True, digits: int = 4) -> tuple[str, str]:
@@ -49,8 +69,8 @@ def _place(value: float, digits: int) -> int:
 def _decimal(value: float, place: int, signed: bool) -> str:
     number = Decimal(repr(float(value))).quantize(Decimal(1).scaleb(place), rounding=ROUND_HALF_UP)
     if number == 0:
-        return f"{abs(number):f}"
-    return f"{number:{'+' if signed else ''}f}".replace("-", "−")
+        return typographic(f"{abs(number):f}")
+    return typographic(f"{number:{'+' if signed else ''}f}")
 
 
 def fixed(value: float, decimals: int, *, signed: bool = False) -> str:
@@ -90,8 +110,10 @@ def minutes(seconds: float) -> str:
 
 
 def listed(words: list[str]) -> str:
-    """Return words as an enumeration: ``a, b and c``."""
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else ""
+    """Return words as an enumeration: ``a, b and c``, in the language of the page."""
+    return (
+        words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {_AND[_LANGUAGE.get()]} {words[-1]}" if words else ""
+    )
 
 
 def finite(reduce: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float:

@@ -24,7 +24,7 @@ from errormotion.report.page.assemble import page
 from errormotion.report.page.head import Head, head_of, moment
 from errormotion.report.page.verdict import verdict
 from errormotion.report.parts import beams
-from errormotion.report.text import DASH
+from errormotion.report.text import DASH, written_in
 from errormotion.tolerances.conformity import Conformity, judge
 from errormotion.tolerances.table import Tolerances, from_run
 
@@ -111,11 +111,13 @@ def write_report(
         sources.append(
             Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {}), f"p{i + 1}", _limits(tolerances))
         )
-    parts = [part for source in sources for part in chapters(source)]
-    parts[:1] = [_noted(part, run or {}) for part in parts[:1]]
-    decision = verdict(_judged(sources, tolerances)) if tolerances is not None else None
     head = form.of(head_of(run or {}))
-    found = page(sources, parts, title, head=head, decision=decision)
+    with written_in(head.language):
+        parts = [part for source in sources for part in chapters(source)]
+        parts[:1] = [_noted(part, run or {}) for part in parts[:1]]
+        decision = verdict(_judged(sources, tolerances)) if tolerances is not None else None
+        texts = [_texts(source, head.language) for source in sources]
+        found = page(sources, parts, title, head=head, decision=decision, texts=texts)
     target = _write(found.html, Path(out))
     sheets = [sheet(table, k, section) for k, (section, table) in enumerate(found.tables, 1)]
     for path in form.beside(target):
@@ -126,6 +128,12 @@ def write_report(
         else:
             write_csv(sheets, path, comma=head.language == "de")
     return target
+
+
+def _texts(source: Source, language: str) -> Mapping[str, str]:
+    """Return the catalogue of the plugin that made a dataset; empty where it brings none."""
+    owner = _owner(source.errors)
+    return owner.texts(language) if language and hasattr(owner, "texts") else {}
 
 
 def _limits(tolerances: Tolerances | None) -> dict[str, tuple[float, float]]:

@@ -36,6 +36,8 @@ ACTIONS = """addEventListener("load", () => {
   found.push(tip.innerText, path() !== whole);
   svg.dispatchEvent(new MouseEvent("dblclick"));
   found.push(path() === whole);
+  svg.closest("figure").dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" }));
+  found.push(tip.innerText);
   const space = document.querySelector(".turn canvas");
   const drawn = space.getContext("2d").getImageData(0, 0, space.width, space.height).data;
   found.push(drawn.some((each) => each > 0));
@@ -72,8 +74,9 @@ def test_values_zoom_and_space(drift, tmp_path: Path) -> None:
     )
     found = re.search(r'<pre id="log">(.*?)</pre>', done.stdout, re.DOTALL)
     assert found is not None
-    first, zoomed, changed, back, drawn = found[1].split("|")
+    first, zoomed, changed, back, by_key, drawn = found[1].split("|")
     name = NAME.replace("<", "&lt;").replace(">", "&gt;")
     assert first == f"time 50.0 min; {name}: 100.0 ± 0.25 µm"
     assert zoomed.startswith("time 25.5")  # the left edge is at 25 min now
+    assert by_key.startswith("time 51.0 min;")
     assert (changed, back, drawn) == ("true", "true", "true")

@@ -126,3 +126,18 @@ def test_limits_near_a_curve_are_lines_and_others_are_named():
     assert "limit of EX, EY" in svg
     assert "limits outside of the graph: EY −1.2e+04" in svg
     assert "EZ" not in svg
+
+
+def test_numbers_of_a_narrow_panel_do_not_touch():
+    kept = []
+
+    def paint(figure):
+        kept.append(figure.add_axes((0.1, 0.2, 0.13, 0.7)))
+        kept[0].plot([0, 120], [0, 1])
+
+    canvas.draw(paint, "k", 2.0)
+    low, high = kept[0].get_xlim()
+    ticks = [tick for tick in kept[0].get_xticks() if low <= tick <= high]
+    points = 72 * canvas.WIDTH * 0.13
+    assert len(ticks) >= 2
+    assert points * np.diff(ticks).min() / (high - low) > 3 * 4.6  # three digits

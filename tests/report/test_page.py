@@ -137,9 +137,9 @@ def test_settings_are_shown_as_the_campaign_states_them(drift):
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
-        ("/home/j doe/runs/a.csv", "a.csv"),
+        ("/srv/j doe/runs/a.csv", "a.csv"),
         ("C:\\Users\\j doe\\a.csv", "a.csv"),
-        ("read from /home/jdoe/a.csv, twice", "read from a.csv, twice"),
+        ("read from /srv/jdoe/a.csv, twice", "read from a.csv, twice"),
         ("../2026-drift/errors.nc", "../2026-drift/errors.nc"),
         ("serial:///dev/ttyUSB0", "serial:///dev/ttyUSB0"),
         ("15000 /min", "15000 /min"),
@@ -151,8 +151,8 @@ def test_private_paths_are_reduced_to_the_file(text, shown):
 
 
 def test_no_private_path_of_a_run_is_printed(beams, tmp_path):
-    campaign = {"name": "a", "folder": "/home/jdoe/secret", "text": "x", "file": "c.toml"}
-    html = written(beams, tmp_path, campaign=campaign, inputs={"beams": "/home/jdoe/other/errors.nc"})
+    campaign = {"name": "a", "folder": "/srv/jdoe/secret", "text": "x", "file": "c.toml"}
+    html = written(beams, tmp_path, campaign=campaign, inputs={"beams": "/srv/jdoe/other/errors.nc"})
     assert "jdoe" not in html
     assert "c.toml" in html
 

@@ -38,6 +38,7 @@ class LinearPositioning:
     raw_schemas = lazy("errormotion.methods.linear_positioning.schema:RAW_SCHEMAS")
     simulate = lazy("errormotion.methods.linear_positioning.simulation:simulate")
     chapters = lazy("errormotion.methods.linear_positioning.report:chapters")
+    texts = lazy("errormotion.methods.linear_positioning.report:texts")
     redrawing = lazy("errormotion.methods.linear_positioning.redrawing:redrawing")
     conformance = lazy("errormotion.methods.linear_positioning.conformance:subjects")
     log_readers = lazy("errormotion.methods.linear_positioning.rtl:LOG_READERS")

@@ -37,6 +37,7 @@ class Multilateration:
     Settings: ClassVar[type[PluginSettings]] = MultilaterationSettings
     raw_schemas = lazy("errormotion.methods.multilateration.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.multilateration.report:chapters")
+    texts = lazy("errormotion.methods.multilateration.report:texts")
     figures = lazy("errormotion.methods.multilateration.figures:figures")
     simulate = lazy("errormotion.methods.multilateration.simulation:simulate")
     truth = lazy("errormotion.methods.multilateration.simulation:truth_of")

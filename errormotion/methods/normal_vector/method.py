@@ -39,6 +39,7 @@ class NormalVector:
     Settings: ClassVar[type[PluginSettings]] = BallSettings
     raw_schemas = lazy("errormotion.methods.normal_vector.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.normal_vector.report:chapters")
+    texts = lazy("errormotion.methods.normal_vector.report:texts")
     figures = lazy("errormotion.datasets.results.merit:last_values")
     simulate = lazy("errormotion.methods.normal_vector.simulation:simulate")
     truth = lazy("errormotion.methods.normal_vector.simulation:truth_of")

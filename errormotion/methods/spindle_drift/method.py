@@ -35,6 +35,7 @@ class SpindleDrift:
     Settings: ClassVar[type[PluginSettings]] = DriftSettings
     raw_schemas = lazy("errormotion.methods.spindle_drift.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.spindle_drift.report:chapters")
+    texts = lazy("errormotion.methods.spindle_drift.report:texts")
     log_readers = lazy("errormotion.methods.spindle_drift.log_import.importer:LOG_READERS")
     figures = lazy("errormotion.methods.spindle_drift.figures:figures")
     simulate = lazy("errormotion.methods.spindle_drift.simulation:simulate")

@@ -101,16 +101,8 @@ def _by_browser(program: str, page: Path, out: Path) -> None:
 def _by_weasyprint(page: Path, out: Path) -> None:
     try:
         from weasyprint import HTML
+        from weasyprint.urls import URLFetcher
     except (ImportError, OSError) as error:  # OSError: its own libraries are missing
         raise RunError(WHAT_TO_INSTALL) from error
-    HTML(string=page.read_text(encoding="utf-8"), url_fetcher=_refuse).write_pdf(out)
-
-
-def _refuse(url: str, *_: object, **__: object) -> dict[str, object]:
-    """Refuse every address but data inside of the page."""
-    if url.startswith("data:"):
-        from weasyprint import default_url_fetcher
-
-        found: dict[str, object] = default_url_fetcher(url)
-        return found
-    raise ValueError("a report refers to nothing outside of itself")
+    only_inside = URLFetcher(allowed_protocols=("data",))
+    HTML(string=page.read_text(encoding="utf-8"), url_fetcher=only_inside).write_pdf(out)

@@ -10,7 +10,7 @@ from dataclasses import replace
 from errormotion import plugins
 from errormotion.datasets.results.merit import figures_of
 from errormotion.report.document import Block, Cell, Part, Section, Source, Table, Text, or_dash
-from errormotion.report.text import DASH
+from errormotion.report.text import DASH, typographic
 
 SECTION = "provenance"
 """Name of the sections of chapters that belong to the annex."""
@@ -54,5 +54,5 @@ def values(sources: Sequence[Source]) -> list[Section]:
 
 
 def _number(value: float | None) -> Cell:
-    text = DASH if value is None or not math.isfinite(value) else f"{value:.9g}".replace("-", "−")
+    text = DASH if value is None or not math.isfinite(value) else typographic(f"{value:.9g}")
     return or_dash(text, "not determined")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
@@ -19,7 +19,11 @@ from errormotion.report import provenance
 from errormotion.report.document import Cell, Part, Section, Source, Table
 from errormotion.report.page import annex
 from errormotion.report.page.head import PAPERS, Head, calibrations, facts, measured
+from errormotion.report.page.language import Catalogue
 from errormotion.report.page.verdict import Verdict
+
+_COMPOSED = ("Method", "Report", "Instruments")
+"""Facts with words of the page; the others are names."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +41,12 @@ def page(
     *,
     head: Head | None = None,
     decision: Verdict | None = None,
+    texts: Sequence[Mapping[str, str]] = (),
 ) -> Page:
-    """Return a report as HTML that needs nothing else, and its tables."""
+    """Return a report as HTML that needs nothing else, and its tables.
+
+    ``texts`` are the catalogues of plugins for the language of the head.
+    """
     head, script = head or Head(), _script()
     first = sources[0]
     everything = [(s.provenance, s.run, dict(s.raw.attrs) if s.raw is not None else {}) for s in sources]
@@ -46,13 +54,19 @@ def page(
     body, appended = annex.divided(parts)
     identity = head.number or sha256("".join(map(_identity, sources)).encode()).hexdigest()[:12]
     written = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    t = Catalogue(head.language, texts)
+    found = facts(first, machine, head, f"{identity}, written {written}")
     calibrated = calibrations(head, measured(first))
-    appended = [*annex.values(sources), *appended]
+    calibrated = (t.block(calibrated[0]), [t(each) for each in calibrated[1]]) if calibrated else None
+    body = [t.part(part) for part in body]
+    appended = [t.section(each) for each in annex.values(sources)] + [t.section(each, rows=False) for each in appended]
+    decision = _translated(decision, t)
     shown = {
-        "title": title or f"{machine}: {parts[0].title[0].lower()}{parts[0].title[1:]}",
-        "heading": title or parts[0].title,
+        "title": title or f"{machine}: {body[0].title}",
+        "heading": title or body[0].title,
+        "language": t.language,
         "head": head,
-        "facts": facts(first, machine, head, f"{identity}, written {written}"),
+        "facts": [(name, t(name), t.word(fact) if name in _COMPOSED else fact) for name, fact in found],
         "calibrations": calibrated,
         "decision": decision,
         "simulated": provenance.simulated(everything) or _truth(sources),
@@ -60,28 +74,40 @@ def page(
         "parts": body,
         "annex": appended,
         "several": len(parts) > 1,
-        "kind": parts[0].kind,
+        "kind": t(parts[0].kind),
         "stated": any(part.stated for part in parts),
         "identity": identity,
         "script": Markup(script),
         "script_hash": b64encode(sha256(script.encode()).digest()).decode(),
-        "foot": _css(f"Report {identity}"),
+        "foot": _css(str(t(f"Report {identity}"))),
         "paper": PAPERS.get(head.paper, "A4"),
         "version": errormotion.__version__,
         "written": written,
     }
-    tables = [("Calibrations", calibrated[0])] if calibrated else []
+    tables = [(t("Calibrations"), calibrated[0])] if calibrated else []
     tables += [(section.title, table) for part in body for section in part.sections for table in _tables(section)]
-    tables += [("Limits", decision.table)] if decision else []
+    tables += [(t("Limits"), decision.table)] if decision else []
     tables += [(section.title, table) for section in appended for table in _tables(section)]
-    return Page(_templates().get_template("report.html.j2").render(shown), tables)
+    return Page(_templates(t).get_template("report.html.j2").render(shown), tables)
+
+
+def _translated(decision: Verdict | None, t: Catalogue) -> Verdict | None:
+    if decision is None or t.language == "en":
+        return decision
+    return Verdict(
+        t(decision.word),
+        decision.tone,
+        t(decision.sentence),
+        t.block(decision.picture) if decision.picture is not None else None,
+        t.block(decision.table),
+    )
 
 
 def _tables(section: Section) -> list[Table]:
     return [block for block in section.blocks if isinstance(block, Table)]
 
 
-def _templates() -> Environment:
+def _templates(t: Catalogue) -> Environment:
     templates = Environment(
         loader=PackageLoader("errormotion.report.page"),
         autoescape=True,
@@ -91,6 +117,7 @@ def _templates() -> Environment:
     )
     templates.tests["table"] = lambda block: isinstance(block, Table)
     templates.tests["cell"] = lambda value: isinstance(value, Cell)
+    templates.filters["t"] = t
     templates.filters["kind"] = lambda block: type(block).__name__.lower()
     return templates
 

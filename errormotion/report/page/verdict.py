@@ -11,7 +11,7 @@ from matplotlib.figure import Figure as Canvas
 
 from errormotion.report import canvas
 from errormotion.report.document import Cell, Figure, Table, estimate, or_dash
-from errormotion.report.text import significant
+from errormotion.report.text import significant, typographic
 from errormotion.tolerances.conformity import FIELD_UNITS, Conformity, Row
 from errormotion.tolerances.decision import INSIDE, OPEN, OUTSIDE, WORDS, overall
 
@@ -99,7 +99,7 @@ def _limits(row: Row) -> str:
 
 
 def _plain(number: float) -> str:
-    return f"{number:.4g}".replace("-", "−")
+    return typographic(f"{number:.4g}")
 
 
 def _value(row: Row) -> Cell:
@@ -125,7 +125,7 @@ def _sentence(rows: Sequence[Row], decision: int, rule: str, failures: Sequence[
     count = sum(row.decision == decision for row in rows)
     deciding = _in_words(rows[0])
     if decision == INSIDE:
-        one = "The limit is kept" if n == 1 else f"All {n} limits are kept"
+        one = "The limit is kept" if n == 1 else "Both limits are kept" if n == 2 else f"All {n} limits are kept"
         return f"{one} ({rule}). Closest to its limit: {deciding}."
     what = "exceeded" if decision == OUTSIDE else "not decided"
     one = f"The limit is {what}" if n == 1 else f"{count} of {n} limits {'is' if count == 1 else 'are'} {what}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from errormotion.datasets.results.merit import is_planned
 from errormotion.methods.linear_positioning.report import chapter, diagonals, moving
 from errormotion.report.document import Part, Source
+from errormotion.report.page.language import texts_of
 
 
 def chapters(source: Source) -> list[Part]:
@@ -16,3 +17,8 @@ def chapters(source: Source) -> list[Part]:
     if "squareness" in source.errors:
         return [diagonals.part(source, source.key)]
     return [chapter.part(source, source.key)]
+
+
+def texts(language: str) -> dict[str, str]:
+    """Return the catalogue of this chapter: English text = text in the language."""
+    return texts_of(__name__, language)

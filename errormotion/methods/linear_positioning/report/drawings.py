@@ -42,8 +42,8 @@ def over_position(view: View, key: str, limits: Mapping[str, tuple[float, float]
         if np.isfinite(middle).any():
             upper.plot(P, middle, color=canvas.BLACK, linewidth=0.9, linestyle=(0, (5, 2)), label="mean of both")
         _levels(upper, view)
-        if view.name in limits:
-            lower_limit, upper_limit = (each / view.size for each in limits[view.name])
+        if view.name[:2] in limits:
+            lower_limit, upper_limit = (each / view.size for each in limits[view.name[:2]])
             canvas.limit_lines(upper, [(view.name, lower_limit, upper_limit)])
         canvas.label_ends(upper, ends)
         upper.set_ylabel(f"{view.name} / {view.unit}", labelpad=2)

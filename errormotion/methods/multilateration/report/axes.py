@@ -54,7 +54,7 @@ def blocks(errors: xr.Dataset, key: str) -> list[Block]:
         found.append(
             Text(
                 f"What the errors of the axes leave of the errors of the targets is {fixed(sigma0, 2)} times what "
-                "expected from their uncertainty; 1 means that the axes explain them.",
+                "their uncertainty lets expect; 1 means that the axes explain them.",
                 "plain" if sigma0 < 1.5 else "warning",
             )
         )

@@ -107,7 +107,8 @@
     tell(found) {
       const [left, right, top, bottom] = this.view;
       const { xName, xUnit } = this.group.dataset;
-      const lines = [["", `${xName} ${this.across.words(found[0].qx, [left, right])} ${xUnit}`.trim()]];
+      const at = `${xName} ${this.across.words(found[0].qx, [left, right])} ${xUnit}`.trim();
+      const lines = this.across.kind === "fixed" ? [] : [["", at]];
       for (const { curve, best, qy } of found) {
         const value = this.up.words(qy, [bottom, top]);
         const U = curve.expanded && Number.isFinite(curve.expanded[best]) && curve.expanded[best] > 0
@@ -143,6 +144,22 @@
       svg.addEventListener("pointerdown", (event) => this.press(event));
       svg.addEventListener("pointerup", (event) => this.release(event));
       svg.addEventListener("dblclick", () => this.reset());
+      const figure = svg.closest("figure");
+      figure.tabIndex = 0;
+      figure.addEventListener("keydown", (event) => this.key(event));
+      figure.addEventListener("blur", hide);
+      [this.row, this.share] = [0, 0.5];
+    }
+    key(event) {
+      const along = { ArrowLeft: -0.01, ArrowRight: 0.01 }[event.key], down = { ArrowUp: -1, ArrowDown: 1 }[event.key];
+      if (event.key === "Escape") this.reset();
+      if (!along && !down) return;
+      event.preventDefault();
+      this.share = Math.min(Math.max(this.share + (along || 0), 0), 1);
+      this.row = Math.min(Math.max(this.row + (down || 0), 0), this.panels.length - 1);
+      const { x, y, wide, high } = this.panels[this.row];
+      const at = new DOMPoint(x + this.share * wide, y + high / 2).matrixTransform(this.svg.getScreenCTM());
+      this.move({ clientX: at.x, clientY: at.y });
     }
     at(event) {
       const place = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
