@@ -81,7 +81,8 @@ def main(made: Path) -> None:
         page.goto(address + "compare")
         for test in COMPARED:
             page.check(f"tr:has(label:text-is('{test}')) >> nth=0 >> input")
-        page.check("input[name=same_start]")
+        for freedom in ("EX", "EY", "EZ"):
+            page.check(f"input[name=freedom][value={freedom}]")
         page.click("button:has-text('Compare')")
         page.wait_for_selector("#figure[data-drawn] canvas")
         page.wait_for_timeout(500)

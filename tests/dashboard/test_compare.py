@@ -38,6 +38,17 @@ def test_the_verdict_is_that_of_the_function(served: Any, pair_of_runs: tuple[Pa
     assert (status, bool(json.loads(text)["item"]["doc"]["roots"])) == (200, True)
 
 
+def test_freedoms_reference_and_point_are_passed_on(served: Any, pair_of_runs: tuple[Path, list[str]]) -> None:
+    root, keys = pair_of_runs
+    _, _, text = served.ask(f"/compare?{_query(keys, freedom='EX', since='10', x='0', y='0', z='-100')}")
+    names = {name: datasets.load(root / name / "errors.nc") for name in keys}
+    found = compare(names, at=(0.0, 0.0, -0.1), freedoms=["EX"], since=600.0)
+    assert escape(verdict(found)[0]) in text
+    assert "p of EX" in text
+    assert "p of EZ" not in text
+    assert "expected a time in min" in served.ask(f"/compare?{_query(keys, since='x')}")[2]
+
+
 def test_the_report_of_a_comparison_is_in_a_sandbox(served: Any, pair_of_runs: tuple[Path, list[str]]) -> None:
     _, headers, text = served.ask(f"/compare/report.html?{_query(pair_of_runs[1])}")
     assert headers["Content-Security-Policy"].startswith("sandbox")
