@@ -1,8 +1,8 @@
 # Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz guided wire faults mutations endurance lowest lock
-.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz guided wire faults mutations endurance lowest lock
+.PHONY: help setup demo test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance lowest lock
+.PHONY: help setup demo test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance lowest lock
 
 BIN := .venv/bin
 ARGS ?=
@@ -40,6 +40,9 @@ bench: .venv/.dev  ## run every benchmark and print its figures
 
 validate: .venv/.dev  ## run the Monte Carlo validation and write docs/validation.md
 	$(BIN)/python benchmarks/validate.py $(ARGS)
+
+closed-loop: .venv/.dev  ## compensate 10 virtual machines in a closed loop, and write docs/validation.md
+	$(BIN)/python benchmarks/validate.py closed_loop $(ARGS)
 
 fuzz: .venv/.dev  ## try 1e6 damaged frames of every codec (ARGS="--frames 1e5") and write docs/reliability.md
 	$(BIN)/python tools/fuzz.py $(ARGS)

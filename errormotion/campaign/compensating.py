@@ -29,7 +29,7 @@ from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.compensation.online.audit import AuditLog
 from errormotion.compensation.online.follower import Conditions, Follower, State, Step
-from errormotion.compensation.online.prediction import PARAMETERS, Prediction, predictor
+from errormotion.compensation.online.prediction import PARAMETERS, Prediction, predictor, refusal
 from errormotion.compensation.online.settings import Limits
 from errormotion.datasets import provenance
 from errormotion.errors import BenchError, CompensationError, InstrumentError
@@ -266,16 +266,7 @@ class Compensation:
                 self._known[name] = snapshot.time, value
         recent = {name: value for name, (at, value) in self._known.items() if snapshot.time - at <= self.limits.oldest}
         prediction = self._predictor.update(snapshot.time, recent, recent)
-        if prediction.missing:
-            return prediction, f"no reading for {self.limits.oldest:g} s: {', '.join(prediction.missing)}"
-        if prediction.outside:
-            return prediction, f"outside the training range: {', '.join(prediction.outside)}"
-        widest = 2 * float(prediction.uncertainty[:3].max())
-        if not widest <= self.limits.uncertainty:
-            return prediction, (
-                f"U of the prediction is {widest * 1e6:.1f} um, above {self.limits.uncertainty * 1e6:g} um"
-            )
-        return prediction, ""
+        return prediction, refusal(prediction, self.limits)
 
     def _read(self) -> tuple[tuple[float, float, float] | None, str, str]:
         """Return the offset in effect, why it may not change, and why the machine takes none."""

@@ -9,12 +9,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
+from errormotion.campaign import head
 from errormotion.campaign.limits import NO_MOTIONS, Limits, extent, steps_of, violations
 from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
 from errormotion.campaign.timeline import Timeline, follower
@@ -74,6 +76,8 @@ class BenchTable(BaseModel):
     compensator: CompensatorTable | None = None
     limits: Limits = Limits()
     certificates: Certificates = {}
+    laboratory: head.Laboratory | None = None
+    calibrated_until: dict[str, date] = Field(default={}, description="instrument or certified item = last day")
 
 
 class TestTable(BaseModel):
@@ -107,6 +111,7 @@ class CampaignTable(BaseModel):
     test: list[TestTable] = Field(min_length=1)
     operator: str = Field(default="", max_length=200, description="who measures")
     certificates: Certificates = {}
+    report: head.ReportTable | None = None
     tolerances: Tolerances | None = None
     timeline: Timeline | None = None
 
@@ -155,6 +160,8 @@ class BenchPlan:
     description: MachineDescription | None = None
     certificates: Mapping[str, str] = field(default_factory=dict)
     compensator: BenchCompensator | None = None
+    laboratory: head.Laboratory | None = None
+    calibrated_until: Mapping[str, date] = field(default_factory=dict)
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -207,6 +214,7 @@ class CampaignPlan:
     tolerances: Tolerances | None = None
     operator: str = ""
     timeline: Timeline | None = None
+    report: head.ReportTable | None = None
 
     @property
     def sha256(self) -> str:
@@ -224,7 +232,10 @@ def load_bench(path: str | Path) -> BenchPlan:
     """
     path = Path(path)
     tomlfile.read_toml(path, error=BenchError)
-    return parse_bench(path.read_text(encoding="utf-8-sig"), path)
+    plan = parse_bench(path.read_text(encoding="utf-8-sig"), path)
+    if mistakes := head.logo_mistakes(plan.laboratory, path.parent):
+        raise BenchError(tomlfile.report(path, mistakes))
+    return plan
 
 
 def load_campaign(path: str | Path) -> CampaignPlan:
@@ -290,11 +301,21 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
             instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
     compensator, found = _compensator(data.get("compensator"), table)
     mistakes += found
+    mistakes += head.until_mistakes(table.calibrated_until, table.instruments) if table else []
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
-    certified = table.certificates
     return BenchPlan(
-        table.name, table.machine, tuple(instruments), source, text, limits, description, certified, compensator
+        name=table.name,
+        machine=table.machine,
+        instruments=tuple(instruments),
+        source=source,
+        text=text,
+        limits=limits,
+        description=description,
+        certificates=table.certificates,
+        compensator=compensator,
+        laboratory=table.laboratory,
+        calibrated_until=table.calibrated_until,
     )
 
 
@@ -347,6 +368,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         tolerances=table.tolerances,
         operator=table.operator,
         timeline=table.timeline,
+        report=table.report,
     )
 
 

@@ -22,6 +22,7 @@ from uuid import uuid4
 import xarray as xr
 
 from errormotion import datasets
+from errormotion.campaign import head
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
 from errormotion.campaign.folder import FolderGoneError, RunFolder, list_runs, now
@@ -37,6 +38,7 @@ from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
 from errormotion.datasets.validation import explained
 from errormotion.errors import ErrormotionError, RunError
+from errormotion.report.page import logo
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
 
@@ -239,7 +241,7 @@ class _Session:
         plan = self.campaign
         info = test.method.info
         settings = provenance.plain(test.settings.model_dump(mode="json"))
-        return RunFolder.create(
+        folder = RunFolder.create(
             self.runs,
             test.name,
             self.run_id,
@@ -267,6 +269,7 @@ class _Session:
                 "tolerances": plan.tolerances.model_dump(mode="json") if plan.tolerances else None,
                 "inputs": {},
                 "operator": plan.operator,
+                "head": head.stated(plan.bench.laboratory, plan.report, plan.bench.calibrated_until, test.certificates),
                 "instruments": [answer.record() for answer in self.bench.chosen(test.instruments).answers],
                 "software": provenance.make({}, None, None)["software"],
                 "samples": {},
@@ -277,6 +280,9 @@ class _Session:
                 "steps": [],
             },
         )
+        if plan.bench.laboratory is not None and plan.bench.laboratory.logo:
+            logo.copy(plan.bench.source.parent / plan.bench.laboratory.logo, folder.path)
+        return folder
 
     def _test(self, folder: RunFolder, test: TestPlan, folders: Mapping[str, RunFolder]) -> None:
         inputs = {}

@@ -8,15 +8,16 @@ from typing import Annotated, Literal
 
 import typer
 
-from errormotion.cli.demo import CONTROLLERS
+from errormotion.cli.demo import COMPENSATED, CONTROLLERS
 from errormotion.cli.guard import ERROR, INVALID, USAGE, guarded
 from errormotion.cli.output import show, show_json, table
+from errormotion.cli.wording import share
 
 app = typer.Typer(
     name="errormotion",
     help="Measure the error motions of machine tools.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -43,6 +44,8 @@ Runs = Annotated[
 Tolerances = Annotated[
     Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the campaign.")
 ]
+Paper = Literal["A4", "Letter"]
+Language = Literal["en", "de"]
 Limits = Annotated[Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on each result.")]
 
 
@@ -82,13 +85,17 @@ def demo(
         str,
         typer.Option(help=f"Controller of the machine: {', '.join(CONTROLLERS)}. All but the first must be installed."),
     ] = next(iter(CONTROLLERS)),
+    compensate: Annotated[
+        bool, typer.Option("--compensate", help="Fit a model to a warm-up, and compensate further ones.")
+    ] = False,
     json_: Json = False,
 ) -> None:
     """Measure a virtual machine and compare the result with the truth."""
-    if controller not in CONTROLLERS:
-        typer.echo(f"--controller {controller}: expected one of {', '.join(CONTROLLERS)}.", err=True)
+    shown = COMPENSATED if compensate else CONTROLLERS
+    if controller not in shown:
+        typer.echo(f"--controller {controller}: expected one of {', '.join(shown)}.", err=True)
         raise typer.Exit(USAGE)
-    import_module(CONTROLLERS[controller]).run(runs, json_)
+    import_module(shown[controller]).run(runs, json_)
 
 
 @app.command()
@@ -250,7 +257,7 @@ def compensate_run(
 @app.command()
 @guarded
 def simulate(
-    plugin: Annotated[str, typer.Argument(help="The id of an instrument plugin.")],
+    plugin: Annotated[str, typer.Argument(help="The id of an instrument or a compensator.")],
     port: Annotated[
         int | None,
         typer.Option(min=0, max=65535, help="Port of the device, the next one for its next line; default: a free one."),
@@ -349,12 +356,18 @@ def report(
     run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
     out: Annotated[Path | None, typer.Option(help="The page to write; default: report.html in the run folder.")] = None,
     tolerances: Tolerances = None,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Print the page as PDF beside it.")] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="Write every table as CSV into a folder beside the page.")] = False,
+    xlsx: Annotated[bool, typer.Option("--xlsx", help="Write every table into a workbook beside the page.")] = False,
+    paper: Annotated[Paper | None, typer.Option(help="Paper; default: that of the campaign, else A4.")] = None,
+    language: Annotated[Language | None, typer.Option(help="Language; default: that of the campaign, else en.")] = None,
     json_: Json = False,
 ) -> None:
     """Write the report of a run."""
     from errormotion.cli.commands import data
 
-    data.report(run, out, tolerances, json_)
+    also = tuple(name for name, wanted in (("xlsx", xlsx), ("csv", csv), ("pdf", pdf)) if wanted)
+    data.report(run, out, tolerances, json_, language=language or "", paper=paper or "", also=also)
 
 
 @app.command()
@@ -462,6 +475,39 @@ def runs(
     from errormotion.cli.commands import runs as command
 
     command.runs(folders or [], machine, method, since, tolerances, json_)
+
+
+@app.command("open")
+@guarded
+def open_(
+    place: Annotated[
+        Path, typer.Argument(help="A run folder, a folder of runs (its newest run with a report), or a page.")
+    ] = Path("runs"),
+    browser: Annotated[bool, typer.Option(help="Open the browser; without, print the path only.")] = True,
+    json_: Json = False,
+) -> None:
+    """Open the last report in the browser, and print its path."""
+    from errormotion.cli.commands.results import show as command
+
+    command.open_report(place, browser=browser, as_json=json_)
+
+
+@app.command()
+@guarded
+def export(
+    result: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
+    out: Annotated[Path, typer.Option(help="The file to write: .csv, .xlsx, .nc or .zarr; it must not exist.")],
+    freedoms: Annotated[str | None, typer.Option(help="Which are written: EX,EZ; default: all.")] = None,
+    at: Annotated[str | None, typer.Option(help="Functional point, mm; default: that of the result.")] = None,
+    k: Annotated[float, typer.Option("-k", min=0, max=10, help="Coverage factor of the uncertainties.")] = 2.0,
+    json_: Json = False,
+) -> None:
+    """Write the tables of a result for a spreadsheet, in field units, or the dataset as NetCDF."""
+    from errormotion.cli.commands.results import export as command
+
+    point = None if at is None else _millimetres("--at", at)
+    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else None
+    command.export(result, out, chosen, point, k, json_)
 
 
 @app.command()
@@ -581,7 +627,9 @@ def plugins_check(
 @plugins_app.command("new")
 @guarded
 def plugins_new(
-    what: Annotated[Literal["instrument", "method"], typer.Argument(help="instrument or method.")],
+    what: Annotated[
+        Literal["instrument", "method", "compensator"], typer.Argument(help="instrument, method or compensator.")
+    ],
     name: Annotated[str, typer.Argument(help="Name of the plugin; its id is made from it.")],
     out: Annotated[Path | None, typer.Option(help="Folder to write; default: errormotion-NAME.")] = None,
     json_: Json = False,
@@ -671,6 +719,46 @@ def model_check(
     from errormotion.cli.commands import model as command
 
     command.check_model(model, errors, report, json_)
+
+
+@compensate_app.command("effect")
+@guarded
+def compensate_effect(
+    before: Annotated[Path, typer.Argument(help="Errors without the compensation: NetCDF, run folder, or runs.")],
+    after: Annotated[Path, typer.Argument(help="Errors of the same machine with it.")],
+    at: Annotated[str | None, typer.Option(help="Functional point 'x,y,z', mm; default: that of BEFORE.")] = None,
+    over: Annotated[
+        str | None, typer.Option(metavar="DIM", help="What the errors are compared over: time, position or target.")
+    ] = None,
+    select: Annotated[
+        list[str] | None, typer.Option(help="One element of another dimension, counted from 0: position=3.")
+    ] = None,
+    freedoms: Annotated[str | None, typer.Option(help="Which are compared: EX,EZ; default: all known ones.")] = None,
+    since: Annotated[float | None, typer.Option(help="Reference state, s after time 0 of both.")] = None,
+    tolerances: Annotated[
+        Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on both, and on the reduction.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
+    json_: Json = False,
+) -> None:
+    """Compare two results of one machine: what a compensation took off, and what is left."""
+    from errormotion.cli.commands import compensation_effect as command
+
+    point = None if at is None else _millimetres("--at", at)
+    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
+    code = command.run(
+        before,
+        after,
+        at=point,
+        over=over,
+        select=select or [],
+        freedoms=chosen,
+        since=since,
+        tolerances=tolerances,
+        report=report,
+        as_json=json_,
+    )
+    raise typer.Exit(code)
 
 
 @compensate_app.command("table")
@@ -770,3 +858,6 @@ def compensate_program(
         report=report,
     )
     command.program(part, with_, choice, out, json_)
+
+
+share(app, plugins_app, bench_app, model_app, compensate_app)

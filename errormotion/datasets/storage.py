@@ -21,6 +21,7 @@ import xarray as xr
 from xarray.indexes import RangeIndex
 
 from errormotion.datasets.checks import storable_violations
+from errormotion.datasets.compression import as_stored, encoding
 from errormotion.datasets.files.containers import check_netcdf, check_zarr
 from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.schemas import SCHEMA
@@ -34,9 +35,6 @@ _CLASSIC_SIGNATURE = b"CDF"
 
 # Longer time coordinates are left on disk: an index would pull them into memory.
 _LONGEST_INDEX = 100_000
-
-# Bytes; below, the structure of the chunks takes the space that compression saves.
-_LEAST_COMPRESSED = 2**16
 
 _REASONS = {
     errno.ENOENT: "there is no such folder",
@@ -100,7 +98,8 @@ def load(path: str | Path) -> xr.Dataset:
 def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write a dataset beside its place, bring it to the disk and rename it.
 
-    A NetCDF file is composed in memory, a Zarr folder one variable at a time (piece by piece if dask holds it).
+    Large influences of an error dataset are rounded, see `errormotion.datasets.compression.as_stored`. A NetCDF file is
+    composed in memory, a Zarr folder one variable at a time (piece by piece if dask holds it).
     Evenly spaced times that the attributes ``sample_rate`` and ``time_start`` tell are left out.
 
     Parameters
@@ -137,7 +136,7 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
             # Composed in memory: HDF5 crashes the process when the disk fills up under an open file.
             ready = storable(ds)
             composed = io.BytesIO()  # ours: Python 3.13 complains of one that is closed while its contents are in use
-            ready.to_netcdf(composed, engine="h5netcdf", encoding=_compression(ready))
+            ready.to_netcdf(composed, engine="h5netcdf", encoding=encoding(ready))
             part.write_bytes(composed.getvalue())
         _sync(part)
         _refuse_existing(path, overwrite)
@@ -147,11 +146,11 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
 
 
 def storable(ds: xr.Dataset) -> xr.Dataset:
-    """Return a dataset as it goes to disk: texts of free length, no encoding of its former file, no derivable times."""
+    """Return a dataset as it goes to disk: texts of free length, no former encoding, no derivable times."""
     index = ds.xindexes.get("time")
     if isinstance(index, RangeIndex) and math.isclose(index.step * ds.attrs.get("sample_rate", 0.0), 1.0):
         ds = ds.drop_vars("time").assign_attrs(time_start=float(index.start))
-    ds = ds.drop_encoding()
+    ds = as_stored(ds).drop_encoding()
     # Zarr v3 has no type for texts of fixed width; objects become its texts of free length.
     texts = {name: variable.astype(object) for name, variable in ds.variables.items() if variable.dtype.kind in "UT"}
     return (
@@ -159,19 +158,6 @@ def storable(ds: xr.Dataset) -> xr.Dataset:
         .assign(texts)
         .set_coords([name for name in texts if name in ds.coords])
     )
-
-
-def _compression(ds: xr.Dataset) -> dict[Any, dict[str, Any]]:
-    """Return the NetCDF encoding of the large variables of an error dataset: without loss, and by any reader's means.
-
-    Raw datasets stay as they are: noise takes more time than it saves space.
-    """
-    if ds.attrs.get("schema") != SCHEMA:
-        return {}
-    large = [
-        name for name, each in ds.variables.items() if each.dtype.kind in "fiu" and each.nbytes >= _LEAST_COMPRESSED
-    ]
-    return {name: {"zlib": True, "complevel": 1, "shuffle": True} for name in large}
 
 
 def _engine_of(path: Path) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets import hash_dataset
+from errormotion.datasets.compression import as_stored
 from errormotion.datasets.schemas import ERROR_ROWS
 from errormotion.errors import DatasetError
 from errormotion.montecarlo.adaptive import Summary
@@ -120,7 +121,7 @@ def build(
         "digits": found.digits,
         "seed": seed,
         "sources": list(sources),
-        "errors_hash": hash_dataset(errors),
+        "errors_hash": hash_dataset(as_stored(errors)),
         "notes": [*notes, *thinned] or [""],
     }
     ds = xr.Dataset(variables, coords={**own, "dof": names, "limit": ["low", "high"]}, attrs=attrs)

@@ -7,9 +7,9 @@ chapters. They are loaded at first use, because the drawing library takes time t
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from errormotion.report.write import write_page, write_report, write_run_report
+    from errormotion.report.write import Form, write_page, write_report, write_run_report
 
-__all__ = ["write_page", "write_report", "write_run_report"]
+__all__ = ["Form", "write_page", "write_report", "write_run_report"]
 
 
 def __getattr__(name: str) -> Any:

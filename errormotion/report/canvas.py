@@ -16,6 +16,8 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from errormotion.report.marks import Marks, marks, name_parts, state_uncertainty
+
 #: After Okabe and Ito, distinguishable with any colour vision; light colours are darkened so that text is legible.
 BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE, BLACK = (
     "#0072B2",
@@ -75,9 +77,11 @@ def draw(paint: Callable[[Figure], None], key: str, height: float, width: float 
     with style():
         figure = Figure(figsize=(width, height))
         paint(figure)
+        name_parts(figure)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return inline(buffer.getvalue(), key)
+        found = marks(figure)
+    return inline(buffer.getvalue(), key, found)
 
 
 def stack(figure: Figure, heights: Sequence[float], right: float = RIGHT) -> list[Axes]:
@@ -110,18 +114,22 @@ def decimate(time: np.ndarray, values: np.ndarray, bins: int = 450) -> tuple[np.
     time, values : ndarray, (n,)
         ``values`` may contain NaN; a bin of NaN alone gives one NaN, so that the gap is visible.
     """
+    picks = _picks(values, bins)
+    return (time, values) if picks is None else (time[picks], values[picks])
+
+
+def _picks(values: np.ndarray, bins: int) -> np.ndarray | None:
+    """Return the indices that are drawn of a curve; None for all."""
     if values.size <= 2 * bins:
-        return time, values
-    t, y = [], []
+        return None
+    found = []
     for part in np.array_split(np.arange(values.size), bins):
         known = part[np.isfinite(values[part])]
         if known.size == 0:
-            picks = part[:1]
+            found.append(part[:1])
         else:
-            picks = np.unique([known[np.argmin(values[known])], known[np.argmax(values[known])]])
-        t.append(time[picks])
-        y.append(values[picks])
-    return np.concatenate(t), np.concatenate(y)
+            found.append(np.unique([known[np.argmin(values[known])], known[np.argmax(values[known])]]))
+    return np.concatenate(found)
 
 
 def envelope(
@@ -148,13 +156,53 @@ def curve(
     colour: str,
     dash: tuple[float, ...] | None = None,
     width: float = 1.1,
+    name: str = "",
+    bins: int = 450,
 ) -> None:
-    """Draw one curve, with a band if an expanded uncertainty is given."""
+    """Draw one curve, with a band if an expanded uncertainty is given; ``name`` is shown with values in the page."""
     if expanded is not None and np.isfinite(expanded).any():
         t, low, high = envelope(time, values - expanded, values + expanded)
         axes.fill_between(t, low, high, color=colour, alpha=0.22, linewidth=0)
-    t, y = decimate(time, values)
-    axes.plot(t, y, color=colour, linewidth=width, linestyle=(0, dash) if dash else "-")
+    picks = _picks(values, bins)
+    drawn = slice(None) if picks is None else picks
+    label = name or "_curve"
+    look = (0, dash) if dash else "-"
+    (line,) = axes.plot(time[drawn], values[drawn], color=colour, linewidth=width, linestyle=look, label=label)
+    if expanded is not None:
+        state_uncertainty(line, np.asarray(expanded)[drawn])
+
+
+def limit_lines(axes: Axes, limits: Sequence[tuple[str, float, float]]) -> None:
+    """Draw the limits of curves as dashed lines; those far from the curves are named in the corner instead.
+
+    Parameters
+    ----------
+    limits : sequence of (name, lower, upper)
+        In the unit of the ordinate; infinite where there is none. Draw the curves first.
+    """
+    low, high = axes.get_ylim()
+    span = high - low
+    named: dict[float, list[str]] = {}
+    for name, *values in limits:
+        for value in values:
+            if np.isfinite(value):
+                named.setdefault(value, []).append(name)
+    near = {value: names for value, names in named.items() if low - span <= value <= high + span}
+    for value, names in near.items():
+        axes.axhline(value, color=BLACK, linewidth=0.8, linestyle=(0, (6, 2)))
+        axes.annotate(
+            f"limit of {', '.join(names)}", (0.0, value), xycoords=("axes fraction", "data"), xytext=(3, 2),
+            textcoords="offset points", fontsize=6.5, color=BLACK,
+        )  # fmt: skip
+    if near:
+        axes.set_ylim(min(low, min(near) - 0.06 * span), max(high, max(near) + 0.12 * span))
+    far = [f"{', '.join(names)} {value:.4g}".replace("-", "−") for value, names in named.items() if value not in near]
+    if far:
+        text = f"limits outside of the graph: {'; '.join(far)}"
+        axes.annotate(
+            text, (1.0, 1.0), xycoords="axes fraction", xytext=(0, 3), textcoords="offset points", ha="right",
+            fontsize=6.5, color=BLACK,
+        )  # fmt: skip
 
 
 def label_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
@@ -187,8 +235,11 @@ def label_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
         )
 
 
-def inline(svg: str, key: str) -> Markup:
-    """Return an SVG file as an element for HTML: no namespaces, metadata, style sheet, font families or unused ids."""
+def inline(svg: str, key: str, named: Marks | None = None) -> Markup:
+    """Return an SVG file as an element for HTML: no namespaces, metadata, style sheet, font families or unused ids.
+
+    ``named`` are attributes of elements by their identifiers, for the script of the page.
+    """
     root = ElementTree.fromstring(svg)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -196,12 +247,16 @@ def inline(svg: str, key: str) -> Markup:
     for parent in list(root.iter()):
         for child in [child for child in parent if child.tag in ("metadata", "style")]:
             parent.remove(child)
+    _resolve(root)
     text = ElementTree.tostring(root, encoding="unicode")
     wanted = set(re.findall(r"url\(#([^)]+)\)", text)) | set(re.findall(r'href="#([^"]+)"', text))
     for element in root.iter():
         attributes = element.attrib
         if "id" in attributes:
             name = attributes.pop("id")
+            attributes.update((named or {}).get(name, {}))
+            if tick := re.fullmatch(r"([xy])tick_\d+", name):
+                attributes["class"] = f"tick {tick[1]}"
             if name in wanted:
                 attributes["id"] = f"{key}-{name}"
         if attributes.get("href", "").startswith("#"):
@@ -217,6 +272,33 @@ def inline(svg: str, key: str) -> Markup:
         root.attrib.pop(name, None)
     root.set("aria-hidden", "true")
     return Markup(ElementTree.tostring(root, encoding="unicode"))
+
+
+def _resolve(root: ElementTree.Element) -> None:
+    """Put areas, which matplotlib defines and then uses once at the left edge, in the place of their use."""
+    text = ElementTree.tostring(root, encoding="unicode")
+    defined = {each.attrib["id"]: each for each in root.iter("path") if "id" in each.attrib}
+    for parent in list(root.iter()):
+        for i, child in enumerate(list(parent)):
+            name = child.attrib.get("href", "").lstrip("#")
+            if child.tag != "use" or name not in defined or float(child.attrib.get("x", 1)) != 0:
+                continue
+            if text.count(f'"#{name}"') == 1:
+                d = _lowered(defined[name].attrib["d"], float(child.attrib.get("y", 0)))
+                style = f"{defined[name].attrib.get('style', '')}; {child.attrib.get('style', '')}".strip("; ")
+                parent[i] = ElementTree.Element("path", {"d": d, "style": style})
+                defined.pop(name).attrib.pop("id")
+    for parent in list(root.iter("defs")):
+        for child in [child for child in parent if child.tag == "path" and "id" not in child.attrib]:
+            parent.remove(child)
+
+
+def _lowered(path: str, down: float) -> str:
+    """Return path data moved down."""
+    return re.sub(_PAIR, lambda found: f"{found[1]} {float(found[2]) + down:.6f}", path)
+
+
+_PAIR = re.compile(r"(-?[\d.]+(?:e-?\d+)?)\s+(-?[\d.]+(?:e-?\d+)?)")
 
 
 def _short(path: str) -> str:

@@ -138,6 +138,8 @@ class Source:
         The provenance of the errors, read from its JSON.
     key : str
         Prefix that makes the identifiers of figures unique in the page.
+    limits : mapping of str to (lower, upper)
+        Limits of freedoms by name, SI; infinite where there is none. Drawn as lines.
     """
 
     errors: xr.Dataset
@@ -145,6 +147,7 @@ class Source:
     run: Mapping[str, Any] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     key: str = "p1"
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def settings(self) -> Mapping[str, Any]:

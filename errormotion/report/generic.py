@@ -38,7 +38,7 @@ def part(source: Source, key: str) -> Part:
         _key_figures(errors),
         _summary(errors),
         [
-            Section("errors", "Error motions", _curves(errors, key)),
+            Section("errors", "Error motions", _curves(source, key)),
             Section("uncertainty", "Uncertainty", _uncertainty(errors)),
             Section(
                 "quality",
@@ -115,7 +115,8 @@ def _abscissa(errors: xr.Dataset, dim: str) -> tuple[np.ndarray, str]:
     return np.arange(1.0, size + 1), f"number of {dim}"
 
 
-def _curves(errors: xr.Dataset, key: str) -> list[Block]:
+def _curves(source: Source, key: str) -> list[Block]:
+    errors = source.errors
     dims = _dims(errors)
     if not dims:
         return [budget.twist_table(errors, {"value": errors}, names_of(errors))]
@@ -148,9 +149,13 @@ def _curves(errors: xr.Dataset, key: str) -> list[Block]:
                 axes.set_yticks([])
                 continue
             for place, pick in enumerate(picks):
-                canvas.curve(axes, x, values[pick], expanded[pick], colour=canvas.COLOURS[place % len(canvas.COLOURS)])
+                colour, name = canvas.COLOURS[place % len(canvas.COLOURS)], _place_name(errors, others, int(pick))
+                canvas.curve(axes, x, values[pick], expanded[pick], colour=colour, name=name or names[freedom])
             if x.size == 1:
                 axes.errorbar(x, values[picks[0]], expanded[picks[0]], fmt="o", markersize=3, color=canvas.BLUE)
+            if freedom in source.limits:
+                lower, upper = source.limits[freedom]
+                canvas.limit_lines(axes, [(names[freedom], lower / size, upper / size)])
         for axes in panels[-1]:
             axes.set_xlabel(label)
 
@@ -159,6 +164,15 @@ def _curves(errors: xr.Dataset, key: str) -> list[Block]:
     spans = "; ".join(f"{names[name]} {_span(errors, name, i)}" for i, name in enumerate(errors.em.names))
     height = 2.3 if single else 4.6
     return [Figure(canvas.draw(paint, f"{key}-errors", height), caption, f"Error motions over {along}: {spans}.")]
+
+
+def _place_name(errors: xr.Dataset, others: list[str], index: int) -> str:
+    """Return the place of a curve along the other dims, in words; empty without other dims."""
+    found = []
+    for dim, k in zip(others, np.unravel_index(index, [errors.sizes[dim] for dim in others]), strict=True):
+        x, label = _abscissa(errors, dim)
+        found.append(f"{label.partition(' / ')[0]} {x[k]:.4g} {label.partition(' / ')[2]}".strip())
+    return ", ".join(found)
 
 
 def _span(errors: xr.Dataset, name: str, index: int) -> str:

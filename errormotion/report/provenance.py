@@ -9,11 +9,15 @@ from typing import Any
 
 import xarray as xr
 
+from errormotion.report import settings
 from errormotion.report.document import Block, Cell, Source, Table, Text
 from errormotion.report.text import DASH
 
 _ATTRIBUTES = ("schema", "method", "method_version", "component", "frame", "functional_point", "reference", "sign")
 _RUN = ("campaign", "bench", "inputs", "samples")
+_ROOT = r"(?:~[\\/]|/|[A-Za-z]:[\\/]|\\\\)"
+_WHOLE_PATH = re.compile(rf"{_ROOT}[^\\/\n]+[\\/][^\n]*$")
+_PATH = re.compile(rf"(?<![^\s'\"(=,;\[]){_ROOT}(?:[^\\/\s'\"<>|,;]+[\\/])+[^\\/\s'\"<>|,;]*")
 _INSTRUMENT = ("name", "manufacturer", "model", "serial_number", "firmware", "address", "calibration")
 
 
@@ -106,16 +110,10 @@ def blocks(source: Source) -> list[Block]:
     found: list[Block] = []
     table = instrument_table(provenance)
     found.append(table if table is not None else Text("The provenance lists no instruments.", "note"))
-    settings = [[name, value] for name, value in _flat(provenance.get("settings", {}))]
-    if settings:
-        found.append(
-            Table(
-                "Effective settings of the method, including defaults, in SI units.",
-                ["setting", "value"],
-                settings,
-                numeric=False,
-            )
-        )
+    effective = settings_rows(source)
+    if effective:
+        caption = "Effective settings of the method, including defaults: as the campaign states them, and in SI units."
+        found.append(Table(caption, ["setting", "value", "SI"], effective, numeric=False))
     attributes = [[name.replace("_", " "), text(errors.attrs[name])] for name in _ATTRIBUTES if name in errors.attrs]
     rest = {name: value for name, value in provenance.items() if name not in ("settings", "instruments")}
     found.append(
@@ -129,17 +127,41 @@ def blocks(source: Source) -> list[Block]:
     return found
 
 
+def settings_rows(source: Source) -> list[list[Cell | str]]:
+    """Return the effective settings: path, value as in the campaign or in field units, SI value with its unit."""
+    effective = source.provenance.get("settings", {})
+    units = settings.units(settings.settings_class(str(source.errors.attrs.get("method"))))
+    written = {path: text(leaf) for path, leaf in walk(settings.stated(source.run))}
+    rows: list[list[Cell | str]] = []
+    for path, leaf in walk(effective):
+        if not path:
+            continue
+        unit = settings.unit_of(units, path)
+        shown = written.get(path) or (settings.field(leaf, unit) if unit else "") or text(leaf)
+        rows.append([".".join(path), shown, f"{text(leaf)} {unit}" if unit and text(leaf) != DASH else ""])
+    return rows
+
+
 def _brief(value: Any) -> Any:
-    """Return an entry of ``run.json`` without the full text of a file, which is represented by its hash."""
-    return {name: entry for name, entry in value.items() if name != "text"} if isinstance(value, Mapping) else value
+    """Return an entry of ``run.json`` without the full text of a file (its hash stands for it) and its folder."""
+    if not isinstance(value, Mapping):
+        return value
+    return {name: entry for name, entry in value.items() if name not in ("text", "folder")}
 
 
 def _flat(value: Any) -> list[tuple[str, str]]:
     return [(".".join(path), text(leaf)) for path, leaf in walk(value) if path]
 
 
+def public(text: str) -> str:
+    """Return a text without the folders of this computer: an absolute path is reduced to the name of its file."""
+    if _WHOLE_PATH.match(text):
+        return re.split(r"[\\/]", text.rstrip("\\/"))[-1]
+    return _PATH.sub(lambda found: re.split(r"[\\/]", found[0].rstrip("\\/"))[-1], text)
+
+
 def text(value: Any) -> str:
-    """Return a leaf of the provenance as text; a missing one as a dash."""
+    """Return a leaf of the provenance as text, without private paths; a missing one as a dash."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if value is None or value == "" or (isinstance(value, (list, tuple, dict)) and not value):
@@ -152,4 +174,4 @@ def text(value: Any) -> str:
         return ", ".join(text(entry) for entry in value)
     if isinstance(value, Mapping):
         return ", ".join(f"{key}: {text(entry)}" for key, entry in value.items())
-    return str(value)
+    return public(str(value))

@@ -63,6 +63,7 @@ class Panel:
     legend: bool = False
     strip: bool = False
     held: bool = False
+    limits: Sequence[tuple[str, float, float]] = ()
 
     @property
     def heading(self) -> str:
@@ -99,8 +100,11 @@ def clock(seconds: Array) -> Clock:
     return Clock(seconds / _DAY, "days", _DAY)
 
 
-def errors(dataset: xr.Dataset) -> list[Panel]:
-    """Return displacements and rotations of an error dataset over time; unknown errors have no curve."""
+def errors(dataset: xr.Dataset, limits: Mapping[str, tuple[float, float]] | None = None) -> list[Panel]:
+    """Return displacements and rotations of an error dataset over time; unknown errors have no curve.
+
+    ``limits`` of errors by name, SI, are drawn as lines.
+    """
     panels = []
     for title, first, (unit, size) in (("Displacements", 0, UM), ("Rotations", 3, SECOND_OF_ARC)):
         lines = []
@@ -110,7 +114,9 @@ def errors(dataset: xr.Dataset) -> list[Panel]:
                 colour = canvas.COLOURS[i % 3]
                 lines.append(Line(FREEDOMS[i], values / size, 2 * sigma(dataset, i) / size, colour))
         if lines:
-            panels.append(Panel(title, unit, lines))
+            stated = [(line.name, *limits[line.name]) for line in lines if limits and line.name in limits]
+            drawn = [(name, lower / size, upper / size) for name, lower, upper in stated]
+            panels.append(Panel(title, unit, lines, limits=drawn))
     return panels
 
 
@@ -233,12 +239,12 @@ def _panel(axes: Axes, panel: Panel, time: Array) -> None:
         _strip(axes, panel, time)
         return
     for line in panel.lines:
-        canvas.curve(axes, time, line.values, line.expanded, colour=line.colour, dash=line.dash)
+        canvas.curve(axes, time, line.values, line.expanded, colour=line.colour, dash=line.dash, name=line.name)
         if time.size <= DOTTED and not panel.legend:
-            axes.plot(time, line.values, "o", color=line.colour, markersize=2.2, markeredgewidth=0)
+            _dots(axes, time, line.values, line.colour, 2.2)
         elif alone(line.values).any():
             single = alone(line.values)
-            axes.plot(time[single], line.values[single], "o", color=line.colour, markersize=1.8, markeredgewidth=0)
+            _dots(axes, time[single], line.values[single], line.colour, 1.8)
     axes.margins(y=0.08)
     if panel.legend:
         low, high = axes.get_ylim()
@@ -251,6 +257,11 @@ def _panel(axes: Axes, panel: Panel, time: Array) -> None:
         )  # fmt: skip
     else:
         axes.axhline(0, color="#888888", linewidth=0.6)
+        canvas.limit_lines(axes, panel.limits)
+
+
+def _dots(axes: Axes, time: Array, values: Array, colour: str, size: float) -> None:
+    axes.plot(time, values, "o", color=colour, markersize=size, markeredgewidth=0, label="_nolegend_")
 
 
 def alone(values: Array) -> NDArray[np.bool_]:

@@ -1,13 +1,15 @@
-"""A spatial drawing that can be rotated without scripts: all views are drawn, and one is shown.
+"""A spatial drawing that can be rotated: by the script of the page from its points, else by choosing one of some views.
 
 The views are selected with radio buttons, so that arrow keys rotate the drawing. The selected view is printed.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -19,6 +21,8 @@ _MARGIN = 22.0
 _TURNS = 12
 _ELEVATION = np.radians(24.0)
 _FIXED = ((0.0, np.pi / 2, "from above"), (0.0, 0.0, "along Y"), (np.pi / 2, 0.0, "along X"))
+TURN = " Dragging and the arrow keys turn it; without its script, the buttons do."
+"""End of the caption of a drawing."""
 _INK = "#222222"
 _LETTER, _LINE = 5.2, 9.5  # width of a letter and height of a line of the names, points
 
@@ -38,12 +42,13 @@ class Lines:
 
 @dataclass(frozen=True)
 class Dots:
-    """Points (k, 3), m, with optional names."""
+    """Points (k, 3), m, with optional names, and notes that the page shows when one points at them."""
 
     places: Array
     colour: str
     radius: float = 1.4
     names: Sequence[str] = ()
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -110,13 +115,37 @@ def draw(scene: Scene, key: str) -> Markup:
         pictures.append(_picture(scene, camera(azimuth, elevation), centre, scale, f"{key}-p{k}"))
         rules.append(f"#{key}-v{k}:checked~#{key}-p{k}")
     style = (
-        f"#{key}-t>svg{{display:none}}{','.join(rules)}{{display:block!important}}"
-        f"#{key}-t{{font-size:8pt;color:#555}}#{key}-t>input{{margin:0 1px;vertical-align:middle}}"
-        f"#{key}-t>label{{margin-right:6px}}@media print{{#{key}-t>:not(svg){{display:none}}}}"
+        f"#{key}-t svg{{display:none}}{','.join(rules)}{{display:block!important}}"
+        f"#{key}-t{{font-size:8pt;color:#555}}#{key}-t input{{margin:0 1px;vertical-align:middle}}"
+        f"#{key}-t label{{margin-right:6px}}@media print{{#{key}-t :is(input,label,span){{display:none}}}}"
     )
+    points_of = escape(json.dumps(_plain(scene, centre, points), ensure_ascii=False, separators=(",", ":")))
     return Markup(
-        f"<div id='{key}-t'><style>{style}</style><span>rotate: </span>{''.join(buttons)}{''.join(pictures)}</div>"
+        f"<div id='{key}-t' class='turn' data-scene=\"{points_of}\"><style>{style}</style><span>rotate: </span>"
+        f"{''.join(buttons)}{''.join(pictures)}</div>"
     )
+
+
+def _plain(scene: Scene, centre: Array, points: Array) -> dict[str, Any]:
+    """Return the scene for the script of the page; places to a millionth of its size."""
+    radius = float(np.linalg.norm(points - centre, axis=1).max()) or 1.0
+    decimals = 6 - math.floor(math.log10(radius))
+
+    def of(part: Lines | Dots | Ellipsoids) -> dict[str, Any]:
+        if isinstance(part, Lines):
+            look = {"width": part.width, "head": part.head, "dash": part.dash}
+            return {"kind": "lines", "colour": part.colour, **look, "ends": part.ends.round(decimals).tolist()}
+        if isinstance(part, Dots):
+            texts = {"names": [str(name) for name in part.names], "notes": [str(note) for note in part.notes]}
+            shape = {"places": part.places.round(decimals).tolist(), "radius": part.radius}
+            return {"kind": "dots", "colour": part.colour, **shape, **{k: v for k, v in texts.items() if v}}
+        shapes = [[float(f"{each:.4g}") for each in shape.ravel()] for shape in part.shapes]
+        matrices = np.array(shapes).reshape(-1, 3, 3).tolist()
+        places = part.places.round(decimals).tolist()
+        return {"kind": "ellipsoids", "colour": part.colour, "places": places, "shapes": matrices}
+
+    parts = [of(part) for part in scene.parts]
+    return {"centre": centre.round(decimals).tolist(), "radius": float(f"{radius:.6g}"), "parts": parts}
 
 
 def _picture(scene: Scene, R: Array, centre: Array, scale: float, name: str) -> str:

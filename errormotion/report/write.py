@@ -5,26 +5,56 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from datetime import UTC, datetime
-from hashlib import sha256
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import xarray as xr
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
-import errormotion
 from errormotion import plugins
 from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError, RunError
 from errormotion.report import generic, provenance
 from errormotion.report.budget import FREEDOMS
-from errormotion.report.document import Cell, Part, Section, Source, Table
+from errormotion.report.document import Part, Section, Source, Table
+from errormotion.report.exports import pdf, xlsx
+from errormotion.report.exports.tables import sheet, write_csv
+from errormotion.report.page import logo
+from errormotion.report.page.assemble import page
+from errormotion.report.page.head import Head, head_of, moment
+from errormotion.report.page.verdict import verdict
 from errormotion.report.parts import beams
 from errormotion.report.text import DASH
-from errormotion.tolerances.conformity import judge
+from errormotion.tolerances.conformity import Conformity, judge
 from errormotion.tolerances.table import Tolerances, from_run
+
+
+@dataclass(frozen=True)
+class Form:
+    """How a report is written.
+
+    ``language`` and ``paper`` replace those of the campaign; ``also`` names what is written beside the page: ``pdf``,
+    ``csv`` (a folder), ``xlsx``.
+    """
+
+    language: str = ""
+    paper: str = ""
+    also: tuple[str, ...] = ()
+
+    def of(self, head: Head) -> Head:
+        """Return a head in this language and for this paper."""
+        return replace(head, language=self.language or head.language, paper=self.paper or head.paper)
+
+    def beside(self, page: Path) -> list[Path]:
+        """Return the files and folders that are written beside a page."""
+        return [
+            page.with_name(f"{page.stem}-tables") if kind == "csv" else page.with_suffix(f".{kind}")
+            for kind in self.also
+        ]
+
+
+PLAIN = Form()
+"""The page alone."""
 
 #: Chapters of components that several methods measure; used where the method brings no chapter of its own.
 COMPONENTS = {"beam": beams.part}
@@ -40,6 +70,7 @@ def write_report(
     raw: xr.Dataset | None = None,
     title: str | None = None,
     run: Mapping[str, Any] | None = None,
+    form: Form = PLAIN,
 ) -> Path:
     """Write the report of one or several error datasets as one HTML file.
 
@@ -55,6 +86,8 @@ def write_report(
         Title of the report; without it, made of the machine and what was tested.
     run : mapping, optional
         What else is known of the measurement, such as the content of ``run.json``: machine, test, operator, start.
+    form : Form, optional
+        Language, paper, and what is written beside the page.
 
     Returns
     -------
@@ -65,27 +98,44 @@ def write_report(
     ------
     DatasetError
         No dataset, or one that is no error dataset.
+    RunError
+        The page was written, and a PDF of it could not be.
     """
     datasets = [errors] if isinstance(errors, xr.Dataset) else list(errors)
     if not datasets:
         raise DatasetError("A report needs at least one error dataset, and none was given.")
-    sources = []
+    sources, tolerances = [], from_run(run or {})
     for i, dataset in enumerate(datasets):
         _check_reportable(dataset)
         validate(dataset)
-        sources.append(Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {}), f"p{i + 1}"))
-    tolerances = from_run(run or {})
-    parts = [part for source in sources for part in _judged(chapters(source), source, tolerances)]
+        sources.append(
+            Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {}), f"p{i + 1}", _limits(tolerances))
+        )
+    parts = [part for source in sources for part in chapters(source)]
     parts[:1] = [_noted(part, run or {}) for part in parts[:1]]
-    return write_page(sources, parts, Path(out), title)
+    decision = verdict(_judged(sources, tolerances)) if tolerances is not None else None
+    head = form.of(head_of(run or {}))
+    found = page(sources, parts, title, head=head, decision=decision)
+    target = _write(found.html, Path(out))
+    sheets = [sheet(table, k, section) for k, (section, table) in enumerate(found.tables, 1)]
+    for path in form.beside(target):
+        if path.suffix == ".pdf":
+            pdf.write(target, path)
+        elif path.suffix == ".xlsx":
+            xlsx.write(sheets, path)
+        else:
+            write_csv(sheets, path, comma=head.language == "de")
+    return target
 
 
-def _judged(parts: list[Part], source: Source, tolerances: Tolerances | None) -> list[Part]:
-    """Return the chapters of a source; the summary of the first one starts with the decision on the tolerances."""
-    if tolerances is None or not parts or str(source.errors.attrs.get("schema")) != plugins.ERRORS_SCHEMA:
-        return parts
-    lines = judge(source.errors, tolerances).lines()
-    return [replace(parts[0], summary=[*lines, *parts[0].summary]), *parts[1:]]
+def _limits(tolerances: Tolerances | None) -> dict[str, tuple[float, float]]:
+    return {name: limit.interval for name, limit in tolerances.freedoms.items()} if tolerances is not None else {}
+
+
+def _judged(sources: Sequence[Source], tolerances: Tolerances) -> list[Conformity]:
+    """Return the decision on each error dataset."""
+    stated = [source.errors for source in sources if str(source.errors.attrs.get("schema")) == plugins.ERRORS_SCHEMA]
+    return [judge(errors, tolerances) for errors in stated]
 
 
 def _noted(part: Part, run: Mapping[str, Any]) -> Part:
@@ -94,7 +144,7 @@ def _noted(part: Part, run: Mapping[str, Any]) -> Part:
     if not notes and not damaged:
         return part
     rows = [
-        [_moment(each.at or str(run.get("created", DASH))), each.text, each.by, _moment(each.noted)] for each in notes
+        [moment(each.at or str(run.get("created", DASH))), each.text, each.by, moment(each.noted)] for each in notes
     ]
     head = ["time of the event", "note", "by", "noted"]
     table = Table("Notes on this run", head, rows, numeric=False, notes=damaged)
@@ -135,7 +185,7 @@ def write_page(sources: Sequence[Source], parts: Sequence[Part], out: Path, titl
     Path
         ``out``.
     """
-    return _write(_page(sources, parts, title), out)
+    return _write(page(sources, parts, title).html, out)
 
 
 def _owner(dataset: xr.Dataset) -> Any:
@@ -178,18 +228,18 @@ def _check_reportable(dataset: xr.Dataset) -> None:
         )
 
 
-def _write(page: str, out: Path) -> Path:
+def _write(text: str, out: Path) -> Path:
     """Write a page beside its place, and rename it."""
     beside = out.with_name(out.name + ".part")
     try:
-        beside.write_text(page, encoding="utf-8")
+        beside.write_text(text, encoding="utf-8")
         os.replace(beside, out)
     finally:
         beside.unlink(missing_ok=True)
     return out
 
 
-def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
+def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = PLAIN) -> Path:
     """Write the report of a run folder from its error datasets, its raw dataset and ``run.json``.
 
     Parameters
@@ -198,6 +248,8 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
         Of a test, or of a monitor.
     out : Path, optional
         The file; without it, ``report.html`` in the folder.
+    form : Form, optional
+        Language, paper, and what is written beside the page.
 
     Raises
     ------
@@ -224,14 +276,15 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
     if os.path.lexists(folder / "run.json"):
         run = dict(read_run(folder))
     run["events"] = events.read(folder)
+    run["logo"] = logo.of_folder(folder)
     target = Path(out) if out is not None else folder / "report.html"
     if log is not None:
-        return write_report(log, target, run=run)
+        return write_report(log, target, run=run, form=form)
     parts = []
     for path in files:
         errors = load(path)
         parts += [errors, *belonging(errors, path)]
-    return write_report(parts, target, raw=raw, run=run)
+    return write_report(parts, target, raw=raw, run=run, form=form)
 
 
 def belonging(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
@@ -249,92 +302,3 @@ def _provenance(dataset: xr.Dataset, run: Mapping[str, Any]) -> dict[str, Any]:
     if "provenance" not in dataset.attrs:
         return {name: run[name] for name in ("instruments", "settings", "software") if run.get(name)}
     return provenance.read(dataset)
-
-
-def _page(sources: Sequence[Source], parts: Sequence[Part], title: str | None) -> str:
-    first = sources[0]
-    attributes = first.errors.attrs
-    everything = [(s.provenance, s.run, dict(s.raw.attrs) if s.raw is not None else {}) for s in sources]
-    machine = str(attributes.get("machine", "unknown machine"))
-    templates = Environment(
-        loader=PackageLoader("errormotion.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    templates.tests["table"] = lambda block: isinstance(block, Table)
-    templates.tests["cell"] = lambda value: isinstance(value, Cell)
-    templates.filters["kind"] = lambda block: type(block).__name__.lower()
-    identity = sha256("".join(map(_identity, sources)).encode()).hexdigest()[:12]
-    return templates.get_template("report.html.j2").render(
-        title=title or f"{machine}: {parts[0].title[0].lower()}{parts[0].title[1:]}",
-        heading=title or parts[0].title,
-        facts=_facts(first, machine),
-        simulated=provenance.simulated(everything) or (_truth(sources)),
-        replayed=provenance.replayed(everything),
-        parts=parts,
-        several=len(parts) > 1,
-        kind=parts[0].kind,
-        stated=any(part.stated for part in parts),
-        identity=identity,
-        version=errormotion.__version__,
-        written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-    )
-
-
-def _identity(source: Source) -> str:
-    attributes = source.errors.attrs
-    if "provenance" in attributes:
-        return str(attributes["provenance"])
-    return f"{source.run.get('id')} {attributes.get('start')} {dict(source.errors.sizes)}"
-
-
-def _truth(sources: Sequence[Source]) -> str:
-    if any(source.errors.attrs.get("method") == "twin" for source in sources):
-        return "the values are the truth of a virtual machine"
-    return ""
-
-
-def _facts(source: Source, machine: str) -> list[tuple[str, str]]:
-    """Return what heads the report: who measured what, where and when, as far as it is known."""
-    errors, run = source.errors, source.run
-
-    def known(*names: str) -> str:
-        for holder in (run, source.provenance, errors.attrs, errors["time"].attrs if "time" in errors.coords else {}):
-            for name in names:
-                if name in holder and not isinstance(holder[name], (Mapping, list)) and holder[name] not in (None, ""):
-                    return provenance.text(holder[name])
-        return DASH
-
-    attributes, test = errors.attrs, known("test", "name")
-    method = [
-        ("Method", f"{attributes.get('method', DASH)}, version {attributes.get('method_version', DASH)}"),
-        ("Reference state", str(attributes.get("reference", DASH))),
-    ]
-    instruments = provenance.instruments(source.provenance)
-    return [
-        ("Machine", machine),
-        ("Test", test if test != DASH else str(attributes.get("iso_test", DASH))),
-        ("Measured", _moment(known("started", "start", "created"))),
-        ("Operator", known("operator")),
-        *(method if "method" in attributes else []),
-        ("Run", known("id", "run")),
-        ("Instruments", "; ".join(_instrument(row) for row in instruments) or DASH),
-    ]
-
-
-def _instrument(row: Mapping[str, str]) -> str:
-    made = f"{row['manufacturer']} {row['model'] or row['name']}".strip()
-    return f"{made}, serial number {row['serial_number']}" if row["serial_number"] else made
-
-
-def _moment(text: str) -> str:
-    """Return an ISO 8601 time as people read it; any other text as it is."""
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError:
-        return text
-    if moment.tzinfo is None:
-        return moment.strftime("%Y-%m-%d %H:%M")
-    return moment.astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -201,10 +201,7 @@ def arrives(subject: CompensatorSubject) -> str:
     """A written offset comes into effect on each axis with its sign, and is read back."""
     with started(subject) as device, armed(subject, device) as compensator:
         follow(subject, compensator, device)
-        wait_for(
-            lambda: near(compensator.read().offset, subject.offset, subject.resolution),
-            f"read(): expected {um(subject.offset)}, found {um(compensator.read().offset)}",
-        )
+        _reads_what_is_in_effect(subject, compensator, device, "read()")
     return um(subject.offset)
 
 
@@ -267,10 +264,7 @@ def restart(subject: CompensatorSubject) -> str:
             follow(subject, compensator, device)
         machine = device.machine
         with armed(subject, device) as compensator:
-            wait_for(
-                lambda: near(compensator.read().offset, machine.offset, subject.resolution),
-                f"read() after a restart: expected {um(machine.offset)}, found {um(compensator.read().offset)}",
-            )
+            _reads_what_is_in_effect(subject, compensator, device, "after a restart")
             for _ in range(3):
                 write(compensator, device, subject.offset)
                 machine.elapse(0.6 * machine.watchdog)
@@ -287,8 +281,7 @@ def two_connections(subject: CompensatorSubject) -> str:
         with closing(made(subject, device)) as second:
             try:
                 second.open()
-                found = second.read().offset
-                require_offset(subject, found, device.machine.offset, "the second connection reads")
+                _reads_what_is_in_effect(subject, second, device, "the second connection")
             except InstrumentError as error:
                 seen = f"the second one is refused: {type(error).__name__}"
         seconds = time.perf_counter() - start
@@ -296,8 +289,16 @@ def two_connections(subject: CompensatorSubject) -> str:
         time.sleep(10 * POLL)
         require(device.machine.orders == orders, "the second connection sent an order")
         write(compensator, device, subject.offset)
-        require_offset(subject, compensator.read().offset, device.machine.offset, "the first connection reads")
+        _reads_what_is_in_effect(subject, compensator, device, "the first connection")
     return seen
+
+
+def _reads_what_is_in_effect(subject: CompensatorSubject, compensator: Any, device: Any, who: str) -> None:
+    """Wait until a compensator reads the offset in effect."""
+    wait_for(
+        lambda: near(compensator.read().offset, device.machine.offset, subject.resolution),
+        lambda: f"{who}: expected {um(device.machine.offset)}, found {um(compensator.read().offset)}",
+    )
 
 
 @COMPENSATOR_CHECKS.add(why_not=_no_states)

@@ -53,11 +53,12 @@ def armed(subject: CompensatorSubject, device: Any) -> Iterator[Any]:
         yield compensator
 
 
-def wait_for(condition: Callable[[], bool], message: str) -> None:
+def wait_for(condition: Callable[[], bool], message: str | Callable[[], str]) -> None:
     """Wait until a condition holds; fail with a message where it does not."""
     end = time.monotonic() + ARRIVAL
     while not condition():
-        require(time.monotonic() < end, message)
+        if time.monotonic() >= end:
+            require(False, message if isinstance(message, str) else message())
         time.sleep(POLL)
 
 
@@ -96,9 +97,10 @@ def follow(subject: CompensatorSubject, compensator: Any, device: Any) -> None:
 def require_ramp(device: Any, what: str) -> None:
     """Let the time of the watchdog and of a ramp pass; fail where the offset jumps or does not reach zero."""
     machine = device.machine
-    start = machine.offset
-    slowest = machine.watchdog + max(map(abs, start)) / machine.slew
-    before, step = start, 1.05 * slowest / STEPS
+    before = machine.offset
+    # until the watchdog ends it, the offset may still move towards the last order
+    slowest = 2 * machine.watchdog + max(map(abs, before)) / machine.slew
+    step = 1.05 * slowest / STEPS
     for _ in range(STEPS):
         machine.elapse(step)
         now = machine.offset

@@ -118,14 +118,39 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
     # ------------------------------------------------------------------ commands
 
     def start(self, schedule: Sequence[Event] = ()) -> None:
-        """Restart at time 0, cold and at rest, with a schedule of commands.
+        """Restart at time 0, cold and at rest, with a schedule of commands and without offsets.
 
         Raises
         ------
         BenchError
             Events out of order, a speed that the spindle does not have, an unknown axis.
         """
-        self.state = replace(self.state, schedule=self._schedule(schedule))
+        self._follow(schedule, None)
+
+    def compensate(self, times: ArrayLike, offsets: ArrayLike) -> None:
+        """Add offsets to the commanded positions: the errors are those that remain, of a tool in the spindle.
+
+        Parameters
+        ----------
+        times : (n,)
+            s, increasing.
+        offsets : (n, 3)
+            X, Y and Z, m; linear between, constant before and after. They replace earlier ones.
+
+        Raises
+        ------
+        BenchError
+            Wrong shapes, times that do not increase, numbers that are not finite.
+        """
+        t, values = np.asarray(times, dtype=float), np.asarray(offsets, dtype=float)
+        if t.ndim != 1 or values.shape != (t.size, 3) or t.size == 0:
+            raise BenchError(f"expected times (n,) and offsets (n, 3); found {t.shape} and {values.shape}")
+        if not np.isfinite(t).all() or not np.isfinite(values).all() or not (np.diff(t) > 0).all():
+            raise BenchError("expected finite offsets at increasing times")
+        self._follow(self._events, (t, values))
+
+    def _follow(self, schedule: Sequence[Event], offset: tuple[Array, Array] | None) -> None:
+        self.state = replace(self.state, schedule=self._schedule(schedule), offset=offset)
         self._sensing = self._sense()
 
     def command(self, event: Event) -> None:
@@ -139,17 +164,18 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
             As `start`; the schedule stays unchanged.
         """
         events = sorted([*self._events, event], key=lambda each: each.time)
-        self.start(events)
+        self._follow(events, self.state.offset)
 
     def stop_spindle(self, time: float) -> None:
         """Stop the spindle at a time, s, and remove its later commands from the schedule."""
         events = [event if event.time < time else replace(event, spindle_speed=None) for event in self._events]
-        self.start(events)
+        self._follow(events, self.state.offset)
         self.command(Event(time, spindle_speed=0.0))
 
     def forget(self, events: Sequence[Event], time: float) -> None:
         """Remove these events from the schedule, as far as they are at or after a time, s."""
-        self.start([each for each in self._events if each.time < time or each not in events])
+        left = [each for each in self._events if each.time < time or each not in events]
+        self._follow(left, self.state.offset)
 
     @property
     def _events(self) -> tuple[Event, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,9 @@ from errormotion.compensation.thermal_model import ThermalModel
 from errormotion.compensation.thermal_model.features import Feature
 from errormotion.compensation.thermal_model.model import Parts
 from errormotion.errors import BenchError, CompensationError, InstrumentError
+from errormotion.instruments.compensator.modbus_registers import ModbusRegisters
+from errormotion.instruments.simulators.compensator.plc import SimulatedPlc
+from errormotion.instruments.transports import parse_address
 from errormotion.plugins import Applied, Identity, InstrumentInfo, PluginSettings
 
 MACHINE = "Mill 5"
@@ -269,6 +273,25 @@ def test_after_a_lost_connection_it_goes_on_from_the_offset_of_the_machine(
     again = next(k for k in range(27, 50) if moments[k].step.state is State.FOLLOWING)
     assert moments[again].step.offset[0] == pytest.approx(-4e-6, abs=2 * MOST)
     assert Machine.offset[0] == pytest.approx(-10e-6)
+
+
+def test_a_plc_follows_and_ramps_to_zero_when_the_program_ends(
+    plan: BenchPlan, model: xr.Dataset, tmp_path: Path
+) -> None:
+    address = f"sim://cframe/plc?clock=0&watchdog=1&slew={2 * LIMITS.slew}&limit={LIMITS.limit}"
+    with closing(SimulatedPlc(parse_address(address))) as plc:
+        settings = ModbusRegisters.Settings(**plc.driver_settings)
+        plan = replace(plan, compensator=BenchCompensator(ModbusRegisters, plc.driver_url, settings, LIMITS))
+        script = {k: lambda: plc.machine.elapse(TICK) for k in range(60)}  # the time of the PLC is that of the periods
+        script[2] = set_to(Thermometer, "value", STEADY + 1)
+        run(Compensation(plan, model, tmp_path), script, 20)
+        assert plc.machine.orders == 0
+        Thermometer.value = STEADY
+        moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 40)
+        assert {"fault", "ramping"}.isdisjoint(states(moments))
+        assert plc.machine.offset[0] == pytest.approx(-5e-6, abs=1e-9)
+        plc.machine.elapse(2.0)  # the program has ended
+        assert plc.machine.offset == (0.0, 0.0, 0.0)
 
 
 def test_an_offset_that_is_not_taken_is_a_fault(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:

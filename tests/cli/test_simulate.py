@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from errormotion import plugins
 from errormotion.cli.app import app
 from errormotion.cli.commands import simulate
+from errormotion.cli.commands.plugins import group_of
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.line_profiler.keyence_ljx.driver import KeyenceLJX
 from errormotion.instruments.thermometer.dcon import DconSettings, DconTemperature
@@ -117,9 +118,9 @@ def test_the_printed_address_is_that_of_the_driver(monkeypatch: pytest.MonkeyPat
 def test_only_what_can_be_simulated_is_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     for wrong in ("nosuch", "tracker_table", "spindle_drift"):
         listed = run(monkeypatch, wrong).stderr.replace("\n", " ").partition("Known here: ")[2]
-        assert {"dcon_temperature", "optoncdt"} <= set(listed.strip(". ").split(", "))
+        assert {"dcon_temperature", "optoncdt", "offset_file"} <= set(listed.strip(". ").split(", "))
         for name in listed.strip(". ").split(", "):
-            assert plugins.get("instruments", name).info.simulator
+            assert plugins.get(group_of(name), name).info.simulator
 
 
 def test_a_bench_file_states_machine_and_device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

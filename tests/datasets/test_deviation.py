@@ -81,7 +81,7 @@ def test_the_accessor_treats_the_deviation_as_the_only_freedom() -> None:
     assert ds.em.iso_names() == {"deviation": "deviation"}
     figure = ds.isel(travel=0).em.plot()
     assert [axes.get_ylabel() for axes in figure.axes] == ["um"]
-    assert figure.axes[0].get_xlabel() == "angle / rad"
+    assert figure.axes[0].get_xlabel() == "angle / deg"
 
 
 def test_the_sensitivity_moves_so_that_the_deviation_stays() -> None:

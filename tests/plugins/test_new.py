@@ -14,7 +14,9 @@ from errormotion.errors import PluginError
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("what", "name"), [("instrument", "LX9 gauge"), ("method", "dial drift")])
+@pytest.mark.parametrize(
+    ("what", "name"), [("instrument", "LX9 gauge"), ("method", "dial drift"), ("compensator", "XC control")]
+)
 def test_the_tests_of_a_new_plugin_pass(what: str, name: str, tmp_path: Path) -> None:
     folder = tmp_path / "new"
     result = CliRunner().invoke(app, ["plugins", "new", what, name, "--out", str(folder)])

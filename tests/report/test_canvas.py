@@ -4,6 +4,7 @@ import re
 from xml.etree import ElementTree
 
 import numpy as np
+import pytest
 
 from errormotion.report import canvas
 
@@ -81,3 +82,47 @@ def test_a_picture_inside_a_drawing_is_kept_in_it():
     svg = str(canvas.draw(paint, "k", 2.0))
     assert re.findall(r'href="(data:image/png;base64,|#k-)', svg).count("data:image/png;base64,") == 1
     assert "#k-data:" not in svg
+
+
+def test_the_page_can_read_values_and_uncertainty_off_a_drawn_curve():
+    t, values = np.linspace(0, 50, 40), np.sin(np.linspace(0, 6, 40)) * 7
+    values[11] = np.nan
+    expanded = 0.1 + 0.01 * t
+
+    def paint(figure):
+        axes = canvas.stack(figure, [1.5])[0]
+        canvas.curve(axes, t, values, expanded, colour=canvas.BLUE, name="EX <b>")
+        axes.axhline(0)
+        axes.set_xlabel("time / min")
+        axes.set_title("Displacements / µm")
+
+    root = ElementTree.fromstring(str(canvas.draw(paint, "k", 2.2)))
+    (panel,) = [each for each in root.iter("g") if each.get("class") == "panel"]
+    (curve,) = [each for each in panel.iter("g") if each.get("data-curve") is not None]
+    left, top, wide, high = map(float, panel.get("data-box").split())
+    x0, x1 = map(float, panel.get("data-x").split())
+    y0, y1 = map(float, panel.get("data-y").split())
+    drawn = np.array(re.findall(r"(-?[\d.]+) (-?[\d.]+)", curve.find("path").get("d")), float)
+    known = np.isfinite(values)
+    # A hundredth of a point on the page.
+    assert x0 + (drawn[:, 0] - left) / wide * (x1 - x0) == pytest.approx(t[known], abs=0.01 * (x1 - x0) / wide)
+    assert y1 - (drawn[:, 1] - top) / high * (y1 - y0) == pytest.approx(values[known], abs=0.01 * (y1 - y0) / high)
+    assert np.array(curve.get("data-u").split(), float) == pytest.approx(expanded[known], rel=6e-3)
+    assert (curve.get("data-name"), curve.get("data-unit")) == ("EX <b>", "µm")
+    assert (panel.get("data-x-name"), panel.get("data-x-unit"), panel.get("data-zoom")) == ("time", "min", "")
+    assert len([each for each in root.iter("g") if (each.get("class") or "").startswith("tick")]) > 5
+
+
+def test_limits_near_a_curve_are_lines_and_others_are_named():
+    def paint(figure):
+        axes = figure.subplots()
+        axes.plot([0, 1], [0, 10])
+        canvas.limit_lines(axes, [("EX", -5.0, 12.0), ("EY", -12000.0, 12.0), ("EZ", -np.inf, np.inf)])
+        low, high = axes.get_ylim()
+        assert low < -5
+        assert 12 < high < 20
+
+    svg = str(canvas.draw(paint, "k", 2.0))
+    assert "limit of EX, EY" in svg
+    assert "limits outside of the graph: EY −1.2e+04" in svg
+    assert "EZ" not in svg

@@ -17,7 +17,8 @@ HOMES = {
 #: Folder of the package with examples: campaigns and benches that a person may write, and their programs.
 EXAMPLES = "errormotion/cli/demo/"
 #: Words that are ids and something else as well: variables of published datasets, the command of a package, and
-#: defaults of published settings that name another plugin; the package of thermal models; a format of tables.
+#: defaults of published settings that name another plugin; the package of thermal models; a format of tables;
+#: a simulated server on the parts of another.
 OTHER_MEANINGS = {
     ("optoncdt", "errormotion/instruments/spindle_frame/"),
     ("optoncdt", "errormotion/instruments/simulators/spindle_frame/"),
@@ -28,6 +29,7 @@ OTHER_MEANINGS = {
     ("thermal_model", "errormotion/cli/commands/model.py"),
     ("thermal_model", "errormotion/compensation/"),
     ("linuxcnc", "errormotion/compensation/tables/formats/linuxcnc.py"),
+    ("opcua", "errormotion/instruments/simulators/compensator/nodes.py"),
 }
 
 

@@ -154,12 +154,14 @@ def emscon_points() -> list[bytes]:
 
 
 def modbus_answers(framing: modbus.Framing) -> list[bytes]:
-    return [modbus.encode_answer(framing, 1, 3, words, 1) for words in ([555, 1], [0, 100, 7, 65535])]
+    one = modbus.encode_write(framing, 1, modbus.WRITE_ONE, 7, [3], 1)  # is its own confirmation
+    return [one, *(modbus.encode_answer(framing, 1, 3, words, 1) for words in ([555, 1], [0, 100, 7, 65535]))]
 
 
 def modbus_requests(framing: modbus.Framing) -> list[bytes]:
     one = modbus.encode_request(framing, 1, 3, 0, 2, 1)
-    return [one, one + modbus.encode_request(framing, 1, 4, 5, 100, 2), one[:1] + one]
+    written = [modbus.encode_write(framing, 1, 16, 5, [1, 2, 3], 3), modbus.encode_write(framing, 1, 6, 5, [9], 4)]
+    return [one, one + modbus.encode_request(framing, 1, 4, 5, 100, 2), one[:1] + one, *written]
 
 
 def can_frames() -> list[bytes]:

@@ -4,7 +4,7 @@ import atexit
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from itertools import islice
@@ -293,14 +293,22 @@ def modbus_answer(framing: modbus.Framing) -> Read:
         taken, line = b"", Received(data)
         while lacking := modbus.missing(framing, taken):
             taken += line.read(lacking)
-        each(*(lambda kind=kind, own=own: decode(taken, kind, own) for kind, own in MODBUS.items()))
+        each(
+            *(lambda kind=kind, own=own: decode(taken, kind, own) for kind, own in MODBUS.items()),
+            lambda: modbus.decode_written(framing, taken, 1, modbus.WRITE_ONE, 7, [3], 1),
+            lambda: modbus.decode_written(framing, taken, 1, modbus.WRITE_SEVERAL, 7, [3, 4], 1),
+        )
 
     return read
 
 
 def modbus_request(framing: modbus.Framing) -> Read:
     def read(data: bytes) -> None:
-        server = ModbusServer(framing, 1, 3, {0: 125}, lambda: {0: 7})
+        def write(registers: Mapping[int, int]) -> int:
+            assert all(0 <= register < 125 and 0 <= value <= 0xFFFF for register, value in registers.items())
+            return 0
+
+        server = ModbusServer(framing, 1, 3, {0: 125}, lambda: {0: 7}, write)
         for piece, _ in pieces(data):
             for answer in server.receive(piece):
                 assert len(answer) <= 260

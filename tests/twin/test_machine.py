@@ -135,3 +135,27 @@ def test_twist_is_continuous_where_nothing_is_switched(warming):
 def test_an_unknown_machine_names_the_known_ones():
     with pytest.raises(BenchError, match="cframe or gantry, or a description; found"):
         VirtualMachine("lathe")
+
+
+def test_an_offset_of_the_commands_displaces_the_tool() -> None:
+    """Linear between its times; commands keep it, and a restart takes it off."""
+    machine = VirtualMachine("cframe", seed=3)
+    machine.start([Event(0.0, 12000.0)])
+    times, point = np.array([600.0, 1200.0, 1800.0]), [0.1, 0.0, 0.2]
+    before = machine.truth_probing(times, point).em.twist().values
+    machine.compensate([600.0, 1800.0], [[0.0, 0.0, 0.0], [1e-6, -2e-6, 30e-6]])
+    machine.command(Event(3000.0, 0.0))
+    moved = machine.truth_probing(times, point).em.twist().values - before
+    np.testing.assert_allclose(moved[:, :3], np.outer([0, 0.5, 1], [1e-6, -2e-6, 30e-6]), atol=1e-15)
+    np.testing.assert_array_equal(moved[:, 3:], 0)
+    machine.start([Event(0.0, 12000.0)])
+    np.testing.assert_array_equal(machine.truth_probing(times, point).em.twist().values, before)
+
+
+@pytest.mark.parametrize(
+    ("times", "offsets"),
+    [([0.0], [[0.0, 0.0]]), ([1.0, 1.0], np.zeros((2, 3))), ([0.0], [[np.nan] * 3]), ([], np.zeros((0, 3)))],
+)
+def test_offsets_that_are_none_are_refused(times: list[float], offsets: list[list[float]]) -> None:
+    with pytest.raises(BenchError, match="offsets"):
+        VirtualMachine("cframe").compensate(times, offsets)

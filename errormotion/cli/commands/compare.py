@@ -56,7 +56,7 @@ def compare(
             raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
     results, left_out = load(paths, _named(stated.names), every=stated.by is not None)
     results = _completed(results, stated)
-    results = {name: _over(name, ds, stated) for name, ds in results.items()}
+    results = {name: over_one(name, ds, stated) for name, ds in results.items()}
     groups = _groups(results, stated.by)
     found = compared(results, at=at, freedoms=freedoms, since=since, same_start=same_start, groups=groups)
     if stated.over is not None and stated.over not in found["value"].dims:
@@ -108,7 +108,7 @@ def _completed(results: dict[str, xr.Dataset], stated: Stated) -> dict[str, xr.D
     return found
 
 
-def _over(name: str, ds: xr.Dataset, stated: Stated) -> xr.Dataset:
+def over_one(name: str, ds: xr.Dataset, stated: Stated) -> xr.Dataset:
     """Return a result at the selected element of each dimension but that of the comparison."""
     for each in stated.select:
         dim, _, index = each.partition("=")

@@ -244,14 +244,23 @@ def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
             show(f"  note: {note}")
 
 
-def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) -> None:
+def report(
+    run: Path,
+    out: Path | None,
+    tolerances: Path | None,
+    as_json: bool,
+    *,
+    language: str = "",
+    paper: str = "",
+    also: tuple[str, ...] = (),
+) -> None:
     """Write the report of a run folder or of one file of errors, and decide on its tolerances."""
     from errormotion.campaign.folder import RunFolder
-    from errormotion.report import write_report, write_run_report
+    from errormotion.report import Form, write_report, write_run_report
     from errormotion.report.write import belonging
 
     limits = load_tolerances(tolerances) if tolerances is not None else None
-    found = None
+    found, form = None, Form(language, paper, also)
     if run.is_dir():
         folder = RunFolder.open(run)
         stored = limits or from_run(folder.data)
@@ -261,7 +270,7 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
                 found = judge(errors, stored)
             folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
         with reading(run):
-            path = write_run_report(run, out)
+            path = write_run_report(run, out, form=form)
         if out is None:
             folder.data["report"] = path.relative_to(folder.path).as_posix()
             folder.step("report", "done")
@@ -269,14 +278,18 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
     else:
         with reading(run), datasets.load(run) as errors, explained(run, errors):
             state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
-            path = write_report([errors, *belonging(errors, run)], out or run.with_suffix(".html"), run=state)
+            page = out or run.with_suffix(".html")
+            path = write_report([errors, *belonging(errors, run)], page, run=state, form=form)
             found = judge(errors, limits) if limits is not None else None
     if as_json:
-        show_json({"ok": True, "report": str(path), "conformity": found.plain() if found is not None else None})
+        files = [str(each) for each in form.beside(path)]
+        plain = found.plain() if found is not None else None
+        show_json({"ok": True, "report": str(path), "files": files, "conformity": plain})
     else:
         for line in lines_of(found) if found is not None else []:
             show(line)
-        show(str(path))
+        for each in (path, *form.beside(path)):
+            show(str(each))
     if found is not None:
         end_with([found.plain()])
 

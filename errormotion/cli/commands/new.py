@@ -24,7 +24,7 @@ def new(what: str, name: str, out: Path | None, as_json: bool) -> None:
     Parameters
     ----------
     what : str
-        ``instrument`` or ``method``.
+        ``instrument``, ``method`` or ``compensator``.
     name : str
         The id of the plugin, or words from which it is made: "LG7 gauge" becomes ``lg7_gauge``.
     out : Path, optional

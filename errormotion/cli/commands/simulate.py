@@ -1,4 +1,4 @@
-"""``errormotion simulate``: the simulated device of an instrument plugin, by itself."""
+"""``errormotion simulate``: the simulated device of an instrument, or machine of a compensator, by itself."""
 
 from __future__ import annotations
 
@@ -55,16 +55,17 @@ def _wait() -> None:
 
 
 def _simulator_of(plugin_id: str) -> str:
-    instruments = {each.id: each for each in plugins.available("instruments")}
-    simulated = {name: each.cls.info.simulator for name, each in instruments.items() if each.cls is not None}
+    groups: tuple[plugins.Group, ...] = ("instruments", "compensators")
+    found = {each.id: each for group in groups for each in plugins.available(group)}
+    simulated = {name: each.cls.info.simulator for name, each in found.items() if each.cls is not None}
     if simulator := simulated.get(plugin_id):
         return str(simulator)
     choices = nearest(plugin_id, [name for name, simulator in simulated.items() if simulator])
-    if plugin_id in instruments and instruments[plugin_id].cls is None:
-        plugins.get("instruments", plugin_id)  # states why it does not load
-    if plugin_id in instruments:
-        raise PluginError(f"The instrument '{plugin_id}' has no simulator of its own. {choices}")
-    raise PluginError(f"Expected an instrument that can be simulated; found '{plugin_id}'. {choices}")
+    if plugin_id in found:
+        group = found[plugin_id].group
+        plugins.get(group, plugin_id)  # states why it does not load
+        raise PluginError(f"The {group.rstrip('s')} '{plugin_id}' has no simulator of its own. {choices}")
+    raise PluginError(f"Expected an instrument or a compensator that can be simulated; found '{plugin_id}'. {choices}")
 
 
 def _pairs(settings: list[str]) -> dict[str, str]:
@@ -83,6 +84,8 @@ def _address(plugin_id: str, bench: Path | None, machine: str | None, params: di
             describe(plan.description)
             host = NAME
         own = [each.address for each in plan.instruments if each.driver.info.id == plugin_id]
+        if plan.compensator is not None and plan.compensator.driver.info.id == plugin_id:
+            own.append(plan.compensator.address)
         addresses = [each for each in own if each.startswith("sim://")]
         if addresses:
             first = parse_address(addresses[0])
@@ -103,13 +106,14 @@ def _print(plugin_id: str, simulator: str, device: Any, as_json: bool) -> None:
     lines = dict(getattr(device, "urls", {}))
     address = _driver_address(device, lines)
     if as_json:
-        where = {"address": address, "url": device.url, "lines": lines}
+        settings = dict(getattr(device, "driver_settings", {}))
+        where = {"address": address, "url": device.url, "lines": lines, "settings": settings}
         show_json({"ok": True, "plugin": plugin_id, "simulator": simulator, **where})
         sys.stdout.flush()
         return
     show(f"{plugin_id}: {address or device.url}")
-    for name, url in lines.items():
-        show(f"{name}: {url}")
+    for name, value in (lines | dict(getattr(device, "driver_settings", {}))).items():
+        show(f"{name}: {value}")
     show("Ctrl-C ends it.")
 
 

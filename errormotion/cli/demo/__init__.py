@@ -2,3 +2,8 @@
 
 CONTROLLERS = {"virtual": "errormotion.cli.demo.spindle", "linuxcnc": "errormotion.cli.demo.probing"}
 """Module of the demonstration for each controller; the first one needs nothing installed."""
+COMPENSATED = {
+    "virtual": "errormotion.cli.demo.compensated",
+    "linuxcnc": "errormotion.cli.demo.compensated_probing",
+}
+"""Module of the demonstration of a closed loop for each controller that has one."""

@@ -10,6 +10,7 @@ import xarray as xr
 
 from errormotion import plugins
 from errormotion.arrays import Array
+from errormotion.compensation.online.settings import Limits
 from errormotion.errors import CompensationError
 
 PARAMETERS = ("spindle_speed", "feed")
@@ -34,6 +35,18 @@ class Prediction:
     uncertainty: Array
     missing: tuple[str, ...] = ()
     outside: tuple[str, ...] = ()
+
+
+def refusal(prediction: Prediction, limits: Limits) -> str:
+    """Return why a prediction must not be followed; empty where it may be."""
+    if prediction.missing:
+        return f"no reading for {limits.oldest:g} s: {', '.join(prediction.missing)}"
+    if prediction.outside:
+        return f"outside the training range: {', '.join(prediction.outside)}"
+    widest = 2 * float(prediction.uncertainty[:3].max())
+    if not widest <= limits.uncertainty:
+        return f"U of the prediction is {widest * 1e6:.1f} um, above {limits.uncertainty * 1e6:g} um"
+    return ""
 
 
 class Predictor(Protocol):

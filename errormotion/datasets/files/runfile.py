@@ -82,6 +82,7 @@ class _Run(_Table):
     results: list[dict[str, Any]] | None = None
     tolerances: dict[str, Any] | None = None
     conformity: dict[str, Any] | None = None
+    head: dict[str, Any] | None = None
 
 
 class State(dict[str, Any]):

@@ -16,8 +16,12 @@ from errormotion.errors import DatasetError
 from errormotion.kinematics import iso, twists
 
 if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from scipy.spatial.transform import RigidTransform
+
+    from errormotion.datasets.results.plotting.figure import Form
 
 INDEPENDENT = "independent"
 """Name of the rest in a budget: what is drawn anew at every value."""
@@ -334,11 +338,28 @@ class ErrorMotion:
         coords = {"group": [*names, INDEPENDENT], **self._coords("dof")}
         return xr.DataArray(np.stack([*rows, rest]), dims=("group", *self.dims, "dof"), coords=coords, name="budget")
 
-    def plot(self) -> Figure:
-        """Return a figure: displacements in um and rotations in arcsec, with their k = 2 bands."""
+    def plot(
+        self,
+        freedoms: str | Sequence[str] | None = None,
+        at: ArrayLike | None = None,
+        k: float = 2.0,
+        ax: Axes | Sequence[Axes] | None = None,
+        form: Form = "auto",
+    ) -> Figure:
+        """Return a figure: displacements in um and rotations in arcsec with their uncertainty; see `plot_errors`.
+
+        Curves, maps over two dims, or arrows in a volume, of some ``freedoms``, ``at`` a functional point (m), with the
+        coverage factor ``k``, in the axes ``ax``.
+        """
         from errormotion.datasets.results.plotting import plot_errors  # matplotlib only when something is drawn
 
-        return plot_errors(self._ds)
+        return plot_errors(self._ds, freedoms, at, k, ax, form)
+
+    def to_dataframe(self, freedoms: str | Sequence[str] | None = None, k: float = 2.0) -> pd.DataFrame:
+        """Return errors and expanded uncertainties as a table in field units; see `tables.to_dataframe`."""
+        from errormotion.datasets.results.tables import to_dataframe
+
+        return to_dataframe(self._ds, freedoms, k)
 
     def _check_levers(self, shift: Array) -> None:
         """Refuse a shift along axes whose travel is no lever of the rotations."""

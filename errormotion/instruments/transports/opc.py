@@ -7,7 +7,11 @@ replayed without a server::
     {"read": ["ns=2;s=/Channel/Spindle/actSpeed[u1,1]"]}
     [{"value": 12000.0, "status": "Good", "time": "2026-03-01T12:00:00+00:00"}]
 
-Nothing is written to a server: the three requests are ``server``, ``browse`` and ``read``.
+The requests are ``server``, ``browse``, ``read``, ``describe`` (type of a value, and whether it can be written) and
+``write``, which only compensators send::
+
+    {"write": [["ns=2;s=Offset.X", "Double", 0.0021], ["ns=2;s=Heartbeat", "UInt32", 17]]}
+    ["Good", "Good"]
 """
 
 from __future__ import annotations
@@ -41,6 +45,8 @@ MOST_TEXT = 4096
 """Characters of a text; more are cut off."""
 DROP_TIMEOUT = 0.5
 """Time limit of the farewell to a server, s."""
+WRITABLE = 2
+"""Bit of an access level: the present value can be written."""
 MOST_BYTES = 16 << 20
 """Largest message of a server, bytes."""
 
@@ -62,6 +68,25 @@ class Credentials:
     security: str = ""
     user: str = ""
     password: str = ""
+
+    @classmethod
+    def read(cls, security: str, user: str, password_file: str) -> Credentials:
+        """Return credentials with the password in the first line of a file; an empty name: none.
+
+        Raises
+        ------
+        InstrumentError
+            There is no such file, or no line of text in it.
+        """
+        if not password_file:
+            return cls(security, user)
+        try:
+            password = Path(password_file).read_text(encoding="utf-8").splitlines()[0]
+        except (OSError, IndexError, UnicodeDecodeError) as error:
+            raise InstrumentError(
+                f"password_file '{password_file}': expected a file with the password; {error}"
+            ) from None
+        return cls(security, user, password)
 
 
 class OpcUaTransport(Transport):
@@ -199,6 +224,10 @@ class OpcUaTransport(Transport):
                 return await _browse(client, node)
             case {"read": list(nodes)}:
                 return await _read(client, nodes[:MOST_NODES])
+            case {"describe": list(nodes)}:
+                return await _describe(client, nodes[:MOST_NODES])
+            case {"write": list(values)}:
+                return await _write(client, values[:MOST_NODES])
         raise ProtocolError(f"{self.url}: unknown request {sorted(request)}")
 
 
@@ -224,6 +253,33 @@ async def _read(client: Client, nodes: Sequence[str]) -> list[dict[str, Any]]:
     """Return the values of nodes; of a node that cannot be read its status only."""
     values = await client.read_attributes([_node(client, node) for node in nodes])
     return [_plain(each) for each in values]
+
+
+async def _describe(client: Client, nodes: Sequence[str]) -> list[dict[str, Any]]:
+    """Return type and status of the values of nodes, and whether this user can write them."""
+    from asyncua.ua.attribute_ids import AttributeIds
+
+    found = [_node(client, node) for node in nodes]
+    values = await client.read_attributes(found)
+    levels = await client.read_attributes(found, AttributeIds.UserAccessLevel)
+    return [
+        {
+            "type": value.Value.VariantType.name if value.Value is not None else "Null",
+            "status": _plain(value)["status"],
+            "writable": bool(((level.Value.Value if level.Value is not None else 0) or 0) & WRITABLE),
+        }
+        for value, level in zip(values, levels, strict=True)
+    ]
+
+
+async def _write(client: Client, values: Sequence[tuple[str, str, Any]]) -> list[str]:
+    """Write values by one request; return the status of each. Neither status nor times are sent with them."""
+    from asyncua import ua
+
+    nodes = [_node(client, node).nodeid for node, _, _ in values]
+    data = [ua.DataValue(ua.Variant(value, ua.VariantType[kind]), StatusCode=None) for _, kind, value in values]
+    found = await client.uaclient.write_attributes(nodes, data)
+    return ["Good" if status.is_good() else text(status.name) for status in found]
 
 
 def _node(client: Client, node: str) -> Any:

@@ -1,4 +1,4 @@
-"""Subjects of the conformance kit: positioning with temperatures, and all six freedoms."""
+"""Subjects of the conformance kit: positioning with temperatures, all six freedoms, a moving axis, diagonals."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from functools import partial
 from typing import Literal
 
 from errormotion.methods.linear_positioning.method import LinearPositioning
-from errormotion.methods.linear_positioning.settings import FREEDOMS, Freedom, Moving, Settings
+from errormotion.methods.linear_positioning.settings import FREEDOMS, Diagonals, Freedom, Moving, Settings
 from errormotion.methods.linear_positioning.simulation import simulate
 from errormotion.plugins import MethodSubject
 
@@ -32,7 +32,22 @@ def subjects() -> tuple[MethodSubject, ...]:
         motion=((0.0, 0.0, 0.0), (0.1, -0.2, 0.05)),
         seeds=SEEDS,
     )
-    return (_subject("positioning", "X", ("EX",)), _subject("six freedoms", "Y", FREEDOMS), warming)
+    return (_subject("positioning", "X", ("EX",)), _subject("six freedoms", "Y", FREEDOMS), warming, _diagonals())
+
+
+def _diagonals() -> MethodSubject:
+    names = ("PP0", "NP0", "PPP", "NNP")
+    return MethodSubject(
+        LinearPositioning,
+        partial(simulate, Settings(diagonals=Diagonals(names=names), runs=RUNS, count=7)),
+        raw_vectors={"stop_point": "point", "functional_point": "point"},
+        settings={"diagonals": {"names": names}, "trials": 200},
+        name="diagonals",
+        optional=("functional_point", "length_uncertainty", "alignment_uncertainty"),
+        measured=("diagonal_deviation", "stop_point"),
+        seeds=SEEDS,
+        motion=((0.0, 0.0, 0.0), (0.1, -0.2, 0.05)),
+    )
 
 
 def _subject(name: str, axis: Literal["X", "Y"], freedoms: tuple[Freedom, ...]) -> MethodSubject:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from errormotion.datasets.results.merit import is_planned
@@ -29,6 +30,8 @@ def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
         return []
     if "distortion" in errors:
         return _distortion(errors)
+    if "squareness" in errors:
+        return _diagonals(errors)
     found = []
     for freedom in map(str, errors["freedom"].values):
         of = errors.sel(freedom=freedom)
@@ -40,6 +43,32 @@ def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
                 limit = errors.attrs.get(LIMITS.get(name, "")) if along else None
                 title = f"{name} of {freedom} (ISO 230-2)"
                 found.append(FigureOfMerit(title, value, 2.0 * u + abs(bias), unit, limit))
+    return found
+
+
+def _diagonals(errors: xr.Dataset) -> list[FigureOfMerit]:
+    """Return E, R and B of each diagonal, the largest E of the body diagonals, and squareness."""
+    found, body = [], []
+    for name in map(str, errors["diagonal"].values):
+        of = errors.sel(diagonal=name)
+        for figure in OTHERS:
+            value, bias, u = (
+                float(of[part].sel(figure=figure)) for part in ("figure_value", "figure_bias", "figure_u")
+            )
+            if math.isfinite(value):
+                found.append(FigureOfMerit(f"{figure} of {name} (ISO 230-6)", value, 2.0 * u + abs(bias), "m"))
+                if figure == "E" and "0" not in name:
+                    body.append(found[-1])
+    if len(body) > 1:
+        largest = max(body, key=lambda each: each.value)
+        found.append(replace(largest, name="largest E of the body diagonals (ISO 230-6)"))
+    for name in map(str, errors["squareness_of"].values):
+        variance = errors["squareness_covariance"].sel(squareness_of=name, squareness_of_=name)
+        value = float(errors["squareness"].sel(squareness_of=name))
+        effects = errors["squareness_influence"].sel(squareness_of=name)
+        influence = dict(zip(map(str, errors["source"].values), effects.values.tolist(), strict=True))
+        U = 2.0 * math.sqrt(float(variance))
+        found.append(FigureOfMerit(f"squareness {name} by diagonals", value, U, "rad", influence=influence))
     return found
 
 

@@ -30,6 +30,7 @@ class LinearPositioning:
             "the errors between the targets, where they change faster than the targets follow one another",
             "the slope of a straightness: its reference line joins the first and the last target",
             "errors of the instrument that its stated uncertainty does not cover",
+            "which errors of the axes a diagonal is made of: body diagonals alone do not separate them",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("controller",), raw_schema=SCHEMA)
@@ -39,6 +40,7 @@ class LinearPositioning:
     chapters = lazy("errormotion.methods.linear_positioning.report:chapters")
     redrawing = lazy("errormotion.methods.linear_positioning.redrawing:redrawing")
     conformance = lazy("errormotion.methods.linear_positioning.conformance:subjects")
+    log_readers = lazy("errormotion.methods.linear_positioning.rtl:LOG_READERS")
     figures = lazy("errormotion.methods.linear_positioning.figures:figures")
 
     def acquire(
@@ -52,7 +54,10 @@ class LinearPositioning:
         """Measure; yield one raw dataset a run, or a target of a pendulum cycle. See ``acquisition``."""
         from errormotion.methods.linear_positioning.acquisition.measure import measure_axis
         from errormotion.methods.linear_positioning.acquisition.warming import measure_moving
+        from errormotion.methods.linear_positioning.diagonals.acquisition import measure_diagonals
 
+        if settings.diagonals is not None:
+            return measure_diagonals(bench, settings, done)
         if settings.moving is not None:
             return measure_moving(bench, settings, done)
         return measure_axis(bench, settings, done)
@@ -63,9 +68,10 @@ class LinearPositioning:
         instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
     ) -> list[Step]:
         """Return every step of the machine, for the check of its limits and for a dry run."""
+        from errormotion.methods.linear_positioning.diagonals import planning
         from errormotion.methods.linear_positioning.planning.motions import steps
 
-        return steps(settings)
+        return planning.steps(settings) if settings.diagonals is not None else steps(settings)
 
     def programs(
         self,
@@ -73,14 +79,18 @@ class LinearPositioning:
         instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
     ) -> Mapping[str, str]:
         """Return the NC program of the test by file name."""
+        from errormotion.methods.linear_positioning.diagonals import planning
         from errormotion.methods.linear_positioning.planning.motions import programs
 
-        return programs(settings)
+        return planning.programs(settings) if settings.diagonals is not None else programs(settings)
 
     def check_machine(self, settings: PositioningSettings, machine: MachineDescription) -> dict[str, str]:
         """Return what contradicts the machine: an axis that it has not, targets outside of its travel."""
+        from errormotion.methods.linear_positioning.diagonals import planning
         from errormotion.methods.linear_positioning.planning.targets import reach
 
+        if settings.diagonals is not None:
+            return planning.outside(settings, machine)
         test = settings.travel if settings.moving is not None else reach(settings)
         if settings.axis not in machine.travel:
             return {"axis": f"expected one of {', '.join(machine.travel)}; found '{settings.axis}'"}
@@ -93,22 +103,26 @@ class LinearPositioning:
         return {}
 
     def append_dim(self, settings: PositioningSettings) -> str:
-        """Return ``run``, ``target`` for pendulum cycles, ``cycle`` for a moving axis."""
+        """Return ``run``, ``target`` for pendulum cycles, ``cycle`` for a moving axis, ``diagonal`` for diagonals."""
+        if settings.diagonals is not None:
+            return "diagonal"
         if settings.moving is not None:
             return "cycle"
         return "run" if settings.cycle == "linear" else "target"
 
     def progress(self, settings: PositioningSettings) -> float:
-        """Return the number of runs, of targets for pendulum cycles, of readings of a moving axis."""
+        """Return the number of runs, of targets for pendulum cycles, of readings of a moving axis, of diagonals."""
         from errormotion.methods.linear_positioning import moving
         from errormotion.methods.linear_positioning.planning.targets import positions
 
+        if settings.diagonals is not None:
+            return float(len(settings.diagonals.names))
         if settings.moving is not None:
             return float(sum(1 for _ in moving.cycles(settings)))
         return float(settings.runs if settings.cycle == "linear" else positions(settings).size)
 
     def identify(self, raw: xr.Dataset, settings: PositioningSettings | None = None) -> xr.Dataset:
-        """Turn a raw dataset into an error dataset of an axis over ``position``.
+        """Turn a raw dataset into an error dataset of an axis over ``position``, or of diagonals over their stops.
 
         Parameters
         ----------
@@ -134,10 +148,16 @@ class LinearPositioning:
             from errormotion.methods.linear_positioning.identification.moving import identify_moving
 
             return identify_moving(checked, settings or PositioningSettings(), self.info)
+        if "diagonal" in checked.dims:
+            from errormotion.methods.linear_positioning.diagonals.identification import identify_diagonals
+
+            return identify_diagonals(checked, settings or PositioningSettings(), self.info)
         return identify(checked, settings or PositioningSettings(), self.info)
 
     def plan(self, settings: PositioningSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance. See ``planning``."""
+        from errormotion.methods.linear_positioning.diagonals.plan import plan_diagonals
         from errormotion.methods.linear_positioning.planning.plan import plan
 
-        return plan(settings or PositioningSettings(), self.info)
+        found = settings or PositioningSettings()
+        return plan(found, self.info) if found.diagonals is None else plan_diagonals(found, self.info)

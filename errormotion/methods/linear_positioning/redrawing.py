@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.methods.linear_positioning.diagonals.redrawing import redraw_diagonals
 from errormotion.methods.linear_positioning.identification import budget, moving
 from errormotion.methods.linear_positioning.identification.identify import Evaluated, evaluate
 from errormotion.methods.linear_positioning.schema import APPROACHES
@@ -31,6 +32,8 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     """Return the readings, and their sources: scatter, drift, instrument, alignment, expansion."""
     if "end_deviation" in raw:
         return _moving(raw, settings, errors)
+    if "diagonal_deviation" in raw:
+        return redraw_diagonals(raw, settings)
     found = evaluate(raw, settings, [])
     groups = dict.fromkeys(source.group for source in found.sources if source.group != budget.END)
     sources = {"readings": Redraw(_readings(found), groups=(budget.END,), own=True)}

@@ -5,6 +5,7 @@ from errormotion.datasets.schemas import DIRECTION, NO_LIMIT, POSITION, XYZ, Raw
 SCHEMA = "errormotion.raw.linear_positioning/1"
 APPROACHES = ("forward", "backward")
 READINGS = ("freedom", "run", "approach", "target")
+STOPS = ("diagonal", "run", "approach", "stop")
 SENSORS = ("run", "approach", "target", "sensor")
 
 _COEFFICIENT = (0.0, 1e-4)
@@ -25,6 +26,16 @@ _LENGTH = Row(
     0.0,
     1e-3,
     "relative standard uncertainty of the lengths of the instrument (wavelength, air, calibration)",
+    required=False,
+)
+
+_ALIGNMENT = Row(
+    "alignment_uncertainty",
+    (),
+    "rad",
+    0.0,
+    0.1,
+    "standard uncertainty of the angle between the measured line and the axis or diagonal, in each of two directions",
     required=False,
 )
 
@@ -119,15 +130,7 @@ RAW_SCHEMAS = (
                 "standard uncertainty of `workpiece_expansion`",
                 required=False,
             ),
-            Row(
-                "alignment_uncertainty",
-                (),
-                "rad",
-                0.0,
-                0.1,
-                "standard uncertainty of the angle between the measured line and the axis, in each of two directions",
-                required=False,
-            ),
+            _ALIGNMENT,
         ),
         sizes=DIRECTION,
         labels=XYZ,
@@ -162,6 +165,35 @@ RAW_SCHEMAS = (
             Row("temperature", ("cycle", "sensor"), "degC", -40.0, 100.0, "of each sensor; NaN = none", required=False),
         ),
         sizes={**DIRECTION, "end": 2},
+        labels=XYZ,
+    ),
+    RawSchema(
+        SCHEMA,
+        "diagonals",
+        "diagonal",
+        (
+            Row(
+                "diagonal_deviation",
+                STOPS,
+                "m",
+                -0.1,
+                0.1,
+                "actual minus commanded displacement along the diagonal since its first stop; NaN = no reading. Labels "
+                "of diagonal: such as PPP, NP0; labels of approach: forward, backward",
+                missing=True,
+            ),
+            Row(
+                "stop_point",
+                ("diagonal", "stop", "direction"),
+                "m",
+                *POSITION,
+                "commanded position of the axes at each stop, in the order of the diagonal",
+            ),
+            _POINT,
+            _LENGTH,
+            _ALIGNMENT,
+        ),
+        sizes=DIRECTION,
         labels=XYZ,
     ),
 )

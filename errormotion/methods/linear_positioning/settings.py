@@ -14,10 +14,13 @@ Coefficient = Annotated[float, Quantity("a coefficient of expansion", "1/K", "11
 TemperatureStep = Annotated[float, Quantity("a difference of temperatures", "K", "0.2 K")]
 Ratio = Annotated[float, Quantity("a ratio", "1", "0.5 um/m")]
 Point = tuple[Length, Length, Length]
+Span = tuple[Length, Length]
 
 Freedom = Literal["EX", "EY", "EZ", "EA", "EB", "EC"]
 FREEDOMS: tuple[Freedom, ...] = ("EX", "EY", "EZ", "EA", "EB", "EC")
 MINUTE = 60.0
+BODY_DIAGONALS = ("PPP", "NPP", "PNP", "NNP")
+"""The four diagonals of a volume, all of them rising in Z."""
 
 
 class Side(PluginSettings):
@@ -66,6 +69,44 @@ class Moving(PluginSettings):
     feed: Velocity = Field(default=10.0 / MINUTE, gt=0, description="feed of the moves between the readings")
 
 
+class Diagonals(PluginSettings):
+    """Displacements along diagonals of a volume (ISO 230-6)."""
+
+    names: tuple[str, ...] = Field(
+        default=BODY_DIAGONALS,
+        min_length=1,
+        description="a letter for X, Y, Z each: P the axis rises along the diagonal, N it falls, 0 it rests; PPP and "
+        "NPP are body diagonals, PP0 and NP0 those of a face parallel to XY",
+    )
+    volume: tuple[Span, Span, Span] = Field(
+        default=((0.0, 0.5), (0.0, 0.4), (0.0, 0.3)),
+        description="lowest and highest position of X, Y and Z; an axis that rests is at its position in start",
+    )
+    channels: dict[str, str] = Field(
+        default_factory=dict,
+        description="channel of the interferometer for each diagonal, with '-' ahead where it counts down; default its "
+        "only channel",
+    )
+
+    @model_validator(mode="after")
+    def _fits(self) -> Diagonals:
+        for axis, (low, high) in zip("XYZ", self.volume, strict=True):
+            if not low < high:
+                raise ValueError(f"volume: expected the lower end of {axis} first; found {low:g} and {high:g} m")
+        lines = []
+        for name in self.names:
+            if len(name) != 3 or set(name) - set("PN0") or name.count("0") > 1:
+                raise ValueError(
+                    f"names: expected three letters P, N or 0, at most one 0, such as PPP or NP0; found '{name}'"
+                )
+            lines.append(name if name.strip("0")[0] == "P" else name.translate(str.maketrans("PN", "NP")))
+        if len(set(lines)) < len(lines):
+            raise ValueError(f"names: expected each diagonal once, in one direction; found {', '.join(self.names)}")
+        if unknown := set(self.channels) - set(self.names):
+            raise ValueError(f"channels: expected diagonals among {', '.join(self.names)}; found {sorted(unknown)[0]}")
+        return self
+
+
 class Settings(PluginSettings):
     """Settings of ``linear_positioning``: the test, its evaluation, and its sources of uncertainty."""
 
@@ -100,6 +141,9 @@ class Settings(PluginSettings):
     moving: Moving | None = Field(
         default=None,
         description="measure the thermal distortion by the moving axis at both ends of the travel instead of targets",
+    )
+    diagonals: Diagonals | None = Field(
+        default=None, description="measure displacements along diagonals of a volume instead of one axis"
     )
     start: Point = Field(default=(0.0, 0.0, 0.0), description="positions of the axes that do not move")
     overrun: Length = Field(default=2e-3, gt=0, description="distance beyond a target before an approach turns")
@@ -157,6 +201,8 @@ class Settings(PluginSettings):
             raise ValueError("targets: expected three or more positions that differ")
         if 0 < self.count < 3:
             raise ValueError(f"count: expected 3 targets or more; found {self.count}")
+        if self.moving is not None and self.diagonals is not None:
+            raise ValueError("diagonals: expected either diagonals or a moving axis; found both")
         if self.settle > self.dwell:
             raise ValueError(f"settle: expected at most the dwell, {self.dwell:g} s; found {self.settle:g} s")
         return self

@@ -15,6 +15,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
+from errormotion.methods.linear_positioning.diagonals.simulation import simulate_diagonals
 from errormotion.methods.linear_positioning.planning.targets import positions
 from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, SCHEMA, SENSORS
 from errormotion.methods.linear_positioning.warming import simulate_moving
@@ -45,12 +46,14 @@ class Behaviour:
 
 
 def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return deviations at the targets of the settings, or at the ends of a moving axis, and the true errors.
+    """Return deviations at targets, at the ends of a moving axis, or along diagonals, and the true errors.
 
     The seed selects the machine, its scatter, and the errors of the instrument.
     """
     if settings.moving is not None:
         return simulate_moving(settings, seed)
+    if settings.diagonals is not None:
+        return simulate_diagonals(settings, seed)
     return raw_and_truth(settings, seed, Behaviour())
 
 

@@ -17,7 +17,7 @@ from errormotion.report import canvas
 from errormotion.report.document import Block, Cell, Figure, Source, Table, Text, or_dash
 from errormotion.report.text import DASH, finite, fixed, integer, listed, percent
 from errormotion.report.timeline import UNKNOWN, sensor_names
-from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw
+from errormotion.report.turntable import TURN, Dots, Ellipsoids, Lines, Scene, draw
 
 _FAINT, _STILL, _COOLER = "#c3c8d0", "#6f7680", canvas.BLUE
 _WARMER = ("#6f7680", "#B07800", "#D55E00", "#96280a")
@@ -169,7 +169,7 @@ def _map(placed: Sequence[Sensor], lost: Sequence[str], key: str, others: tuple[
         + "Dashed lines lead to the base of the drawing."
         + (f" Grey points: {listed(list(names))}." if len(names) else "")
         + (f" Position unknown: {listed(list(lost))}." if lost else "")
-        + " The buttons rotate the drawing, as do the arrow keys after a click on one."
+        + TURN
     )
     words = "; ".join(f"{s.name} {fixed(s.change, 1, signed=True)} K" for s in placed)
     return Figure(draw(Scene(parts), key), caption, f"Sensors in space, with their change: {words}.")

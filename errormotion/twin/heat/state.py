@@ -33,6 +33,9 @@ class ThermalState:
         Steady correction of X, Y, Z by the control at top speed, m.
     schedule : Schedule
         The commands.
+    offset : (times, offsets), optional
+        What a compensation adds to the commands: times (n,), s, and X, Y, Z, (n, 3), m; linear between, constant
+        before and after.
     """
 
     kind: MachineKind
@@ -41,6 +44,7 @@ class ThermalState:
     growth: Array
     correction: Array
     schedule: Schedule
+    offset: tuple[Array, Array] | None = None
     _cold: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -93,6 +97,11 @@ class ThermalState:
             if name not in self.kind.behind:
                 turn += grown[:, 3:]
         twist[:, :3] -= self.correction_at(t) * self.schedule.compensation(t)
+        if self.offset is not None:
+            times, offsets = self.offset
+            twist[:, :3] += np.column_stack(
+                [np.interp(np.asarray(t, dtype=float), times, column) for column in offsets.T]
+            )
         return twist, turn
 
 

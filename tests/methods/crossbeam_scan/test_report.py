@@ -218,7 +218,7 @@ def test_the_chapter_has_its_sections(html):
 def test_the_file_stays_small_and_leads_nowhere(html):
     assert len(html.encode()) < 3_000_000
     assert not re.findall(r"https?:", html)
-    assert "<script" not in html
+    assert html.count("<script") == 1  # that of the page
     assert "<image" not in html
     assert re.findall(r"url\((?!#)", html) == []
 

@@ -16,6 +16,10 @@ class TestMovingAxis(MethodConformance):
     subject = SUBJECTS[2]
 
 
+class TestDiagonals(MethodConformance):
+    subject = SUBJECTS[3]
+
+
 @pytest.mark.slow
 class TestSixFreedoms(MethodConformance):
     subject = SUBJECTS[1]

@@ -8,4 +8,7 @@ from errormotion.instruments.controller.linuxcnc.settings import LinuxCNCSetting
 #: The program that is copied to the machine.
 BRIDGE = Path(__file__).with_name("bridge.py")
 
-__all__ = ["BRIDGE", "LinuxCNC", "LinuxCNCSettings"]
+#: The realtime part of a compensation, which LinuxCNC loads.
+COMPENSATION = Path(__file__).with_name("compensation.tcl")
+
+__all__ = ["BRIDGE", "COMPENSATION", "LinuxCNC", "LinuxCNCSettings"]

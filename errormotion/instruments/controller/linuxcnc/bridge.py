@@ -6,13 +6,14 @@ LinuxCNC's Python module works only in the Python of the system, beside LinuxCNC
 ``{"id": 1, "op": "move_to", "position": [0.1, 0, 0]}``, its answer ``{"id": 1, "ok": true, "result": ...}`` or
 ``{"id": 1, "ok": false, "error": "..."}``. While an order runs, ``{"id": 1, "beat": 7, "time": 3.2}`` is sent five
 times a second. Lengths are in m, speeds in m/s, those of spindles in 1/min, times in s since the bridge started;
-what is unknown is null. Positions are those of the machine (G53), without any offset of work or tool.
+what is unknown is null. Positions are those of the machine (G53), without any offset of work, tool or compensation.
 
 The first request of a connection is ``{"id": 0, "op": "hello", "token": "...", "control": true, "client": "NAME"}``
 with the token in a file that only the user can read. A connection whose first line is anything else, or that sends a
 line that is not a request, is closed. One client (one NAME) at a time controls the machine; the others read, and may
 stop it. One order at a time moves the machine. An order or program ends with the connection of its client: if that is
-lost, the bridge aborts the motion. No request can end the bridge.
+lost, the bridge aborts the motion. No request can end the bridge. A bridge with ``--compensate`` lets one client, which
+says ``"compensate": true`` in its first request, set the offset of ``compensation.tcl``, and nothing else thereby.
 """
 
 from __future__ import annotations
@@ -62,6 +63,9 @@ MAX_TASKS = 16  # requests of one client that are being answered
 MAX_NAME = 64  # characters of an id or a name
 MAX_TEXT = 500  # characters of an error text
 MIN_TOKEN = 32  # characters
+SIGN_INTERVAL = 0.02  # s between two signs of life, of several servo cycles
+THREAD_INTERVAL = 0.02  # s between two looks whether a thread is cut
+OFFSET_TOLERANCE = 1e-6  # m between LinuxCNC's offset and the one that was set
 MAX_FEED = 10.0  # m/s, where LinuxCNC states no limit
 MAX_SPINDLE = 1e6  # 1/min, where LinuxCNC states no limit
 AXES = "XYZ"
@@ -103,7 +107,7 @@ class Client(asyncio.Protocol):
     def __init__(self, bridge: Bridge) -> None:
         self.bridge = bridge
         self.transport: Any = None
-        self.greeted = self.control = self.gone = False
+        self.greeted = self.control = self.compensate = self.gone = False
         self.name = ""
         self.program: list[str] = []  # parts of a program that are here already
         self.tasks: set[asyncio.Task[None]] = set()
@@ -317,6 +321,113 @@ class Job:
         self.ended_by = ""
 
 
+class Offsets:
+    """The offset of ``compensation.tcl``: what is asked for, what is in effect, and why it may not change.
+
+    Limit, slew limit, hold and watchdog are in the servo thread, and act without this process. What is set here is
+    checked once more.
+
+    Parameters
+    ----------
+    hal : module
+        LinuxCNC's module.
+    """
+
+    def __init__(self, hal: Any) -> None:
+        self.hal = hal
+        self._signed = -math.inf  # time of the last sign of life
+
+    @property
+    def route(self) -> str:
+        """``external``, ``feedback``, or empty where ``compensation.tcl`` is not loaded."""
+        for route, pin in (("external", "errormotion-counts-x.out"), ("feedback", "errormotion-limit-x.out")):
+            with contextlib.suppress(Exception):
+                self.hal.get_value(pin)
+                return route
+        return ""
+
+    def state(self, unit: float) -> dict[str, Any]:
+        """Return limits and offset in m, and why the offset stays as it is, for lengths in a unit in m."""
+        route = self.route
+        if not route:
+            raise RefusedError("LinuxCNC has not loaded compensation.tcl; name it in the INI file")
+        planned = [self._get(f"errormotion-limit-{each}.out") for each in "xyz"]
+        offset = [self._get(f"axis.{each}.eoffset") for each in "xyz"] if route == "external" else planned
+        return {
+            "route": route,
+            "offset": [unit * x for x in offset],
+            "limit": unit * min(self._get(f"errormotion-limit-{each}.max") for each in "xyz"),
+            "slew": unit * self._get("errormotion-slew.in0"),
+            "watchdog": self._get("errormotion-alive.width"),
+            "alive": bool(self._get("errormotion-alive.out")),
+            "busy": self._busy(route, max(abs(unit * (x - y)) for x, y in zip(offset, planned))),  # noqa: B905
+            "fault": self._fault(route, unit, planned),
+        }
+
+    def set(self, offset: Any, unit: float) -> None:
+        """Ask for an offset, m, and give a sign of life."""
+        state = self.state(unit)
+        if not isinstance(offset, list) or len(offset) != len(AXES):
+            raise RefusedError(f"expected an offset of X, Y, Z in m; found {str(offset)[:MAX_NAME]}")
+        goal = [_number(x, "an offset in m") for x in offset]
+        if state["fault"]:
+            raise RefusedError(state["fault"])
+        most = state["slew"] * state["watchdog"] + OFFSET_TOLERANCE
+        for axis, x, now in zip(AXES, goal, state["offset"]):  # noqa: B905
+            if abs(x) > state["limit"] * (1 + 1e-9):
+                raise RefusedError(
+                    f"expected an offset of at most {1e6 * state['limit']:g} um; found {axis} {1e6 * x:g}"
+                )
+            if abs(x - now) > most:
+                raise RefusedError(
+                    f"{axis} {1e6 * x:g} um is a jump of {1e6 * abs(x - now):.3g} um; the slew limit allows "
+                    f"{1e6 * most:.3g} um until the watchdog acts"
+                )
+        for each, x in zip("xyz", goal):  # noqa: B905
+            self.hal.set_p(f"errormotion-source-{each}.in1", repr(x / unit))
+        if time.monotonic() - self._signed > SIGN_INTERVAL:  # two changes in one servo cycle would be none
+            self._signed = time.monotonic()
+            self.hal.set_p("errormotion-sign.in0", str(int(not self._get("errormotion-sign.in0"))))
+
+    def hold(self) -> None:
+        """Hold the offset for the next half second: a thread is being cut."""
+        self.hal.set_p("errormotion-thread.in", str(int(not self._get("errormotion-thread.in"))))
+
+    def spindle_leads(self) -> bool:
+        """Whether the axes follow the spindle, or wait for its index: G33, G33.1, G76, G95."""
+        return bool(self._get("motion.debug-float-1") or self._get("spindle.0.index-enable"))
+
+    def _get(self, pin: str) -> float:
+        return float(self.hal.get_value(pin))
+
+    def _busy(self, route: str, behind: float) -> str:
+        if self._get("errormotion-motion.out5"):
+            return "the machine probes"
+        if self._get("errormotion-thread.out"):
+            return "a thread is cut"
+        if self._get("errormotion-hold-2.in1"):
+            return "the program holds the offset"
+        if route == "external" and (self._get("motion.eoffset-limited") or behind > OFFSET_TOLERANCE):
+            return "LinuxCNC limits the offset at an end of travel"
+        return ""
+
+    def _fault(self, route: str, unit: float, planned: list[float]) -> str:
+        if not self._get("motion.motion-enabled"):
+            return "the machine is off or in e-stop"
+        if not self._get("motion.is-all-homed"):
+            return "the machine is not homed"
+        if route == "feedback":
+            return ""
+        asked = [self._get(f"axis.{each}.eoffset-request") for each in "xyz"]
+        wrong = max(unit * abs(x - y) for x, y in zip(asked, planned))  # noqa: B905
+        if wrong > OFFSET_TOLERANCE:
+            return (
+                f"LinuxCNC has an external offset that is {1e6 * wrong:.3g} um off the one that was set here: another "
+                "program, or an end of travel; switch the machine off and on"
+            )
+        return ""
+
+
 class Bridge:
     """Operations of LinuxCNC by request.
 
@@ -332,6 +443,8 @@ class Bridge:
         Prefixes of the HAL pins that clients may set.
     load : str
         HAL pin with the load of the spindle, as a fraction of the rated one; empty where there is none.
+    compensates : bool
+        Whether a client may set the offset of ``compensation.tcl``.
     token : str
         The first request of a client must have it.
     """
@@ -346,6 +459,7 @@ class Bridge:
         pins: tuple[str, ...] = (),
         load: str = "",
         *,
+        compensates: bool = False,
         token: str,
     ) -> None:
         if len(token) < MIN_TOKEN:
@@ -356,6 +470,8 @@ class Bridge:
         self._serial = 0  # of the last command that LinuxCNC has accepted
         self.programs, self.load = programs, load
         self.pins = tuple(pin for pin in (each.strip() for each in pins) if pin)
+        self.offsets = Offsets(hal)
+        self.compensates = compensates
         self.turn = asyncio.Lock()
         self._token = token.encode()
         self.alarms: list[str] = []
@@ -367,10 +483,11 @@ class Bridge:
         self._stops = 0
         self._stopping: dict[str, asyncio.Future[int]] = {}  # stops under way, which further ones join
         self._began = time.monotonic()
-        reads = (self.identify, self.state, self.elapse, self.finish, self.stop, self.estop)
+        reads = (self.identify, self.state, self.elapse, self.finish, self.stop, self.estop, self.offset)
         changes = (self.reset, self.set_pins, self.program_part)
         moves = (self.home, self.enable, self.move_to, self.probe, self.spindle, self.run_program)
-        self._work: dict[str, Callable[..., Any]] = {each.__name__: each for each in (*reads, *changes, *moves)}
+        every = (*reads, *changes, *moves, self.set_offset)
+        self._work: dict[str, Callable[..., Any]] = {each.__name__: each for each in every}
         self._waits, self._orders = {"elapse", "finish"}, {each.__name__ for each in moves}
         self._reads = {each.__name__ for each in reads}
         self._of_client = {"elapse", "finish", "program_part", "run_program"}
@@ -408,17 +525,25 @@ class Bridge:
         if not isinstance(name, str) or len(name) > MAX_NAME or not isinstance(arguments.get("control"), bool):
             client.end(f"expected 'control', true or false, and a name of at most {MAX_NAME} characters as 'client'")
             return
+        if not isinstance(arguments.get("compensate", False), bool):
+            client.end("expected 'compensate', true or false")
+            return
         if not client.greeted and sum(each.greeted for each in self.clients) >= MAX_CLIENTS:
             client.end(f"{MAX_CLIENTS} clients are connected already")
             return
         client.welcome()
-        client.name, client.control = name, False
+        client.name, client.control, client.compensate = name, False, False
         holder = next((each for each in self.clients if each.control), None)
         client.control = arguments["control"] and (holder is None or holder.name == name != "")
+        other = next((each for each in self.clients if each.compensate), None)
+        asked = arguments.get("compensate", False) and self.compensates
+        client.compensate = asked and (other is None or other.name == name != "")
         result = {
             "protocol": PROTOCOL,
             "control": client.control,
             "controlled_by": None if holder is None else holder.name,
+            "compensate": client.compensate,
+            "compensated_by": None if other is None else other.name,
         }
         client.send({"id": number, "ok": True, "result": result, "time": self.time})
 
@@ -427,7 +552,9 @@ class Bridge:
         work = self._work.get(op)
         if work is None:
             client.send(self._failure(number, f"unknown operation: {op}"))
-        elif op not in self._reads and not client.control:
+        elif op == "set_offset" and not client.compensate:
+            client.send(self._failure(number, self._no_compensation()))
+        elif op not in self._reads and op != "set_offset" and not client.control:
             client.send(
                 self._failure(
                     number, "this client only reads: another one controls the machine, or it did not ask for control"
@@ -445,6 +572,11 @@ class Bridge:
             answer = self._wait if op in self._waits else self._reply
             return self._in_background(client, answer(client, number, bound))
         return None
+
+    def _no_compensation(self) -> str:
+        if not self.compensates:
+            return "the bridge was started without --compensate"
+        return "this client does not compensate: another one does, or it did not ask for it"
 
     def _in_background(self, client: Client, work: Any) -> asyncio.Task[None]:
         task: asyncio.Task[None] = asyncio.ensure_future(work)
@@ -521,6 +653,16 @@ class Bridge:
     def _metres(self, places: Any) -> list[float]:
         return [self._unit * float(x) for x in places[:3]]
 
+    def _place(self, position: Any) -> list[float]:
+        """Return a position of LinuxCNC, m, without the external offset, which LinuxCNC adds to what was commanded."""
+        return [x - offset for x, offset in zip(self._metres(position), self._external())]  # noqa: B905
+
+    def _external(self) -> list[float]:
+        """Return the external offset, m; it does not change while the machine probes."""
+        with contextlib.suppress(Exception):  # LinuxCNC 2.7 has none
+            return self._metres([self.hal.get_value(f"axis.{each}.eoffset") for each in "xyz"])
+        return [0.0, 0.0, 0.0]
+
     async def identify(self) -> dict[str, Any]:
         """Identify the version of LinuxCNC, the machine's name and its INI file."""
         self._look()
@@ -545,8 +687,8 @@ class Bridge:
         modes = {self.cnc.MODE_MANUAL: "manual", self.cnc.MODE_MDI: "mdi", self.cnc.MODE_AUTO: "automatic"}
         return {
             "time": self.time,
-            "position": self._metres(s.actual_position),
-            "commanded_position": self._metres(s.position),
+            "position": self._place(s.actual_position),
+            "commanded_position": self._place(s.position),
             "spindle_speed": self._spindle_speed(),
             "spindle_commanded": float(s.spindle[0]["speed"]),
             "spindle_load": self._pin(self.load),
@@ -697,13 +839,13 @@ class Bridge:
         goal, words = self._goal(target), f"G38.3 {self._feed(feed)}"
         if self.stat.probe_val:
             raise RefusedError("the probe is tripped before it moves")
-        if math.dist(goal, self._metres(self.stat.position)) < POSITION_TOLERANCE:
+        if math.dist(goal, self._place(self.stat.position)) < POSITION_TOLERANCE:
             raise RefusedError("the probe is at the target already")
         if self.stat.spindle[0]["direction"]:
             raise RefusedError("the spindle turns; stop it before the machine probes")
         await self._mdi(f"{words} {_axis_words(self._in_work_frame(goal))}")
         if self.stat.probe_tripped:
-            return {"tripped": True, "position": self._metres(self.stat.probed_position), "time": self.time}
+            return {"tripped": True, "position": self._place(self.stat.probed_position), "time": self.time}
         await self._require_arrival(goal)
         return {"tripped": False, "position": None, "time": self.time}
 
@@ -800,10 +942,31 @@ class Bridge:
         """Set HAL pins whose names have a prefix of `pins`."""
         values = {str(name): _number(value, f"a value of the pin {name}") for name, value in dict(pins).items()}
         for name in values:
-            if not self.pins or not name.startswith(self.pins):
+            if not self.pins or not name.startswith(self.pins) or name.startswith("errormotion-"):
                 raise RefusedError(f"the pin {name} is not among those that clients may set")
         for name, value in values.items():
             self.hal.set_p(name, repr(value))
+
+    # ------------------------------------------------------------------ compensation
+
+    async def offset(self) -> dict[str, Any]:
+        """Return the offset in effect, its limits, and why it does not change."""
+        self._look()
+        holder = next((each.name for each in self.clients if each.compensate), None)
+        return {**self.offsets.state(self._unit), "by": holder}
+
+    async def set_offset(self, offset: Any) -> None:
+        """Ask for an offset of X, Y, Z in m; each request is a sign of life for the watchdog in the servo thread."""
+        self._look()
+        self.offsets.set(offset, self._unit)
+
+    async def watch_threads(self) -> None:
+        """Hold the offset while a thread is cut."""
+        while self.offsets.route:
+            with contextlib.suppress(Exception):  # LinuxCNC has ended, or is still starting
+                if self.offsets.spindle_leads():
+                    self.offsets.hold()
+            await asyncio.sleep(THREAD_INTERVAL)
 
     # ------------------------------------------------------------------ steps of orders
 
@@ -942,7 +1105,7 @@ class Bridge:
             await asyncio.sleep(POLL_INTERVAL)
 
     async def _require_arrival(self, goal: list[float]) -> None:
-        place = self._metres(self.stat.position)
+        place = self._place(self.stat.position)
         if math.dist(goal, place) > POSITION_TOLERANCE:
             found = ", ".join(f"{1e3 * x:.4f}" for x in place)
             raise RefusedError(f"the machine has stopped before its goal, at {found} mm{await self._texts()}")
@@ -1054,6 +1217,7 @@ async def run(make: Callable[[], Bridge], line: socket.socket, announce: Path | 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         loop.add_signal_handler(number, ended.set)
     await bridge.await_linuxcnc()
+    watch = asyncio.ensure_future(bridge.watch_threads()) if bridge.compensates else None
     server = await loop.create_server(lambda: Client(bridge), sock=line, backlog=MAX_CLIENTS)
     name = line.getsockname()
     where = {"socket": name} if isinstance(name, str) else {"port": name[1]}
@@ -1068,7 +1232,17 @@ async def run(make: Callable[[], Bridge], line: socket.socket, announce: Path | 
             await asyncio.wait_for(ended.wait(), 0.1)
         if bridge.clients:
             last_client = time.monotonic()
+    if watch is not None:
+        watch.cancel()
     server.close()
+
+
+def _component(hal: Any) -> Any:
+    """Return a component of HAL; the name of a bridge that was killed stays taken until LinuxCNC ends."""
+    try:
+        return hal.component("errormotion-bridge")
+    except Exception:  # noqa: BLE001 - of LinuxCNC's module
+        return hal.component(f"errormotion-bridge-{os.getpid()}")
 
 
 def main(words: list[str]) -> int:
@@ -1084,6 +1258,9 @@ def main(words: list[str]) -> int:
     )
     parser.add_argument("--pins", default="", help="prefixes of the HAL pins that clients may set, with commas between")
     parser.add_argument("--load-pin", default="", help="HAL pin with the load of the spindle, 1 = rated")
+    parser.add_argument(
+        "--compensate", action="store_true", help="allow one client to set the offset of compensation.tcl"
+    )
     options = parser.parse_args(words)
     path = options.socket.expanduser()
     orders, stops = Sender(), Sender()
@@ -1096,12 +1273,23 @@ def main(words: list[str]) -> int:
     import hal
     import linuxcnc
 
-    component = hal.component("errormotion-bridge")  # so that LinuxCNC ends this process with the others
+    component = _component(hal)  # so that LinuxCNC ends this process with the others
     component.ready()
     try:
         with tempfile.TemporaryDirectory(prefix="errormotion-") as folder:
             pins = tuple(options.pins.split(","))
-            make = partial(Bridge, linuxcnc, hal, orders, stops, Path(folder), pins, options.load_pin, token=token)
+            make = partial(
+                Bridge,
+                linuxcnc,
+                hal,
+                orders,
+                stops,
+                Path(folder),
+                pins,
+                options.load_pin,
+                compensates=options.compensate,
+                token=token,
+            )
             asyncio.run(run(make, line, options.announce, options.idle))
     finally:
         if options.port is None:

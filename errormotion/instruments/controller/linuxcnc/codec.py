@@ -39,6 +39,34 @@ class Answer:
     error: str = ""
 
 
+@dataclass(frozen=True)
+class Offset:
+    """Offset of a compensation in LinuxCNC.
+
+    Attributes
+    ----------
+    route : str
+        ``external`` or ``feedback``.
+    offset : tuple of float
+        Of X, Y, Z in effect, m.
+    limit, slew, watchdog : float
+        Largest offset, m, its fastest change, m/s, and the time without a request after which it goes to zero, s.
+    busy, fault : str
+        Why the offset does not change, and why none is taken; empty: it does, one is.
+    by : str
+        The client that may set it; empty: none.
+    """
+
+    route: str
+    offset: tuple[float, float, float]
+    limit: float
+    slew: float
+    watchdog: float
+    busy: str
+    fault: str
+    by: str
+
+
 def encode_request(number: int, op: str, arguments: Mapping[str, Any]) -> bytes:
     """Return a request as bytes; InstrumentError where it holds NaN or infinity."""
     try:
@@ -72,6 +100,28 @@ def decode_welcome(result: Any) -> tuple[bool, str]:
             f"Expected the bridge of LinuxCNC with protocol {PROTOCOL}; found {str(result)[:200]} ({error!r}). Copy "
             "bridge.py of this version to the machine"
         ) from None
+
+
+def decode_right(result: Any) -> tuple[bool, str]:
+    """Return whether the bridge gives the right to set offsets, and who else has it; ProtocolError where it is old."""
+    decode_welcome(result)
+    try:
+        return _switch(result, "compensate"), str(result["compensated_by"] or "")[:64]
+    except (ValueError, KeyError, TypeError):
+        raise ProtocolError(
+            "The bridge is of a version without compensation; copy bridge.py of this version to the machine"
+        ) from None
+
+
+def decode_offset(result: Any) -> Offset:
+    """Return the offset of a compensation; ProtocolError where a value is missing or not finite."""
+    try:
+        x, y, z = (_finite(each) for each in result["offset"])
+        limit, slew, watchdog = (_known(result, name) for name in ("limit", "slew", "watchdog"))
+        busy, fault, route = (str(result[name])[:500] for name in ("busy", "fault", "route"))
+        return Offset(route, (x, y, z), limit, slew, watchdog, busy, fault, str(result["by"] or "")[:64])
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise ProtocolError(f"Expected the offset of LinuxCNC; found {str(result)[:200]} ({error!r})") from None
 
 
 def decode(line: bytes) -> Answer | Beat:
@@ -154,10 +204,17 @@ def _number(value: Any) -> float:
 
 
 def _known(values: Mapping[str, Any], name: str) -> float:
-    value = _number(values[name])
-    if not math.isfinite(value):
-        raise ValueError(f"{name} is {value}")
-    return value
+    try:
+        return _finite(values[name])
+    except ValueError as error:
+        raise ValueError(f"{name} is {error}") from None
+
+
+def _finite(value: Any) -> float:
+    number = _number(value)
+    if not math.isfinite(number):
+        raise ValueError(str(number))
+    return number
 
 
 def _position(value: Any) -> list[float]:

@@ -151,7 +151,7 @@ class OpcUa(Driver):
         settings = self.settings
         return open_session(
             self.address,
-            Credentials(settings.security, settings.user, _first_line(settings.password_file)),
+            Credentials.read(settings.security, settings.user, settings.password_file),
             timeout=settings.timeout,
             simulator=self.info.simulator,
             record=self._record,
@@ -219,12 +219,3 @@ def _all_of(answers: Sequence[Any]) -> bool | None:
 def _text(answer: Mapping[str, Any] | None) -> str:
     value = None if answer is None else answer.get("value")
     return "" if value is None else str(value)
-
-
-def _first_line(path: str) -> str:
-    if not path:
-        return ""
-    try:
-        return Path(path).read_text(encoding="utf-8").splitlines()[0]
-    except (OSError, IndexError, UnicodeDecodeError) as error:
-        raise InstrumentError(f"password_file '{path}': expected a file with the password; {error}") from None

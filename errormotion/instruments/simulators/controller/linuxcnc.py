@@ -5,9 +5,9 @@ HAL, less the error of the tip there, so that the servo thread of the machine tr
 The world's clock advances with the real time of motion, and at once with ``elapse``.
 
 Parameters of the address besides the common ones: ``ready`` (1; 0 = in e-stop and not homed, as after power-on),
-``unit`` (``mm`` or ``inch``, of the INI file), ``linger`` (10 s; time that LinuxCNC runs on after the last driver has
-closed; it always ends with the process), ``wait`` (90 s; for another simulated LinuxCNC on this computer
-to end).
+``unit`` (``mm`` or ``inch``, of the INI file), ``route`` (of a compensation: ``external`` or ``feedback``), ``limit``
+and ``slew`` (of a compensation, 50 um and 1 um/s), ``linger`` (10 s; time that LinuxCNC runs on after the last driver
+has closed; it always ends with the process), ``wait`` (90 s; for another simulated LinuxCNC on this computer to end).
 """
 
 from __future__ import annotations
@@ -22,8 +22,14 @@ from typing import Any
 import numpy as np
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
-from errormotion.instruments.controller.linuxcnc import BRIDGE
-from errormotion.instruments.simulators.controller.linuxcnc_config import PINS, hal_text, ini_text, pin_values
+from errormotion.instruments.controller.linuxcnc import BRIDGE, COMPENSATION
+from errormotion.instruments.simulators.controller.linuxcnc_config import (
+    PINS,
+    Compensated,
+    hal_text,
+    ini_text,
+    pin_values,
+)
 from errormotion.instruments.simulators.controller.linuxcnc_process import LinuxCNCProcess
 from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
@@ -57,7 +63,9 @@ class Control:
     def _started(self, address: Address) -> LinuxCNCProcess:
         machine, linger = self.world.machine, address.number("linger", LINGER)
         own = "--socket {folder}/bridge.sock --token {folder}/token --announce {folder}/bridge.json"
-        arguments = f"{own} --idle {max(linger, LEAST_IDLE):g} --pins {PINS}"
+        arguments = (
+            f"--compensate --idle {max(linger, LEAST_IDLE):g} --pins {PINS} {own}"  # LinuxCNC reads 255 characters
+        )
         ini = ini_text(
             self.world.name,
             machine.travel,
@@ -65,8 +73,13 @@ class Control:
             machine.top_speed,
             arguments=arguments,
             inch=self.inch,
+            compensated=_compensated(address),
         )
-        files = {"linuxcnc.ini": ini, "balls.hal": hal_text(len(self.world.balls))}
+        files = {
+            "linuxcnc.ini": ini,
+            "balls.hal": hal_text(len(self.world.balls)),
+            COMPENSATION.name: COMPENSATION.read_text(),
+        }
         return LinuxCNCProcess(files, BRIDGE, wait=address.number("wait", START_TIMEOUT))
 
     def join(self, world: VirtualWorld) -> None:
@@ -125,10 +138,16 @@ class Control:
         return pins
 
 
-Key = tuple[str, int, bool, str, float]
+Key = tuple[str, int, bool, str, float, Compensated]
 
 _controls: dict[Key, Control] = {}
 _lock = threading.Lock()
+
+
+def _compensated(address: Address) -> Compensated:
+    usual = Compensated()
+    limit, slew = address.number("limit", 1e6 * usual.limit), address.number("slew", 1e6 * usual.slew)
+    return Compensated(address.params.get("route", usual.route), 1e-6 * limit, 1e-6 * slew)
 
 
 def _control(world: VirtualWorld, address: Address) -> Control:
@@ -140,7 +159,7 @@ def _control(world: VirtualWorld, address: Address) -> Control:
         LinuxCNC is not installed, does not start, or runs for another world.
     """
     warm, ready = world.machine.sensors_on_for > 0, address.number("ready", 1)
-    key = (world.name, world.seed, warm, address.params.get("unit", "mm"), ready)
+    key = (world.name, world.seed, warm, address.params.get("unit", "mm"), ready, _compensated(address))
     with _lock:
         control = _controls.get(key)
         if control is None or not control.process.running:

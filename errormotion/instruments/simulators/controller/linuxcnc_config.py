@@ -7,6 +7,7 @@ centre (``sum2``, ``hypot``) is compared with a reach (``comp``), and any of the
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 PINS = "ball"
 SERVO_PERIOD = 1e-3  # s
@@ -14,12 +15,26 @@ ACCELERATION = 3000.0  # mm/s^2
 SLACK = 1e-3  # mm, so that the ends of travel can be reached
 FAR = 1e9  # mm
 
+HOLD = "motion.digital-out-00"
+
+_COMPENSATION = """TWOPASS = ON
+HALFILE = compensation.tcl
+
+[ERRORMOTION]
+ROUTE = {route}
+LIMIT = {limit:.9g}
+SLEW = {slew:.9g}
+WATCHDOG = {watchdog:g}
+HOLD = {hold}
+"""
+
 _AXIS = """
 [AXIS_{axis}]
 MIN_LIMIT = {low:.6f}
 MAX_LIMIT = {high:.6f}
 MAX_VELOCITY = {speed:.6f}
 MAX_ACCELERATION = {acceleration:g}
+OFFSET_AV_RATIO = {ratio:.9g}
 
 [JOINT_{joint}]
 TYPE = LINEAR
@@ -67,7 +82,7 @@ TOOL_TABLE = linuxcnc.tbl
 [HAL]
 HALFILE = LIB:basic_sim.tcl -no_use_hal_manualtoolchange -no_simulated_home -no_make_ddts
 HALFILE = balls.hal
-
+{compensation}
 [KINS]
 KINEMATICS = trivkins coordinates=XYZ
 JOINTS = 3
@@ -86,6 +101,24 @@ MAX_REVERSE_VELOCITY = {top_speed:g}
 """
 
 
+@dataclass(frozen=True)
+class Compensated:
+    """Compensation of a simulated LinuxCNC.
+
+    Attributes
+    ----------
+    route : str
+        ``external`` or ``feedback``.
+    limit, slew, watchdog : float
+        Largest offset, m, its fastest change, m/s, and the time without a sign of life until it goes to zero, s.
+    """
+
+    route: str = "external"
+    limit: float = 50e-6
+    slew: float = 1e-6
+    watchdog: float = 2.0
+
+
 def ini_text(
     machine: str,
     travel: Mapping[str, tuple[float, float]],
@@ -94,6 +127,7 @@ def ini_text(
     *,
     arguments: str,
     inch: bool = False,
+    compensated: Compensated | None = None,
 ) -> str:
     """Return an INI file for axes X, Y, Z with travels in m, a rapid feed in m/s and a top speed in 1/min.
 
@@ -111,6 +145,15 @@ def ini_text(
         fastest=2 * unit * rapid,
         acceleration=2 * scale * ACCELERATION,
         top_speed=top_speed,
+        compensation=""
+        if compensated is None
+        else _COMPENSATION.format(
+            route=compensated.route,
+            limit=unit * compensated.limit,
+            slew=unit * compensated.slew,
+            watchdog=compensated.watchdog,
+            hold=HOLD,
+        ),
     )
     for joint, (axis, (low, high)) in enumerate(travel.items()):
         text += _AXIS.format(
@@ -121,6 +164,7 @@ def ini_text(
             speed=unit * rapid,
             acceleration=scale * ACCELERATION,
             ferror=5 * scale,
+            ratio=0.0 if compensated is None else compensated.slew / rapid,
         )
     return text
 

@@ -1,4 +1,4 @@
-"""Modbus: requests of registers on one line.
+"""Modbus: registers that are read and written on one line.
 
 * ``modbus+tcp://192.168.0.9:502?unit=1`` Modbus TCP
 * ``modbus+rtu:///dev/ttyUSB0?baudrate=9600&unit=1`` RTU on a serial line, 8N1
@@ -13,6 +13,7 @@ wrong checksum, is used in tests only.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -21,10 +22,13 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.transports.address import MODBUS, Address, parse_address
 from errormotion.instruments.transports.base import Transport
 from errormotion.instruments.transports.modbus.codec import (
+    WRITE_SEVERAL,
     Framing,
     ModbusRefusal,
     decode_answer,
+    decode_written,
     encode_request,
+    encode_write,
     missing,
 )
 from errormotion.instruments.transports.quiet import await_quiet, discard_input
@@ -34,6 +38,12 @@ from errormotion.instruments.transports.recording import read_recording
 QUIET_INTERVAL = 0.05  # s without a byte after which a transmission has ended
 MAX_STRAY_BYTES = 512  # largest number of bytes discarded after a damaged answer
 MAX_LATE_ANSWERS = 8  # skipped after a timeout
+READ_HOLDING = 3
+
+Encode = Callable[[int], bytes]
+"""Returns a request with a transaction number."""
+Decode = Callable[[bytes, int], list[int] | None]
+"""Returns the registers of an answer to a transaction; None for a late answer to an earlier one."""
 
 
 class ModbusLine(Transport):
@@ -80,29 +90,51 @@ class ModbusLine(Transport):
         InstrumentError
             The connection is lost; the next call connects again.
         """
+        return self._repeated(
+            f"function {function} of unit {self.unit} for {count} registers from {register} on",
+            lambda number: encode_request(self.framing, self.unit, function, register, count, number),
+            lambda data, number: decode_answer(self.framing, data, self.unit, function, count, number),
+            lambda: self._await_late_answer(function, register, count),
+        )
+
+    def write_registers(self, register: int, values: Sequence[int], *, function: int = WRITE_SEVERAL) -> None:
+        """Write registers from ``register`` on: one by function 6, up to 123 by function 16 (the default).
+
+        A damaged answer leaves open whether they were written; the retries write the same once more.
+
+        Raises
+        ------
+        As `registers`.
+        """
+        self._repeated(
+            f"function {function} of unit {self.unit} for {len(values)} registers from {register} on",
+            lambda number: encode_write(self.framing, self.unit, function, register, values, number),
+            lambda data, number: decode_written(self.framing, data, self.unit, function, register, values, number),
+            lambda: self._await_late_answer(READ_HOLDING, register, len(values)),
+        )
+
+    def _repeated(self, what: str, encode: Encode, decode: Decode, prepare: Callable[[], None]) -> list[int]:
         for attempt in range(self._retries + 1):
             try:
-                return self._exchange(function, register, count)
+                return self._exchange(what, encode, decode, prepare)
             except ProtocolError:
                 if attempt == self._retries:
                     raise
                 self.repeated += 1
         raise AssertionError  # the loop has ended by itself
 
-    def _exchange(self, function: int, register: int, count: int) -> list[int]:
-        self._await_late_answer(function, register, count)
+    def _exchange(self, what: str, encode: Encode, decode: Decode, prepare: Callable[[], None]) -> list[int]:
+        prepare()
         self._number = (self._number + 1) % (1 << 16)
-        self._line.write(encode_request(self.framing, self.unit, function, register, count, self._number))
+        self._line.write(encode(self._number))
         end = time.monotonic() + self.timeout
         try:
             while True:
-                data = self._frame(end)
-                found = decode_answer(self.framing, data, self.unit, function, count, self._number)
+                found = decode(self._frame(end), self._number)
                 if found is not None:
                     return found
         except ModbusRefusal as error:
-            what = f"{self.url}: function {function} of unit {self.unit} for {count} registers from {register} on"
-            raise ModbusRefusal(error.code, what) from None
+            raise ModbusRefusal(error.code, f"{self.url}: {what}") from None
         except ProtocolError as error:
             self._settle()
             raise ProtocolError(f"{self.url}: {error}") from None

@@ -1,4 +1,4 @@
-"""Modbus frames for reading registers: functions 3 and 4, in the framings RTU and TCP (MBAP).
+"""Modbus frames: registers are read (functions 3 and 4) and written (6 and 16), in the framings RTU and TCP (MBAP).
 
 After the Modbus application protocol 1.1b3 and the serial line guide 1.02. Pure functions from bytes to numbers.
 """
@@ -25,6 +25,9 @@ EXCEPTIONS = {
 }
 LONGEST_FRAME: Mapping[str, int] = {"tcp": 260, "rtu": 256}
 """Bytes of the longest frame by framing."""
+WRITE_ONE, WRITE_SEVERAL = 6, 16
+MOST_WRITTEN = 123
+"""Registers of one request of function 16."""
 _HEAD = 7  # bytes of an MBAP header
 _MAX_MBAP_LENGTH = 254  # bytes after its length field
 
@@ -44,6 +47,26 @@ def encode_request(framing: Framing, unit: int, function: int, register: int, co
     return _frame(framing, unit, struct.pack(">BHH", function, register, count), number)
 
 
+def encode_write(
+    framing: Framing, unit: int, function: int, register: int, values: Sequence[int], number: int = 0
+) -> bytes:
+    """Return the request that writes registers from ``register`` on: one by function 6, up to 123 by function 16.
+
+    Raises
+    ------
+    ValueError
+        The function writes no registers, or not so many.
+    """
+    count = len(values)
+    if function == WRITE_ONE and count == 1:
+        pdu = struct.pack(">BHH", function, register, values[0])
+    elif function == WRITE_SEVERAL and 1 <= count <= MOST_WRITTEN:
+        pdu = struct.pack(f">BHHB{count}H", function, register, count, 2 * count, *values)
+    else:
+        raise ValueError(f"function {function} does not write {count} registers")
+    return _frame(framing, unit, pdu, number)
+
+
 def encode_answer(framing: Framing, unit: int, function: int, registers: Sequence[int], number: int = 0) -> bytes:
     """Return the answer with these registers."""
     pdu = struct.pack(f">BB{len(registers)}H", function, 2 * len(registers), *registers)
@@ -60,7 +83,7 @@ def _frame(framing: Framing, unit: int, pdu: bytes, number: int) -> bytes:
 def missing(framing: Framing, data: bytes) -> int:
     """Return the number of bytes that an incomplete answer still lacks, as far as its start shows."""
     if framing == "rtu":
-        size = 5 if len(data) < 3 or data[1] & 0x80 else 5 + data[2]
+        size = 5 if len(data) < 3 or data[1] & 0x80 else 8 if data[1] in (WRITE_ONE, WRITE_SEVERAL) else 5 + data[2]
     elif len(data) < _HEAD - 1:
         size = _HEAD + 2
     else:
@@ -83,9 +106,33 @@ def decode_answer(
     ModbusRefusal
         An exception reply.
     """
-    if framing == "rtu":
-        return _decode_rtu(data, unit, function, count)
-    return _decode_tcp(data, unit, function, count, number)
+    pdu = _pdu(framing, data, unit, function, number)
+    if pdu is None:
+        return None
+    if pdu[1] != 2 * count or len(pdu) != 2 + 2 * count:
+        raise ProtocolError(f"Expected {count} registers; found {len(pdu) - 2} bytes: {_shown(data)}")
+    return list(struct.unpack(f">{count}H", pdu[2:]))
+
+
+def decode_written(
+    framing: Framing, data: bytes, unit: int, function: int, register: int, values: Sequence[int], number: int = 0
+) -> list[int] | None:
+    """Return the values once a complete answer confirms that they were written; None as in `decode_answer`.
+
+    Raises
+    ------
+    ProtocolError
+        Too short, a wrong checksum, another unit, another function, other registers than those written.
+    ModbusRefusal
+        An exception reply.
+    """
+    pdu = _pdu(framing, data, unit, function, number)
+    if pdu is None:
+        return None
+    expected = struct.pack(">BHH", function, register, values[0] if function == WRITE_ONE else len(values))
+    if pdu != expected:
+        raise ProtocolError(f"Expected the confirmation {expected.hex(' ')}; found {_shown(data)}")
+    return list(values)
 
 
 class ModbusRefusal(InstrumentError):  # noqa: N818 - that is what it is
@@ -102,39 +149,42 @@ class ModbusRefusal(InstrumentError):  # noqa: N818 - that is what it is
         super().__init__(f"{what} is refused: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")
 
 
-def _decode_rtu(data: bytes, unit: int, function: int, count: int) -> list[int]:
+def _pdu(framing: Framing, data: bytes, unit: int, function: int, number: int) -> bytes | None:
+    """Return the function code and what follows; None for the late answer to an earlier request (TCP only)."""
+    found = _unframed_rtu(data) if framing == "rtu" else _unframed_tcp(data, number)
+    if found is None:
+        return None
+    came, pdu = found
+    if came != unit:
+        raise ProtocolError(f"Expected an answer of unit {unit}; found that of unit {came}: {_shown(data)}")
+    if pdu[0] == function | 0x80 and len(pdu) == 2:
+        raise ModbusRefusal(pdu[1], f"Function {function} of unit {unit}")
+    if pdu[0] != function:
+        raise ProtocolError(f"Expected an answer to function {function}; found {_shown(data)}")
+    return pdu
+
+
+def _unframed_rtu(data: bytes) -> tuple[int, bytes]:
     if len(data) < 5:
         raise ProtocolError(f"Expected a Modbus answer of at least 5 bytes; found {data.hex(' ') or 'nothing'}")
     if data[-2:] != (right := crc16(data[:-2])):
         raise ProtocolError(
             f"The answer {_shown(data)} has the checksum {data[-2:].hex(' ')}; expected {right.hex(' ')}"
         )
-    return _decode_pdu(data[0], data[1:-2], unit, function, count, data)
+    return data[0], data[1:-2]
 
 
-def _decode_tcp(data: bytes, unit: int, function: int, count: int, number: int) -> list[int] | None:
+def _unframed_tcp(data: bytes, number: int) -> tuple[int, bytes] | None:
     if len(data) < _HEAD + 2:
         raise ProtocolError(f"Expected a Modbus answer of at least {_HEAD + 2} bytes; found {data.hex(' ')}")
-    came, protocol, length, came_unit = struct.unpack(">HHHB", data[:_HEAD])
+    came, protocol, length, unit = struct.unpack(">HHHB", data[:_HEAD])
     if protocol or length != len(data) - 6:
         raise ProtocolError(f"Expected the header of a Modbus answer; found {_shown(data)}")
     if came != number:
         if (number - came) % (1 << 16) < 1 << 15:
             return None
         raise ProtocolError(f"Expected the answer to transaction {number}; found that to {came}")
-    return _decode_pdu(came_unit, data[_HEAD:], unit, function, count, data)
-
-
-def _decode_pdu(came_unit: int, pdu: bytes, unit: int, function: int, count: int, data: bytes) -> list[int]:
-    if came_unit != unit:
-        raise ProtocolError(f"Expected an answer of unit {unit}; found that of unit {came_unit}: {_shown(data)}")
-    if pdu[0] == function | 0x80 and len(pdu) == 2:
-        raise ModbusRefusal(pdu[1], f"Function {function} of unit {unit}")
-    if pdu[0] != function:
-        raise ProtocolError(f"Expected an answer to function {function}; found {_shown(data)}")
-    if pdu[1] != 2 * count or len(pdu) != 2 + 2 * count:
-        raise ProtocolError(f"Expected {count} registers; found {len(pdu) - 2} bytes: {_shown(data)}")
-    return list(struct.unpack(f">{count}H", pdu[2:]))
+    return unit, data[_HEAD:]
 
 
 def _shown(data: bytes) -> str:

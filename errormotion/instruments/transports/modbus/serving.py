@@ -1,4 +1,4 @@
-"""The device's end of a Modbus line: requests of registers in, answers out.
+"""The device's end of a Modbus line: requests to read and to write registers in, answers out.
 
 After the Modbus application protocol V1.1b3 (PDUs, exceptions), the guide to Modbus messaging on TCP/IP V1.0b (MBAP)
 and the guide to Modbus over serial line V1.02 (RTU). It shares no code with the client.
@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Literal
 
 READ_FUNCTIONS = (3, 4)
+WRITE_ONE, WRITE_SEVERAL = 6, 16
+MAX_WRITTEN = 123
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
 MAX_REGISTERS = 125
 MAX_RTU_BYTES = 256
@@ -80,6 +82,9 @@ class ModbusServer:
         Existing register blocks: first register to number of registers. Others are refused with exception 2.
     registers : callable
         Returns all registers by number, or the code of an exception; called at each accepted request.
+    write : callable, optional
+        Takes registers that are written, number to value, all of one request; returns 0, or the code of an exception.
+        Default: functions 6 and 16 are refused with exception 1.
 
     Attributes
     ----------
@@ -95,7 +100,9 @@ class ModbusServer:
         function: int,
         blocks: Mapping[int, int],
         registers: Callable[[], Mapping[int, int] | int],
+        write: Callable[[Mapping[int, int]], int] | None = None,
     ) -> None:
+        self._write = write
         self._framing, self._unit, self._function = framing, unit, function
         self._blocks, self._registers = dict(blocks), registers
         self._rest = b""
@@ -197,9 +204,13 @@ class ModbusServer:
     def respond(self, pdu: bytes) -> bytes:
         """Return the answer to a request without its framing.
 
-        The order of the checks is that of sections 6.3 and 6.4: function, number of registers, addresses, reading.
+        The order of the checks is that of sections 6.3, 6.4, 6.6 and 6.12: function, number of registers, addresses,
+        reading or writing.
         """
         function = pdu[0]
+        if function in (WRITE_ONE, WRITE_SEVERAL) and self._write is not None:
+            refusal = self._written(function, pdu[1:], self._write)
+            return bytes((function | 0x80, refusal)) if refusal else pdu[:5]
         found = self._read(function, pdu[1:])
         if isinstance(found, int):
             return bytes((function | 0x80, found))
@@ -213,12 +224,28 @@ class ModbusServer:
         first, count = struct.unpack(">HH", arguments)
         if not 1 <= count <= MAX_REGISTERS:
             return ILLEGAL_VALUE
-        if not any(start <= first and first + count <= start + size for start, size in self._blocks.items()):
+        if not self._exist(first, count):
             return ILLEGAL_ADDRESS
         registers = self._registers()
         if isinstance(registers, int):
             return registers
         return [registers.get(number, 0) for number in range(first, first + count)]
+
+    def _written(self, function: int, arguments: bytes, write: Callable[[Mapping[int, int]], int]) -> int:
+        """Write registers; return 0, or the code of an exception."""
+        first, count, data = int.from_bytes(arguments[:2], "big"), 1, arguments[2:]
+        if function == WRITE_SEVERAL:
+            count, data = int.from_bytes(arguments[2:4], "big"), arguments[5:]
+            if not 1 <= count <= MAX_WRITTEN or arguments[4:5] != bytes((2 * count,)):
+                return ILLEGAL_VALUE
+        if len(data) != 2 * count:
+            return ILLEGAL_VALUE
+        if not self._exist(first, count):
+            return ILLEGAL_ADDRESS
+        return write(dict(enumerate(struct.unpack(f">{count}H", data), start=first)))
+
+    def _exist(self, first: int, count: int) -> bool:
+        return any(start <= first and first + count <= start + size for start, size in self._blocks.items())
 
 
 def _is_frame(data: bytes) -> bool:

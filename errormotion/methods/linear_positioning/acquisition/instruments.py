@@ -6,6 +6,7 @@ points to the tracker the angles have an effect of second order only.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -48,7 +49,10 @@ def reader(bench: Bench, settings: Settings) -> Reader:
         No instrument that can read these freedoms.
     """
     if bench.has_kind("interferometer"):
-        return InterferometerReader(bench.of_kind("interferometer"), settings)
+        wanted = {
+            f"channels.{name}": (settings.channels.get(name, ""), UNITS[DOF.index(name)]) for name in settings.freedoms
+        }
+        return InterferometerReader(bench.of_kind("interferometer"), wanted, settings.average)
     along = DOF[direction_of(settings.axis)]
     if bench.has_kind("laser_tracker"):
         tracker = bench.of_kind("laser_tracker")
@@ -59,7 +63,27 @@ def reader(bench: Bench, settings: Settings) -> Reader:
             )
         if hasattr(tracker, "measure"):
             return TrackerReader(tracker, settings.average)
-    raise MethodError(
+    raise _missing()
+
+
+def along_line(bench: Bench, settings: Settings, channel: str, name: str) -> Reader:
+    """Return the reader of displacements along a diagonal; ``channel`` is that of an interferometer.
+
+    Raises
+    ------
+    MethodError
+        No instrument that can read them.
+    """
+    if bench.has_kind("interferometer"):
+        wanted = {f"diagonals.channels.{name}": (channel, "m")}
+        return InterferometerReader(bench.of_kind("interferometer"), wanted, settings.average)
+    if bench.has_kind("laser_tracker") and hasattr(tracker := bench.of_kind("laser_tracker"), "measure"):
+        return TrackerReader(tracker, settings.average)
+    raise _missing()
+
+
+def _missing() -> MethodError:
+    return MethodError(
         "Expected an instrument of kind 'interferometer', or a 'laser_tracker' that measures one target at a time; the "
         "bench has none. Run the NC program, write the readings to a table, and use 'errormotion identify FILE'."
     )
@@ -68,24 +92,21 @@ def reader(bench: Bench, settings: Settings) -> Reader:
 class InterferometerReader:
     """Reads the channels of an interferometer."""
 
-    def __init__(self, instrument: Any, settings: Settings) -> None:
-        self._instrument, self._average = instrument, settings.average
+    def __init__(self, instrument: Any, wanted: Mapping[str, tuple[str, str]], average: int) -> None:
+        """Take the channels of an instrument: ``wanted`` holds channel and unit by the key of the setting."""
+        self._instrument, self._average = instrument, average
         self.id = str(type(instrument).info.id)
         self.lost = True
         channels = dict(instrument.channels)
-        stated = settings.channels
-        if not stated and len(settings.freedoms) == len(channels) == 1:
-            stated = {settings.freedoms[0]: next(iter(channels))}
+        only = next(iter(channels)) if len(wanted) == len(channels) == 1 else ""
         self._signs, self._names = [], []
-        for freedom in settings.freedoms:
-            text = stated.get(freedom, "")
+        for key, (stated, unit) in wanted.items():
+            text = stated or only
             name = text.removeprefix("-")
-            unit = UNITS[DOF.index(freedom)]
             if channels.get(name) != unit:
                 known = ", ".join(f"{each} ({kind})" for each, kind in channels.items())
                 raise MethodError(
-                    f"channels.{freedom}: expected a channel in {unit} of the interferometer, which has {known}; found "
-                    f"'{text}'."
+                    f"{key}: expected a channel in {unit} of the interferometer, which has {known}; found '{text}'."
                 )
             self._names.append(name)
             self._signs.append(-1.0 if text.startswith("-") else 1.0)

@@ -58,10 +58,10 @@ def measure_axis(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
             yield stand.measure(list(part), along_runs)
 
 
-class Stand:
-    """Machine and instrument of a bench."""
+class Motion:
+    """The control of a bench: it moves to positions and lets time pass."""
 
-    def __init__(self, bench: Bench, settings: Settings, zero: float | None = None) -> None:
+    def __init__(self, bench: Bench, settings: Settings) -> None:
         self.bench, self.settings = bench, settings
         self.control: Any = bench.of_kind("controller") if bench.has_kind("controller") else None
         if not hasattr(self.control, "move_to"):
@@ -69,6 +69,43 @@ class Stand:
                 "Expected an instrument of kind 'controller' that can move the axis to a position (move_to); the bench "
                 "has none. Run the NC program, write the readings to a table, and use 'errormotion identify FILE'."
             )
+
+    def go(self, goal: Array, feed: float | None = None) -> None:
+        """Move to a position (3,), m, with the feed of the approaches or another, and wait until the axes have arrived.
+
+        Raises
+        ------
+        MethodError
+            They do not arrive.
+        """
+        self.control.move_to([float(value) for value in goal], self.settings.feed if feed is None else feed)
+        limit = time.monotonic() + self.settings.timeout
+        while True:
+            state = self.control.state()
+            off = np.abs(np.array(state["position"], np.float64) - goal)
+            if not state.get("running", False) and off.max() <= self.settings.arrival:
+                return
+            if time.monotonic() > limit:
+                k = int(off.argmax())
+                raise MethodError(
+                    f"{'XYZ'[k]} {goal[k] * 1e3:.3f} mm: the control is {off[k] * 1e3:.4g} mm off after "
+                    f"{self.settings.timeout:g} s. Is the feed held, or the position out of travel?"
+                )
+            time.sleep(_POLL_INTERVAL)
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass: that of the machine, where it has its own."""
+        if hasattr(self.control, "elapse"):
+            self.control.elapse(seconds)
+        else:
+            time.sleep(seconds)
+
+
+class Stand(Motion):
+    """Machine and instrument of a bench, for one axis."""
+
+    def __init__(self, bench: Bench, settings: Settings, zero: float | None = None) -> None:
+        super().__init__(bench, settings)
         self.reader = reader(bench, settings)
         self.places = positions(settings)
         self.zero = float(self.places[0]) if zero is None else zero  # position at which the instrument is set to zero
@@ -116,28 +153,9 @@ class Stand:
         MethodError
             It does not arrive.
         """
-        goal = list(self.settings.start)
+        goal = np.array(self.settings.start, np.float64)
         goal[direction_of(self.settings.axis)] = place
-        self.control.move_to(goal, self.settings.feed if feed is None else feed)
-        limit = time.monotonic() + self.settings.timeout
-        while True:
-            state = self.control.state()
-            off = float(np.abs(np.array(state["position"], np.float64) - goal).max())
-            if not state.get("running", False) and off <= self.settings.arrival:
-                return
-            if time.monotonic() > limit:
-                raise MethodError(
-                    f"{self.settings.axis} {place * 1e3:.3f} mm: the control is {off * 1e3:.4g} mm off after "
-                    f"{self.settings.timeout:g} s. Is the feed held, or the position out of travel?"
-                )
-            time.sleep(_POLL_INTERVAL)
-
-    def wait(self, seconds: float) -> None:
-        """Let time pass: that of the machine, where it has its own."""
-        if hasattr(self.control, "elapse"):
-            self.control.elapse(seconds)
-        else:
-            time.sleep(seconds)
+        self.go(goal, feed)
 
     def temperatures(self) -> Array:
         """Return the temperatures of the sensors now, degC; NaN where unknown."""

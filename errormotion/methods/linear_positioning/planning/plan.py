@@ -39,12 +39,7 @@ def plan(settings: Settings, info: MethodInfo) -> xr.Dataset:
         {"freedom": [names[name] for name in settings.freedoms], "approach": list(APPROACHES)},
         {"schema": SCHEMA, "axis": settings.axis, "machine": "plan"},
     )
-    stated = settings.uncertainty
-    scatter = SCATTER if stated.scatter is None else stated.scatter
-    drift = DRIFT if stated.drift is None else stated.drift
-    assumed = settings.model_copy(
-        update={"uncertainty": stated.model_copy(update={"scatter": scatter, "drift": drift})}
-    )
+    assumed, scatter, drift = assumed_scatter(settings)
     notes: list[str] = []
     found = evaluate(raw, assumed, notes, planned=True)
     errors = build(found, raw, info, provenance.make(assumed, None, None, steps=["plan"]), {})
@@ -60,6 +55,15 @@ def plan(settings: Settings, info: MethodInfo) -> xr.Dataset:
         f"{format_quantity(float(u.max()), unit, 2)}."
     )
     return errors.assign_attrs(reference="planned, not measured", notes=notes)
+
+
+def assumed_scatter(settings: Settings) -> tuple[Settings, float, float]:
+    """Return settings that state scatter and drift, and both."""
+    stated = settings.uncertainty
+    scatter = SCATTER if stated.scatter is None else stated.scatter
+    drift = DRIFT if stated.drift is None else stated.drift
+    update = {"uncertainty": stated.model_copy(update={"scatter": scatter, "drift": drift})}
+    return settings.model_copy(update=update), scatter, drift
 
 
 def _plan_moving(settings: Settings, info: MethodInfo) -> xr.Dataset:

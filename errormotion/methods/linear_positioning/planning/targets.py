@@ -45,7 +45,11 @@ def positions(settings: Settings) -> Array:
     if settings.targets:
         return np.sort(np.array(settings.targets, np.float64))
     low, high = settings.travel
-    count = settings.count or needed(high - low)
+    return spread(low, high, settings.count or needed(high - low), settings)
+
+
+def spread(low: float, high: float, count: int, settings: Settings) -> Array:
+    """Return positions from ``low`` to ``high`` with their random parts, (count,), m."""
     interval = (high - low) / (count - 1)
     largest = min(RANDOM_SHARE * interval if settings.random_part is None else settings.random_part, 0.49 * interval)
     part = np.random.default_rng(settings.seed).uniform(-largest, largest, count)
@@ -61,9 +65,9 @@ def needed(length: float) -> int:
     return max(FEWEST, math.ceil(length / LONG_INTERVAL - 1e-9) + 1)
 
 
-def sequence(settings: Settings) -> Iterator[Approach]:
-    """Yield the approaches in their order: linear or pendulum cycles."""
-    places = [float(place) for place in positions(settings)]
+def sequence(settings: Settings, positions_of: Array | None = None) -> Iterator[Approach]:
+    """Yield the approaches in their order, linear or pendulum cycles: of the targets of the settings, or of others."""
+    places = [float(place) for place in (positions(settings) if positions_of is None else positions_of)]
     beyond = settings.overrun
     last = len(places) - 1
     if settings.cycle == "linear":

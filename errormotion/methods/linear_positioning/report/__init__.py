@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from errormotion.datasets.results.merit import is_planned
-from errormotion.methods.linear_positioning.report import chapter, moving
+from errormotion.methods.linear_positioning.report import chapter, diagonals, moving
 from errormotion.report.document import Part, Source
 
 
@@ -13,4 +13,6 @@ def chapters(source: Source) -> list[Part]:
         return []
     if "distortion" in source.errors:
         return [moving.part(source, source.key)]
+    if "squareness" in source.errors:
+        return [diagonals.part(source, source.key)]
     return [chapter.part(source, source.key)]

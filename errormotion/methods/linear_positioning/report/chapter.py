@@ -30,7 +30,7 @@ def part(source: Source, key: str) -> Part:
         Section(
             f"graph-{view.name}",
             f"{_title(view)} {view.name}",
-            [drawings.over_position(view, f"{key}-{view.name}"), *_target_tables(view)],
+            [drawings.over_position(view, f"{key}-{view.name}", source.limits), *target_tables(view)],
         )
         for view in seen
     ]
@@ -45,7 +45,7 @@ def part(source: Source, key: str) -> Part:
 
 def _figures(seen: list[View], limits: dict[str, float], key: str) -> list[Block]:
     bars = [drawings.against_limits(seen[0], limits, key)] if limits else []
-    first, *others = (_figure_table(view, limits) for view in seen)
+    first, *others = (figure_table(view, limits) for view in seen)
     return [first, *bars, *others]
 
 
@@ -91,7 +91,8 @@ def _verdict(view: View, name: str, limit: float) -> str:
     return "not decided, since its uncertainty contains the limit of"
 
 
-def _figure_table(view: View, limits: dict[str, float]) -> Table:
+def figure_table(view: View, limits: dict[str, float]) -> Table:
+    """Return the figures of one freedom or diagonal with excess and uncertainty."""
     rows: list[list[Cell | str]] = []
     for name in FIGURES:
         value, bias, u = view.value[name], view.bias[name], view.u[name]
@@ -112,7 +113,7 @@ def _figure_table(view: View, limits: dict[str, float]) -> Table:
     return Table(caption, ["figure", "what it is", "value", "excess", "true figure", "limit"], rows, numeric=False)
 
 
-def _target_tables(view: View) -> list[Block]:
+def target_tables(view: View) -> list[Block]:
     """Return the results by target as the standard lists them, some targets a table."""
     found: list[Block] = []
     decimals = _decimals(view)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
@@ -20,7 +21,7 @@ HEIGHTS = (2.6, 1.1)
 """Of the panels of deviations and of the reversal error, inch."""
 
 
-def over_position(view: View, key: str) -> Figure:
+def over_position(view: View, key: str, limits: Mapping[str, tuple[float, float]]) -> Figure:
     """Return runs, means and mean ± 2 s of both approaches over the position, and the reversal error below."""
     P = view.position
 
@@ -33,20 +34,23 @@ def over_position(view: View, key: str) -> Figure:
             upper.fill_between(
                 P, view.mean[k] - 2 * view.s[k], view.mean[k] + 2 * view.s[k], color=colour, alpha=0.15, linewidth=0
             )
-            for run in view.readings[k]:
-                upper.plot(P, run, color=colour, linewidth=0.45, alpha=0.55)
-            upper.plot(P, view.mean[k], color=colour, linewidth=1.4, marker="o", markersize=3.2)
+            for j, run in enumerate(view.readings[k]):
+                upper.plot(P, run, color=colour, linewidth=0.45, alpha=0.55, label=f"run {j + 1}, {name}")
+            upper.plot(P, view.mean[k], color=colour, linewidth=1.4, marker="o", markersize=3.2, label=f"mean {name}")
             ends.append((float(view.mean[k][-1]), name, colour))
         middle = view.mean.mean(axis=0)
         if np.isfinite(middle).any():
-            upper.plot(P, middle, color=canvas.BLACK, linewidth=0.9, linestyle=(0, (5, 2)))
+            upper.plot(P, middle, color=canvas.BLACK, linewidth=0.9, linestyle=(0, (5, 2)), label="mean of both")
         _levels(upper, view)
+        if view.name in limits:
+            lower_limit, upper_limit = (each / view.size for each in limits[view.name])
+            canvas.limit_lines(upper, [(view.name, lower_limit, upper_limit)])
         canvas.label_ends(upper, ends)
         upper.set_ylabel(f"{view.name} / {view.unit}", labelpad=2)
         reversal = view.mean[0] - view.mean[1]
         lower.axhline(0, color=DARK, linewidth=0.6)
         lower.vlines(P, 0, reversal, color=canvas.GREEN, linewidth=1.2)
-        lower.plot(P, reversal, color=canvas.GREEN, marker="s", markersize=3.2, linewidth=0)
+        lower.plot(P, reversal, color=canvas.GREEN, marker="s", markersize=3.2, linewidth=0, label="B")
         lower.set_ylabel(f"B / {view.unit}", labelpad=2)
         lower.set_xlabel("target position / mm")
 

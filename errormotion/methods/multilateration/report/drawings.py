@@ -10,15 +10,14 @@ from errormotion.arrays import Array
 from errormotion.methods.multilateration.report.view import AXES, Network, thinned
 from errormotion.report import canvas
 from errormotion.report.document import Block, Figure, Text
-from errormotion.report.text import finite, fixed, integer, listed, significant
-from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw, enlargement
+from errormotion.report.text import finite, fixed, integer, listed, rounded, significant
+from errormotion.report.turntable import TURN, Dots, Ellipsoids, Lines, Scene, draw, enlargement
 
 _VECTORS, _SIGHTS, _ELLIPSOIDS = 400, 60, 150
 _ARROW = 0.12  # longest arrow, share of the diagonal of the volume
 _TYPICAL, _LARGEST = 0.015, 0.1  # half axis of the median ellipsoid, and of the largest: shares of the same
 _SOFT, _FAINT = "#8a8f98", "#c3c8d0"
 _SHADES = ("#7fb0dc", "#2a5599", "#D55E00")  # thirds of the longest, shortest first
-_TURN = " The buttons turn it, as do the arrow keys after a click on one."
 
 
 def _span(net: Network) -> float:
@@ -47,7 +46,8 @@ def vectors(net: Network, key: str) -> Block:
     picked = thinned(known, _VECTORS, net.worst)
     ends = np.stack([net.place[picked], net.place[picked] + factor * net.error[picked]], axis=1)
     third = np.minimum(3 * net.length[picked] / longest, 2.999).astype(int)
-    parts: list[Lines | Dots | Ellipsoids] = [_box(net), Dots(net.place[picked], _SOFT, 0.9)]
+    notes = [_note(net, int(i)) for i in picked]
+    parts: list[Lines | Dots | Ellipsoids] = [_box(net), Dots(net.place[picked], _SOFT, 0.9, notes=notes)]
     parts += [Lines(ends[third == k], colour, 1.0, 3.2) for k, colour in enumerate(_SHADES) if (third == k).any()]
     parts.append(Dots(ends[picked == net.worst, 0], _SHADES[2], 1.6, [net.targets[net.worst]]))
     um = 1e6 * longest
@@ -55,10 +55,17 @@ def vectors(net: Network, key: str) -> Block:
     caption = (
         f"Error vectors, {integer(factor)} times enlarged, from the commanded places (dots). Pale: up to a third of "
         f"the longest, which is {fixed(um, 2)} µm at {net.targets[net.worst]}; dark: up to two thirds; "
-        f"red: above.{fewer}{_TURN}"
+        f"red: above.{fewer}{TURN}"
     )
     alt = f"Error vectors of {integer(picked.size)} targets in space; the longest is {fixed(um, 2)} µm."
     return Figure(draw(Scene(parts), key), caption, alt)
+
+
+def _note(net: Network, target: int) -> str:
+    """Return name and error of a target with its expanded uncertainty, one line each."""
+    errors = zip(("EX", "EY", "EZ"), net.error[target], net.sigma[target], strict=True)
+    lines = [(name, *rounded(1e6 * value, 2e6 * sigma)) for name, value, sigma in errors]
+    return "\n".join([net.targets[target], *(f"{name}: {value} ± {U} µm" for name, value, U in lines)])
 
 
 def layout(net: Network, key: str) -> Block:
@@ -88,7 +95,7 @@ def layout(net: Network, key: str) -> Block:
         else ""
     )
     dashed = " Dashed: no reading, or one that was left out." if broken else ""
-    caption = f"Places of the tracker, targets, and lines of sight.{dashed}{fewer}{_TURN}"
+    caption = f"Places of the tracker, targets, and lines of sight.{dashed}{fewer}{TURN}"
     alt = f"{len(stands)} places of the tracker around {integer(net.drawn.size)} targets."
     return Figure(draw(Scene(parts), key), caption, alt)
 
@@ -113,7 +120,7 @@ def ellipsoids(net: Network, key: str) -> Block:
         f"Uncertainty of the targets, k = 2: ellipsoids {integer(factor)} times enlarged. The longest half axis is "
         f"{significant(1e6 * largest)} µm, at {net.targets[worst]}; the median over the targets is "
         f"{significant(1e6 * typical)} µm. What all targets share lies in them "
-        f"too.{_TURN}"
+        f"too.{TURN}"
     )
     return Figure(draw(Scene(parts), key), caption, f"Uncertainty ellipsoids of {integer(picked.size)} targets.")
 

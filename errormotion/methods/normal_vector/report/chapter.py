@@ -158,7 +158,7 @@ def errors_over_time(source: Source, key: str, seen: Probing) -> list[Block]:
     names = timeline.sensor_names(errors)
     values = errors["temperature"].transpose("time", "sensor").values if names else np.empty((len(seen.time), 0))
     panels = [
-        *timeline.errors(errors),
+        *timeline.errors(errors, source.limits),
         *timeline.temperatures(names, np.asarray(values, float)),
         *timeline.working(errors, held=True, commanded=commanded),
     ]

@@ -11,7 +11,7 @@ from errormotion.report import canvas, timeline
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Figure, Text
 from errormotion.report.text import SECOND_OF_ARC, UM, finite, fixed, integer, listed
-from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw, enlargement
+from errormotion.report.turntable import TURN, Dots, Ellipsoids, Lines, Scene, draw, enlargement
 
 _LONGEST = 0.22  # drawn length of the longest displacement, relative to the diagonal of the balls
 _FAINT, _SOFT = "#c3c8d0", "#6f7680"
@@ -63,7 +63,7 @@ def balls(seen: Probing, key: str) -> Block:
             if poor
             else ""
         )
-        + " The buttons rotate the drawing, as do the arrow keys after a click on one."
+        + TURN
     )
     alt = f"Balls {listed(seen.balls)} in space with their displacements, magnified {integer(factor)} times."
     return Figure(draw(Scene(parts), key), caption, alt)

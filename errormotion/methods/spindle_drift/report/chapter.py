@@ -226,8 +226,8 @@ def _values(source: Source) -> list[Block]:
 def _drift(source: Source, key: str) -> list[Block]:
     done = events(source)
     made = [
-        spindle_figures.displacements(source.errors, done, f"{key}-d"),
-        spindle_figures.tilts(source.errors, done, f"{key}-t"),
+        spindle_figures.displacements(source.errors, done, f"{key}-d", source.limits),
+        spindle_figures.tilts(source.errors, done, f"{key}-t", source.limits),
     ]
     return [figure for figure in made if figure is not None] or [Text("No instant has a valid result.", "warning")]
 

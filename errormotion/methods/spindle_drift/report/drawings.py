@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -17,6 +17,9 @@ from errormotion.report.series import LOOK, Curve, Event, curves, last_known, mi
 from errormotion.report.text import UM, fixed
 from errormotion.report.timeline import events_in_words, mark
 
+Limits = Mapping[str, tuple[float, float]]
+"""Lower and upper limits of errors by name, SI."""
+
 
 def overview(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | None:
     """Return all displacements in one panel, for the summary; None where all are unknown."""
@@ -29,7 +32,7 @@ def overview(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | No
     return Figure(svg, caption, _in_words("All displacements over time", [found], minutes_of(errors)))
 
 
-def displacements(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | None:
+def displacements(errors: xr.Dataset, done: Sequence[Event], key: str, limits: Limits) -> Figure | None:
     """Return the displacement curves with their bands: X, Y and Z above one another; None where all are unknown."""
     found = curves(errors)
     rows = [[found[name] for name in names] for names in (("X1", "X2"), ("Y1", "Y2"), ("Z",))]
@@ -38,7 +41,7 @@ def displacements(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure
         return None
     labels = ["µm"] * len(rows)
     titles = [f"Displacement in {row[0].name[0]}" for row in rows]
-    svg = _stack(errors, rows, labels, done, key, speed=True, titles=titles)
+    svg = _stack(errors, rows, labels, done, key, speed=True, titles=titles, limits=limits)
     caption = (
         "Displacement of the spindle side relative to the workpiece side, against the reference state. L1 and L2 are "
         "the two levels of measurement. Bands: expanded uncertainty, k = 2."
@@ -46,13 +49,14 @@ def displacements(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure
     return Figure(svg, caption + events_in_words(done), _in_words("Displacement over time", rows, minutes_of(errors)))
 
 
-def tilts(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | None:
+def tilts(errors: xr.Dataset, done: Sequence[Event], key: str, limits: Limits) -> Figure | None:
     """Return the two tilt curves with their bands; None where both are unknown."""
     found = curves(errors)
     rows = [[found["A"], found["B"]]]
     if not any(np.isfinite(curve.values).any() for curve in rows[0]):
         return None
-    svg = _stack(errors, rows, ["arcsec"], done, key, height=1.5, titles=["Tilt about X (A) and about Y (B)"])
+    titles = ["Tilt about X (A) and about Y (B)"]
+    svg = _stack(errors, rows, ["arcsec"], done, key, height=1.5, titles=titles, limits=limits)
     caption = (
         "Tilt of the spindle axis about X (A, inclination in the YZ plane) and about Y (B, inclination in the XZ "
         "plane), right-handed. Bands: expanded uncertainty, k = 2."
@@ -78,7 +82,7 @@ def temperatures(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure 
         for place, i in enumerate(known):
             colour = canvas.COLOURS[place % len(canvas.COLOURS)]
             dash = DASHES[place // len(canvas.COLOURS) % len(DASHES)]
-            canvas.curve(axes, time, values[:, i], colour=colour, dash=dash)
+            canvas.curve(axes, time, values[:, i], colour=colour, dash=dash, name=names[i])
         handles = list(axes.get_lines())
         axes.legend(handles, [" " + names[i] for i in known], loc="center left", bbox_to_anchor=(1.01, 0.5))
         axes.set_ylabel("temperature / °C")
@@ -115,7 +119,7 @@ def channels(errors: xr.Dataset, name: str, title: str, caption: str, key: str) 
     def paint(figure: Canvas) -> None:
         panels = canvas.stack(figure, heights)
         for axes, label, row in zip(panels, names, values, strict=True):
-            canvas.curve(axes, time, row, colour=LOOK.get(label, (BLUE, None))[0], width=0.7)
+            canvas.curve(axes, time, row, colour=LOOK.get(label, (BLUE, None))[0], width=0.7, name=label)
             axes.set_ylabel("µm")
             axes.locator_params(axis="y", nbins=3)
             axes.margins(y=0.12)
@@ -152,6 +156,7 @@ def _stack(
     titles: list[str],
     height: float = 1.4,
     speed: bool = False,
+    limits: Limits | None = None,
 ) -> Markup:
     time = minutes_of(errors)
     turning = running(errors) if speed else None
@@ -165,13 +170,15 @@ def _stack(
             for line in row:
                 colour, dash = LOOK[line.name]
                 size = line.unit[1]
-                canvas.curve(axes, time, line.values / size, 2 * line.uncertainty / size, colour=colour, dash=dash)
+                expanded = 2 * line.uncertainty / size
+                canvas.curve(axes, time, line.values / size, expanded, colour=colour, dash=dash, name=line.name)
                 last = last_known(line.values)
                 ends[-1].append((np.nan if last is None else line.values[last] / size, line.name, colour))
             axes.axhline(0, color="#888888", linewidth=0.6)
             axes.set_ylabel(f"{label}")
             axes.set_title(title)
             axes.margins(y=0.1)
+            canvas.limit_lines(axes, _limits_of(row, limits or {}))
         if turning is not None:
             _speed_strip(panels[-1], time, np.asarray(errors["spindle_speed"].values, float))
         _time_axis(panels[-1], time)
@@ -181,6 +188,17 @@ def _stack(
             canvas.label_ends(axes, row_ends)
 
     return canvas.draw(paint, key, canvas.stack_height(heights))
+
+
+def _limits_of(row: Sequence[Curve], limits: Limits) -> list[tuple[str, float, float]]:
+    """Return the limits of the curves that are errors at the functional point, in the unit of the page."""
+    found = []
+    for line in row:
+        freedom = f"E{line.name}"
+        if freedom in limits:
+            lower, upper = (each / line.unit[1] for each in limits[freedom])
+            found.append((freedom, lower, upper))
+    return found
 
 
 def _speed_strip(axes: Axes, time: np.ndarray, speed: np.ndarray) -> None:

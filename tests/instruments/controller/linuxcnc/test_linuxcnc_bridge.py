@@ -383,8 +383,16 @@ def test_one_client_controls_and_the_others_read_and_stop(play: Callable[[Test],
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         other = Wire(bridge, client="two")
         assert wire.welcome["result"]["control"] is True
-        assert other.welcome["result"] == {"protocol": 2, "control": False, "controlled_by": "one"}
-        for op in sorted(bridge._work.keys() - {"identify", "state", "elapse", "finish", "stop", "estop"}):
+        expected = {
+            "protocol": 2,
+            "control": False,
+            "controlled_by": "one",
+            "compensate": False,
+            "compensated_by": None,
+        }
+        assert other.welcome["result"] == expected
+        reads = {"identify", "state", "elapse", "finish", "stop", "estop", "offset", "set_offset"}
+        for op in sorted(bridge._work.keys() - reads):
             assert "only reads" in await other.ask(op)
         assert not fake.lines
         assert (await other.ask("state"))["enabled"]
@@ -925,3 +933,42 @@ def test_commands_are_sent_by_another_process_and_a_lost_one_ends_the_bridge(
         asyncio.run(test())
     finally:
         os.waitpid(sender.pid, 0)
+
+
+def test_a_bridge_gives_the_right_to_compensate_only_where_it_was_started_with_it(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        other = Wire(bridge, client="two", control=False, compensate=True)
+        assert other.welcome["result"]["compensate"] is False
+        assert "started without --compensate" in await other.ask("set_offset", offset=[0, 0, 0])
+        assert "started without --compensate" in await wire.ask("set_offset", offset=[0, 0, 0])
+
+    play(test)
+
+
+def test_one_client_compensates_and_may_do_nothing_else(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        bridge.compensates = True
+        first = Wire(bridge, client="two", control=False, compensate=True)
+        second = Wire(bridge, client="three", control=False, compensate=True)
+        assert first.welcome["result"]["compensate"] is True
+        assert (second.welcome["result"]["compensate"], second.welcome["result"]["compensated_by"]) == (False, "two")
+        assert "only reads" in await first.ask("move_to", position=[0, 0, 0])
+        assert "only reads" in await first.ask("set_pins", pins={"ball0": 1.0})
+        assert "has not loaded" in await first.ask("set_offset", offset=[0, 0, 0])
+        for client in (wire, second):
+            assert "does not compensate" in await client.ask("set_offset", offset=[0, 0, 0])
+        await first.disconnect()
+        third = Wire(bridge, client="three", control=False, compensate=True)
+        assert third.welcome["result"]["compensate"] is True
+
+    play(test)
+
+
+def test_no_client_sets_the_pins_of_the_compensation_directly(tmp_path: Path) -> None:
+    async def test() -> None:
+        bridge = made(FakeLinuxCNC(), tmp_path, pins=("", "e"))
+        wire = Wire(bridge)
+        assert "not among those" in await wire.ask("set_pins", pins={"errormotion-source-x.in1": 1.0})
+        await wire.disconnect()
+
+    asyncio.run(test())

@@ -1,0 +1,66 @@
+"""The head of reports: what bench and campaign state of the laboratory, the order and the calibrations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import date
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from errormotion.datasets import certificates
+from errormotion.datasets.files import tomlfile
+from errormotion.report.page import logo
+
+
+class Laboratory(BaseModel):
+    """``[laboratory]`` of a bench file: who tests."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    name: str = Field(max_length=200, description="name of the laboratory")
+    address: str = Field(default="", max_length=1000, description="address, in one or several lines")
+    accreditation: str = Field(default="", max_length=200, description="accreditation or department")
+    logo: str = Field(default="", description="picture (.png, .jpg, .svg), relative to this file")
+
+
+class ReportTable(BaseModel):
+    """``[report]`` of a campaign file: the order, and how its reports are written."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    customer: str = Field(default="", max_length=200, description="customer")
+    order: str = Field(default="", max_length=200, description="number of the order")
+    number: str = Field(default="", max_length=100, description="number of the report; default: made of the data")
+    language: Literal["", "en", "de"] = Field(default="", description="language of the report: en, de")
+    paper: Literal["", "A4", "Letter"] = Field(default="", description="paper of the report: A4, Letter")
+
+
+def logo_mistakes(laboratory: Laboratory | None, folder: Path) -> list[str]:
+    """Return why the logo of a laboratory cannot be used; empty without one."""
+    found = logo.mistake(folder / laboratory.logo) if laboratory is not None and laboratory.logo else ""
+    return [f"laboratory.logo: {found}"] if found else []
+
+
+def until_mistakes(until: Mapping[str, date], instruments: Mapping[str, Any]) -> list[str]:
+    """Return the keys of ``[calibrated_until]`` that are neither an instrument of the bench nor a certified item."""
+    known = [*instruments, *certificates.ITEMS]
+    return [
+        f"calibrated_until.{name}: expected an instrument or a certified item; {tomlfile.nearest(name, known)}"
+        for name in until
+        if name not in known
+    ]
+
+
+def stated(
+    laboratory: Laboratory | None, report: ReportTable | None, until: Mapping[str, date], certified: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return the head of the reports of a campaign for a ``run.json``; without what is not stated."""
+    found: dict[str, Any] = {}
+    if laboratory is not None:
+        found |= {"laboratory": laboratory.name, "address": laboratory.address}
+        found["accreditation"] = laboratory.accreditation
+    found |= report.model_dump() if report is not None else {}
+    if until:
+        found["calibrated_until"] = {name: day.isoformat() for name, day in until.items()}
+        found["certificates"] = dict(certified)
+    return {key: each for key, each in found.items() if each}

@@ -1,0 +1,1 @@
+"""Commands that hand a result on: to the browser, to a spreadsheet."""

@@ -1,0 +1,97 @@
+"""What the analysis of a compensation returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from errormotion.compare.ground import Ground
+from errormotion.compensation.effect.magnitude import Interval
+from errormotion.tolerances.conformity import Conformity
+
+REDUCED, WORSE, OPEN = "reduced", "larger", "not shown"
+
+
+@dataclass(frozen=True)
+class Part:
+    """One freedom, or the displacement of the tool as a whole; m or rad.
+
+    Attributes
+    ----------
+    name : str
+        Freedom, or `analysis.DISPLACEMENT`.
+    unit : str
+        SI.
+    before, after : Interval
+        Root mean squares over the common points, the uncertainty of the measurement taken off.
+    reduction : Interval
+        1 less their ratio.
+    correctable : bool
+        Whether linear axes can take it off; they cannot take off rotations.
+    floor : float
+        Root mean square that AFTER would show in the mean if nothing were left: its measurement uncertainty.
+    reference : float
+        The part of ``floor`` that comes from the reference state, on which every value depends.
+    """
+
+    name: str
+    unit: str
+    before: Interval
+    after: Interval
+    reduction: Interval
+    correctable: bool
+    floor: float
+    reference: float
+
+    @property
+    def perfect(self) -> float:
+        """Root mean square that AFTER would show in the mean with a perfect model.
+
+        For a displacement ``floor``; for a rotation what BEFORE had, and ``floor``.
+        """
+        left = 0.0 if self.correctable else self.before.value
+        return float((left**2 + self.floor**2) ** 0.5)
+
+    @property
+    def outcome(self) -> str:
+        """REDUCED or WORSE where the interval of the reduction excludes 0, else OPEN."""
+        return REDUCED if self.reduction.low > 0 else WORSE if self.reduction.high < 0 else OPEN
+
+
+@dataclass(frozen=True)
+class FigurePair:
+    """A figure of merit of both results; SI, U with k = 2, NaN where one result does not have it."""
+
+    name: str
+    unit: str
+    before: tuple[float, float]
+    after: tuple[float, float]
+    reduction: Interval
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What a compensation changed.
+
+    Attributes
+    ----------
+    parts : tuple of Part
+        Each freedom that both results see, then the displacement as a whole.
+    figures : tuple of FigurePair
+    ground : Ground
+        Both results, ``before`` and ``after``, at the same points.
+    before, after, gained : Conformity or None
+        Decisions on the limits: of both results, and on ``reduction of ...``.
+    notes : tuple of str
+    """
+
+    parts: tuple[Part, ...]
+    figures: tuple[FigurePair, ...]
+    ground: Ground
+    before: Conformity | None
+    after: Conformity | None
+    gained: Conformity | None
+    notes: tuple[str, ...]
+
+    def part(self, name: str) -> Part:
+        """Return one of the parts by its name."""
+        return next(each for each in self.parts if each.name == name)

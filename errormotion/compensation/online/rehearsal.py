@@ -1,0 +1,76 @@
+"""A compensation in simulated time: what it would have written for given readings, by the decisions of the real one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.compensation.online.follower import Conditions, Follower
+from errormotion.compensation.online.prediction import Predictor, refusal
+from errormotion.compensation.online.settings import Limits
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """What was decided at each of n instants.
+
+    Attributes
+    ----------
+    time : (n,)
+        s.
+    offset : (n, 3)
+        m.
+    state, cause : tuple of str
+        State, and why the offset did not follow.
+    """
+
+    time: Array
+    offset: Array
+    state: tuple[str, ...]
+    cause: tuple[str, ...]
+
+    def share(self, state: str) -> float:
+        """Return the share of the instants in a state."""
+        return self.state.count(state) / len(self.state)
+
+
+def rehearse(
+    predictor: Predictor,
+    limits: Limits,
+    time: Array,
+    temperature: Mapping[str, Array],
+    parameter: Mapping[str, Array],
+    busy: NDArray[np.bool_] | None = None,
+) -> Rehearsal:
+    """Follow readings from the reference state on, armed with an offset of 0.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    limits : Limits
+    time : (n,)
+        s, increasing; usually ``limits.period`` apart.
+    temperature, parameter : mapping of str to (n,)
+        Readings by their names; NaN: unknown.
+    busy : (n,) of bool, optional
+        When the machine must not be disturbed, as by probing.
+    """
+    follower = Follower(limits)
+    follower.arm(np.zeros(3))
+    offset, states, causes = np.zeros((len(time), 3)), [], []
+    for k, now in enumerate(time):
+        heat = {name: float(values[k]) for name, values in temperature.items()}
+        speeds = {name: float(values[k]) for name, values in parameter.items()}
+        prediction = predictor.update(float(now), heat, speeds)
+        cause = refusal(prediction, limits)
+        target = None if cause else -prediction.errors[:3]
+        probing = "probing" if busy is not None and busy[k] else ""
+        step = follower.step(float(now), Conditions(target, cause, probing))
+        offset[k] = step.offset
+        states.append(str(step.state))
+        causes.append(step.cause)
+    return Rehearsal(np.asarray(time, dtype=float), offset, tuple(states), tuple(causes))

@@ -1,0 +1,210 @@
+"""Compensators for machines under LinuxCNC, through the bridge and ``compensation.tcl`` in its servo thread.
+
+``compensation.tcl`` bounds the offset, limits its change, holds it, and ramps it to zero without a sign of life, also
+when the bridge has ended. The bridge checks each offset once more, and takes them from one client at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from errormotion.datasets.units import Time
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.compensator.door import OffsetDoor
+from errormotion.instruments.controller.linuxcnc import codec
+from errormotion.instruments.controller.linuxcnc.driver import NAME, read_token
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.transports import Transport
+from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo, PluginSettings
+
+SIMULATOR = "errormotion.instruments.simulators.controller.linuxcnc:SimulatedLinuxCNC"
+
+
+class LinuxCNCCompensatorSettings(PluginSettings):
+    """Settings of ``linuxcnc_offset`` and ``linuxcnc_feedback``."""
+
+    token_file: Path = Field(
+        default=Path("~/.errormotion/linuxcnc.token"),
+        description="file with the token of the bridge, readable by its user only",
+    )
+    timeout: Time = Field(default=1.0, description="time limit without an answer of the bridge", gt=0, le=10)
+
+
+class LinuxCNCOffset(Driver):
+    """Offsets as external offsets of LinuxCNC (``axis.L.eoffset``).
+
+    Opening and reading change nothing. `arm` asks the bridge for the right to set offsets, which one program at a time
+    has; after a lost connection the next `write` does.
+
+    Parameters
+    ----------
+    address : str
+        As that of the driver ``linuxcnc``: ``unix://~/.errormotion/linuxcnc.sock``, ``sim://cframe/linuxcnc?seed=3``.
+    settings : LinuxCNCCompensatorSettings, optional
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="linuxcnc_offset",
+        kind="compensator",
+        summary="Offsets of LinuxCNC 2.9 (external offsets), with limits and watchdog in its servo thread.",
+        status="simulated_only",
+        simulator=SIMULATOR,
+    )
+    Settings: ClassVar[type[PluginSettings]] = LinuxCNCCompensatorSettings
+    route: ClassVar[str] = "external"
+
+    def __init__(self, address: str, settings: Any = None) -> None:
+        super().__init__(address, settings)
+        self._door = OffsetDoor(f"{self.info.id} at {address}")
+        self._number = 0
+        self._may_write = False
+
+    @classmethod
+    def conformance(cls) -> CompensatorSubject:
+        """Return what the conformance kit examines: the machine that runs here, without writing to it."""
+        return CompensatorSubject(
+            cls, address="unix://~/.errormotion/linuxcnc.sock", dead_address="unix:///nonexistent/linuxcnc.sock"
+        )
+
+    def close(self) -> None:
+        """Disconnect and disarm; the offset ramps to zero by the watchdog in the servo thread. Idempotent."""
+        self._door.disarm()
+        super().close()
+
+    def identify(self) -> Identity:
+        """Return the machine."""
+        facts = self._ask("identify")
+        try:
+            return Identity(
+                manufacturer=str(facts["manufacturer"]),
+                model=str(facts["model"]),
+                serial_number=str(facts["serial_number"]),
+                firmware=str(facts["firmware"]),
+                simulated=self.transport.simulated,
+                details={"address": self.address, "route": self.route},
+            )
+        except (KeyError, TypeError):
+            raise ProtocolError(f"Expected the identity of a LinuxCNC; found {str(facts)[:200]}") from None
+
+    def arm(self, limit: float) -> None:
+        """Let offsets be written up to a limit of each axis, m; ask the bridge for the right to set them.
+
+        Raises
+        ------
+        InstrumentError
+            Another program has the right, the bridge gives none, or its limit is below this one.
+        """
+        self._door.arm(limit)
+        try:
+            found = self._state()
+            if found.limit < limit * (1 - 1e-6):
+                raise InstrumentError(
+                    f"{self.address}: expected [ERRORMOTION] LIMIT of at least {1e6 * limit:g} um in LinuxCNC's INI "
+                    f"file; found {1e6 * found.limit:g} um"
+                )
+            self._claim(self.transport)
+        except BaseException:
+            self._door.disarm()
+            raise
+
+    def read(self) -> Applied:
+        """Return the offset in effect; busy: it is held in the servo thread; fault: LinuxCNC takes none.
+
+        Raises
+        ------
+        InstrumentError
+            No answer; the connection is closed, and `open` opens another.
+        """
+        found = self._state()
+        fault = found.fault
+        if not fault and found.by and not self._may_write:
+            fault = f"another program compensates the machine: {found.by}"
+        return Applied(found.offset, found.busy, fault)
+
+    def write(self, offset: Sequence[float]) -> None:
+        """Ask for an offset of X, Y, Z, m; a sign of life for the watchdog.
+
+        Raises
+        ------
+        InstrumentError
+            Not armed, beyond the limit, not three finite numbers; no answer; or the bridge refuses it: another
+            program compensates, the machine is off, the offset jumps.
+        """
+        values, line = self._door.offset(offset), self.transport
+        if not self._may_write:
+            self._claim(line)
+        self._ask("set_offset", offset=list(values))
+
+    # ------------------------------------------------------------------ connection
+
+    def _start_session(self) -> None:
+        self._number, self._may_write = 0, False
+        self._hello(self.transport, compensate=False)
+
+    def _state(self) -> codec.Offset:
+        found = codec.decode_offset(self._ask("offset"))
+        if found.route != self.route:
+            raise InstrumentError(
+                f"{self.address}: expected ROUTE = {self.route} in LinuxCNC's INI file for {self.info.id}; found "
+                f"{found.route}"
+            )
+        return found
+
+    def _claim(self, line: Transport) -> None:
+        given, other = codec.decode_right(self._hello(line, compensate=True))
+        if not given:
+            why = f"another program has it ({other})" if other else "start the bridge with --compensate"
+            raise InstrumentError(f"{self.address} gives no right to set offsets: {why}")
+        self._may_write = True
+
+    def _hello(self, line: Transport, *, compensate: bool) -> Any:
+        token = "" if line.simulated else read_token(self.settings.token_file, self.address)
+        return self._ask("hello", token=token, control=False, client=f"{NAME} {id(self):x}", compensate=compensate)
+
+    def _ask(self, op: str, **arguments: Any) -> Any:
+        """Return the result of a request; after a failure without an answer the connection is closed."""
+        line = self.transport
+        self._number += 1
+        request = codec.encode_request(self._number, op, arguments)
+        try:
+            line.write(request)
+            answer = self._answer(line)
+        except InstrumentError:
+            self._drop()
+            raise
+        if not answer.ok:
+            raise InstrumentError(f"{self.address} refuses '{op.replace('_', ' ')}': {answer.error}")
+        return answer.result
+
+    def _answer(self, line: Transport) -> codec.Answer:
+        try:
+            message = codec.decode(line.read_until(codec.LINE_END, limit=codec.LONGEST_LINE))
+        except InstrumentTimeoutError:
+            raise InstrumentTimeoutError(
+                f"{self.address}: the bridge of LinuxCNC did not answer within {self.settings.timeout:g} s"
+            ) from None
+        if message.number is None and not getattr(message, "ok", True):
+            raise InstrumentError(f"{self.address}: the bridge ends the connection: {getattr(message, 'error', '')}")
+        if message.number != self._number or not isinstance(message, codec.Answer):
+            raise ProtocolError(f"{self.address}: expected the answer to request {self._number}; found {message}")
+        return message
+
+
+class LinuxCNCFeedback(LinuxCNCOffset):
+    """Offsets in the feedback path of LinuxCNC: added to the motors' commands, subtracted from their feedback.
+
+    LinuxCNC does not know them: its positions are those without errors. Otherwise as `LinuxCNCOffset`.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="linuxcnc_feedback",
+        kind="compensator",
+        summary="Offsets in the feedback path of LinuxCNC 2.9, with limits and watchdog in its servo thread.",
+        status="simulated_only",
+        simulator=SIMULATOR,
+    )
+    route: ClassVar[str] = "feedback"

@@ -1,0 +1,176 @@
+"""``modbus_registers``: offsets in holding registers of a PLC, with a register as sign of life.
+
+The program of the PLC adds the offsets, and must have a watchdog on the heartbeat, a slew limit and a bound of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+from errormotion.errors import InstrumentError
+from errormotion.instruments.compensator.door import ROUNDING, OffsetDoor
+from errormotion.instruments.compensator.register_map import SIZES, RegisterSettings, runs
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.transports.modbus.client import READ_HOLDING, ModbusLine, open_modbus
+from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo
+
+MOST_READ, MOST_WRITTEN = 125, 123
+"""Registers of one request."""
+
+
+class ModbusRegisters(Driver):
+    """Writes offsets to a PLC by Modbus TCP, RTU on a serial line, or RTU through a serial server.
+
+    All registers that are adjacent are written by one request; the heartbeat is written with the last one, so that an
+    offset that was written in part is no sign of life.
+
+    Parameters
+    ----------
+    address : str
+        ``modbus+tcp://host:502?unit=1``, ``modbus+rtu:///dev/ttyUSB0?baudrate=19200&unit=1``,
+        ``modbus+rtu-tcp://host:4001?unit=1``, ``sim://cframe/plc``.
+    settings : RegisterSettings, optional
+    record : Path, optional
+        Recording of the session.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="modbus_registers",
+        kind="compensator",
+        summary="Offsets in holding registers of a PLC, with a heartbeat: Modbus TCP, RTU, RTU over TCP.",
+        status="peer_verified",
+        simulator="errormotion.instruments.simulators.compensator.plc:SimulatedPlc",
+    )
+    Settings: ClassVar[type[RegisterSettings]] = RegisterSettings
+    settings: RegisterSettings
+
+    @classmethod
+    def conformance(cls) -> tuple[CompensatorSubject, ...]:
+        """Return what the conformance kit examines: TCP, and 16 bits on a serial line."""
+        limits = {"timeout": 0.3, "retry": 0.0}
+        tcp = CompensatorSubject(cls, settings=limits, dead_address="modbus+tcp://127.0.0.1:9")
+        address = f"{tcp.address}&wire=pty&type=i16&scale=1e-8&word_order=little&function=6"
+        faults = ("silence", "checksum")
+        rtu = CompensatorSubject(
+            cls, address, limits, "rtu", faults=faults, dead_address="modbus+rtu:///dev/no_such_line"
+        )
+        return tcp, rtu
+
+    def __init__(self, address: str, settings: RegisterSettings | None = None, *, record: Path | None = None) -> None:
+        super().__init__(address, settings, record=record)
+        self._door = OffsetDoor(f"{self.info.id} at {address}")
+        self._heartbeat = 0
+
+    @property
+    def line(self) -> ModbusLine:
+        """The open Modbus line; InstrumentError before ``open``."""
+        line = self.transport
+        if not isinstance(line, ModbusLine):
+            raise TypeError(f"expected a ModbusLine, found {type(line).__name__}")
+        return line
+
+    def close(self) -> None:
+        """Disconnect and disarm; the watchdog of the PLC ramps to zero. Idempotent."""
+        self._door.disarm()
+        super().close()
+
+    def identify(self) -> Identity:
+        """Return the unit; PLCs report no name by their registers."""
+        line = self.line
+        line.registers(READ_HOLDING, self.settings.heartbeat, 1)
+        return Identity(
+            manufacturer="Modbus",
+            model="holding registers",
+            serial_number=f"unit {line.unit}",
+            simulated=line.simulated,
+            details={"address": self.address, "framing": line.framing},
+        )
+
+    def arm(self, limit: float) -> None:
+        """Let offsets pass up to a limit of each axis, m; nothing is sent.
+
+        Raises
+        ------
+        InstrumentError
+            The registers cannot hold such an offset, or one count is more than the limit.
+        """
+        largest, scale = self.settings.largest, self.settings.scale
+        if not scale <= limit <= largest:
+            raise InstrumentError(
+                f"{self.address}: the registers hold offsets from {scale * 1e6:g} um to {largest * 1e6:g} um; the "
+                f"limit is {limit * 1e6:g} um. Change 'scale' or 'type'"
+            )
+        self._door.arm(limit)
+
+    def read(self) -> Applied:
+        """Return the offset in effect, m, and what the PLC states.
+
+        Raises
+        ------
+        ProtocolError, InstrumentTimeoutError, InstrumentError
+            As of `ModbusLine.registers`.
+        """
+        settings = self.settings
+        wanted = {first + i: 0 for first, n in settings.states.items() for i in range(n)}
+        found = self._read(wanted)
+        size = SIZES[settings.type]
+        x, y, z = (
+            settings.count([found[first + i] for i in range(size)]) * settings.scale
+            for first in settings.applied or settings.offset
+        )
+        return Applied((x, y, z), self._state(found, "busy"), self._state(found, "stop"))
+
+    def write(self, offset: Sequence[float]) -> None:
+        """Write the offset of X, Y, Z, m, and the next number of the heartbeat.
+
+        Raises
+        ------
+        InstrumentError
+            It is not armed, or an offset is beyond the limit or not finite: nothing was sent. Else as of
+            `ModbusLine.write_registers`.
+        """
+        line, settings = self.line, self.settings
+        values = self._door.offset(offset)
+        most = int(self._door.limit * (1 + ROUNDING) / settings.scale)
+        words: dict[int, int] = {}
+        for first, value in zip(settings.offset, values, strict=True):
+            count = min(max(round(value / settings.scale), -most), most)
+            words.update(enumerate(settings.words(count), start=first))
+        self._heartbeat = (self._heartbeat + 1) % (1 << 16)
+        words[settings.heartbeat] = self._heartbeat
+        parts = list(runs(words, MOST_WRITTEN if settings.function == 16 else 1))
+        alive = settings.heartbeat
+        for first, part in sorted(parts, key=lambda part: part[0] <= alive < part[0] + len(part[1])):
+            line.write_registers(first, part, function=settings.function)
+
+    def _state(self, found: dict[int, int], name: str) -> str:
+        register = getattr(self.settings, name)
+        value = found[register] if register is not None else 0
+        return f"the PLC states {name} (register {register} is {value})" if value else ""
+
+    def _read(self, wanted: dict[int, int]) -> dict[int, int]:
+        """Return registers by their numbers."""
+        found: dict[int, int] = {}
+        for first, part in runs(wanted, MOST_READ):
+            found.update(enumerate(self.line.registers(READ_HOLDING, first, len(part)), start=first))
+        return found
+
+    def _connect(self) -> ModbusLine:
+        settings = self.settings
+        return open_modbus(
+            self.address,
+            unit=settings.unit,
+            simulator=self.info.simulator,
+            record=self._record,
+            timeout=settings.timeout,
+            retry=settings.retry,
+            retries=settings.retries,
+            baudrate=settings.baudrate,
+        )
+
+    def _start_session(self) -> None:
+        """Go on from the last heartbeat, so that the first write is a sign of life; check the other registers."""
+        (self._heartbeat,) = self.line.registers(READ_HOLDING, self.settings.heartbeat, 1)
+        self.read()

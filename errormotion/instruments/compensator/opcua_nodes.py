@@ -1,0 +1,248 @@
+"""``opcua_nodes``: offsets in nodes of an OPC UA server, with a node as sign of life.
+
+The PLC or the control behind the server adds the offsets. It must have a watchdog on the heartbeat, a slew limit and a
+bound of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from pydantic import Field, model_validator
+
+from errormotion.datasets.units import Length, Time
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.compensator.door import ROUNDING, OffsetDoor
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.opc import Credentials, open_session, request
+from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo, PluginSettings
+
+SIGNED = {"SByte": 7, "Int16": 15, "Int32": 31, "Int64": 63}
+UNSIGNED = {"Boolean": 1, "Byte": 8, "UInt16": 16, "UInt32": 32, "UInt64": 64}
+"""Types of whole numbers, and bits of the largest one."""
+FRACTIONS = ("Float", "Double")
+BEATS = 1 << 15
+"""Values of the heartbeat, unless its type has fewer."""
+IDENTITY = {"manufacturer": "i=2263", "model": "i=2261", "firmware": "i=2264"}
+"""Nodes of every server: ManufacturerName, ProductName, SoftwareVersion."""
+
+
+class OpcUaNodesSettings(PluginSettings):
+    """Settings of a server with nodes for offsets."""
+
+    offset: tuple[str, str, str] = Field(description="ids of the nodes for the offset of X, Y, Z: 'ns=2;s=Offset.X'")
+    heartbeat: str = Field(description="id of the node that changes at each write; a whole number or a Boolean")
+    applied: tuple[str, str, str] | None = Field(
+        default=None, description="ids of the nodes with the offset in effect; default: those of `offset`"
+    )
+    stop: str = Field(default="", description="id of a node that is not 0 or false while no offsets are taken")
+    busy: str = Field(default="", description="id of a node that is not 0 or false while the offset must not change")
+    scale: Length = Field(default=1e-3, description="offset for the number 1 in a node", gt=0, le=1)
+    security: str = Field(
+        default="", description="'Basic256Sha256,SignAndEncrypt,client.der,client.pem'; empty: no encryption"
+    )
+    user: str = Field(default="", description="name of the user; empty: anonymous")
+    password_file: str = Field(default="", description="file whose first line is the user's password")
+    timeout: Time = Field(default=1.0, description="time limit of one request", gt=0, le=10)
+
+    @model_validator(mode="after")
+    def _different(self) -> Self:
+        ids = [*self.offset, *(self.applied or ()), *filter(None, (self.heartbeat, self.stop, self.busy))]
+        if double := next((each for each in ids if ids.count(each) > 1), None):
+            raise ValueError(f"the node '{double}' is named twice")
+        if not all((*self.offset, self.heartbeat)):
+            raise ValueError("'offset' and 'heartbeat': expected ids of nodes; found an empty text")
+        return self
+
+    @property
+    def read(self) -> tuple[str, ...]:
+        """Ids of the nodes that are read for the state."""
+        return *(self.applied or self.offset), *filter(None, (self.stop, self.busy))
+
+
+class OpcUaNodes(Driver):
+    """Writes offsets to nodes of an OPC UA server, all and the heartbeat by one request.
+
+    Parameters
+    ----------
+    address : str
+        ``opc.tcp://host:4840``, ``sim://cframe/nodes``.
+    settings : OpcUaNodesSettings
+    record : Path, optional
+        Recording of the session.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="opcua_nodes",
+        kind="compensator",
+        summary="Offsets in nodes of an OPC UA server of a PLC or a control, with a heartbeat.",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.compensator.nodes:SimulatedNodes",
+    )
+    Settings: ClassVar[type[OpcUaNodesSettings]] = OpcUaNodesSettings
+    settings: OpcUaNodesSettings
+
+    @classmethod
+    def conformance(cls) -> CompensatorSubject:
+        """Return what the conformance kit examines."""
+        faults = ("silence", "split", "garbage", "disconnect", "unavailable", "refused")
+        return CompensatorSubject(cls, settings={"timeout": 0.8}, faults=faults, dead_address="opc.tcp://127.0.0.1:9")
+
+    def __init__(self, address: str, settings: OpcUaNodesSettings | None = None, *, record: Path | None = None) -> None:
+        super().__init__(address, settings, record=record)
+        self._door = OffsetDoor(f"{self.info.id} at {address}")
+        self._types: list[str] = []
+        self._beat, self._beats = 0, BEATS
+
+    def close(self) -> None:
+        """Disconnect and disarm; the watchdog at the other end ramps to zero. Idempotent."""
+        self._door.disarm()
+        super().close()
+
+    def identify(self) -> Identity:
+        """Return the product as the server states it."""
+        known = {name: _text(each) for name, each in zip(IDENTITY, self._values(IDENTITY.values()), strict=True)}
+        return Identity(
+            manufacturer=known["manufacturer"],
+            model=known["model"],
+            serial_number="unknown",
+            firmware=known["firmware"],
+            simulated=self.transport.simulated,
+            details={"address": self.address},
+        )
+
+    def arm(self, limit: float) -> None:
+        """Let offsets pass up to a limit of each axis, m; nothing is sent.
+
+        Raises
+        ------
+        InstrumentError
+            A node of whole numbers cannot hold such an offset.
+        """
+        scale = self.settings.scale
+        for node, kind in zip(self.settings.offset, self._types, strict=False):
+            if kind in FRACTIONS:
+                continue
+            largest = ((1 << SIGNED[kind]) - 1) * scale
+            if not scale <= limit <= largest:
+                raise InstrumentError(
+                    f"{self.address}: node '{node}' ({kind}) holds offsets from {scale * 1e6:g} um to "
+                    f"{largest * 1e6:g} um; the limit is {limit * 1e6:g} um. Change 'scale'"
+                )
+        self._door.arm(limit)
+
+    def read(self) -> Applied:
+        """Return the offset in effect, m, NaN where a value is not good, and what the server states.
+
+        Raises
+        ------
+        InstrumentError
+            The connection is lost, the server refuses, or its answer is none.
+        """
+        settings = self.settings
+        answers = dict(zip(settings.read, self._values(settings.read), strict=True))
+        x, y, z = (_number(answers[node]) * settings.scale for node in settings.applied or settings.offset)
+        return Applied((x, y, z), _state(answers, "busy", settings.busy), _state(answers, "stop", settings.stop))
+
+    def write(self, offset: Sequence[float]) -> None:
+        """Write the offset of X, Y, Z, m, and the next value of the heartbeat.
+
+        Raises
+        ------
+        InstrumentError
+            It is not armed, or an offset is beyond the limit or not finite: nothing was sent. Else the connection is
+            lost, or the server did not take a value.
+        """
+        line, settings = self.transport, self.settings
+        numbers = [self._held(kind, x) for kind, x in zip(self._types, self._door.offset(offset), strict=False)]
+        self._beat = (self._beat + 1) % self._beats
+        beat = bool(self._beat) if self._types[-1] == "Boolean" else self._beat
+        nodes = (*settings.offset, settings.heartbeat)
+        values = [list(each) for each in zip(nodes, self._types, [*numbers, beat], strict=True)]
+        statuses = request(line, {"write": values})
+        if not isinstance(statuses, list) or len(statuses) != len(nodes):
+            raise ProtocolError(f"{self.address}: expected {len(nodes)} statuses; found {str(statuses)[:80]}")
+        refused = [f"{node}: {str(each)[:60]}" for node, each in zip(nodes, statuses, strict=True) if each != "Good"]
+        if refused:
+            raise InstrumentError(f"{self.address}: the server did not take the offset: {', '.join(refused)}")
+
+    def _held(self, kind: str, offset: float) -> float:
+        """Return an offset, m, as a node of this type holds it, never beyond the limit."""
+        scale = self.settings.scale
+        if kind in FRACTIONS:
+            return offset / scale
+        most = int(self._door.limit * (1 + ROUNDING) / scale)
+        return min(max(round(offset / scale), -most), most)
+
+    def _values(self, nodes: Any) -> list[Any]:
+        answers = request(self.transport, {"read": list(nodes)})
+        whole = isinstance(answers, list) and len(answers) == len(list(nodes))
+        if not whole or not all(isinstance(each, dict) for each in answers):
+            raise ProtocolError(f"{self.address}: expected the values of nodes; found {str(answers)[:80]}")
+        return list(answers)
+
+    def _connect(self) -> Transport:
+        settings = self.settings
+        return open_session(
+            self.address,
+            Credentials.read(settings.security, settings.user, settings.password_file),
+            timeout=settings.timeout,
+            simulator=self.info.simulator,
+            record=self._record,
+        )
+
+    def _start_session(self) -> None:
+        """Check the nodes, and go on from the last heartbeat, so that the first write is a sign of life."""
+        settings = self.settings
+        nodes = (*settings.offset, settings.heartbeat)
+        found = request(self.transport, {"describe": list(nodes)})
+        if not isinstance(found, list) or len(found) != len(nodes) or not all(isinstance(each, dict) for each in found):
+            raise ProtocolError(f"{self.address}: expected descriptions of nodes; found {str(found)[:80]}")
+        self._types = [str(each.get("type")) for each in found]
+        for node, each, kind in zip(nodes, found, self._types, strict=True):
+            allowed = {**SIGNED, **UNSIGNED} if node == settings.heartbeat else (*SIGNED, *FRACTIONS)
+            if each.get("status") != "Good" or not each.get("writable") or kind not in allowed:
+                raise InstrumentError(
+                    f"{self.address}: node '{node}': expected a number that can be written; found type {kind[:40]}, "
+                    f"status {str(each.get('status'))[:60]}, writable {each.get('writable')}"
+                )
+        (beat,) = self._values([settings.heartbeat])
+        known = _number(beat)
+        self._beats = min(BEATS, 1 << {**SIGNED, **UNSIGNED}[self._types[-1]])
+        self._beat = int(known) % self._beats if math.isfinite(known) else 0
+        for node, value in zip(settings.read, self._values(settings.read), strict=True):
+            if value.get("status") != "Good":
+                raise InstrumentError(f"{self.address}: node '{node}': the server answers {_status(value)}")
+
+
+def _number(answer: dict[str, Any]) -> float:
+    value = answer.get("value")
+    if not isinstance(value, bool | int | float):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:  # a whole number beyond the range of float
+        return math.nan
+
+
+def _state(answers: dict[str, Any], name: str, node: str) -> str:
+    """Return why a state holds; empty where it does not. One that cannot be read holds."""
+    if not node:
+        return ""
+    value = _number(answers[node])
+    if math.isnan(value):
+        return f"{name} is not known: {node} has the status {_status(answers[node])}"
+    return f"the server states {name} ({node} is {value:g})" if value else ""
+
+
+def _status(answer: dict[str, Any]) -> str:
+    return str(answer.get("status"))[:60]
+
+
+def _text(answer: dict[str, Any]) -> str:
+    value = answer.get("value")
+    return value if isinstance(value, str) and value.strip() else "unknown"

@@ -1,0 +1,200 @@
+"""An OPC UA server, of the package asyncua, whose machine takes offsets from its nodes."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Coroutine
+from typing import Any, TypeVar
+
+import numpy as np
+from asyncua import ua
+from asyncua.crypto.permission_rules import User, UserRole
+from asyncua.server.address_space import AddressSpace, AttributeService
+from asyncua.ua.attribute_ids import AttributeIds
+from asyncua.ua.status_codes import StatusCodes
+
+from errormotion.instruments.simulators.compensator.machine import MachinePart
+from errormotion.instruments.simulators.controller.opcua.listening import FaultyServer, Outgoing
+from errormotion.instruments.simulators.controller.opcua.space import Ids, SmallServer, Space, number
+from errormotion.instruments.simulators.faults import parse_fault
+from errormotion.instruments.transports import Address
+from errormotion.instruments.transports.serving import listening_at, not_listening, reachable_at
+
+AXES = "XYZ"
+MM = 1e-3
+WRITABLE = 3
+"""Access level: can be read and written."""
+NAMESPACE = "urn:errormotion:machine"
+INDEX = 2
+"""Of the namespace of the nodes."""
+Result = TypeVar("Result")
+
+
+class SimulatedNodes:
+    """A machine whose nodes ``Offset.X`` to ``Z`` and ``Heartbeat`` are written.
+
+    It states the offset in effect in ``Applied.X`` to ``Z``, and ``Stop`` and ``Busy``, in the namespace 2. Offsets are
+    Double in mm, the heartbeat is a UInt32, the states are Boolean. Parameters of the address: those of `MachinePart`.
+
+    Faults beside those of all devices: ``unavailable`` (values have a bad status) and ``refused`` (no write is taken).
+
+    Attributes
+    ----------
+    url : str
+        Address for the client.
+    machine : MachinePart
+    driver_settings : mapping
+        Settings of the compensator for this server.
+    """
+
+    faults = ("silence", "split", "garbage", "drop", "disconnect", "late", "unavailable", "refused")
+
+    def __init__(self, address: Address) -> None:
+        self.fault = parse_fault(address, self.faults)
+        self.machine = MachinePart(address)
+        self._outgoing = Outgoing(self.fault, np.random.default_rng(int(address.number("seed", 0))), lambda: None)
+        self._path = address.path or "nodes"
+        self._host, self._port = listening_at()
+        self._server: FaultyServer | None = None
+        self._beat: Any = None
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # what a client does wrong is no concern of the user
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="sim-nodes", daemon=True)
+        self._thread.start()
+        try:
+            self._run(self._start())
+        except OSError as error:
+            self.close()
+            raise not_listening(self._host, self._port, error) from None
+        except BaseException:
+            self.close()
+            raise
+        self.url = f"opc.tcp://{reachable_at(self._host, self._port)}/{self._path}"
+
+    def close(self) -> None:
+        """End the server; idempotent."""
+        if self._loop.is_closed():
+            return
+        self._run(self._end())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def report_delivered(self, samples: int) -> None:
+        """Take no note: nothing streams."""
+
+    @property
+    def driver_settings(self) -> dict[str, Any]:
+        """Settings of the compensator for this server."""
+        return {
+            "offset": tuple(self._id(f"Offset.{axis}").to_string() for axis in AXES),
+            "heartbeat": self._id("Heartbeat").to_string(),
+            "applied": tuple(self._id(f"Applied.{axis}").to_string() for axis in AXES),
+            "stop": self._id("Stop").to_string(),
+            "busy": self._id("Busy").to_string(),
+            "scale": MM,
+        }
+
+    def write(self, space: AddressSpace) -> None:
+        """Take the offset that the nodes hold."""
+        held = [self._held(space, f"Offset.{axis}") for axis in AXES]
+        beat = self._held(space, "Heartbeat")
+        alive, self._beat = beat != self._beat, beat
+        self.machine.order([value * MM for value in held], alive=alive)
+
+    # ------------------------------------------------------------------ in the thread of the server
+
+    def _run(self, work: Coroutine[Any, Any, Result]) -> Result:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+
+    async def _start(self) -> None:
+        inner = SmallServer()
+        inner.disabled_clock = True  # its thread would delay the end by a second
+        inner.allow_remote_admin = False
+        server = FaultyServer(inner)
+        server.outgoing = self._outgoing
+        server.name = "errormotion"
+        server.socket_address = self._host, self._port
+        server.set_endpoint(f"opc.tcp://{reachable_at(self._host, self._port)}/{self._path}")
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        await server.init()
+        await server.register_namespace(NAMESPACE)
+        space = Space(inner)
+        for axis in AXES:
+            self._add(space, inner.aspace, f"Offset.{axis}", 0.0, ua.VariantType.Double, writable=True)
+        self._add(space, inner.aspace, "Heartbeat", 0, ua.VariantType.UInt32, writable=True)
+        self._beat = 0
+        for i, axis in enumerate(AXES):
+            self._live(space, f"Applied.{axis}", ua.VariantType.Double, lambda i=i: self.machine.offset[i] / MM)
+        self._live(space, "Stop", ua.VariantType.Boolean, lambda: bool(self.machine.fault))
+        self._live(space, "Busy", ua.VariantType.Boolean, lambda: bool(self.machine.busy))
+        inner.attribute_service = _Attributes(inner.aspace, self)
+        await server.start()
+        self._server, self._port = server, server.port
+
+    def _add(
+        self, space: Space, held: AddressSpace, name: str, value: Any, kind: ua.VariantType, *, writable: bool
+    ) -> None:
+        node = self._id(name)
+        title = ua.QualifiedName(name, ua.UInt16(INDEX))
+        data_type = number(getattr(Ids, kind.name))
+        space.variable(node, title, number(Ids.ObjectsFolder), data_type, ua.Variant(value, kind))
+        if writable:
+            for attribute in (AttributeIds.AccessLevel, AttributeIds.UserAccessLevel):
+                held[node].attributes[attribute].value = ua.DataValue(
+                    ua.Variant(ua.Byte(WRITABLE), ua.VariantType.Byte)
+                )
+
+    def _live(self, space: Space, name: str, kind: ua.VariantType, read: Any) -> None:
+        def value() -> ua.DataValue:
+            if self.fault.kind == "unavailable" and self._outgoing.reached:
+                return ua.DataValue(StatusCode=ua.StatusCode(ua.UInt32(StatusCodes.BadNoCommunication)))
+            return ua.DataValue(ua.Variant(read(), kind))
+
+        title = ua.QualifiedName(name, ua.UInt16(INDEX))
+        data_type = number(getattr(Ids, kind.name))
+        space.variable(self._id(name), title, number(Ids.ObjectsFolder), data_type, value)
+
+    def _id(self, name: str) -> ua.NodeId:
+        return ua.NodeId(ua.String(name), ua.Int16(INDEX))
+
+    def _held(self, space: AddressSpace, name: str) -> Any:
+        value = space.read_attribute_value(self._id(name), AttributeIds.Value).Value
+        return value.Value if value is not None else None
+
+    async def _end(self) -> None:
+        """Stop the server and everything that still runs in this thread."""
+        server, self._server = self._server, None
+        if server is not None:
+            await server.stop()
+        running = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+        await asyncio.get_running_loop().shutdown_default_executor()
+
+
+class _Attributes(AttributeService):
+    """Reads and writes attributes; the machine takes what one request has written, as a whole.
+
+    Parameters
+    ----------
+    space : AddressSpace
+    device : SimulatedNodes
+    """
+
+    def __init__(self, space: AddressSpace, device: SimulatedNodes) -> None:
+        super().__init__(space)
+        self._space, self._device = space, device
+
+    async def write(self, params: ua.WriteParameters, user: User = User(role=UserRole.Admin)) -> list[ua.StatusCode]:  # noqa: B008 - as the base has it
+        """Write attributes; return the status of each."""
+        own = any(each.NodeId.NamespaceIndex == INDEX for each in params.NodesToWrite)  # others: the server itself
+        if own and self._device.fault.kind == "refused":
+            return [ua.StatusCode(ua.UInt32(StatusCodes.BadUserAccessDenied)) for _ in params.NodesToWrite]
+        found = await super().write(params, user)
+        if own:
+            self._device.write(self._space)
+        return found

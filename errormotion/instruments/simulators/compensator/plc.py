@@ -1,0 +1,137 @@
+"""A PLC that takes offsets in holding registers: bound, slew limit and a watchdog on the heartbeat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pydantic import ValidationError
+
+from errormotion.errors import InstrumentError
+from errormotion.instruments.compensator.register_map import SIZES, RegisterSettings
+from errormotion.instruments.simulators.compensator.machine import MachinePart
+from errormotion.instruments.simulators.device import SimulatedDevice
+from errormotion.instruments.transports import Address
+from errormotion.instruments.transports.modbus.client import framing_of
+from errormotion.instruments.transports.modbus.serving import ModbusServer, checksum
+
+FAILURE, REFUSED = 4, 2  # Modbus exceptions: server device failure, illegal data address
+_SAME = ("type", "word_order")
+_UNIT_POSITION = {"tcp": 6, "rtu": 0}  # position of the unit in a frame
+
+
+class SimulatedPlc(SimulatedDevice):
+    """A PLC with the program that a machine needs.
+
+    Registers: offsets, then the heartbeat; offsets in effect, a stop and a busy register, which it writes itself.
+    Further parameters of the address: ``framing`` (``tcp`` or ``rtu``; default by ``wire``), ``unit`` (1), ``type``,
+    ``word_order``, ``scale`` and ``function`` as in the settings of the compensator, ``first`` (0, the first register),
+    and those of `MachinePart`.
+
+    Further faults: ``exception`` (a reply that refuses), ``unit`` (the answer of another device), ``short`` (the answer
+    breaks off), ``checksum`` (RTU).
+
+    Attributes
+    ----------
+    machine : MachinePart
+    driver_settings : mapping
+        Settings of the compensator for this PLC.
+    """
+
+    faults: tuple[str, ...] = ("silence", "split", "garbage", "drop", "disconnect", "exception", "unit", "short")
+
+    def __init__(self, address: Address) -> None:
+        self._framing = framing_of(address)
+        if self._framing == "rtu":
+            self.faults = (*self.faults, "checksum")
+        self._unit = address.whole("unit", 1, 255)
+        self.driver_settings = _settings(address)
+        self._map = RegisterSettings.model_validate(self.driver_settings)
+        self.machine = MachinePart(address)
+        self._words: dict[int, int] = {}
+        self._heartbeat = 0
+        last = max(self._map.states) + 1
+        first = min(self._map.offset)
+        self._device: ModbusServer | None = None
+        super().__init__(address, line_end=b"", default_name="plc")
+        self._device = ModbusServer(self._framing, self._unit, 3, {first: last - first}, self._registers, self._written)
+
+    @property
+    def driver_url(self) -> str:
+        """Address of the device in a bench file."""
+        scheme, _, place = self.url.partition("://")
+        kind = "rtu" if scheme == "serial" else "tcp" if self._framing == "tcp" else "rtu-tcp"
+        return f"modbus+{kind}://{place}?unit={self._unit}"
+
+    def reply(self, data: bytes) -> None:
+        """Send an answer, damaged where that is due."""
+        if self.fault.hits("checksum", self._answers):
+            data = data[:-1] + bytes((data[-1] ^ 1,))
+        elif self.fault.hits("unit", self._answers):
+            place = _UNIT_POSITION[self._framing]
+            data = data[:place] + bytes((data[place] ^ 2,)) + data[place + 1 :]
+            if self._framing == "rtu":
+                data = data[:-2] + checksum(data[:-2])
+        elif self.fault.hits("short", self._answers):
+            data = data[: len(data) // 2]
+        super().reply(data)
+
+    def connection_opened(self) -> None:
+        """Forget the incomplete request of the connection before."""
+        super().connection_opened()
+        if self._device is not None:
+            self._device.reset()
+
+    def _on_data(self, data: bytes) -> None:
+        if self._device is None:
+            return
+        for answer in self._device.receive(data):
+            self.reply(answer)
+        if self._device.lost:
+            self._server.disconnect()
+
+    def _registers(self) -> dict[int, int] | int:
+        """Return the registers now, or the code of a refusal."""
+        if self.fault.hits("exception", self._answers):
+            return FAILURE
+        found, plc = dict(self._words), self._map
+        for first, value in zip(plc.applied or (), self.machine.offset, strict=True):
+            found.update(enumerate(plc.words(round(value / plc.scale)), start=first))
+        for register, text in ((plc.stop, self.machine.fault), (plc.busy, self.machine.busy)):
+            if register is not None:
+                found[register] = int(bool(text))
+        return found
+
+    def _written(self, registers: Mapping[int, int]) -> int:
+        """Take registers; return 0, or the code of a refusal. Those that the PLC writes itself are refused."""
+        if self.fault.hits("exception", self._answers):
+            return FAILURE
+        plc, size = self._map, SIZES[self._map.type]
+        if max(registers) > plc.heartbeat:
+            return REFUSED
+        self._words.update(registers)
+        beat = self._words.get(plc.heartbeat, 0)
+        alive, self._heartbeat = beat != self._heartbeat, beat
+        counts = [plc.count([self._words.get(first + i, 0) for i in range(size)]) for first in plc.offset]
+        self.machine.order([count * plc.scale for count in counts], alive=alive)
+        return 0
+
+
+def _settings(address: Address) -> dict[str, object]:
+    """Return the settings of the compensator that the parameters of an address describe."""
+    given: dict[str, object] = {key: address.params[key] for key in _SAME if key in address.params}
+    size = SIZES.get(str(given.get("type", "i32")), 2)
+    first = address.whole("first", 0, 60000)
+    state = first + 3 * size + 1
+    given |= {
+        "scale": address.number("scale", 1e-9),
+        "function": address.whole("function", 16, 16),
+        "offset": tuple(first + i * size for i in range(3)),
+        "heartbeat": state - 1,
+        "applied": tuple(state + i * size for i in range(3)),
+        "stop": state + 3 * size,
+        "busy": state + 3 * size + 1,
+    }
+    try:
+        return RegisterSettings.model_validate(given).model_dump(include=set(given))
+    except ValidationError as error:
+        raise InstrumentError(f"The registers in '{address.url}' cannot be: {error.errors()[0]['msg']}") from None

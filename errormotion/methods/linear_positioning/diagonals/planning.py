@@ -1,0 +1,88 @@
+"""What the machine does along the diagonals: stops, steps, and the NC program."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.methods.linear_positioning.diagonals.lines import Line, distances, lines
+from errormotion.methods.linear_positioning.planning.targets import sequence
+from errormotion.plugins import Step
+
+if TYPE_CHECKING:
+    from errormotion.kinematics.description import MachineDescription
+    from errormotion.methods.linear_positioning.settings import Settings
+
+MM, MINUTE = 1e3, 60.0
+PROGRAM = "diagonals.nc"
+
+
+def stops(settings: Settings) -> Iterator[tuple[Line, Array, float]]:
+    """Yield every position at which the axes stop: its diagonal, (3,) m, and how long they rest there, s."""
+    for line, places in zip(lines(settings), distances(settings), strict=True):
+        for approach in sequence(settings, places):
+            if approach.before is not None:
+                yield line, line.point(approach.before), 0.0
+            yield line, line.point(approach.place), settings.dwell
+
+
+def steps(settings: Settings) -> list[Step]:
+    """Return every step: to the start of each diagonal in rapid, moves with the feed, and rests."""
+    found: list[Step] = []
+    last: tuple[str, Array] | None = None
+    for line, place, rest in stops(settings):
+        x, y, z = (float(value) for value in place)
+        if last is None or last[0] != line.name:
+            found.append(Step("move", (x, y, z), float("nan"), float("nan")))
+        elif (length := float(np.linalg.norm(place - last[1]))) > 0.0:
+            found.append(Step("move", (x, y, z), settings.feed, length / settings.feed))
+        last = (line.name, place)
+        if rest > 0:
+            found.append(Step("rest", None, float("nan"), rest))
+    return found
+
+
+def seconds(settings: Settings) -> float:
+    """Return the duration of the test at its feed, rests included, s; accelerations and rapid moves are neglected."""
+    return float(np.nansum([step.seconds for step in steps(settings)]))
+
+
+def programs(settings: Settings) -> Mapping[str, str]:
+    """Return the test as an NC program by file name: it stops (M0) ahead of each diagonal, for the instrument."""
+    found = iter(lines(settings))
+    text = [
+        "%",
+        f"({PROGRAM}: diagonals after ISO 230-6, {settings.runs} runs, {settings.cycle} cycles)",
+        f"(about {seconds(settings) / MINUTE:.1f} min, dwells G4 P in s)",
+        "(machine coordinates: work offset all zero, no tool length offset)",
+        "G90 G94 G21",
+    ]
+    for step in steps(settings):
+        if step.place is None:
+            text.append(f"G4 P{step.seconds:.3f}")
+            continue
+        words = " ".join(f"{name}{value * MM:.3f}" for name, value in zip("XYZ", step.place, strict=True))
+        if np.isnan(step.feed):
+            text += [f"(diagonal {next(found).name}: align the instrument)", f"G0 {words}", "M0"]
+        else:
+            text.append(f"G1 {words} F{step.feed * MM * MINUTE:.10g}")
+    return {PROGRAM: "\n".join([*text, "M30", "%", ""])}
+
+
+def outside(settings: Settings, machine: MachineDescription) -> dict[str, str]:
+    """Return what contradicts the machine, by setting: an axis that it has not, stops outside of its travel."""
+    places = np.array([place for _, place, _ in stops(settings)])
+    for k, axis in enumerate("XYZ"):
+        first, last = float(places[:, k].min()), float(places[:, k].max())
+        if axis not in machine.travel:
+            return {"diagonals": f"expected a machine with the axes X, Y and Z; it has {', '.join(machine.travel)}"}
+        low, high = machine.travel[axis]
+        if first < low - 1e-9 or last > high + 1e-9:
+            return {
+                "diagonals.volume": f"expected stops and overrun within {axis} {low * MM:g} mm to {high * MM:g} mm; "
+                f"found {first * MM:.3f} mm to {last * MM:.3f} mm"
+            }
+    return {}

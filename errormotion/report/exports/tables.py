@@ -1,0 +1,120 @@
+"""Tables of a report as rows of numbers and texts, and as CSV files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from markupsafe import Markup
+
+from errormotion.report.document import Cell, Table
+
+Entry = float | str | None
+_NUMBER = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:e[+-]?\d+)?")
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One table: its number and section, caption, names of columns, rows, and the reasons of missing values.
+
+    ``decimals`` are those of the numbers on the page, None for other entries; its shape is that of ``rows``.
+    """
+
+    number: int
+    section: str
+    caption: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[Entry]]
+    decimals: Sequence[Sequence[int | None]]
+    notes: Sequence[str]
+
+
+def sheet(table: Table, number: int, section: str) -> Sheet:
+    """Return a table with a column of its own for each expanded uncertainty; a dash is an empty entry."""
+    names = _names(table)
+    bodies = [row for row in table.rows if len(row) == len(names)]
+    uncertain = [any(isinstance(row[j], Cell) and row[j].uncertainty for row in bodies) for j in range(len(names))]  # type: ignore[union-attr]
+    head: list[str] = []
+    for name, has in zip(names, uncertain, strict=True):
+        head += [name, f"U of {name}"] if has else [name]
+    rows, decimals, notes = [], [], list(table.notes)
+    for row in table.rows:
+        texts: list[str] = []
+        for j, entry in enumerate(row):
+            cell = entry if isinstance(entry, Cell) else Cell(entry)
+            texts.append(_plain(cell.text))
+            if len(row) == len(names) and uncertain[j]:
+                texts.append(_plain(cell.uncertainty))
+            if cell.reason and len(row) == len(names):
+                notes.append(f"{texts[0]}, {names[j]}: {cell.reason}")
+        parsed = [_parsed(text) for text in texts]
+        rows.append([value for value, _ in parsed])
+        decimals.append([places for _, places in parsed])
+    return Sheet(number, section, _plain(table.caption), head, rows, decimals, notes)
+
+
+def _names(table: Table) -> list[str]:
+    """Return the names of the columns, with those of their groups."""
+    over = [_plain(name) for name, span in table.groups for _ in range(span)]
+    over += [""] * (len(table.head) - len(over))
+    return [f"{group}: {_plain(name)}" if group else _plain(name) for name, group in zip(table.head, over, strict=True)]
+
+
+def _plain(text: str | Markup) -> str:
+    if isinstance(text, Markup):
+        return str(text.striptags())
+    return str(text)
+
+
+def _parsed(text: str) -> tuple[Entry, int | None]:
+    """Return a number with its decimals where a text is one, else the text; None for nothing or a dash."""
+    stripped = text.strip()
+    if stripped in ("", "—"):
+        return None, None
+    written = stripped.replace("−", "-").replace("\u202f", "")
+    if _NUMBER.fullmatch(written):
+        written = written.replace(",", ".")
+        return float(written), len(written.partition("e")[0].partition(".")[2])
+    return stripped, None
+
+
+def write_csv(sheets: Sequence[Sheet], folder: Path, *, comma: bool = False) -> Path:
+    """Write a CSV file (UTF-8) for each table into a folder, which is replaced.
+
+    With ``comma``, numbers have a decimal comma and columns are separated by semicolons.
+    """
+    beside = folder.with_name(folder.name + ".part")
+    shutil.rmtree(beside, ignore_errors=True)
+    beside.mkdir(parents=True)
+    for each in sheets:
+        text = io.StringIO()
+        writer = csv.writer(text, delimiter=";" if comma else ",", lineterminator="\r\n")
+        writer.writerow([_safe(name) for name in each.head])
+        for row, decimals in zip(each.rows, each.decimals, strict=True):
+            writer.writerow([_written(entry, places, comma) for entry, places in zip(row, decimals, strict=True)])
+        for note in (each.caption, *each.notes):
+            writer.writerow([_safe(f"# {note}")])
+        name = f"{each.number:02d}-{re.sub(r'[^a-z0-9]+', '-', each.section.lower()).strip('-')[:40]}.csv"
+        (beside / name).write_bytes(text.getvalue().encode("utf-8-sig"))
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(beside, folder)
+    return folder
+
+
+def _written(entry: Entry, places: int | None, comma: bool) -> str:
+    if isinstance(entry, float):
+        text = f"{entry:.{places or 0}f}" if abs(entry) >= 1e-6 or not entry else f"{entry:.9g}"
+        return text.replace(".", ",") if comma else text
+    return _safe(entry or "")
+
+
+def _safe(text: str) -> str:
+    """Return a text that no spreadsheet takes for a formula."""
+    return f"'{text}" if text.startswith(_FORMULA) else text

@@ -1,0 +1,58 @@
+"""Annex of a report: values in SI units, settings, versions. What a reader of the result does not need first."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from errormotion import plugins
+from errormotion.datasets.results.merit import figures_of
+from errormotion.report.document import Block, Cell, Part, Section, Source, Table, Text, or_dash
+from errormotion.report.text import DASH
+
+SECTION = "provenance"
+"""Name of the sections of chapters that belong to the annex."""
+
+log = logging.getLogger(__name__)
+
+
+def divided(parts: Sequence[Part]) -> tuple[list[Part], list[Section]]:
+    """Return the chapters without what belongs to the annex, and the sections of the annex."""
+    body = [replace(part, sections=[section for section in part.sections if section.name != SECTION]) for part in parts]
+    annex = []
+    for k, part in enumerate(parts, 1):
+        of = f": {k} {part.title}" if len(parts) > 1 else ""
+        annex += [
+            replace(section, name=f"{SECTION}-{k}", title=section.title + of)
+            for section in part.sections
+            if section.name == SECTION
+        ]
+    return body, annex
+
+
+def values(sources: Sequence[Source]) -> list[Section]:
+    """Return the section of the figures of merit in SI units, unrounded; empty where there are none."""
+    blocks: list[Block] = []
+    for source in sources:
+        if str(source.errors.attrs.get("schema")) != plugins.ERRORS_SCHEMA:
+            continue
+        try:
+            figures = figures_of(source.errors)
+        except Exception as error:  # of a foreign plugin
+            log.exception("the figures of merit failed")
+            blocks.append(Text(f"The figures of merit could not be computed: {type(error).__name__}: {error}.", "note"))
+            continue
+        rows: list[list[Cell | str]] = [
+            [each.name, _number(each.value), _number(each.expanded_uncertainty), each.unit or "1"] for each in figures
+        ]
+        if rows:
+            caption = "Figures of merit as computed, in SI units; U: expanded uncertainty, k = 2."
+            blocks.append(Table(caption, ["figure", "value", "U", "unit"], rows))
+    return [Section("values", "Values in SI units", blocks)] if blocks else []
+
+
+def _number(value: float | None) -> Cell:
+    text = DASH if value is None or not math.isfinite(value) else f"{value:.9g}".replace("-", "−")
+    return or_dash(text, "not determined")

@@ -1,0 +1,119 @@
+"""The HTML of a report."""
+
+from __future__ import annotations
+
+import re
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from hashlib import sha256
+from importlib.resources import files
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+import errormotion
+from errormotion.report import provenance
+from errormotion.report.document import Cell, Part, Section, Source, Table
+from errormotion.report.page import annex
+from errormotion.report.page.head import PAPERS, Head, calibrations, facts, measured
+from errormotion.report.page.verdict import Verdict
+
+
+@dataclass(frozen=True)
+class Page:
+    """A report: its HTML, and its tables in reading order with the titles of their sections."""
+
+    html: str
+    tables: Sequence[tuple[str, Table]]
+
+
+def page(
+    sources: Sequence[Source],
+    parts: Sequence[Part],
+    title: str | None = None,
+    *,
+    head: Head | None = None,
+    decision: Verdict | None = None,
+) -> Page:
+    """Return a report as HTML that needs nothing else, and its tables."""
+    head, script = head or Head(), _script()
+    first = sources[0]
+    everything = [(s.provenance, s.run, dict(s.raw.attrs) if s.raw is not None else {}) for s in sources]
+    machine = str(first.errors.attrs.get("machine", "unknown machine"))
+    body, appended = annex.divided(parts)
+    identity = head.number or sha256("".join(map(_identity, sources)).encode()).hexdigest()[:12]
+    written = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    calibrated = calibrations(head, measured(first))
+    appended = [*annex.values(sources), *appended]
+    shown = {
+        "title": title or f"{machine}: {parts[0].title[0].lower()}{parts[0].title[1:]}",
+        "heading": title or parts[0].title,
+        "head": head,
+        "facts": facts(first, machine, head, f"{identity}, written {written}"),
+        "calibrations": calibrated,
+        "decision": decision,
+        "simulated": provenance.simulated(everything) or _truth(sources),
+        "replayed": provenance.replayed(everything),
+        "parts": body,
+        "annex": appended,
+        "several": len(parts) > 1,
+        "kind": parts[0].kind,
+        "stated": any(part.stated for part in parts),
+        "identity": identity,
+        "script": Markup(script),
+        "script_hash": b64encode(sha256(script.encode()).digest()).decode(),
+        "foot": _css(f"Report {identity}"),
+        "paper": PAPERS.get(head.paper, "A4"),
+        "version": errormotion.__version__,
+        "written": written,
+    }
+    tables = [("Calibrations", calibrated[0])] if calibrated else []
+    tables += [(section.title, table) for part in body for section in part.sections for table in _tables(section)]
+    tables += [("Limits", decision.table)] if decision else []
+    tables += [(section.title, table) for section in appended for table in _tables(section)]
+    return Page(_templates().get_template("report.html.j2").render(shown), tables)
+
+
+def _tables(section: Section) -> list[Table]:
+    return [block for block in section.blocks if isinstance(block, Table)]
+
+
+def _templates() -> Environment:
+    templates = Environment(
+        loader=PackageLoader("errormotion.report.page"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.tests["table"] = lambda block: isinstance(block, Table)
+    templates.tests["cell"] = lambda value: isinstance(value, Cell)
+    templates.filters["kind"] = lambda block: type(block).__name__.lower()
+    return templates
+
+
+@cache
+def _script() -> str:
+    """Return the script of the page."""
+    return (files("errormotion.report.page") / "templates" / "report.js").read_text(encoding="utf-8")
+
+
+def _css(text: str) -> Markup:
+    """Return a text as a string of a style sheet; every character that could end it is escaped."""
+    return Markup('"' + re.sub(r"[^A-Za-z0-9 ._-]", lambda found: f"\\{ord(found[0]):x} ", text[:200]) + '"')
+
+
+def _identity(source: Source) -> str:
+    attributes = source.errors.attrs
+    if "provenance" in attributes:
+        return str(attributes["provenance"])
+    return f"{source.run.get('id')} {attributes.get('start')} {dict(source.errors.sizes)}"
+
+
+def _truth(sources: Sequence[Source]) -> str:
+    if any(source.errors.attrs.get("method") == "twin" for source in sources):
+        return "the values are the truth of a virtual machine"
+    return ""

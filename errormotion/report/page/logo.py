@@ -1,0 +1,50 @@
+"""The logo of a laboratory: a picture of bounded size, copied into a run folder and embedded into the report."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+
+from errormotion.datasets.files.reading import read_bytes
+
+LARGEST = 512 << 10
+"""Bytes."""
+NAME = "logo"
+"""Name of the copy in a run folder, without its suffix."""
+PICTURES = {
+    ".png": (b"\x89PNG\r\n", "image/png"),
+    ".jpg": (b"\xff\xd8\xff", "image/jpeg"),
+    ".svg": (b"<", "image/svg+xml"),
+}
+"""How a file of each suffix begins, and its type."""
+
+
+def mistake(path: Path) -> str:
+    """Return why a file cannot be used as a logo; empty if it can."""
+    known = PICTURES.get(path.suffix.lower())
+    if known is None:
+        return f"expected a picture ({', '.join(PICTURES)}); found '{path.name}'"
+    try:
+        data = read_bytes(path, LARGEST)
+    except OSError as error:
+        return f"{path} cannot be read: {error.strerror}"
+    return "" if _begins(data, known[0]) else f"{path} is no {known[1]} file"
+
+
+def copy(path: Path, folder: Path) -> None:
+    """Copy a logo into a run folder; one that cannot be used any more is left out."""
+    if not mistake(path):
+        (folder / f"{NAME}{path.suffix.lower()}").write_bytes(read_bytes(path, LARGEST))
+
+
+def of_folder(folder: Path) -> str:
+    """Return the logo of a run folder as an address with its data; empty without one."""
+    for suffix, (_, kind) in PICTURES.items():
+        path = folder / f"{NAME}{suffix}"
+        if path.is_file() and not mistake(path):
+            return f"data:{kind};base64,{base64.b64encode(read_bytes(path, LARGEST)).decode()}"
+    return ""
+
+
+def _begins(data: bytes, with_: bytes) -> bool:
+    return data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(with_)

@@ -1,0 +1,144 @@
+"""A LinuxCNC for tests of compensation, whose servo thread records the offset and what the drive of X is commanded.
+
+``ddt`` and ``minmax`` see every cycle: an offset, or a change of it, that lasts one cycle is in the record.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from errormotion.instruments.compensator.linuxcnc import (
+    LinuxCNCCompensatorSettings,
+    LinuxCNCFeedback,
+    LinuxCNCOffset,
+)
+from errormotion.instruments.controller.linuxcnc import BRIDGE, COMPENSATION, LinuxCNC, LinuxCNCSettings
+from errormotion.instruments.simulators.controller.linuxcnc_config import Compensated, ini_text
+from errormotion.instruments.simulators.controller.linuxcnc_process import LinuxCNCProcess
+
+DISPLAY = Path(__file__).with_name("linuxcnc_display.py")
+TRAVEL = 0.1  # m, in both directions
+RAPID = 0.1  # m/s
+MICROMETRE = 1e-3  # mm, the unit of the INI file
+SETTLED = 1e-7  # mm; LinuxCNC's planner comes closer than that in some cycles
+DRIVERS = {"external": LinuxCNCOffset, "feedback": LinuxCNCFeedback}
+WATCH = """
+loadrt ddt names=watch-slew,watch-speed
+loadrt minmax names=watch-offset,watch-change,watch-drive,watch-motion
+net {offset} => watch-slew.in
+net {offset} => watch-offset.in
+net watch-rate watch-slew.out => watch-change.in
+net J0:pos-cmd => watch-speed.in
+net J0:pos-cmd => watch-drive.in
+net watch-velocity watch-speed.out => watch-motion.in
+addf watch-slew servo-thread
+addf watch-speed servo-thread
+addf watch-offset servo-thread
+addf watch-change servo-thread
+addf watch-drive servo-thread
+addf watch-motion servo-thread
+"""
+RECORDS = ("offset", "change", "drive", "motion")
+
+
+@dataclass(frozen=True)
+class Record:
+    """What the servo thread saw since the last `Machine.watch`: offset of X, um, and command of its drive."""
+
+    lowest: float
+    highest: float
+    fastest: float
+    drive_moved: float
+    drive_fastest: float
+
+
+class Machine:
+    """The real LinuxCNC with a compensation, its bridge, and its record."""
+
+    def __init__(self, compensated: Compensated) -> None:
+        self.compensated = compensated
+        axes = dict.fromkeys("XYZ", (-TRAVEL, TRAVEL))
+        ini = ini_text("test", axes, RAPID, 6000.0, arguments="{folder} --compensate", compensated=compensated)
+        ini = ini.replace("HALFILE = compensation.tcl", "HALFILE = compensation.tcl\nHALFILE = watch.hal")
+        external = compensated.route == "external"
+        files = {
+            "linuxcnc.ini": ini,
+            "balls.hal": "",
+            COMPENSATION.name: COMPENSATION.read_text(),
+            "machine_bridge.py": BRIDGE.read_text(),
+            "watch.hal": WATCH.format(offset="watch-x axis.x.eoffset" if external else "errormotion-offset-x"),
+        }
+        self.process = LinuxCNCProcess(files, DISPLAY, wait=120.0)
+        self.address = f"unix://{self.process.socket}"
+        self.token = self.process.folder / "token"
+        self.control = LinuxCNC(self.address, LinuxCNCSettings(arm=True, token_file=self.token))
+
+    def compensator(self) -> LinuxCNCOffset:
+        """Return another compensator, not yet open."""
+        return DRIVERS[self.compensated.route](self.address, LinuxCNCCompensatorSettings(token_file=self.token))
+
+    def hal(self, *lines: str) -> str:
+        """Execute commands of halcmd."""
+        return subprocess.run(
+            ["halcmd", "-s", "-f"], input="\n".join(lines), capture_output=True, text=True, check=True
+        ).stdout
+
+    def pins(self, *names: str) -> list[float]:
+        """Return values of pins; of bits, 1 and 0."""
+        found = self.hal(*(f"getp {name}" for name in names)).split()
+        return [{"TRUE": 1.0, "FALSE": 0.0}.get(text) if text in ("TRUE", "FALSE") else float(text) for text in found]
+
+    def offset(self) -> float:
+        """Return the offset of X that the limit in the servo thread gives, um."""
+        return self.pins("errormotion-limit-x.out")[0] / MICROMETRE
+
+    def watch(self) -> None:
+        """Begin another record."""
+        for value in (1, 0):
+            self.hal(*(f"setp watch-{each}.reset {value}" for each in RECORDS))
+            time.sleep(0.01)  # some servo cycles
+
+    def record(self) -> Record:
+        """Return the record."""
+        found = self.pins(*(f"watch-{each}.{end}" for each in RECORDS for end in ("min", "max")))
+        offset, change, drive, motion = (
+            (found[2 * k] / MICROMETRE, found[2 * k + 1] / MICROMETRE) for k in range(len(RECORDS))
+        )
+        return Record(
+            *offset,
+            max(map(abs, change)),
+            drive[1] - drive[0],
+            max(map(abs, motion)),
+        )
+
+    def kill_bridge(self) -> None:
+        """Kill the bridge and return when another one runs."""
+        announced = self.process.folder / "announced.json"
+        before = json.loads(announced.read_text())["pid"]
+        os.kill(before, signal.SIGKILL)
+        until(lambda: announced.exists() and json.loads(announced.read_text())["pid"] != before)
+
+    def rest(self) -> None:
+        """Switch on, at the start, without an offset."""
+        self.control.reset()
+        self.control.enable()
+        if not self.control.state()["homed"]:
+            self.control.home()
+        until(lambda: self.offset() == 0 and abs(self.pins("axis.x.eoffset")[0]) < SETTLED)
+        self.control.move_to([0.001, 0.0, 0.0])  # LinuxCNC's interpreter may not know how far an offset was left behind
+        self.control.move_to([0.0, 0.0, 0.0])
+
+
+def until(condition: Callable[[], bool], limit: float = 20.0) -> None:
+    """Wait for a condition."""
+    end = time.monotonic() + limit
+    while not condition():
+        assert time.monotonic() < end, "the condition does not come true"
+        time.sleep(0.02)
