@@ -25,6 +25,9 @@ machine = "C-frame (virtual)"
 driver = "dcon_temperature"
 address = "sim://cframe/thermometer?seed=3&sensors=spindle_front,column,ambient"
 channels = ["spindle front", "column", "ambient"]
+places."spindle front" = ["0 mm", "0 mm", "120 mm"]
+places.column = ["0 mm", "280 mm", "300 mm"]
+places.ambient = ["-600 mm", "-300 mm", "500 mm"]
 [instruments.control]
 driver = "virtual_controller"
 arm = true
