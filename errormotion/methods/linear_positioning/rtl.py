@@ -13,7 +13,7 @@ import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -90,7 +90,7 @@ def read_rtl(log: Path, map_file: Path) -> xr.Dataset:
     for k, of in enumerate(passes):
         for number, row in enumerate(of):
             values[number, k, list(row)] = [given.scale * size * value for value in row.values()]
-    variables = {
+    variables: dict[str, tuple[Any, ...]] = {
         "deviation": (READINGS, values[None]),
         "target_position": ("target", np.array(targets), {"units": "m"}),
     }

@@ -100,7 +100,7 @@ def _by_browser(program: str, page: Path, out: Path) -> None:
 
 def _by_weasyprint(page: Path, out: Path) -> None:
     try:
-        from weasyprint import HTML  # type: ignore[import-not-found]
+        from weasyprint import HTML
     except (ImportError, OSError) as error:  # OSError: its own libraries are missing
         raise RunError(WHAT_TO_INSTALL) from error
     HTML(string=page.read_text(encoding="utf-8"), url_fetcher=_refuse).write_pdf(out)

@@ -34,7 +34,7 @@ def part(source: Source, key: str) -> Part:
             Section(
                 f"diagonal-{view.name}",
                 f"Diagonal {view.name}",
-                [drawings.over_position(view, f"{key}-{view.name}"), figure_table(view, {}), *target_tables(view)],
+                [drawings.over_position(view, f"{key}-{view.name}", {}), figure_table(view, {}), *target_tables(view)],
             )
             for view in seen
         ),
