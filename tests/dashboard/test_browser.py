@@ -18,6 +18,7 @@ AXE = Path(__file__).parents[1] / "peers" / "node_modules" / "axe-core" / "axe.m
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="apt-get install chromium"),
+    pytest.mark.skipif(not AXE.is_file(), reason="npm ci --prefix tests/peers"),
 ]
 
 BENCH = """\

@@ -40,7 +40,7 @@ def _handlers(found: Application) -> list[Any]:
 
 def test_every_handler_is_guarded(runs: Path) -> None:
     with ThreadPoolExecutor(1) as workers:
-        context = Context(access_for("127.0.0.1"), Lab(runs), 5006, workers, ())
+        context = Context(access_for("127.0.0.1"), Lab(runs), 5006, workers, workers, ())
     handlers = _handlers(application(context))
     assert len(handlers) >= len(PATHS) - 1
     assert all(issubclass(each, Guarded) for each in handlers)

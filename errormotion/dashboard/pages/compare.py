@@ -80,18 +80,19 @@ class Compare(_Comparing):
         table = await self.apart(self.context.lab.table, Choice(machine=machine))
         found, wrong, wrong_history = None, "", ""
         try:
-            found = await self.apart(_compared, self.context.lab, question) if len(question.runs) > 1 else None
+            found = await self.apart_slow(_compared, self.context.lab, question) if len(question.runs) > 1 else None
         except ErrormotionError as error:
             wrong = str(error)
         try:
             if all(asked.values()):
-                await self.apart(_followed, self.context.lab.runs, *asked.values())
+                await self.apart_slow(_followed, self.context.lab.runs, *asked.values())
         except ErrormotionError as error:
             wrong_history = str(error)
         self.show(
             "compare.html.j2",
             table=table,
             rows=[row for row in table.rows if row.method][:MOST_LISTED],
+            more=sum(bool(row.method) for row in table.rows) > MOST_LISTED,
             machine_chosen=machine,
             question=question,
             freedoms=DOF,
@@ -112,7 +113,7 @@ class Figure(_Comparing):
 
     async def get(self) -> None:
         """Draw it."""
-        found = await self.apart(_compared, self.context.lab, self.question())
+        found = await self.apart_slow(_compared, self.context.lab, self.question())
         self.finish({"item": await self.apart(comparison_item, found)})
 
 
@@ -121,9 +122,9 @@ class Report(_Comparing):
 
     async def get(self) -> None:
         """Send it."""
-        found = await self.apart(_compared, self.context.lab, self.question())
+        found = await self.apart_slow(_compared, self.context.lab, self.question())
         self.set_header("Content-Security-Policy", REPORT_POLICY)
-        self.finish(await self.apart(_page, write_comparison, found))
+        self.finish(await self.apart_slow(_page, write_comparison, found))
 
 
 class History(Guarded):
@@ -131,9 +132,9 @@ class History(Guarded):
 
     async def get(self) -> None:
         """Send it."""
-        found = await self.apart(_followed, self.context.lab.runs, self.word("machine"), self.word("figure"))
+        found = await self.apart_slow(_followed, self.context.lab.runs, self.word("machine"), self.word("figure"))
         self.set_header("Content-Security-Policy", REPORT_POLICY)
-        self.finish(await self.apart(_page, write_history, found))
+        self.finish(await self.apart_slow(_page, write_history, found))
 
 
 def _compared(lab: Lab, question: Question) -> xr.Dataset:
