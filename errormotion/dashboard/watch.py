@@ -112,10 +112,10 @@ class _History:
 
     def last(self, column: int, seconds: float) -> tuple[Array, Array]:
         """Return times and values of a column over the last seconds, in order."""
-        first, n = self.count % self.size if self.count > self.size else 0, min(self.count, self.size)
-        times = np.roll(self.times[:n], -first)
-        begin = int(np.searchsorted(times, times[-1] - seconds)) if n else 0
-        return times[begin:], np.roll(self.rows[:n, column], -first)[begin:]
+        n = min(self.count, self.size)
+        order = (np.arange(self.count - n, self.count)) % self.size
+        begin = int(np.searchsorted(self.times[order], self.times[order[-1]] - seconds)) if n else 0
+        return self.times[order[begin:]], self.rows[order[begin:], column]
 
 
 class Watch:
