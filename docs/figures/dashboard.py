@@ -25,6 +25,9 @@ machine = "C-frame (virtual)"
 driver = "dcon_temperature"
 address = "sim://cframe/thermometer?seed=3&sensors=spindle_front,column,ambient"
 channels = ["spindle front", "column", "ambient"]
+places."spindle front" = ["0 mm", "0 mm", "120 mm"]
+places.column = ["0 mm", "280 mm", "300 mm"]
+places.ambient = ["-600 mm", "-300 mm", "500 mm"]
 [instruments.control]
 driver = "virtual_controller"
 arm = true
@@ -81,7 +84,8 @@ def main(made: Path) -> None:
         page.goto(address + "compare")
         for test in COMPARED:
             page.check(f"tr:has(label:text-is('{test}')) >> nth=0 >> input")
-        page.check("input[name=same_start]")
+        for freedom in ("EX", "EY", "EZ"):
+            page.check(f"input[name=freedom][value={freedom}]")
         page.click("button:has-text('Compare')")
         page.wait_for_selector("#figure[data-drawn] canvas")
         page.wait_for_timeout(500)

@@ -556,11 +556,12 @@ def dashboard(
     ] = None,
     cert: Annotated[Path | None, typer.Option(help="Certificate (PEM) of an encrypted connection.")] = None,
     key: Annotated[Path | None, typer.Option(help="Key (PEM) of the certificate.")] = None,
+    browser: Annotated[bool, typer.Option(help="Open the page in the browser of this computer.")] = True,
 ) -> None:
     """Show runs, and the instruments of a bench, in a browser, until Ctrl-C."""
     from errormotion.cli.commands import dashboard as command
 
-    command.run(runs, bench, interval, host, port, name or [], cert, key)
+    command.run(runs, bench, interval, host, port, name or [], cert, key, browser)
 
 
 @app.command()

@@ -18,8 +18,8 @@ from errormotion.report.text import DASH, rounded
 
 LONGEST_KEY = 600
 """Characters of the key of a run."""
-FILES = {"report": "report.html", "run": FILE, "log": "log.jsonl"}
-"""Files of a run folder that may be fetched, by the word for them; the error dataset is the fourth, ``errors``."""
+FILES = {"report": "report.html", "pdf": "report.pdf", "xlsx": "report.xlsx", "run": FILE, "log": "log.jsonl"}
+"""Files of a run folder that may be fetched, by the word for them; the error dataset is one more, ``errors``."""
 
 
 class NotFoundError(RunError):
@@ -89,8 +89,9 @@ class Lab:
         remarks = [f"{found.undated} runs have no known date."] if found.undated else []
         if found.waiting:
             remarks.append(f"The figures of {found.waiting} runs are not read yet; load the page again.")
+        root = self.runs.resolve()
         return Table(
-            tuple(_row(self.key(path), entry) for path, entry in chosen),
+            tuple(_row(path.relative_to(root).as_posix(), entry) for path, entry in chosen),
             len(found.runs),
             _values(found.machines),
             _values(found.methods),
@@ -98,10 +99,6 @@ class Lab:
             _values(entry.verdict for _, entry in found.runs),
             (*remarks, *(f"Not read: {reason}" for reason in found.skipped)),
         )
-
-    def key(self, folder: Path) -> str:
-        """Return the key of a run: its path in the folder of runs."""
-        return folder.resolve().relative_to(self.runs.resolve()).as_posix()
 
     def folder(self, key: str) -> Path:
         """Return the folder of a run.
@@ -130,7 +127,7 @@ class Lab:
         return read_entry(self.folder(key))
 
     def file(self, key: str, word: str) -> Path:
-        """Return a file of a run: ``report``, ``run``, ``log`` or ``errors``.
+        """Return a file of a run by its word: one of FILES, or ``errors``.
 
         Raises
         ------

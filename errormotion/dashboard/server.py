@@ -28,6 +28,8 @@ BOKEH = ("bokeh.min.js",)
 """Scripts of the package bokeh that pages load."""
 WORKERS = 4
 """Threads that read and compute."""
+SLOW_WORKERS = 2
+"""Threads for work that may take long."""
 LARGEST_REQUEST = 1 << 20
 """Bytes of a request."""
 LARGEST_HEAD = 1 << 15
@@ -134,14 +136,17 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
     context_of_tls = _encryption(options)
     watch = Watch(load_bench(options.bench), options.runs, options.interval) if options.bench is not None else None
     access = access_for(options.host, options.names, secure=context_of_tls is not None)
-    with ThreadPoolExecutor(WORKERS, thread_name_prefix="errormotion-dashboard") as workers:
+    with (
+        ThreadPoolExecutor(WORKERS, thread_name_prefix="errormotion-dashboard") as workers,
+        ThreadPoolExecutor(SLOW_WORKERS, thread_name_prefix="errormotion-dashboard-slow") as slow,
+    ):
         try:
             sockets = bind_sockets(options.port, options.host)
         except OSError as error:
             raise RunError(f"{options.host}, port {options.port}: cannot be listened on: {error.strerror}") from error
         port = int(sockets[0].getsockname()[1])
         pages = ((("/now", "Now"),) if watch is not None else ()) + (("/results", "Results"), ("/compare", "Compare"))
-        context = Context(access, Lab(options.runs), port, workers, pages, watch)
+        context = Context(access, Lab(options.runs), port, workers, slow, pages, watch)
         server = HTTPServer(
             application(context),
             ssl_options=context_of_tls,

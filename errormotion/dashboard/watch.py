@@ -56,7 +56,10 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One value now, NaN if unknown, with its extremes and its change since the monitor started."""
+    """One value now, NaN if unknown, with its extremes and its change since the monitor started.
+
+    ``place`` is the position of a sensor on the machine, m; None if unknown.
+    """
 
     name: str
     value: float
@@ -65,6 +68,7 @@ class Quantity:
     low: float = math.nan
     high: float = math.nan
     change: float = math.nan
+    place: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +112,10 @@ class _History:
 
     def last(self, column: int, seconds: float) -> tuple[Array, Array]:
         """Return times and values of a column over the last seconds, in order."""
-        first, n = self.count % self.size if self.count > self.size else 0, min(self.count, self.size)
-        times = np.roll(self.times[:n], -first)
-        begin = int(np.searchsorted(times, times[-1] - seconds)) if n else 0
-        return times[begin:], np.roll(self.rows[:n, column], -first)[begin:]
+        n = min(self.count, self.size)
+        order = (np.arange(self.count - n, self.count)) % self.size
+        begin = int(np.searchsorted(self.times[order], self.times[order[-1]] - seconds)) if n else 0
+        return self.times[order[begin:]], self.rows[order[begin:], column]
 
 
 class Watch:
@@ -137,6 +141,7 @@ class Watch:
         sensors = self._monitor.sensors
         parameters = PARAMETERS if self._monitor.controller is not None else ()
         self.units = {**dict.fromkeys(sensors, "°C"), **{name: unit for name, unit, _ in parameters}}
+        self._places = dict(zip(sensors, self._monitor.places, strict=True))
         self._history = _History(tuple(self.units), min(MOST_ROWS, max(2, math.ceil(SPAN / interval))))
         self._extremes = np.full((3, len(self.units)), np.nan)  # first, lowest, highest
         self._lock, self._end = threading.Lock(), threading.Event()
@@ -172,10 +177,15 @@ class Watch:
             return Present(_now(), running, error, 0, run, instruments)
         values = dict(zip(self.units, _row(last, self.units), strict=True))
         quantities = {
-            name: Quantity(name, value, self.units[name], last.flags.get(name, ""), low, high, value - first)
+            name: Quantity(
+                name, value, self.units[name], last.flags.get(name, ""), low, high, value - first, self._place(name)
+            )
             for (name, value), first, low, high in zip(values.items(), *self._extremes, strict=True)
         }
         alarms = last.state.get("alarms") or ()
+        alarms = alarms if isinstance(alarms, list | tuple) else (alarms,)
+        if last.state.get("estop") is True:
+            alarms = ("emergency stop", *alarms)
         return Present(
             self._began + timedelta(seconds=last.time),
             running,
@@ -187,7 +197,7 @@ class Watch:
             tuple(each for each in quantities.values() if each.name not in last.temperatures),
             _text(last.state.get("mode")),
             _text(last.state.get("program")),
-            tuple(_text(each) for each in alarms)[:50] if isinstance(alarms, list | tuple) else (_text(alarms),),
+            tuple(_text(each) for each in alarms[:50]),
         )
 
     def history(self, names: Sequence[str], seconds: float) -> Mapping[str, tuple[Array, Array]]:
@@ -245,6 +255,10 @@ class Watch:
         missed = self._last.gaps.get(source.name, 0) if self._last is not None else 0
         kind = str(source.instrument.driver.info.kind)
         return Instrument(source.name, kind, _text(model), state, since, _text(why), missed)
+
+    def _place(self, name: str) -> tuple[float, ...] | None:
+        place = self._places.get(name)
+        return tuple(map(float, place)) if place is not None and np.isfinite(place).all() else None
 
     def _run_name(self) -> str:
         folder = getattr(self._monitor, "folder", None)

@@ -48,11 +48,11 @@ def markup() -> str:
     return MARKUP
 
 
-def finished(root: Path, number: str, bias: float = 0.0) -> RunFolder:
+def finished(root: Path, number: str, bias: float = 0.0, points: int = 5000) -> RunFolder:
     """Write a finished run whose names hold markup: an hour of drift, in the end too large by ``bias`` along Z, m."""
     base = {"bench": {"machine": f"Mill {MARKUP}"}, "method": {"id": "spindle_drift"}, "steps": []}
     folder = RunFolder.create(root, "drift", number, {**base, "status": "finished", "errors": "errors.nc"})
-    t = np.linspace(0.0, 3600.0, 5000)
+    t = np.linspace(0.0, 3600.0, points)
     twist = np.zeros((t.size, 6))
     warm = 1 - np.exp(-t / 900)
     twist[:, 2], twist[:, 4] = (20e-6 + bias) * warm, 5e-5 * warm
@@ -71,7 +71,8 @@ def finished(root: Path, number: str, bias: float = 0.0) -> RunFolder:
 def pair_of_runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """Return a folder with two runs that contradict each other, and their keys."""
     root = tmp_path_factory.mktemp("pair")
-    return root, [finished(root, number, bias).path.name for number, bias in (("00000003", 0.0), ("00000004", 5e-6))]
+    numbers = {"00000003": 0.0, "00000004": 5e-6}
+    return root, [finished(root, number, bias, points=200).path.name for number, bias in numbers.items()]
 
 
 @pytest.fixture(scope="session")

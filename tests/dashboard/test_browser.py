@@ -18,6 +18,7 @@ AXE = Path(__file__).parents[1] / "peers" / "node_modules" / "axe-core" / "axe.m
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="apt-get install chromium"),
+    pytest.mark.skipif(not AXE.is_file(), reason="npm ci --prefix tests/peers"),
 ]
 
 BENCH = """\
@@ -28,6 +29,7 @@ machine = "C-frame (virtual) {markup}"
 driver = "dcon_temperature"
 address = "sim://cframe/thermometer?seed=3&sensors=spindle_front,column,ambient"
 channels = ['spindle front{markup}', "column", "ambient"]
+places.column = ["0 mm", "280 mm", "300 mm"]
 [instruments.control]
 driver = "virtual_controller"
 arm = true
@@ -120,6 +122,7 @@ def test_values_live_and_a_sensor_that_is_unplugged(
     page.wait_for_selector("#curves[data-drawn] canvas")
     page.wait_for_selector(".tiles li.answers >> nth=1")
     assert "spindle front<script>" in page.inner_text("#temperatures")
+    assert page.locator("#map svg").count() == 2
     before = page.inner_text("#clock")
     sync_api.expect(page.locator("#clock")).not_to_have_text(before)
     accessible(page)

@@ -1,10 +1,16 @@
 """The server over HTTP: rules of access on every address, names as text, files in a sandbox, figures."""
 
 import gc
+import http.client
 import json
 import logging
+import socket
+import ssl
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -34,7 +40,7 @@ def _handlers(found: Application) -> list[Any]:
 
 def test_every_handler_is_guarded(runs: Path) -> None:
     with ThreadPoolExecutor(1) as workers:
-        context = Context(access_for("127.0.0.1"), Lab(runs), 5006, workers, ())
+        context = Context(access_for("127.0.0.1"), Lab(runs), 5006, workers, workers, ())
     handlers = _handlers(application(context))
     assert len(handlers) >= len(PATHS) - 1
     assert all(issubclass(each, Guarded) for each in handlers)
@@ -145,3 +151,58 @@ def test_an_address_in_use_is_named(open_to_this_computer: Any, tmp_path: Path) 
 
 def test_another_server_has_another_secret(serving: Callable[..., Any], runs: Path, open_to_this_computer: Any) -> None:
     assert serving(runs).access.session != open_to_this_computer.access.session
+
+
+def test_the_connection_is_encrypted_with_a_certificate(
+    serving: Callable[..., Any], runs: Path, tmp_path: Path
+) -> None:
+    key, cert = _certificate(tmp_path)
+    served = serving(runs, host="0.0.0.0", cert=cert, key=key)
+    port = int(served.address.rstrip("/").rpartition(":")[2])
+    assert served.address.startswith("https://")
+    assert served.access.secure
+    trust = ssl.create_default_context(cafile=str(cert))
+    connection = http.client.HTTPSConnection("127.0.0.1", port, timeout=20, context=trust)
+    body = urlencode({"token": served.access.token})
+    kind = "application/x-www-form-urlencoded"
+    connection.request("POST", "/login", body, {"Origin": f"https://127.0.0.1:{port}", "Content-Type": kind})
+    answer = connection.getresponse()
+    connection.close()
+    assert answer.status == 302
+    assert "Secure" in str(answer.headers["Set-Cookie"])
+
+
+def test_a_client_that_does_not_read_holds_nobody_up(open_to_this_computer: Any, key: str) -> None:
+    port = int(open_to_this_computer.address.rstrip("/").rpartition(":")[2])
+    with ExitStack() as stack:
+        for _ in range(8):  # more than there are threads
+            hanging = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+            hanging.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            hanging.sendall(f"GET /run/file?run={key}&file=errors HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+        stack.enter_context(socket.create_connection(("127.0.0.1", port))).sendall(b"GET /results HTT")
+        assert open_to_this_computer.ask("/results")[0] == 200
+
+
+def _certificate(folder: Path) -> tuple[Path, Path]:
+    """Write a key and a certificate of 127.0.0.1 that it signed itself; return both files."""
+    x509 = pytest.importorskip("cryptography.x509")
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "lab")])
+    now = datetime.now(UTC)
+    cert = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))
+        .not_valid_after(now + timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ip_address("127.0.0.1"))]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    files = folder / "key.pem", folder / "cert.pem"
+    none = serialization.NoEncryption()
+    pem = serialization.Encoding.PEM
+    files[0].write_bytes(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, none))
+    files[1].write_bytes(cert.public_bytes(pem))
+    return files

@@ -21,6 +21,7 @@ machine = "Mill <b>5</b>"
 driver = "dcon_temperature"
 address = "sim://cframe/t?seed=21&sensors=spindle_front,column&open=1"
 channels = ["spindle <i>", "column"]
+places.column = ["-100 mm", "0 mm", "250 mm"]
 """
 SILENT = """\
 [instruments.absent]
@@ -67,6 +68,8 @@ def test_values_states_and_gaps_of_a_bench(make: Callable[..., Watch], tmp_path:
     assert 15 < values["spindle <i>"].value < 25
     assert (math.isnan(values["column"].value), values["column"].flag) == (True, "open")
     assert math.isnan(values["hall"].value)
+    assert values["column"].place == pytest.approx((-0.1, 0.0, 0.25))
+    assert values["hall"].place is None
     times, curve = watch.history(["spindle <i>", "hall", "other"], 600)["spindle <i>"]
     assert (np.diff(times) > 0).all()
     assert abs(times[-1] - time.time()) < 5
@@ -75,6 +78,12 @@ def test_values_states_and_gaps_of_a_bench(make: Callable[..., Watch], tmp_path:
     (run,) = (tmp_path / "runs").glob("*-monitor-*")
     assert '"status": "finished"' in (run / "run.json").read_text()
     assert watch.present().running is False
+
+
+def test_an_emergency_stop_is_an_alarm(make: Callable[..., Watch]) -> None:
+    watch = make(start=False)
+    watch._take(Snapshot(0.0, {}, {}, {"estop": True, "alarms": ["door <b>open</b>"]}, {}, 1))
+    assert watch.present().alarms == ("emergency stop", "door <b>open</b>")
 
 
 def test_a_monitor_that_ends_says_why(make: Callable[..., Watch], tmp_path: Path) -> None:

@@ -243,7 +243,7 @@ class Monitor:
             coords["sensor"] = list(self.sensors)
             data["temperature"] = (("time", "sensor"), values, {"units": "degC"})
             data["temperature_flag"] = (("time", "sensor"), flags, {"units": "1"})
-            data["sensor_place"] = (("sensor", "direction"), self._places, {"units": "m"})
+            data["sensor_place"] = (("sensor", "direction"), self.places, {"units": "m"})
             coords["direction"] = ["x", "y", "z"]
         if self.controller is not None:
             coords["direction"] = ["x", "y", "z"]
@@ -255,7 +255,8 @@ class Monitor:
         return xr.Dataset(data, coords)
 
     @property
-    def _places(self) -> np.ndarray[Any, Any]:
+    def places(self) -> np.ndarray[Any, Any]:
+        """Return the positions of the temperature sensors on the machine, (sensor, 3), m; NaN if unknown."""
         places = {
             name: place
             for source in self.sources

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import threading
+import webbrowser
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -23,6 +25,7 @@ def run(
     names: list[str],
     cert: Path | None,
     key: Path | None,
+    browser: bool,
 ) -> None:
     """Serve the dashboard until Ctrl-C.
 
@@ -41,7 +44,7 @@ def run(
         raise BenchError(f"--interval: {error}") from None
     if not step >= SHORTEST_INTERVAL:
         raise BenchError(f"--interval: expected {SHORTEST_INTERVAL:g} s or more; found '{interval}'")
-    from errormotion.dashboard.access import Access
+    from errormotion.dashboard.access import Access, is_loopback
     from errormotion.dashboard.server import Options, run
 
     def started(address: str, access: Access) -> None:
@@ -51,6 +54,8 @@ def run(
             if not access.secure:
                 show("The connection is not encrypted: anyone on the network can read it. Give --cert and --key.")
         sys.stdout.flush()
+        if browser and is_loopback(host) and sys.stdout.isatty():  # in a thread: some browsers return when they end
+            threading.Thread(target=webbrowser.open, args=[address], daemon=True).start()
 
     try:
         run(Options(runs, host, port, tuple(names), cert, key, bench, step), started)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -21,7 +22,8 @@ from errormotion.dashboard.kept import Kept, stamp
 from errormotion.dashboard.lab import Choice, Lab
 from errormotion.dashboard.pages.page import LONGEST_MESSAGE, Guarded
 from errormotion.dashboard.pages.results import REPORT_POLICY, loaded, millimetres
-from errormotion.errors import ErrormotionError
+from errormotion.errors import DatasetError, ErrormotionError
+from errormotion.kinematics.iso import DOF
 from errormotion.record.history import history
 from errormotion.record.listing import list_runs
 from errormotion.record.page import write as write_history
@@ -38,10 +40,12 @@ MADE: Kept[xr.Dataset] = Kept(4)
 
 @dataclass(frozen=True)
 class Question:
-    """What a browser asks to compare: keys of runs, functional point (m), and whether the starts count as the same."""
+    """What a browser asks to compare: keys of runs, and what `errormotion.compare.compare` takes."""
 
     runs: tuple[str, ...]
     at: tuple[float, ...] | None
+    freedoms: tuple[str, ...]
+    since: float | None
     same_start: bool
 
 
@@ -61,7 +65,9 @@ class _Comparing(Guarded):
             raise HTTPError(400, reason=f"At most {MOST_COMPARED} runs are compared")
         texts = [self.word(axis) for axis in "xyz"]
         at = tuple(millimetres(text) for text in texts) if any(texts) else None
-        return Question(runs, at, self.word("same_start") == "1")
+        freedoms = tuple(each for each in DOF if each in self.get_query_arguments("freedom"))
+        since = _minutes(self.word("since")) if self.word("since") else None
+        return Question(runs, at, freedoms, since, self.word("same_start") == "1")
 
 
 class Compare(_Comparing):
@@ -74,20 +80,23 @@ class Compare(_Comparing):
         table = await self.apart(self.context.lab.table, Choice(machine=machine))
         found, wrong, wrong_history = None, "", ""
         try:
-            found = await self.apart(_compared, self.context.lab, question) if len(question.runs) > 1 else None
+            found = await self.apart_slow(_compared, self.context.lab, question) if len(question.runs) > 1 else None
         except ErrormotionError as error:
             wrong = str(error)
         try:
             if all(asked.values()):
-                await self.apart(_followed, self.context.lab.runs, *asked.values())
+                await self.apart_slow(_followed, self.context.lab.runs, *asked.values())
         except ErrormotionError as error:
             wrong_history = str(error)
         self.show(
             "compare.html.j2",
             table=table,
             rows=[row for row in table.rows if row.method][:MOST_LISTED],
+            more=sum(bool(row.method) for row in table.rows) > MOST_LISTED,
             machine_chosen=machine,
             question=question,
+            freedoms=DOF,
+            since=self.word("since"),
             point=[self.word(axis) for axis in "xyz"],
             query=self.request.query,
             found=_stated(found) if found is not None else None,
@@ -104,7 +113,7 @@ class Figure(_Comparing):
 
     async def get(self) -> None:
         """Draw it."""
-        found = await self.apart(_compared, self.context.lab, self.question())
+        found = await self.apart_slow(_compared, self.context.lab, self.question())
         self.finish({"item": await self.apart(comparison_item, found)})
 
 
@@ -113,9 +122,9 @@ class Report(_Comparing):
 
     async def get(self) -> None:
         """Send it."""
-        found = await self.apart(_compared, self.context.lab, self.question())
+        found = await self.apart_slow(_compared, self.context.lab, self.question())
         self.set_header("Content-Security-Policy", REPORT_POLICY)
-        self.finish(await self.apart(_page, write_comparison, found))
+        self.finish(await self.apart_slow(_page, write_comparison, found))
 
 
 class History(Guarded):
@@ -123,21 +132,30 @@ class History(Guarded):
 
     async def get(self) -> None:
         """Send it."""
-        found = await self.apart(_followed, self.context.lab.runs, self.word("machine"), self.word("figure"))
+        found = await self.apart_slow(_followed, self.context.lab.runs, self.word("machine"), self.word("figure"))
         self.set_header("Content-Security-Policy", REPORT_POLICY)
-        self.finish(await self.apart(_page, write_history, found))
+        self.finish(await self.apart_slow(_page, write_history, found))
 
 
 def _compared(lab: Lab, question: Question) -> xr.Dataset:
     files = {_name(lab, key): lab.file(key, "errors") for key in question.runs}
-    key = (question.at, question.same_start, *(stamp(file) for file in files.values()))
+    asked = {name: value for name, value in asdict(question).items() if name != "runs"}
 
     def make() -> xr.Dataset:
-        return compare(
-            {name: loaded(file) for name, file in files.items()}, at=question.at, same_start=question.same_start
-        )
+        return compare({name: loaded(file) for name, file in files.items()}, **asked)
 
-    return MADE.get(key, make)
+    return MADE.get((*asked.values(), *(stamp(file) for file in files.values())), make)
+
+
+def _minutes(text: str) -> float:
+    """Return a time that a browser states in min, s."""
+    try:
+        value = 60.0 * float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise DatasetError(f"reference: expected a time in min, such as 10; found {text[:40]!r}")
+    return value
 
 
 def _name(lab: Lab, key: str) -> str:

@@ -9,6 +9,7 @@ from datetime import datetime
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import numpy as np
 from tornado.web import HTTPError
 
 from errormotion.dashboard.figures import live_item
@@ -76,13 +77,17 @@ class History(_OfTheBench):
         text = self.word("span") or str(SPANS[0][1])
         if text not in {str(span) for _, span in SPANS} or len(names) > len(watch.units):
             raise HTTPError(400, reason="Unknown span, or too many names")
-        found = await self.apart(watch.history, names, float(text))
-        curves = {
-            name: {"x": [round(1e3 * each) for each in times], "y": [_known(each) for each in values]}
-            for name, (times, values) in found.items()
-        }
         self.set_header("Content-Type", "application/json")
-        self.finish(json.dumps(curves, ensure_ascii=False))
+        self.finish(await self.apart(_curves, watch, names, float(text)))
+
+
+def _curves(watch: Watch, names: list[str], seconds: float) -> str:
+    """Return the last seconds as a JSON document: times in ms since 1970, UTC, and values."""
+    found = {}
+    for name, (times, values) in watch.history(names, seconds).items():
+        y = [each if math.isfinite(each) else None for each in np.round(values, 6).tolist()]
+        found[name] = {"x": np.rint(1e3 * times).astype(np.int64).tolist(), "y": y}
+    return json.dumps(found, ensure_ascii=False)
 
 
 def _plain(present: Present) -> dict[str, Any]:

@@ -41,6 +41,8 @@ class Context:
     lab: Lab
     port: int
     workers: Executor
+    slow: Executor
+    """For work that may take long, such as comparisons, so that it does not hold up the rest."""
     pages: tuple[tuple[str, str], ...]
     """Paths and titles of the pages in the bar."""
     watch: Watch | None = None
@@ -102,6 +104,10 @@ class Guarded(RequestHandler):
     async def apart(self, work: Callable[..., T], *values: Any) -> T:
         """Return the result of work that takes time, done in a thread so that no other client waits."""
         return await IOLoop.current().run_in_executor(self.context.workers, work, *values)
+
+    async def apart_slow(self, work: Callable[..., T], *values: Any) -> T:
+        """Return the result of work that may take long."""
+        return await IOLoop.current().run_in_executor(self.context.slow, work, *values)
 
     def word(self, name: str, longest: int = 400) -> str:
         """Return a value of the query, empty where there is none.

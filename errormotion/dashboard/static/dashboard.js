@@ -25,7 +25,7 @@ function follow(form) {
 
   async function draw() {
     const own = ++number;
-    if (form.querySelector("[name=freedom]") && !form.querySelector("[name=freedom]:checked")) {
+    if (form.querySelector("[type=checkbox][name=freedom]") && !form.querySelector("[name=freedom]:checked")) {
       note.textContent = "No freedom is chosen.";
       return;
     }

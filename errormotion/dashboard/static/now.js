@@ -37,6 +37,7 @@ function show(found) {
     return row;
   }));
   byId("program").textContent = [found.mode && `mode ${found.mode}`, found.program && `program ${found.program}`].filter(Boolean).join(", ");
+  map(found.temperatures);
   byId("temperatures-card").hidden = !found.temperatures.length;
   byId("temperatures").replaceChildren(...found.temperatures.map((each) => {
     const row = element("tr"), name = element("th", each.name);
@@ -45,6 +46,51 @@ function show(found) {
     row.append(name, value, element("td", signed(each.change, 2), "number"), element("td", number(each.low, 2), "number soft"), element("td", number(each.high, 2), "number soft"));
     return row;
   }));
+}
+
+// Cividis, which every colour vision tells apart, from cold to warm.
+const SHADES = ["#00224e", "#2a3f6d", "#575d6d", "#7d7c78", "#a69c75", "#d3bf66", "#fee838"];
+const WIDTH = 520, HEIGHT = 260, MARGIN = 46;
+
+function shape(name, attributes, text) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  if (text !== undefined) made.textContent = text;
+  return made;
+}
+
+function view(sensors, [h, v], low, high) { // one view of the machine, with the same scale along both axes
+  const at = (k) => sensors.map((each) => 1e3 * each.place[k]);
+  const span = (values) => [Math.min(...values), Math.max(...values)];
+  const [h0, h1] = span(at(h)), [v0, v1] = span(at(v));
+  const scale = Math.min((WIDTH - 3.4 * MARGIN) / Math.max(h1 - h0, 1), (HEIGHT - 2 * MARGIN) / Math.max(v1 - v0, 1));
+  const x = (mm) => 1.4 * MARGIN + ((WIDTH - 3.4 * MARGIN) - scale * (h1 - h0)) / 2 + scale * (mm - h0);
+  const y = (mm) => HEIGHT - MARGIN - ((HEIGHT - 2 * MARGIN) - scale * (v1 - v0)) / 2 - scale * (mm - v0);
+  const svg = shape("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}` }), axes = "XYZ";
+  svg.append(shape("rect", { x: 1, y: 1, width: WIDTH - 2, height: HEIGHT - 2, rx: 4 }));
+  svg.append(shape("text", { x: WIDTH - 12, y: HEIGHT - 12, "text-anchor": "end", class: "axis" }, `${axes[h]} →`));
+  svg.append(shape("text", { x: 12, y: 22, class: "axis" }, `↑ ${axes[v]}`));
+  const labels = [];
+  for (const each of sensors) {
+    const place = [x(1e3 * each.place[h]), y(1e3 * each.place[v])];
+    const shade = each.value === null ? "#ffffff" : SHADES[Math.round((SHADES.length - 1) * (each.value - low) / Math.max(high - low, 0.5))];
+    let row = place[1] + 4;
+    while (labels.some(([px, py]) => Math.abs(px - place[0]) < 150 && Math.abs(py - row) < 15)) row += 15;
+    labels.push([place[0], row]);
+    svg.append(shape("circle", { cx: place[0], cy: place[1], r: 8, fill: shade }));
+    svg.append(shape("text", { x: place[0] + 13, y: row }, `${each.name.slice(0, 24)} ${each.flag || number(each.value, 1)}`));
+  }
+  return svg;
+}
+
+function map(temperatures) {
+  const sensors = temperatures.filter((each) => each.place);
+  byId("map-card").hidden = !sensors.length;
+  if (!sensors.length) return;
+  const known = sensors.map((each) => each.value).filter((value) => value !== null);
+  const low = Math.min(...known), high = Math.max(...known);
+  byId("map").replaceChildren(view(sensors, [0, 2], low, high), view(sensors, [1, 2], low, high));
+  byId("map-note").textContent = known.length ? `Dark is ${number(low, 1)} °C, bright ${number(Math.max(high, low + 0.5), 1)} °C; white is unknown.` : "No temperature is known.";
 }
 
 async function ask(path) {
