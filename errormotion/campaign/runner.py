@@ -165,7 +165,7 @@ def resume(
         if "campaign" not in folder.data:  # a log
             continue
         groups.setdefault(str(folder.data["id"]), []).append(folder)
-    changed, skipped = "", []
+    changed = ""
     for run_id, folders in reversed(groups.items()):
         try:
             stated = folders[0].data["campaign"]

@@ -39,14 +39,8 @@ def import_log(log: str | Path, map_file: str | Path, out: str | Path, *, overwr
         The map or the log is wrong; all mistakes at once, each with its key or line. Nothing is written then.
     """
     log, map_file = Path(log), Path(map_file)
-    reader = _reader(map_file)
-    try:
-        raw = reader(log, map_file).assign_attrs(log=log.name, map=map_file.name)
-        validate(raw)
-    except DatasetError as error:
-        if map_file.name in str(error):
-            raise
-        raise DatasetError(f"{error}\nThe log was read with the map {map_file}.") from None
+    raw = _reader(map_file)(log, map_file).assign_attrs(log=log.name, map=map_file.name)
+    validate(raw)
     save(raw, out, overwrite=overwrite)
     return raw
 
