@@ -30,7 +30,7 @@ from linuxcnc_watch import DRIVERS, Machine, Record, until  # noqa: E402
 from errormotion.errors import InstrumentError  # noqa: E402
 from errormotion.instruments.simulators.controller.linuxcnc_config import Compensated  # noqa: E402
 
-TITLE = "A compensation with a fault every 10 minutes"
+TITLE = "A compensation that is disturbed"
 CYCLE = 1e-3  # s
 EXACT = 1e-6
 """Relative, of numbers that HAL prints with seven digits."""
@@ -240,7 +240,7 @@ def section(courses: list[Course], interval: float, seed: int) -> str:
         "wrote to the real LinuxCNC on simulated joints. All times are "
         f"{SPEEDUP:g} times shorter than by default, and the slew limit is as much higher ({slowest:g} um/s; watchdog "
         f"{WATCHDOG:g} s, interval of offsets {LIMITS.period:g} s): {hours:.1f} hours at that scale, with a fault "
-        f"every {SPEEDUP * interval / 60:g} minutes. "
+        f"every {SPEEDUP * interval / 60:.2g} minutes. "
         "The servo thread ran at its real rate, and recorded the extremes of the offset and of its change of all its "
         "cycles. After a fault that needs a person, the program was started again.",
         "",

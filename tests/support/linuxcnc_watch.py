@@ -95,7 +95,7 @@ class Machine:
     def pins(self, *names: str) -> list[float]:
         """Return values of pins; of bits, 1 and 0."""
         found = self.hal(*(f"getp {name}" for name in names)).split()
-        return [{"TRUE": 1.0, "FALSE": 0.0}.get(text) if text in ("TRUE", "FALSE") else float(text) for text in found]
+        return [float({"TRUE": "1", "FALSE": "0"}.get(text, text)) for text in found]
 
     def offset(self) -> float:
         """Return the offset of X that the limit in the servo thread gives, um."""
