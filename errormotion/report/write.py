@@ -298,11 +298,16 @@ def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = 
 def belonging(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
     """Return the datasets beside a file of errors that state its hash (`errors_hash`), such as an evaluation of it."""
     from errormotion.datasets import hash_dataset, load
+    from errormotion.datasets.storage import reading
 
-    beside = [load(path) for path in sorted(file.parent.glob(f"{glob.escape(file.stem)}.*.nc"))]
-    stated = [ds for ds in beside if "errors_hash" in ds.attrs]
+    beside = {path: load(path) for path in sorted(file.parent.glob(f"{glob.escape(file.stem)}.*.nc"))}
+    stated = {path: ds for path, ds in beside.items() if "errors_hash" in ds.attrs}
     own = hash_dataset(errors) if stated else ""
-    return [ds for ds in stated if ds.attrs["errors_hash"] == own]
+    found = {path: ds for path, ds in stated.items() if ds.attrs["errors_hash"] == own}
+    for path, ds in found.items():
+        with reading(path):
+            validate(ds)
+    return list(found.values())
 
 
 def _provenance(dataset: xr.Dataset, run: Mapping[str, Any]) -> dict[str, Any]:

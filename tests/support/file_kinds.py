@@ -116,6 +116,7 @@ def names(target: str) -> tuple[str, ...]:
     """Return names by which a message may call an altered file: its own, or that of the store or run that it is in."""
     parts = Path(target).parts
     labels = [f"'{Path(target).stem}'", "'monday'"]  # of a comparison
+    labels += ["log.csv: "] * (target == "map.toml")  # a line of the log that does not fit the map
     return (*(part for part in parts if part not in ("runs", "errors")), *labels)
 
 
