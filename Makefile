@@ -2,7 +2,6 @@
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance following lowest lock
-.PHONY: help setup demo test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance following lowest lock
 
 BIN := .venv/bin
 ARGS ?=
