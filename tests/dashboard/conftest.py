@@ -94,9 +94,9 @@ def key(runs: Path) -> str:
     return next(path.name for path in runs.iterdir() if "drift" in path.name)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def serving() -> Iterator[Callable[..., Served]]:
-    """Return a function that serves a folder of runs in a thread until the tests end."""
+    """Return a function that serves a folder of runs in a thread until the tests of a module end."""
     from errormotion.dashboard.server import Options, serve
 
     stops: list[Callable[[], None]] = []
@@ -130,13 +130,13 @@ def serving() -> Iterator[Callable[..., Served]]:
         stop()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def open_to_this_computer(serving: Callable[..., Served], runs: Path) -> Served:
     """Return a dashboard without a token."""
     return serving(runs)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def open_to_the_network(serving: Callable[..., Served], runs: Path) -> Served:
     """Return a dashboard that listens on every address, and requires a token."""
     served = serving(runs, host="0.0.0.0")

@@ -120,7 +120,7 @@ def test_nothing_in_the_package_knows_of_it():
 
 def test_it_is_listed_with_its_distribution(installed):
     listed = installed("plugins", "list")
-    assert re.search(r"methods +ballbar +simulated_only +errormotion-ballbar 0\.1\.0", listed)
+    assert re.search(r"(?m)^ballbar +simulated_only +errormotion-ballbar 0\.1\.0", listed)
 
 
 def test_its_raw_data_are_validated_by_its_own_table(installed, measured):

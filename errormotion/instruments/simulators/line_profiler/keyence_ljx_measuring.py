@@ -133,8 +133,9 @@ class Measuring:
             return
         self._stopping.set()
         if not self.measuring:
-            self._notifying = threading.Thread(target=self._end_stream, name=f"sim-{self._name}-end", daemon=True)
-            self._notifying.start()
+            notifying = threading.Thread(target=self._end_stream, name=f"sim-{self._name}-end", daemon=True)
+            notifying.start()
+            self._notifying = notifying
         elif not batches:
             self._ended.set()
             self.feed.end()
