@@ -186,6 +186,7 @@ class Proxy:
             try:
                 device.connect((self._address.host, self._address.port))
             except OSError:
+                device.close()
                 driver.close()
                 continue
             for end in (driver, device):
