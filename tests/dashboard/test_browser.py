@@ -49,7 +49,7 @@ def browser() -> Iterator[Any]:
 def page(browser: Any) -> Iterator[Any]:
     """Return an empty page; at the end nobody else was asked, and nothing failed in it."""
     context = browser.new_context(viewport={"width": 1280, "height": 800}, accept_downloads=True)
-    context.set_default_timeout(10_000)
+    context.set_default_timeout(30_000)
     found = context.new_page()
     asked: list[str] = []
     wrong: list[str] = []
