@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT / "tools")]
 
 import monitored_day  # noqa: E402
-from fuzz import PAGE, sections  # noqa: E402
+from fuzz import PAGE, write_section  # noqa: E402
 from monitored_day import Day  # noqa: E402
 
 TITLE = "A monitor over 24 hours"
@@ -97,14 +97,6 @@ def _range(numbers: list[int]) -> str:
     return f"{low}, constant" if low == high else f"{low} to {high}"
 
 
-def write(page: Path, body: str) -> None:
-    """Replace this programme's section of the page; the others stay."""
-    head, found = sections(page)
-    found[TITLE] = body
-    text = "".join(f"\n## {name}\n\n{part}\n" for name, part in found.items())
-    page.write_text(head.rstrip("\n") + "\n" + text, encoding="utf-8")
-
-
 def main() -> None:
     """Run the day and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -117,7 +109,7 @@ def main() -> None:
         _, day = monitored_day.watch(Path(folder), options.hours, options.speed, options.seed)
     body = section(day, options.seed)
     print(body)
-    write(options.out, body)
+    write_section(options.out, TITLE, body)
     print(f"written to {options.out}")
     sys.exit(bool(failures(day)))
 

@@ -27,7 +27,7 @@ sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT / "tools")]
 
 import fault_processes  # noqa: E402
 from fault_kinds import Kinds, Result  # noqa: E402
-from fuzz import PAGE, sections  # noqa: E402
+from fuzz import PAGE, write_section  # noqa: E402
 
 TITLE = "Runs that are disturbed"
 SHARES = {
@@ -153,14 +153,6 @@ touches (`normal_vector`) when it is complete. What was measured of an incomplet
 is measured again."""
 
 
-def write(page: Path, body: str) -> None:
-    """Replace this programme's section of the page; the others stay."""
-    head, found = sections(page)
-    found[TITLE] = body
-    text = "".join(f"\n## {name}\n\n{part}\n" for name, part in found.items())
-    page.write_text(head.rstrip("\n") + "\n" + text, encoding="utf-8")
-
-
 def can_mount() -> bool:
     """Whether this process may mount a file system."""
     with tempfile.TemporaryDirectory() as place:
@@ -202,7 +194,7 @@ def main() -> None:
 
         list(pool.map(one, work))
         programme.seconds = fault_processes.processor_seconds()
-    write(options.out, programme.section())
+    write_section(options.out, TITLE, programme.section())
     print(f"{programme.seconds:.0f} s of processors; written to {options.out}")
     sys.exit(bool(programme.failures))
 

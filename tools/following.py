@@ -23,7 +23,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT / "tools")]
 
-from fuzz import PAGE, sections  # noqa: E402
+from fuzz import PAGE, write_section  # noqa: E402
 from linuxcnc_follower import LIMITS, SPEEDUP  # noqa: E402
 from linuxcnc_watch import DRIVERS, Machine, Record, until  # noqa: E402
 
@@ -267,14 +267,6 @@ def section(courses: list[Course], interval: float, seed: int) -> str:
     return "\n".join([*lines, "", f"`make following`, seed {seed}, {where}."])
 
 
-def write(page: Path, body: str) -> None:
-    """Replace this programme's section of the page; the others stay."""
-    head, found = sections(page)
-    found[TITLE] = body
-    text = "".join(f"\n## {name}\n\n{part}\n" for name, part in found.items())
-    page.write_text(head.rstrip("\n") + "\n" + text, encoding="utf-8")
-
-
 def main() -> None:
     """Follow on each route, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -294,7 +286,7 @@ def main() -> None:
                 following.close()
     body = section(courses, options.interval, options.seed)
     print(body)
-    write(options.out, body)
+    write_section(options.out, TITLE, body)
     print(f"written to {options.out}")
     sys.exit(any(failures(course) for course in courses))
 

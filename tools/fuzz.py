@@ -141,6 +141,14 @@ def sections(page: Path) -> tuple[str, dict[str, str]]:
     return head, {name: part.strip("\n") for name, part in zip(parts[::2], parts[1::2], strict=True)}
 
 
+def write_section(page: Path, title: str, body: str) -> None:
+    """Replace one section of the page; the others stay."""
+    head, found = sections(page)
+    found[title] = body
+    text = "".join(f"\n## {name}\n\n{part}\n" for name, part in found.items())
+    page.write_text(head.rstrip("\n") + "\n" + text, encoding="utf-8")
+
+
 def updated(body: str, results: Sequence[tuple[fuzzing.Codec, fuzzing.Found]]) -> str:
     """Return the section with the rows and failures of these codecs; those of other codecs stay."""
     names = [codec.name for codec in CODECS]
@@ -166,10 +174,7 @@ def is_done(body: str, codec: fuzzing.Codec, frames: int) -> bool:
 
 def write(page: Path, title: str, results: Sequence[tuple[fuzzing.Codec, fuzzing.Found]]) -> None:
     """Replace the rows of a section of the page."""
-    head, found = sections(page)
-    found[title] = updated(found.get(title, ""), results)
-    text = "".join(f"\n## {name}\n\n{part}\n" for name, part in found.items())
-    page.write_text(head.rstrip("\n") + "\n" + text, encoding="utf-8")
+    write_section(page, title, updated(sections(page)[1].get(title, ""), results))
 
 
 def main() -> None:

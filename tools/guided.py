@@ -252,17 +252,15 @@ def section(rows: dict[str, str], failures: list[str], seconds: float, version: 
 
 def write(page: Path, names: list[str], new: dict[str, str], faults: dict[str, list[str]], seconds: float) -> None:
     """Replace the rows of the targets that were searched; the others, and other sections, stay."""
-    from fuzz import sections
+    from fuzz import sections, write_section
 
-    head, found = sections(page)
-    body = found.get(TITLE, "").splitlines()
+    body = sections(page)[1].get(TITLE, "").splitlines()
     rows = {line[2:].partition(" |")[0]: line for line in body if line.startswith("| ")} | new
     kept = [line for line in body if line.startswith("* ") and not any(line.startswith(f"* {name}: `") for name in new)]
     failures = [f"* {name}: `{text}`" for name, texts in faults.items() for text in texts]
     version = importlib.metadata.version("atheris") if importlib.util.find_spec("atheris") else "not installed"
-    found[TITLE] = section({name: rows[name] for name in names if name in rows}, [*kept, *failures], seconds, version)
-    text = "".join(f"\n## {name}\n\n{part}\n" for name, part in found.items())
-    page.write_text(head.rstrip("\n") + "\n" + text, encoding="utf-8")
+    stated = {name: rows[name] for name in names if name in rows}
+    write_section(page, TITLE, section(stated, [*kept, *failures], seconds, version))
 
 
 def main() -> None:

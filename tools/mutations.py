@@ -26,10 +26,9 @@ sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT / "tools")]
 
 import file_kinds  # noqa: E402
 import file_trials  # noqa: E402
-from faults import write as write_section  # noqa: E402
 from file_kinds import Kind, Library, Outcome  # noqa: E402
 from file_trials import INTERNAL_ERROR  # noqa: E402
-from fuzz import PAGE  # noqa: E402
+from fuzz import PAGE, write_section  # noqa: E402
 
 TITLE = "Altered files"
 PART = 10

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT / "tools")]
 
 import wire_trials as trials  # noqa: E402
-from fuzz import PAGE, sections  # noqa: E402
+from fuzz import PAGE, sections, write_section  # noqa: E402
 from wire_proxy import LATE  # noqa: E402
 
 TITLE = "Disturbed wires"
@@ -99,15 +99,12 @@ def section(rows: Mapping[str, str], failures: Sequence[str], seed: int) -> str:
 
 def write(page: Path, names: Sequence[str], new: Mapping[str, Row], seed: int) -> None:
     """Replace rows and failures of the instruments that were tried; the others, and other sections, stay."""
-    head, found = sections(page)
-    body = found.get(TITLE, "").splitlines()
+    body = sections(page)[1].get(TITLE, "").splitlines()
     rows = {line[2:].partition(" |")[0]: line for line in body if line.startswith("| ")}
     rows |= {name: text_of(name, row) for name, row in new.items()}
     kept = [line for line in body if line.startswith("* ") and line[2:].partition(":")[0] not in new]
     failures = [f"* {name}: `{text}`" for name, row in new.items() for text in row.faults[:SHOWN]]
-    found[TITLE] = section({name: rows[name] for name in names if name in rows}, [*kept, *failures], seed)
-    text = "".join(f"\n## {name}\n\n{part}\n" for name, part in found.items())
-    page.write_text(head.rstrip("\n") + "\n" + text, encoding="utf-8")
+    write_section(page, TITLE, section({name: rows[name] for name in names if name in rows}, [*kept, *failures], seed))
 
 
 def main() -> None:
