@@ -9,17 +9,15 @@ from pydantic import ValidationError
 from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator.register_map import SIZES, RegisterSettings
 from errormotion.instruments.simulators.compensator.machine import MachinePart
-from errormotion.instruments.simulators.device import SimulatedDevice
+from errormotion.instruments.simulators.modbus_device import FAILURE, SimulatedModbusDevice
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.modbus.client import framing_of
-from errormotion.instruments.transports.modbus.serving import ModbusServer, checksum
+from errormotion.instruments.transports.modbus.serving import ModbusServer
 
-FAILURE, REFUSED = 4, 2  # Modbus exceptions: server device failure, illegal data address
+REFUSED = 2  # Modbus exception: illegal data address
 _SAME = ("type", "word_order")
-_UNIT_POSITION = {"tcp": 6, "rtu": 0}  # position of the unit in a frame
 
 
-class SimulatedPlc(SimulatedDevice):
+class SimulatedPlc(SimulatedModbusDevice):
     """A PLC with the program that a machine needs.
 
     Registers: offsets, then the heartbeat; offsets in effect, a stop and a busy register, which it writes itself.
@@ -40,10 +38,6 @@ class SimulatedPlc(SimulatedDevice):
     faults: tuple[str, ...] = ("silence", "split", "garbage", "drop", "disconnect", "exception", "unit", "short")
 
     def __init__(self, address: Address) -> None:
-        self._framing = framing_of(address)
-        if self._framing == "rtu":
-            self.faults = (*self.faults, "checksum")
-        self._unit = address.whole("unit", 1, 255)
         self.driver_settings = _settings(address)
         self._map = RegisterSettings.model_validate(self.driver_settings)
         self.machine = MachinePart(address)
@@ -51,43 +45,8 @@ class SimulatedPlc(SimulatedDevice):
         self._heartbeat = 0
         last = max(self._map.states) + 1
         first = min(self._map.offset)
-        self._device: ModbusServer | None = None
-        super().__init__(address, line_end=b"", default_name="plc")
+        super().__init__(address, "plc")
         self._device = ModbusServer(self._framing, self._unit, 3, {first: last - first}, self._registers, self._written)
-
-    @property
-    def driver_url(self) -> str:
-        """Address of the device in a bench file."""
-        scheme, _, place = self.url.partition("://")
-        kind = "rtu" if scheme == "serial" else "tcp" if self._framing == "tcp" else "rtu-tcp"
-        return f"modbus+{kind}://{place}?unit={self._unit}"
-
-    def reply(self, data: bytes) -> None:
-        """Send an answer, damaged where that is due."""
-        if self.fault.hits("checksum", self._answers):
-            data = data[:-1] + bytes((data[-1] ^ 1,))
-        elif self.fault.hits("unit", self._answers):
-            place = _UNIT_POSITION[self._framing]
-            data = data[:place] + bytes((data[place] ^ 2,)) + data[place + 1 :]
-            if self._framing == "rtu":
-                data = data[:-2] + checksum(data[:-2])
-        elif self.fault.hits("short", self._answers):
-            data = data[: len(data) // 2]
-        super().reply(data)
-
-    def connection_opened(self) -> None:
-        """Forget the incomplete request of the connection before."""
-        super().connection_opened()
-        if self._device is not None:
-            self._device.reset()
-
-    def _on_data(self, data: bytes) -> None:
-        if self._device is None:
-            return
-        for answer in self._device.receive(data):
-            self.reply(answer)
-        if self._device.lost:
-            self._server.disconnect()
 
     def _registers(self) -> dict[int, int] | int:
         """Return the registers now, or the code of a refusal."""

@@ -7,20 +7,17 @@ import math
 from pydantic import ValidationError
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.simulators.device import SimulatedDevice
+from errormotion.instruments.simulators.modbus_device import FAILURE, SimulatedModbusDevice
 from errormotion.instruments.simulators.thermometer.register_values import to_registers, words_of
 from errormotion.instruments.simulators.thermometer.temperatures import Inputs, Unplugging
 from errormotion.instruments.thermometer.registers import ModbusSettings
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.modbus.client import framing_of
-from errormotion.instruments.transports.modbus.serving import ModbusServer, checksum
+from errormotion.instruments.transports.modbus.serving import ModbusServer
 
-FAILURE = 4  # Modbus exception: server device failure
 _SAME = ("map", "type", "function", "first", "stride", "word_order", "byte_order", "scale", "offset", "open_from")
-_UNIT_POSITION = {"tcp": 6, "rtu": 0}  # position of the unit in a frame
 
 
-class SimulatedModbus(SimulatedDevice):
+class SimulatedModbus(SimulatedModbusDevice):
     """A device whose registers are temperature sensors of the machine.
 
     Further parameters of the address: ``framing`` (``tcp`` or ``rtu``; default by ``wire``), ``map``, ``type``,
@@ -40,14 +37,9 @@ class SimulatedModbus(SimulatedDevice):
     )
 
     def __init__(self, address: Address) -> None:
-        self._framing = framing_of(address)
-        if self._framing == "rtu":
-            self.faults = (*self.faults, "checksum")
         self._unplugging = Unplugging(address)
         self._code = address.whole("code", FAILURE, 11)
-        self._unit = address.whole("unit", 1, 255)
-        self._device: ModbusServer | None = None
-        super().__init__(address, line_end=b"", default_name="thermometer")
+        super().__init__(address, "thermometer")
         try:
             self._inputs = Inputs(self.world.machine, address)
             self._settings = _settings(address, self._inputs.names)
@@ -58,41 +50,9 @@ class SimulatedModbus(SimulatedDevice):
             self.close()
             raise
 
-    @property
-    def driver_url(self) -> str:
-        """Address of the device in a bench file."""
-        scheme, _, place = self.url.partition("://")
-        kind = "rtu" if scheme == "serial" else "tcp" if self._framing == "tcp" else "rtu-tcp"
-        return f"modbus+{kind}://{place}?unit={self._unit}"
-
-    def reply(self, data: bytes) -> None:
-        """Send an answer, damaged where that is due."""
-        if self.fault.hits("checksum", self._answers):
-            data = data[:-1] + bytes((data[-1] ^ 1,))
-        elif self.fault.hits("unit", self._answers):
-            place = _UNIT_POSITION[self._framing]
-            data = data[:place] + bytes((data[place] ^ 2,)) + data[place + 1 :]
-            if self._framing == "rtu":
-                data = data[:-2] + checksum(data[:-2])
-        elif self.fault.hits("short", self._answers):
-            data = data[: len(data) // 2]
-        super().reply(data)
-
-    def connection_opened(self) -> None:
-        """Forget the incomplete request of the connection before."""
-        super().connection_opened()
-        if self._device is not None:
-            self._device.reset()
-
     def _on_data(self, data: bytes) -> None:
-        if self._unplugging.keeps_from(self._answers, self._server):
-            return
-        if self._device is None:
-            return
-        for answer in self._device.receive(data):
-            self.reply(answer)
-        if self._device.lost:
-            self._server.disconnect()
+        if not self._unplugging.keeps_from(self._answers, self._server):
+            super()._on_data(data)
 
     def _blocks(self) -> dict[int, int]:
         """Return the registers that the device has: those of its channels, and what lies between."""
