@@ -41,6 +41,8 @@ SLICE = 0.1
 """Interval at which the offset in effect is looked at, s."""
 LONGEST_FAULT = 0.6
 """Of the interval between two faults."""
+TURN = 30.0
+"""Longest real time of one turn of a thread, s."""
 FAULTS = (
     *("silent", "unknown", "outside", "wild"),  # temperatures
     *("busy", "stop", "link", "refused", "other program"),  # the PLC and the line
@@ -77,11 +79,16 @@ class _Heat:
 
 
 class _Simulated(Clock):
-    """A clock that stands until the compensation sleeps; the PLC's goes with it."""
+    """A clock that stands until the compensation sleeps; the PLC's goes with it.
+
+    Whoever sleeps gives every thread that is due then its turn, so that a busy computer changes nothing.
+    """
 
     def __init__(self) -> None:
         self.time, self.plc = 1000.0, None
         self._change = threading.Condition()
+        self._due: dict[threading.Thread, float] = {}
+        self._at_work: set[threading.Thread] = set()
         self.watch: Any = None
 
     def now(self) -> float:
@@ -91,13 +98,26 @@ class _Simulated(Clock):
         self.watch(seconds)
         with self._change:
             self.time += seconds
+            self._at_work.update(each for each, due in self._due.items() if due <= self.time)
             self._change.notify_all()
-        time.sleep(2e-4)  # the thread of the thermometer reads
+            until = time.monotonic() + TURN
+            while any(each.is_alive() for each in self._at_work):
+                assert time.monotonic() < until, f"not back after {TURN:g} s: {self._at_work}"
+                self._change.wait(0.01)
+            self._at_work.clear()
 
     def wait(self, event: threading.Event, seconds: float) -> None:
-        due = self.time + seconds
+        if threading.current_thread() is threading.main_thread():  # for the first reading: no time passes
+            assert event.wait(TURN)
+            return
+        thread = threading.current_thread()
         with self._change:
-            self._change.wait_for(lambda: self.time >= due or event.is_set(), 0.2)
+            due = self._due[thread] = self.time + seconds
+            self._at_work.discard(thread)
+            self._change.notify_all()
+            while self.time < due and not event.is_set():
+                self._change.wait(0.01)  # the event is not of this condition
+            del self._due[thread]
 
 
 @dataclass
