@@ -1,8 +1,8 @@
 """The dashboard: 100 sensors, 8 hours of history, 20 clients that ask ten times a second, one client that hangs.
 
 The server is a process of its own with the real monitor, rows of a second, and thermometers without a line. Beside
-it, a bare tornado server that sends a text of the same length to the same clients. Accuracy: extremes of the reduced curves
-against those of the whole history.
+it, a bare tornado server that sends a text of the same length to the same clients. Accuracy: the peak of one row in
+every reduced curve.
 
 ``python benchmarks/dashboard.py [SECONDS]``
 """
