@@ -222,7 +222,10 @@ class Compensation:
         self._follower.arm(applied)
 
     def stop(self) -> None:
-        """Ramp to zero, then end `follow`."""
+        """Ramp to zero, then end `follow`.
+
+        Without a connection it ends after the time ``hold``; the watchdog of the machine ramps to zero.
+        """
         self._follower.stop()
 
     def follow(self, duration: float = math.inf) -> Iterator[Moment]:
@@ -239,11 +242,14 @@ class Compensation:
             The audit log or the log of readings cannot be written. Nothing further is written to the machine, whose
             watchdog then ramps to zero.
         """
+        able = 0.0  # the last time when the machine took offsets, or no stop had been asked for
         for snapshot in self._monitor.watch():
             if snapshot.time >= duration:
                 self.stop()
             yield self._moment(snapshot)
-            if self.state is State.OFF:
+            stuck = self._follower.stopping and self.state is State.FAULT
+            able = able if stuck else snapshot.time
+            if self.state is State.OFF or (stuck and snapshot.time - able >= self.limits.hold):
                 return
 
     def _moment(self, snapshot: Snapshot) -> Moment:

@@ -6,8 +6,6 @@ arrives at the PLC, and the offset in effect every tenth of a second, are compar
 
 import math
 import random
-import threading
-import time
 from collections import Counter
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
@@ -16,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from simulated_clock import SimulatedClock
 
 from errormotion.campaign.compensating import Compensation
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, parse_bench
-from errormotion.campaign.monitor.clock import Clock
 from errormotion.compensation.online.follower import LONGEST_STEP, State
 from errormotion.compensation.online.settings import Limits
 from errormotion.compensation.thermal_model import ThermalModel
@@ -41,8 +39,6 @@ SLICE = 0.1
 """Interval at which the offset in effect is looked at, s."""
 LONGEST_FAULT = 0.6
 """Of the interval between two faults."""
-TURN = 30.0
-"""Longest real time of one turn of a thread, s."""
 FAULTS = (
     *("silent", "unknown", "outside", "wild"),  # temperatures
     *("busy", "stop", "link", "refused", "other program"),  # the PLC and the line
@@ -76,48 +72,6 @@ class _Heat:
         course = STEADY + 4 * math.sin(_Heat.clock.now() / 900)
         wrong = {"unknown": math.nan, "outside": STEADY + 40, "wild": STEADY + random.uniform(-9, 9)}
         return {"spindle": wrong.get(_Heat.fault, course)}
-
-
-class _Simulated(Clock):
-    """A clock that stands until the compensation sleeps; the PLC's goes with it.
-
-    Whoever sleeps gives every thread that is due then its turn, so that a busy computer changes nothing.
-    """
-
-    def __init__(self) -> None:
-        self.time, self.plc = 1000.0, None
-        self._change = threading.Condition()
-        self._due: dict[threading.Thread, float] = {}
-        self._at_work: set[threading.Thread] = set()
-        self.watch: Any = None
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        self.watch(seconds)
-        with self._change:
-            self.time += seconds
-            self._at_work.update(each for each, due in self._due.items() if due <= self.time)
-            self._change.notify_all()
-            until = time.monotonic() + TURN
-            while any(each.is_alive() for each in self._at_work):
-                assert time.monotonic() < until, f"not back after {TURN:g} s: {self._at_work}"
-                self._change.wait(0.01)
-            self._at_work.clear()
-
-    def wait(self, event: threading.Event, seconds: float) -> None:
-        if threading.current_thread() is threading.main_thread():  # for the first reading: no time passes
-            assert event.wait(TURN)
-            return
-        thread = threading.current_thread()
-        with self._change:
-            due = self._due[thread] = self.time + seconds
-            self._at_work.discard(thread)
-            self._change.notify_all()
-            while self.time < due and not event.is_set():
-                self._change.wait(0.01)  # the event is not of this condition
-            del self._due[thread]
 
 
 @dataclass
@@ -168,7 +122,7 @@ class Hours:
         self.runs, self.until, self.interval = runs, 1000.0 + 3600 * hours, interval
         self.found = Found()
         self._random = random.Random(seed)
-        self._clock = _Simulated()
+        self._clock = SimulatedClock(1000.0)
         self._clock.watch = self._elapse
         self._kind, self._ends, self._next = "", 0.0, 1000.0 + interval
         self._last: tuple[float, ...] | None = None
