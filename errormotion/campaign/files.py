@@ -7,7 +7,7 @@ reported in one message, each with its key, the expected and the found value.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
@@ -123,6 +123,14 @@ class CampaignTable(BaseModel):
         return value
 
 
+class MistakesError(BenchError):
+    """A file with mistakes, each of which begins with its key; ``more`` is the message of a second file."""
+
+    def __init__(self, source: Path, mistakes: Sequence[str], more: str = "") -> None:
+        super().__init__("\n".join(filter(None, [tomlfile.report(source, mistakes), more])))
+        self.source, self.mistakes, self.more = source, tuple(mistakes), more
+
+
 @dataclass(frozen=True)
 class BenchInstrument:
     """One instrument of a bench: the driver's class and its checked settings."""
@@ -234,7 +242,7 @@ def load_bench(path: str | Path) -> BenchPlan:
     _refuse_other(path, tomlfile.read_toml(path, error=BenchError), "bench")
     plan = parse_bench(path.read_text(encoding="utf-8-sig"), path)
     if mistakes := head.logo_mistakes(plan.laboratory, path.parent):
-        raise BenchError(tomlfile.report(path, mistakes))
+        raise MistakesError(path, mistakes)
     return plan
 
 
@@ -247,7 +255,19 @@ def load_campaign(path: str | Path) -> CampaignPlan:
         A file cannot be read, or contains errors; all errors of a file in one message.
     """
     path = Path(path)
-    data = tomlfile.read_toml(path, error=BenchError)
+    tomlfile.read_toml(path, error=BenchError)
+    return campaign_of(path.read_text(encoding="utf-8-sig"), path)
+
+
+def campaign_of(text: str, path: Path) -> CampaignPlan:
+    """Check the text of a campaign file, and the bench file that it names; ``path`` is where it stands or will stand.
+
+    Raises
+    ------
+    BenchError
+        The bench file cannot be read, or one of both contains errors; all errors of a file in one message.
+    """
+    data = tomlfile.parse_toml(text, path, error=BenchError)
     _refuse_other(path, data, "campaign")
     bench = data.get("bench")
     plan, bench_error = None, None
@@ -257,13 +277,15 @@ def load_campaign(path: str | Path) -> CampaignPlan:
         except BenchError as error:
             bench_error = error
     try:
-        campaign = parse_campaign(path.read_text(encoding="utf-8-sig"), path, plan)
-    except BenchError as error:
+        campaign = parse_campaign(text, path, plan)
+    except MistakesError as error:
         if bench_error is None:
             raise
-        raise bench_error if not str(error).strip() else BenchError(f"{error}\n{bench_error}") from None
+        raise MistakesError(path, error.mistakes, str(bench_error)) from None
+    except BenchError:
+        raise bench_error or BenchError(f"{path}: the bench cannot be read") from None
     if mistakes := list(_missing(campaign)):
-        raise BenchError(tomlfile.report(path, mistakes))
+        raise MistakesError(path, mistakes)
     return campaign
 
 
@@ -319,7 +341,7 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
     mistakes += found
     mistakes += head.until_mistakes(table.calibrated_until, table.instruments) if table else []
     if table is None or mistakes:
-        raise BenchError(tomlfile.report(source, mistakes))
+        raise MistakesError(source, mistakes)
     return BenchPlan(
         name=table.name,
         machine=table.machine,
@@ -362,7 +384,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         earlier.append(test.name)
     mistakes += _timeline_mistakes(table, bench) if table else []
     if table is None or mistakes:
-        raise BenchError(tomlfile.report(source, mistakes))
+        raise MistakesError(source, mistakes)
     if bench is None:
         raise BenchError("")
     tests = []
