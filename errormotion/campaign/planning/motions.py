@@ -77,16 +77,25 @@ def duration(seconds: float) -> str:
 
 
 def picture(plan: CampaignPlan, found: Motions) -> Figure:
-    """Return a drawing of the path from above, from the front and from the side, and of the spindle speed over time."""
+    """Return a drawing of the path from above, from the front and from the side, and of the spindle speed over time.
+
+    Where no axis moves, only the spindle speed is drawn.
+    """
     from matplotlib.figure import Figure
 
+    title = f"{plan.name}: {found.test}, {duration(found.extent.seconds)}"
+    if all(step.place is None for step in found.steps):
+        figure = Figure(figsize=(WIDTH, HEIGHT / 2), layout="constrained")
+        _speeds(figure.subplots(), found.steps)
+        figure.suptitle(title)
+        return figure
     figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     above, front, side, time = figure.subplots(2, 2).ravel()
     for axes, (first, second) in zip((above, front, side), ((0, 1), (0, 2), (1, 2)), strict=True):
         _view(axes, found.steps, plan.bench.limits, first, second)
     _speeds(time, found.steps)
     figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    figure.suptitle(f"{plan.name}: {found.test}, {duration(found.extent.seconds)}")
+    figure.suptitle(title)
     return figure
 
 

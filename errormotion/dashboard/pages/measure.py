@@ -67,7 +67,6 @@ class Measure(_OfCampaigns):
             name=name,
             text=text,
             before=hash_of(text),
-            folder=campaigns.folder,
         )
 
 

@@ -107,7 +107,10 @@ function show(form) {
 }
 
 function ready() {
-  if (control) byId("start").disabled = byId("plan").disabled || planned !== text.value;
+  if (control) {
+    byId("start").disabled = byId("plan").disabled || planned !== text.value;
+    byId("start-note").hidden = !byId("start").disabled;
+  }
   byId("plan-card").hidden = planned !== text.value;
 }
 
@@ -219,10 +222,10 @@ async function command(path, body, pressed) {
   pressed.disabled = true;
   try {
     await ask(path, body);
-    byId("processes-note").hidden = true;
+    byId("refused").hidden = true;
   } catch (error) {
-    byId("processes-note").textContent = error.message;
-    byId("processes-note").hidden = false;
+    byId("refused").textContent = error.message;
+    byId("refused").hidden = false;
   }
   pressed.disabled = false;
 }
@@ -235,7 +238,7 @@ function process(each) { // made anew only when something but the progress has c
     made.dataset.key = key;
     made.dataset.process = each.name;
     const where = each.test ? `test ${each.number + 1} of ${each.total}, ${each.test}: ` : "";
-    made.append(element("h3", `${each.campaign} on ${each.machine}`));
+    made.append(element("h3", `${each.campaign} on ${each.machine}`), element("p", `started ${new Date(each.started).toLocaleString("en-GB")}`, "note"));
     made.append(element("p", each.alive ? `${where}${each.stopping ? "stopping" : each.stage}` : WORDS[each.ended], `state ${each.ended || "live"}`));
     if (each.alive) {
       const bar = element("progress");
@@ -262,7 +265,6 @@ function process(each) { // made anew only when something but the progress has c
     if (control && each.alive) links.append(button("Stop", (event) => command("/measure/stop", { process: each.name }, event.target), "stop"));
     if (control && each.resume) links.append(button("Resume", (event) => command("/measure/resume", { run: each.resume }, event.target)));
     if (links.childNodes.length) made.append(links);
-    made.append(element("p", `started ${new Date(each.started).toLocaleString("en-GB")}`, "note"));
     if (card) card.replaceWith(made);
     cards.set(each.name, (card = made));
   }
@@ -282,19 +284,19 @@ async function processes() {
     const found = (await ask("/measure/processes.json")).processes;
     const names = new Set(found.map((each) => each.name));
     for (const name of cards.keys()) if (!names.has(name)) cards.delete(name);
-    const made = found.map(process), place = byId("processes");
-    if (made.length !== place.children.length || made.some((card, k) => place.children[k] !== card)) place.replaceChildren(...made);
-    byId("processes-card").hidden = !found.length;
+    for (const [id, own] of [["processes", found.filter((each) => each.alive)], ["ended", found.filter((each) => !each.alive)]]) {
+      const made = own.map(process), place = byId(id);
+      if (made.length !== place.children.length || made.some((card, k) => place.children[k] !== card)) place.replaceChildren(...made);
+      byId(`${id}-card`).hidden = !own.length;
+    }
     const now = found.find((each) => each.alive && each.stage === "measuring" && each.tests.length);
     running = now ? now.tests.find((test) => test.name === now.test)?.run ?? null : null;
     document.body.classList.remove("lost");
   } catch (error) {
     document.body.classList.add("lost");
-    byId("processes-note").textContent = error.message;
+    byId("lost").textContent = error.message;
   }
-  byId("processes-note").hidden = !document.body.classList.contains("lost") && byId("processes-note").hidden;
-  if (document.body.classList.contains("lost")) [byId("processes-note").hidden, byId("processes-card").hidden] = [false, false];
-  else if (byId("processes-note").textContent === "The dashboard does not answer.") byId("processes-note").hidden = true;
+  byId("lost").hidden = !document.body.classList.contains("lost");
   setTimeout(processes, INTERVAL);
 }
 
