@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -175,14 +176,12 @@ class Compensations:
             found[str(self.bench)] = self.bench
             if (self.folder / self.bench.name).resolve() == self.bench.resolve():
                 found.pop(self.bench.name, None)
-        return [
-            self._benches.get((name, *stamp(path)), lambda n=name, p=path: _bench(n, p)) for name, path in found.items()
-        ]
+        return [self._benches.get((name, *stamp(path)), partial(_bench, name, path)) for name, path in found.items()]
 
     def models(self) -> list[Model]:
         """Return the models of the folder and of the folder of runs."""
         paths = [*_files(self.folder, ".nc"), *_files(self.runs, ".nc")]
-        found = [self._models.get(stamp(path), lambda p=path: _model(p)) for path in paths]
+        found = [self._models.get(stamp(path), partial(_model, path)) for path in paths]
         return [each for each in found if each is not None]
 
     def start(self, bench: str, model: str, arm: str | None) -> Start:
