@@ -17,14 +17,14 @@ from tornado.web import Application, HTTPError, StaticFileHandler
 from errormotion.campaign.files import load_bench
 from errormotion.dashboard.access import LOOPBACK, Access, access_for
 from errormotion.dashboard.lab import Lab
-from errormotion.dashboard.pages import compare, measure, now, results
+from errormotion.dashboard.pages import compare, compensate, measure, now, results
 from errormotion.dashboard.pages.login import Login
 from errormotion.dashboard.pages.page import Context, Guarded, note_request
 from errormotion.dashboard.watch import Watch
 from errormotion.errors import RunError
 
 HERE = Path(__file__).parent
-PAGES = (("/measure", "Measure"), ("/results", "Results"), ("/compare", "Compare"))
+PAGES = (("/measure", "Measure"), ("/results", "Results"), ("/compare", "Compare"), ("/compensate", "Compensate"))
 """Paths and titles of the pages that every dashboard has."""
 BOKEH = ("bokeh.min.js",)
 """Scripts of the package bokeh that pages load."""
@@ -106,6 +106,7 @@ def application(context: Context) -> Application:
             (r"/compare/report\.html", compare.Report, one),
             (r"/compare/history\.html", compare.History, one),
             *((path, handler, one) for path, handler in measure.HANDLERS),
+            *compensate.handlers(context),
             (r"/results", results.Results, one),
             (r"/run", results.Run, one),
             (r"/run/figure\.json", results.Figure, one),
