@@ -224,6 +224,7 @@ class Compensations:
             )
         finally:
             os.close(descriptor)
+        threading.Thread(target=process.wait, daemon=True).start()  # no zombie stays, whether anybody asks or not
         started = Start(bench, model, arm is not None, datetime.now(UTC), process, Path(name))
         self.starts.appendleft(started)
         return started

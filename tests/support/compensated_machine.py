@@ -33,6 +33,7 @@ address = "{address}"
 [compensator.limits]
 period = "0.2 s"
 slew = "20 um/s"
+hold = "1 s"
 """
 
 
