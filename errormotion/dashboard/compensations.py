@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -175,17 +176,13 @@ class Compensations:
             found[str(self.bench)] = self.bench
             if (self.folder / self.bench.name).resolve() == self.bench.resolve():
                 found.pop(self.bench.name, None)
-        return [
-            self._benches.get((name, *stamp(path)), lambda n=name, p=path: _bench(n, p)) for name, path in found.items()
-        ]
+        return [self._benches.get((name, *stamp(path)), partial(_bench, name, path)) for name, path in found.items()]
 
     def models(self) -> list[Model]:
         """Return the models of the folder and of the folder of runs."""
         paths = {path.name: path for path in _files(self.folder, ".nc")}
         paths |= {f"{self.runs.name}/{path.name}": path for path in _files(self.runs, ".nc")}
-        found = [
-            self._models.get((name, *stamp(path)), lambda n=name, p=path: _model(n, p)) for name, path in paths.items()
-        ]
+        found = [self._models.get((name, *stamp(path)), partial(_model, name, path)) for name, path in paths.items()]
         return [each for each in found if each is not None]
 
     def start(self, bench: str, model: str, arm: str | None) -> Start:
