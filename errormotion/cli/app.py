@@ -568,11 +568,15 @@ def dashboard(
     cert: Annotated[Path | None, typer.Option(help="Certificate (PEM) of an encrypted connection.")] = None,
     key: Annotated[Path | None, typer.Option(help="Key (PEM) of the certificate.")] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser of this computer.")] = True,
+    campaigns: Annotated[Path, typer.Option(help="The folder of the campaign files.")] = Path(),
+    allow_control: Annotated[
+        bool, typer.Option("--allow-control", help="Let the pages start and stop what moves or changes a machine.")
+    ] = False,
 ) -> None:
     """Show runs, and the instruments of a bench, in a browser, until Ctrl-C."""
     from errormotion.cli.commands import dashboard as command
 
-    command.run(runs, bench, interval, host, port, name or [], cert, key, browser)
+    command.run(runs, bench, interval, host, port, name or [], cert, key, browser, campaigns, allow_control)
 
 
 @app.command()
