@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from simulated_clock import SimulatedClock
 
 from errormotion import datasets
-from errormotion.campaign.compensating import AUDIT, Compensation, Moment
+from errormotion.campaign.compensating import Compensation, Moment
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, BenchPlan, parse_bench
+from errormotion.campaign.following import AUDIT
 from errormotion.compensation.online.audit import verify
 from errormotion.compensation.online.follower import State
 from errormotion.compensation.online.settings import Limits
@@ -186,7 +188,7 @@ def never_beyond(start: float = 0.0) -> None:
 def test_it_follows_the_temperature_and_ramps_to_zero_when_stopped(
     plan: BenchPlan, model: xr.Dataset, tmp_path: Path
 ) -> None:
-    compensation = Compensation(plan, model, tmp_path, arm=MACHINE)
+    compensation = Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock())
     moments = run(compensation, {3: set_to(Thermometer, "value", STEADY + 2), 30: compensation.stop}, 200)
     assert states(moments) == ["following", "ramping", "off"]
     assert min(offset[0] for offset in Machine.written) == pytest.approx(-10e-6)
@@ -203,7 +205,7 @@ def test_it_follows_the_temperature_and_ramps_to_zero_when_stopped(
 
 
 def test_without_arming_nothing_is_written(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
-    compensation = Compensation(plan, model, tmp_path)
+    compensation = Compensation(plan, model, tmp_path, clock=SimulatedClock())
     moments = run(compensation, {3: set_to(Thermometer, "value", STEADY + 2)}, 30)
     assert moments[-1].step.offset[0] == pytest.approx(-10e-6)
     assert Machine.written == ()
@@ -224,7 +226,7 @@ def test_without_a_valid_prediction_it_holds_then_ramps(
 ) -> None:
     script = {0: set_to(Thermometer, "value", STEADY), 3: set_to(Thermometer, "value", STEADY + 2)}
     script |= {25: set_to(Thermometer, "value", cause)}
-    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 80)
+    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()), script, 80)
     assert states(moments) == ["following", "holding", "ramping", "armed"]
     assert any(text in moment.step.cause for moment in moments)
     assert Machine.offset == (0.0, 0.0, 0.0)
@@ -233,14 +235,18 @@ def test_without_a_valid_prediction_it_holds_then_ramps(
 
 def test_a_wide_prediction_is_not_used(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     model["misfit"][1] = 15e-6
-    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), {3: set_to(Thermometer, "value", STEADY + 2)}, 8)
+    moments = run(
+        Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()),
+        {3: set_to(Thermometer, "value", STEADY + 2)},
+        8,
+    )
     assert states(moments) == ["armed"]
     assert "U of the prediction is 30.0 um" in moments[-1].step.cause
 
 
 def test_nothing_changes_while_the_machine_is_busy(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     script = {2: set_to(Thermometer, "value", STEADY + 2), 8: set_to(Machine, "busy", "a probing cycle runs")}
-    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 30)
+    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()), script, 30)
     assert len({tuple(moment.step.offset) for moment in moments[8:]}) == 1
     assert moments[-1].step.cause == "a probing cycle runs"
     assert 0 < abs(Machine.offset[0]) < 10e-6
@@ -249,14 +255,14 @@ def test_nothing_changes_while_the_machine_is_busy(plan: BenchPlan, model: xr.Da
 def test_a_stop_of_the_machine_ends_it(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     script = {2: set_to(Thermometer, "value", STEADY + 2), 8: set_to(Machine, "fault", "emergency stop")}
     script |= {15: set_to(Machine, "fault", "")}
-    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 30)
+    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()), script, 30)
     assert states(moments) == ["following", "fault"]
     assert len(Machine.written) == 8
 
 
 def test_an_offset_that_somebody_else_wrote_ends_it(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     script = {2: set_to(Thermometer, "value", STEADY + 2), 8: set_to(Machine, "offset", (15e-6, 0.0, 0.0))}
-    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 20)
+    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()), script, 20)
     assert states(moments) == ["following", "fault"]
     assert "another offset than the one written" in moments[8].step.cause
 
@@ -268,11 +274,33 @@ def test_after_a_lost_connection_it_goes_on_from_the_offset_of_the_machine(
         Machine.silent, Machine.offset = False, (-4e-6, 0.0, 0.0)
 
     script = {2: set_to(Thermometer, "value", STEADY + 2), 20: set_to(Machine, "silent", True), 26: ramped}
-    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 50)
+    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()), script, 50)
     assert states(moments) == ["following", "fault", "following"]
     again = next(k for k in range(27, 50) if moments[k].step.state is State.FOLLOWING)
     assert moments[again].step.offset[0] == pytest.approx(-4e-6, abs=2 * MOST)
     assert Machine.offset[0] == pytest.approx(-10e-6)
+
+
+def test_a_stop_is_kept_over_a_lost_connection(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
+    compensation = Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock())
+
+    def stopped() -> None:
+        compensation.stop()
+        Machine.silent = True
+
+    script = {2: set_to(Thermometer, "value", STEADY + 2), 20: stopped, 23: set_to(Machine, "silent", False)}
+    moments = run(compensation, script, 80)
+    assert states(moments) == ["following", "fault", "ramping", "off"]
+    assert Machine.offset == (0.0, 0.0, 0.0)
+    never_beyond()
+
+
+def test_stopped_without_a_connection_it_ends(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
+    compensation = Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock())
+    script = {2: set_to(Thermometer, "value", STEADY + 2), 20: set_to(Machine, "silent", True), 30: compensation.stop}
+    moments = run(compensation, script, 80)
+    assert states(moments) == ["following", "fault"]
+    assert moments[-1].snapshot.time - moments[30].snapshot.time == pytest.approx(LIMITS.hold, abs=2 * TICK)
 
 
 def test_a_plc_follows_and_ramps_to_zero_when_the_program_ends(
@@ -284,10 +312,10 @@ def test_a_plc_follows_and_ramps_to_zero_when_the_program_ends(
         plan = replace(plan, compensator=BenchCompensator(ModbusRegisters, plc.driver_url, settings, LIMITS))
         script = {k: lambda: plc.machine.elapse(TICK) for k in range(60)}  # the time of the PLC is that of the periods
         script[2] = set_to(Thermometer, "value", STEADY + 1)
-        run(Compensation(plan, model, tmp_path), script, 20)
+        run(Compensation(plan, model, tmp_path, clock=SimulatedClock()), script, 20)
         assert plc.machine.orders == 0
         Thermometer.value = STEADY
-        moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 40)
+        moments = run(Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()), script, 40)
         assert {"fault", "ramping"}.isdisjoint(states(moments))
         assert plc.machine.offset[0] == pytest.approx(-5e-6, abs=1e-9)
         plc.machine.elapse(2.0)  # the program has ended
@@ -296,7 +324,7 @@ def test_a_plc_follows_and_ramps_to_zero_when_the_program_ends(
 
 def test_an_offset_that_is_not_taken_is_a_fault(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     script = {2: set_to(Thermometer, "value", STEADY + 2), 8: set_to(Machine, "deaf", True)}
-    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE), script, 10)
+    moments = run(Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()), script, 10)
     assert states(moments) == ["following", "fault"]
 
 
@@ -313,13 +341,13 @@ def test_a_restart_does_not_jump(plan: BenchPlan, model: xr.Dataset, tmp_path: P
 
 
 def test_one_machine_has_one_compensation(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
-    with Compensation(plan, model, tmp_path, arm=MACHINE):
+    with Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()):
         with (
             pytest.raises(CompensationError, match=r"compensated already by process \d+"),
-            Compensation(plan, model, tmp_path, arm=MACHINE),
+            Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()),
         ):
             pass
-        with Compensation(plan, model, tmp_path):  # a second one may compute
+        with Compensation(plan, model, tmp_path, clock=SimulatedClock()):  # a second one may compute
             pass
 
 

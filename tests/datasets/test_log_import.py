@@ -189,6 +189,7 @@ def test_mistakes_of_a_map_name_their_key(mistakes, old: str, new: str, expected
         ("S2;P2;", "S2;P1;", "duplicate; first given in line 6"),
         ("900,25", "900000,25", "line 6: column 'Length': makes displacement = 900 m"),
         ("S2;P2;100;0;50;880", "S2;P2;100;0", "line 7: expected 10 fields; found 8"),
+        ("noise: 0,5", "noise: 0,-inf", "values.displacement_noise, 'Length noise' in log.csv: expected one number"),
     ],
 )
 def test_mistakes_of_a_log_name_their_line(mistakes, old: str, new: str, expected: str) -> None:

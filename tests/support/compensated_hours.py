@@ -6,8 +6,6 @@ arrives at the PLC, and the offset in effect every tenth of a second, are compar
 
 import math
 import random
-import threading
-import time
 from collections import Counter
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
@@ -16,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from simulated_clock import SimulatedClock
 
 from errormotion.campaign.compensating import Compensation
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, parse_bench
-from errormotion.campaign.monitor.clock import Clock
 from errormotion.compensation.online.follower import LONGEST_STEP, State
 from errormotion.compensation.online.settings import Limits
 from errormotion.compensation.thermal_model import ThermalModel
@@ -76,30 +74,6 @@ class _Heat:
         return {"spindle": wrong.get(_Heat.fault, course)}
 
 
-class _Simulated(Clock):
-    """A clock that stands until the compensation sleeps; the PLC's goes with it."""
-
-    def __init__(self) -> None:
-        self.time, self.plc = 1000.0, None
-        self._change = threading.Condition()
-        self.watch: Any = None
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        self.watch(seconds)
-        with self._change:
-            self.time += seconds
-            self._change.notify_all()
-        time.sleep(2e-4)  # the thread of the thermometer reads
-
-    def wait(self, event: threading.Event, seconds: float) -> None:
-        due = self.time + seconds
-        with self._change:
-            self._change.wait_for(lambda: self.time >= due or event.is_set(), 0.2)
-
-
 @dataclass
 class Found:
     """What happened, and the extremes."""
@@ -148,7 +122,7 @@ class Hours:
         self.runs, self.until, self.interval = runs, 1000.0 + 3600 * hours, interval
         self.found = Found()
         self._random = random.Random(seed)
-        self._clock = _Simulated()
+        self._clock = SimulatedClock(1000.0)
         self._clock.watch = self._elapse
         self._kind, self._ends, self._next = "", 0.0, 1000.0 + interval
         self._last: tuple[float, ...] | None = None

@@ -44,7 +44,9 @@ def mdi(line):
 
 
 (Path(folder) / "token").write_text("none")
-(Path(folder) / "bridge.json").write_text(json.dumps({"socket": "none", "pid": os.getpid()}))
+announced = Path(folder) / "bridge.part"
+announced.write_text(json.dumps({"socket": "none", "pid": os.getpid()}))
+announced.rename(Path(folder) / "bridge.json")
 found = []
 try:
     wait(lambda: polled(lambda: status.task_mode > 0))

@@ -97,10 +97,13 @@ class Follower:
         self._last: float | None = None
         self._invalid_since: float | None = None
         self._valid_since: float | None = None
-        self._stopping = False
+        self.stopping = False
+        """Whether it was asked to ramp to zero and end."""
 
     def arm(self, applied: Array) -> None:
         """Allow offsets to be written; the first one is the offset that the machine has now, so that nothing jumps.
+
+        After a fault, a stop that was asked for before stays in force.
 
         Parameters
         ----------
@@ -122,9 +125,9 @@ class Follower:
                 f"The machine has an offset of {_um(values)} um, beyond the limit of {self.limits.limit * 1e6:g} um. "
                 "Ramp it to zero first."
             )
+        self.stopping = self.stopping and self.state is State.FAULT
         self.state, self.offset = State.ARMED, np.clip(values, -self.limits.limit, self.limits.limit)
         self._last = self._invalid_since = self._valid_since = None
-        self._stopping = False
 
     def fail(self) -> None:
         """Write nothing until it is armed again: the machine did not take an offset."""
@@ -133,7 +136,7 @@ class Follower:
 
     def stop(self) -> None:
         """Ramp to zero, then end."""
-        self._stopping = True
+        self.stopping = True
 
     def step(self, now: float, conditions: Conditions) -> Step:
         """Return what to write now.
@@ -164,8 +167,8 @@ class Follower:
         elif self.state is State.RAMPING:
             self._move(np.zeros(3), dt)
             if not self.offset.any():
-                self.state = State.OFF if self._stopping else State.ARMED
-        return Step(self.state, self.offset.copy(), "stopped" if self._stopping else cause, limited)
+                self.state = State.OFF if self.stopping else State.ARMED
+        return Step(self.state, self.offset.copy(), "stopped" if self.stopping else cause, limited)
 
     def _valid(self, conditions: Conditions) -> tuple[Array | None, str]:
         if conditions.target is None:
@@ -185,7 +188,7 @@ class Follower:
 
     def _next(self, now: float, valid: bool, busy: str) -> State:
         """Return the state for this step."""
-        if self._stopping:
+        if self.stopping:
             return State.HOLDING if busy else State.RAMPING
         if busy:
             return State.HOLDING if self.state is not State.ARMED or self.offset.any() else State.ARMED

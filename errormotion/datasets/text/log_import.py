@@ -150,6 +150,7 @@ def _read_value(
     if stated is None:
         mistakes.add(0, f"{where}: no line with '{entry.key}' and a value at the top of {log.name}")
         return
+    where += f", '{entry.key}' in {log.name}" if entry.key else ""
     parsed = _numbers(stated, entry.unit)
     if parsed is None or parsed[0].ndim != len(row.dims):
         kind = f"an array with the dims ({', '.join(row.dims)})" if row.dims else "one number"

@@ -138,6 +138,17 @@ def test_a_fault_ends_it_until_it_is_armed_again() -> None:
     assert run(follower, wanted(9, 0, 0), 9.0, 2) == [(State.FOLLOWING, 1), (State.FOLLOWING, 2)]
 
 
+def test_a_stop_is_kept_when_it_is_armed_again_after_a_fault() -> None:
+    follower = armed()
+    run(follower, wanted(3, 0, 0), 0.0, 5)
+    follower.stop()
+    follower.step(5.0, Conditions(fault="no answer"))
+    follower.arm(np.array([1e-6, 0, 0]))
+    assert run(follower, wanted(9, 0, 0), 6.0, 3) == [(State.RAMPING, 1), (State.OFF, 0), (State.OFF, 0)]
+    follower.arm(HERE)
+    assert follower.step(9.0, wanted(9, 0, 0)).state is State.FOLLOWING
+
+
 def test_a_restart_begins_with_the_offset_of_the_machine() -> None:
     follower = armed(applied=np.array([7e-6, 0, 0]))
     assert run(follower, wanted(9, 0, 0), 100.0, 3) == [

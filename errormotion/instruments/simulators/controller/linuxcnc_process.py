@@ -34,6 +34,7 @@ NML = Path("/usr/share/linuxcnc/linuxcnc.nml")
 PROCESSES = ("milltask", "rtapi_app", "linuxcncsvr")
 MEMORY = ("0x48414c32", "0x90280a48", "0x48484c34", *(f"0x{key:x}" for key in range(1001, 1006)))
 """Keys of the shared memory that LinuxCNC leaves when it is killed: HAL, RTAPI, and its messages."""
+MEMORY_TABLE = Path("/proc/sysvipc/shm")
 START_TIMEOUT = 15.0  # s for LinuxCNC to start
 END_TIMEOUT = 10.0  # s for LinuxCNC to end
 
@@ -99,6 +100,7 @@ class LinuxCNCProcess:
         lock = _lock(wait)
         try:
             _refuse_beside_another()
+            _remove_memory()
             for left in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):  # of one whose process was killed
                 shutil.rmtree(left, ignore_errors=True)
             self.folder = Path(tempfile.mkdtemp(prefix=FOLDER))
@@ -199,6 +201,10 @@ class LinuxCNCProcess:
                     group=user.pw_gid if user else None,
                 )
             _kill(_parts(self.folder))
+            with suppress(InstrumentError):  # where the next one has started already, the memory is its own
+                lock = _lock(0.0)
+                _remove_memory()
+                os.close(lock)
 
 
 def _user() -> pwd.struct_passwd | None:
@@ -224,12 +230,21 @@ def _parts(of: Path | None = None) -> dict[int, str]:
 
 
 def _kill(processes: dict[int, str]) -> None:
-    """End processes at once, and remove what they leave."""
+    """End processes at once."""
     for pid in processes:
         with suppress(ProcessLookupError, PermissionError):
             os.kill(pid, signal.SIGKILL)
-    for key in MEMORY if processes else ():
-        subprocess.run(["ipcrm", "-M", key], capture_output=True, check=False)
+
+
+def _remove_memory() -> None:
+    """Remove what a LinuxCNC left that was killed; with the lock held, since the keys of a running one are the same.
+
+    Messages found there by the next one would be taken for its own: its parts then wait in vain for each other.
+    """
+    left = {int(line.split()[0]) % 2**32 for line in MEMORY_TABLE.read_text().splitlines()[1:]}
+    for key in MEMORY:
+        if int(key, 16) in left:
+            subprocess.run(["ipcrm", "-M", key], capture_output=True, check=False)
 
 
 def _lock(wait: float) -> int:
