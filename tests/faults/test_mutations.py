@@ -4,6 +4,7 @@ import json
 import os
 import random
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import altered_datasets
@@ -15,8 +16,12 @@ from file_kinds import Kind, Library
 
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
+from errormotion.compensation.program.reading import offsets
 from errormotion.datasets.files import tomlfile
-from errormotion.errors import DatasetError, RunError
+from errormotion.errors import DatasetError, ErrormotionError, RunError
+from errormotion.instruments.compensator.offset_file import OffsetFile
+from errormotion.instruments.line_profiler.profile_files import ProfileFiles
+from errormotion.instruments.transports import recording
 
 FEW = 2
 """Alterations of each kind."""
@@ -158,6 +163,26 @@ def test_pipes_and_devices_are_no_files(tmp_path: Path) -> None:
         datasets.load(tmp_path / "pipe.nc")
     with pytest.raises(DatasetError, match="not a regular file"):
         tomlfile.read_toml(tmp_path / "device.toml")
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize(
+    "read",
+    [
+        recording.read_recording,
+        recording.read_index,
+        recording.parts_of,
+        recording.read_note,
+        offsets.read_tools,
+        lambda path: ProfileFiles(f"replay://{path}").open(),
+        lambda path: OffsetFile(str(path)).open(),
+    ],
+    ids=["recording", "index", "parts", "note", "tools", "list of scans", "offset"],
+)
+def test_pipes_do_not_stop_a_reader(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ErrormotionError, match="not a regular file"):
+        read(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize("change", ["negative", "asymmetric", "not positive", "gap"])
