@@ -1,10 +1,12 @@
 # Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance following lowest lock
+.PHONY: help setup demo compiled test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance following lowest lock
 
 BIN := .venv/bin
 ARGS ?=
+# Compiled modules are kept: many tests start processes, and would compile everything anew in each.
+unexport PYTHONDONTWRITEBYTECODE
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):[^#]*## /  \1\t/' | expand -t 14
@@ -17,7 +19,7 @@ demo: .venv/.core  ## measure a virtual machine: beam detection, spindle drift, 
 test: .venv/.compiled  ## run the tests without the slow ones (ARGS="-n 0 tests/kinematics -k fit" runs some, one after another)
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow" $(ARGS)
 
-test-all: .venv/.compiled-large  ## run all tests
+test-all: compiled  ## run all tests
 	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
 
 lint: .venv/.dev  ## style, types, and which package imports which
@@ -78,11 +80,15 @@ lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)
 .venv/.dev: requirements.lock requirements-core.lock pyproject.toml
 	@tools/setup dev
 
-# What is compiled at first use is compiled once, before the workers of the tests start.
-.venv/.compiled: .venv/.dev $(shell grep -rlsE 'njit|@compiled' --include='*.py' errormotion)
+# What is compiled at first use, tests included, is compiled once, before the workers of the tests start.
+compiled: .venv/.compiled .venv/.compiled-large
+
+COMPILED := $(shell grep -rlsE 'njit|@compiled' --include='*.py' errormotion)
+
+.venv/.compiled: .venv/.dev $(COMPILED)
 	$(BIN)/python tools/precompile
 	@touch $@
 
-.venv/.compiled-large: .venv/.compiled
+.venv/.compiled-large: .venv/.dev $(COMPILED)
 	$(BIN)/python tools/precompile --large
 	@touch $@

@@ -24,6 +24,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.campaign.files import BenchPlan
+from errormotion.campaign.following import AUDIT, STOP, Status, is_zero, numbers, write_status
 from errormotion.campaign.journal import cause_of
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
@@ -38,13 +39,17 @@ FRAME = "machine"
 """Frame in which a model must state its errors: offsets are along the axes."""
 
 TEST = "compensation"
-AUDIT = "audit.jsonl"
+LONGEST_TEXT = 500
+"""Characters of a text in the state."""
 
 REJOIN = 3
 """Successful readings of the offset after which a lost connection counts as regained."""
 
 AGREEMENT = 3.0
 """Greatest difference of the offset in effect from the one written, in changes of one period at the slew limit."""
+
+CONFIRMATIONS = 10
+"""Readings after the last offset within which the machine should report that it is at zero."""
 
 log = logging.getLogger(__name__)
 
@@ -129,6 +134,7 @@ class Compensation:
         self._lost = False
         self._known: dict[str, tuple[float, float]] = {}
         self._last: tuple[State, str, tuple[float, ...]] | None = None
+        self._status: Status | None = None
         self._stack = ExitStack()
 
     def _check(self, model: xr.Dataset, arm: str | None) -> None:
@@ -195,8 +201,13 @@ class Compensation:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        last = self._status
         with suppress(CompensationError):
-            self._audit.write({"event": "ended", "state": str(self.state), "offset": _list(self._follower.offset)})
+            applied = last.applied if last is not None else None
+            ended = {"state": str(self.state), "offset": numbers(self._follower.offset), "applied": applied}
+            self._audit.write({"event": "ended", **ended})
+        if last is not None:
+            self._show(last.model_copy(update={"ended": True, "time": datetime.now(UTC), "state": str(self.state)}))
         self._stack.__exit__(kind, error, trace)
 
     def _begin(self) -> None:
@@ -224,7 +235,8 @@ class Compensation:
     def stop(self) -> None:
         """Ramp to zero, then end `follow`.
 
-        Without a connection it ends after the time ``hold``; the watchdog of the machine ramps to zero.
+        It ends when the machine reports an offset of zero, or after a few readings more. Without a connection it ends
+        after the time ``hold``; the watchdog of the machine ramps to zero.
         """
         self._follower.stop()
 
@@ -243,14 +255,20 @@ class Compensation:
             watchdog then ramps to zero.
         """
         able = 0.0  # the last time when the machine took offsets, or no stop had been asked for
+        readings = 0  # since the last offset
         for snapshot in self._monitor.watch():
-            if snapshot.time >= duration:
+            if snapshot.time >= duration or (self.folder.path / STOP).exists():
                 self.stop()
-            yield self._moment(snapshot)
+            moment = self._moment(snapshot)
+            yield moment
             stuck = self._follower.stopping and self.state is State.FAULT
             able = able if stuck else snapshot.time
-            if self.state is State.OFF or (stuck and snapshot.time - able >= self.limits.hold):
+            if stuck and snapshot.time - able >= self.limits.hold:
                 return
+            if self.state is State.OFF:
+                readings += 1
+                if not self.armed or readings > CONFIRMATIONS or (moment.applied and is_zero(moment.applied)):
+                    return
 
     def _moment(self, snapshot: Snapshot) -> Moment:
         prediction, cause = self._predict(snapshot)
@@ -259,10 +277,12 @@ class Compensation:
             self._rejoin(applied)
         target, before = None if cause else -prediction.errors[:3], self.state
         step = self._follower.step(snapshot.time, Conditions(target, cause, busy, fault))
-        self._record(snapshot, prediction, step)  # before anything is written
+        self._record(snapshot, prediction, step, applied)  # before anything is written
         if self.armed and before not in (State.OFF, State.FAULT) and step.state is not State.FAULT:
             self._write(step)
-        return Moment(snapshot, prediction, step, applied)
+        moment = Moment(snapshot, prediction, step, applied)
+        self._show(self._stated(moment))
+        return moment
 
     def _predict(self, snapshot: Snapshot) -> tuple[Prediction, str]:
         """Return the prediction, and why it is not to be used."""
@@ -310,7 +330,9 @@ class Compensation:
             log.warning("the offset was not written: %s", cause_of(error))
             self._follower.fail()
 
-    def _record(self, snapshot: Snapshot, prediction: Prediction, step: Step) -> None:
+    def _record(
+        self, snapshot: Snapshot, prediction: Prediction, step: Step, applied: tuple[float, float, float] | None
+    ) -> None:
         now = step.state, step.cause, tuple(map(float, step.offset))
         if now == self._last:
             return
@@ -322,9 +344,10 @@ class Compensation:
             {
                 "elapsed": snapshot.time,
                 "state": str(step.state),
-                "offset": _list(step.offset),
-                "target": _list(-prediction.errors[:3]),
-                "uncertainty": _list(prediction.uncertainty[:3]),
+                "offset": numbers(step.offset),
+                "applied": None if applied is None else numbers(applied),
+                "target": numbers(-prediction.errors[:3]),
+                "uncertainty": numbers(prediction.uncertainty[:3]),
                 "cause": step.cause,
                 "limited": ["XYZ"[k] for k in step.limited],
                 "inputs": known,
@@ -334,6 +357,38 @@ class Compensation:
         if changed:
             log.info("%s%s", step.state, f": {step.cause}" if step.cause else "")
 
+    def _stated(self, moment: Moment) -> Status:
+        step, prediction, state = moment.step, moment.prediction, moment.snapshot.state
+        names = (*self._predictor.temperatures, *self._predictor.parameters)
+        estop = state.get("estop")
+        return Status(
+            time=datetime.now(UTC),
+            machine=self.plan.machine[:LONGEST_TEXT],
+            bench=self.plan.source.name[:LONGEST_TEXT],
+            compensator=self.plan.compensator.driver.info.id if self.plan.compensator is not None else "",
+            armed=self.armed,
+            limits=self.limits,
+            state=str(self.state),
+            cause=step.cause[:LONGEST_TEXT],
+            stopping=self._follower.stopping,
+            elapsed=moment.snapshot.time,
+            offset=numbers(step.offset),
+            applied=None if moment.applied is None else numbers(moment.applied),
+            predicted=numbers(prediction.errors),
+            uncertainty=numbers(prediction.uncertainty),
+            inputs={name: each for name in names for each in numbers([self._known.get(name, (0.0, math.nan))[1]])},
+            missing=tuple(prediction.missing),
+            outside=tuple(prediction.outside),
+            limited=tuple("XYZ"[k] for k in step.limited),
+            estop=estop if isinstance(estop, bool) else None,
+            program=str(state.get("program") or "")[:LONGEST_TEXT],
+        )
+
+    def _show(self, status: Status) -> None:
+        self._status = status
+        with suppress(OSError):  # the audit log is what must be written
+            write_status(self.folder.path, status)
+
     def _close(self) -> None:
         with suppress(InstrumentError):
             self._output.close()
@@ -342,10 +397,6 @@ class Compensation:
 def _parameters(state: Mapping[str, Any]) -> dict[str, float]:
     values = {name: state.get(name) for name in PARAMETERS}
     return {name: math.nan if value is None else float(value) for name, value in values.items()}
-
-
-def _list(values: Array) -> list[float | None]:
-    return [float(v) if math.isfinite(v) else None for v in values]
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import typer
 from errormotion.cli.demo import COMPENSATED, CONTROLLERS
 from errormotion.cli.guard import ERROR, INVALID, USAGE, guarded
 from errormotion.cli.output import show, show_json, table
+from errormotion.cli.page import page_of
 from errormotion.cli.wording import share
 
 app = typer.Typer(
@@ -44,8 +45,9 @@ Runs = Annotated[
 Tolerances = Annotated[
     Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the campaign.")
 ]
-Paper = Literal["A4", "Letter"]
-Language = Literal["en", "de"]
+Paper = Annotated[Literal["A4", "Letter"] | None, typer.Option(help="Paper; default: A4.")]
+Language = Annotated[Literal["en", "de"] | None, typer.Option(help="Language; default: en.")]
+Pdf = Annotated[bool, typer.Option("--pdf", help="Print the page as PDF beside it.")]
 Limits = Annotated[Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on each result.")]
 
 
@@ -387,11 +389,15 @@ def report(
     run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
     out: Annotated[Path | None, typer.Option(help="The page to write; default: report.html in the run folder.")] = None,
     tolerances: Tolerances = None,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Print the page as PDF beside it.")] = False,
+    pdf: Pdf = False,
     csv: Annotated[bool, typer.Option("--csv", help="Write every table as CSV into a folder beside the page.")] = False,
     xlsx: Annotated[bool, typer.Option("--xlsx", help="Write every table into a workbook beside the page.")] = False,
-    paper: Annotated[Paper | None, typer.Option(help="Paper; default: that of the campaign, else A4.")] = None,
-    language: Annotated[Language | None, typer.Option(help="Language; default: that of the campaign, else en.")] = None,
+    paper: Annotated[
+        Literal["A4", "Letter"] | None, typer.Option(help="Paper; default: that of the campaign, else A4.")
+    ] = None,
+    language: Annotated[
+        Literal["en", "de"] | None, typer.Option(help="Language; default: that of the campaign, else en.")
+    ] = None,
     json_: Json = False,
 ) -> None:
     """Write the report of a run."""
@@ -473,6 +479,9 @@ def compare(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the comparison as a dataset (.nc).")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
+    pdf: Pdf = False,
+    paper: Paper = None,
+    language: Language = None,
     json_: Json = False,
 ) -> None:
     """Compare results of one machine: whether they agree, and what explains it where they do not."""
@@ -485,7 +494,9 @@ def compare(
         origins[own] = _millimetres(f"--origin {own}", text)
     chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
     stated = command.Stated(name or [], change or [], origins, chain, by, over, select or [])
-    command.compare(results or [], stated, point, chosen, since, same_start, out, report, json_)
+    command.compare(
+        results or [], stated, point, chosen, since, same_start, out, page_of(report, pdf, paper, language), json_
+    )
 
 
 @app.command()
@@ -557,11 +568,15 @@ def dashboard(
     cert: Annotated[Path | None, typer.Option(help="Certificate (PEM) of an encrypted connection.")] = None,
     key: Annotated[Path | None, typer.Option(help="Key (PEM) of the certificate.")] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser of this computer.")] = True,
+    campaigns: Annotated[Path, typer.Option(help="The folder of the campaign files.")] = Path(),
+    allow_control: Annotated[
+        bool, typer.Option("--allow-control", help="Let the pages start and stop what moves or changes a machine.")
+    ] = False,
 ) -> None:
     """Show runs, and the instruments of a bench, in a browser, until Ctrl-C."""
     from errormotion.cli.commands import dashboard as command
 
-    command.run(runs, bench, interval, host, port, name or [], cert, key, browser)
+    command.run(runs, bench, interval, host, port, name or [], cert, key, browser, campaigns, allow_control)
 
 
 @app.command()
@@ -597,13 +612,18 @@ def history(
     test: Annotated[str | None, typer.Option(help="Only the runs of this test.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the history as a dataset (.nc).")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
+    pdf: Pdf = False,
+    paper: Paper = None,
+    language: Language = None,
     json_: Json = False,
 ) -> None:
     """Show a figure of a machine over time: trend, steps, control limits, notes."""
     from errormotion.cli.commands import history as command
 
     point = None if at is None else _millimetres("--at", at)
-    command.history(folders or [], machine, figure, point, method, test, out, report, json_)
+    command.history(
+        folders or [], machine, figure, point, method, test, out, page_of(report, pdf, paper, language), json_
+    )
 
 
 @app.command()
@@ -745,12 +765,15 @@ def model_check(
         Path, typer.Argument(help="Measured errors that the model was not fitted to: NetCDF or a run folder.")
     ],
     report: Annotated[Path | None, typer.Option(help="Write a report of the comparison, .html.")] = None,
+    pdf: Pdf = False,
+    paper: Paper = None,
+    language: Language = None,
     json_: Json = False,
 ) -> None:
     """Compare the prediction of a model with measured errors."""
     from errormotion.cli.commands import model as command
 
-    command.check_model(model, errors, report, json_)
+    command.check_model(model, errors, page_of(report, pdf, paper, language), json_)
 
 
 @compensate_app.command("effect")
@@ -771,6 +794,9 @@ def compensate_effect(
         Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on both, and on the reduction.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
+    pdf: Pdf = False,
+    paper: Paper = None,
+    language: Language = None,
     json_: Json = False,
 ) -> None:
     """Compare two results of one machine: what a compensation took off, and what is left."""
@@ -787,7 +813,7 @@ def compensate_effect(
         freedoms=chosen,
         since=since,
         tolerances=tolerances,
-        report=report,
+        page=page_of(report, pdf, paper, language),
         as_json=json_,
     )
     raise typer.Exit(code)
@@ -861,6 +887,9 @@ def compensate_program(
     check: Annotated[bool, typer.Option("--check", help="LinuxCNC's interpreter must read the result alike.")] = False,
     partial: Annotated[bool, typer.Option("--partial", help="Leave out freedoms that are not known.")] = False,
     report: Annotated[Path | None, typer.Option(help="Write a page with the correction along the path, .html.")] = None,
+    pdf: Pdf = False,
+    paper: Paper = None,
+    language: Language = None,
     json_: Json = False,
 ) -> None:
     """Write an NC program whose cuts are where those of another were meant."""
@@ -887,7 +916,7 @@ def compensate_program(
         reader=reader,
         check=check,
         partial=partial,
-        report=report,
+        page=page_of(report, pdf, paper, language),
     )
     command.program(part, with_, choice, out, json_)
 

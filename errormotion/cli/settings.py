@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from errormotion.datasets.files import tomlfile
+from errormotion.datasets.files.tomltext import value_of
 from errormotion.errors import MethodError
 
 
@@ -44,11 +44,3 @@ def read_settings(model: Any, file: Path | None, assignments: Sequence[str]) -> 
     if settings is None:
         raise MethodError(tomlfile.report(file or "--set", mistakes))
     return settings
-
-
-def value_of(text: str) -> Any:
-    """Return a value in TOML, or the text where it is none."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        return text

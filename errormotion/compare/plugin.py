@@ -17,4 +17,5 @@ class ComparisonDataset:
     )
     violations = lazy("errormotion.compare.result:violations")
     chapters = lazy("errormotion.compare.report:chapters")
+    texts = lazy("errormotion.compare.report:texts")
     plot = lazy("errormotion.compare.report.picture:plot")

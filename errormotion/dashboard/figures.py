@@ -102,6 +102,31 @@ def live_item(units: Mapping[str, str]) -> dict[str, Any]:
     return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
 
 
+def following_item() -> dict[str, Any]:
+    """Return axes for the offsets of a compensation, without data: the browser fills the sources X, Y and Z."""
+    panels: list[figure] = []
+    looks = (("asked", "from the prediction", 0), ("offset", "offset", 1), ("applied", "in effect", 2))
+    for axis in "XYZ":
+        plot = _axes(f"{axis} / µm", None, last=axis == "Z", x_axis_type="datetime")
+        plot.height = 170 + 40 * (axis == "X") + 30 * (axis == "Z")
+        columns = ("x", "asked", "low", "high", "offset", "applied")
+        source = ColumnDataSource({name: [] for name in columns}, name=axis)
+        plot.varea("x", "low", "high", source=source, color=_look(0)[0], alpha=0.18)
+        for name, title, number in looks:
+            dash = [6.0, 4.0] if name == "applied" else []
+            given = {"legend_label": title} if axis == "X" else {}
+            line = plot.line("x", name, source=source, color=_look(number)[0], line_width=2.0, line_dash=dash, **given)
+            tips = [("time", "@x{%H:%M:%S}"), (title, f"@{name}{{0.00}} µm")]
+            plot.add_tools(HoverTool(renderers=[line], tooltips=tips, formatters={"@x": "datetime"}, mode="mouse"))
+        if axis == "X":
+            _legend(plot)
+        if panels:
+            plot.x_range = panels[0].x_range
+        panels.append(plot)
+    rows = [[panel] for panel in panels]
+    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+
+
 def plain(text: str) -> str:
     """Return a name that is drawn as it is: short, printable, and never taken for mathematics (``$$``)."""
     shown = "".join(each if each.isprintable() else "?" for each in text[:LONGEST])

@@ -17,13 +17,15 @@ from tornado.web import Application, HTTPError, StaticFileHandler
 from errormotion.campaign.files import load_bench
 from errormotion.dashboard.access import LOOPBACK, Access, access_for
 from errormotion.dashboard.lab import Lab
-from errormotion.dashboard.pages import compare, now, results
+from errormotion.dashboard.pages import compare, compensate, measure, now, results
 from errormotion.dashboard.pages.login import Login
 from errormotion.dashboard.pages.page import Context, Guarded, note_request
 from errormotion.dashboard.watch import Watch
 from errormotion.errors import RunError
 
 HERE = Path(__file__).parent
+PAGES = (("/measure", "Measure"), ("/results", "Results"), ("/compare", "Compare"), ("/compensate", "Compensate"))
+"""Paths and titles of the pages that every dashboard has."""
 BOKEH = ("bokeh.min.js",)
 """Scripts of the package bokeh that pages load."""
 WORKERS = 4
@@ -50,14 +52,16 @@ class Options:
     key: Path | None = None
     bench: Path | None = None
     interval: float = 1.0
+    control: bool = False
+    campaigns: Path = Path()
 
 
 class Start(Guarded):
     """The address without a path."""
 
     def get(self) -> None:
-        """Lead to the first page."""
-        self.redirect(self.context.pages[0][0])
+        """Lead to the instruments, or without a bench to the results."""
+        self.redirect("/results" if self.context.watch is None else "/now")
 
 
 class Missing(Guarded):
@@ -101,6 +105,8 @@ def application(context: Context) -> Application:
             (r"/compare/figure\.json", compare.Figure, one),
             (r"/compare/report\.html", compare.Report, one),
             (r"/compare/history\.html", compare.History, one),
+            *((path, handler, one) for path, handler in measure.HANDLERS),
+            *compensate.handlers(context),
             (r"/results", results.Results, one),
             (r"/run", results.Run, one),
             (r"/run/figure\.json", results.Figure, one),
@@ -145,8 +151,10 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
         except OSError as error:
             raise RunError(f"{options.host}, port {options.port}: cannot be listened on: {error.strerror}") from error
         port = int(sockets[0].getsockname()[1])
-        pages = ((("/now", "Now"),) if watch is not None else ()) + (("/results", "Results"), ("/compare", "Compare"))
-        context = Context(access, Lab(options.runs), port, workers, slow, pages, watch)
+        pages = (*((("/now", "Now"),) if watch is not None else ()), *PAGES)
+        context = Context(
+            access, Lab(options.runs), port, workers, slow, pages, watch, options.control, options.campaigns
+        )
         server = HTTPServer(
             application(context),
             ssl_options=context_of_tls,

@@ -17,3 +17,4 @@ class MonteCarloDataset:
     )
     violations = lazy("errormotion.montecarlo.result:violations")
     chapters = lazy("errormotion.montecarlo.report:chapters")
+    texts = lazy("errormotion.montecarlo.report:catalogue")

@@ -9,6 +9,7 @@ import numpy as np
 from errormotion.montecarlo.result import Line, lines
 from errormotion.montecarlo.validation import NOT_VALIDATED
 from errormotion.report.document import Cell, KeyFigure, Part, Section, Source, Table, Text
+from errormotion.report.page.language import texts_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -16,6 +17,11 @@ if TYPE_CHECKING:
 MICROMETRE = (1e6, "um")
 HEAD = ["", "unit", "u linear", "u Monte Carlo", "difference", "tolerance", "linear interval"]
 ARCSEC = (648000 / np.pi, "arcsec")
+
+
+def catalogue(language: str) -> dict[str, str]:
+    """Return the catalogue of these chapters: English text = text in the language."""
+    return texts_of("errormotion.montecarlo", language)
 
 
 def chapters(source: Source) -> list[Part]:

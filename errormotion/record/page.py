@@ -19,7 +19,8 @@ from errormotion.datasets.files.events import instant
 from errormotion.record.text import date, field_of, sentences, sized, trend_text
 from errormotion.report.canvas import BLACK, BLUE, GREEN, PURPLE, VERMILLION, WIDTH, draw
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
-from errormotion.report.write import write_page
+from errormotion.report.page.language import texts_of
+from errormotion.report.write import PLAIN, Form, write_page
 
 HEIGHTS = {"values": 3.1, "chart": 2.5, "ranges": 1.9}
 """Of the figures, inches."""
@@ -27,16 +28,20 @@ MOST_ROWS = 200
 """Rows of the table of values; of more, the newest."""
 
 
-def write(history: xr.Dataset, out: Path) -> Path:
+def write(history: xr.Dataset, out: Path, form: Form = PLAIN) -> Path:
     """Write the page of a history; an older one is replaced in one step."""
     source = Source(history, None, {"test": str(history.attrs["figure"])}, {})
-    path: Path = write_page([source], [part(history, source.key)], out)
-    return path
+    return write_page([source], lambda: [part(history, source.key)], out, form=form)
 
 
 def chapters(source: Any) -> list[Part]:
     """Return the chapters of a stored history."""
     return [part(source.errors, source.key)]
+
+
+def texts(language: str) -> dict[str, str]:
+    """Return the catalogue of these pages: English text = text in the language."""
+    return texts_of("errormotion.record", language)
 
 
 def part(ds: xr.Dataset, key: str) -> Part:

@@ -17,3 +17,4 @@ class HistoryDataset:
     )
     violations = lazy("errormotion.record.history:violations")
     chapters = lazy("errormotion.record.page:chapters")
+    texts = lazy("errormotion.record.page:texts")

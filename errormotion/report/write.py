@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from errormotion.report.document import Part, Section, Source, Table
 from errormotion.report.exports import pdf, xlsx
 from errormotion.report.exports.tables import sheet, write_csv
 from errormotion.report.page import logo
-from errormotion.report.page.assemble import page
+from errormotion.report.page.assemble import Page, page
 from errormotion.report.page.head import Head, head_of, moment
 from errormotion.report.page.verdict import verdict
 from errormotion.report.parts import beams
@@ -118,7 +118,12 @@ def write_report(
         decision = verdict(_judged(sources, tolerances)) if tolerances is not None else None
         texts = [_texts(source, head.language) for source in sources]
         found = page(sources, parts, title, head=head, decision=decision, texts=texts)
-    target = _write(found.html, Path(out))
+    return _finished(found, Path(out), form, head)
+
+
+def _finished(found: Page, out: Path, form: Form, head: Head) -> Path:
+    """Write a page and what belongs beside it."""
+    target = _write(found.html, out)
     sheets = [sheet(table, k, section) for k, (section, table) in enumerate(found.tables, 1)]
     for path in form.beside(target):
         if path.suffix == ".pdf":
@@ -177,24 +182,48 @@ def chapters(source: Source) -> list[Part]:
         ) from error
 
 
-def write_page(sources: Sequence[Source], parts: Sequence[Part], out: Path, title: str | None = None) -> Path:
+def write_page(
+    sources: Sequence[Source],
+    make: Callable[[], Sequence[Part]],
+    out: Path,
+    title: str | None = None,
+    *,
+    form: Form = PLAIN,
+    texts: Callable[[str], Mapping[str, str]] | None = None,
+) -> Path:
     """Write chapters as one page.
 
     Parameters
     ----------
     sources : sequence of Source
         What the chapters were made from; the first one heads the page.
-    parts : sequence of Part
+    make : callable
+        Returns the chapters; called once, with numbers written in the language of the page.
     out : Path
         The file; an older one is replaced in one step.
     title : str, optional
+        Without it, made of the machine and the title of the first chapter.
+    form : Form, optional
+        Language, paper, and what is written beside the page.
+    texts : callable, optional
+        ``texts(language)``: the catalogue of the chapters, where the plugins that made the datasets do not bring it.
 
     Returns
     -------
     Path
         ``out``.
+
+    Raises
+    ------
+    RunError
+        The page was written, and a PDF of it could not be.
     """
-    return _write(page(sources, parts, title).html, out)
+    head = form.of(Head())
+    catalogues = [_texts(source, head.language) for source in sources]
+    catalogues += [texts(head.language)] if texts is not None else []
+    with written_in(head.language):
+        found = page(sources, make(), title, head=head, texts=catalogues)
+    return _finished(found, Path(out), form, head)
 
 
 def _owner(dataset: xr.Dataset) -> Any:

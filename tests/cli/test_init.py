@@ -8,8 +8,8 @@ from typer.testing import Result
 
 from errormotion.campaign.files import load_bench, load_campaign
 from errormotion.cli.commands.init import command
-from errormotion.cli.commands.init.writing import key, value
 from errormotion.datasets.files.tomlfile import parse_toml
+from errormotion.datasets.files.tomltext import key, value
 
 Run = Callable[..., Result]
 CHAIN = "workpiece-X-Y-bed-Z-spindle-tool"

@@ -18,4 +18,5 @@ class MonitorLog:
     )
     raw_schemas = RAW_SCHEMAS
     chapters = lazy("errormotion.campaign.monitor.report:chapters")
+    texts = lazy("errormotion.campaign.monitor.report:texts")
     figures = lazy("errormotion.campaign.monitor.log:figures")

@@ -22,6 +22,7 @@ from errormotion.report.document import (
     Text,
     or_dash,
 )
+from errormotion.report.page.language import texts_of
 from errormotion.report.parts import sensors
 from errormotion.report.text import fixed, integer, listed, percent
 
@@ -29,6 +30,11 @@ _LISTED = 20
 """Most gaps that are listed."""
 _STRIPS = 8
 """Most instruments whose missing readings are drawn."""
+
+
+def texts(language: str) -> dict[str, str]:
+    """Return the catalogue of these chapters: English text = text in the language."""
+    return texts_of("errormotion.campaign.monitor", language)
 
 
 def chapters(source: Source) -> list[Part]:

@@ -13,6 +13,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.cli.output import show, show_json, table, working
+from errormotion.cli.page import Page
 from errormotion.cli.results import load
 from errormotion.compare import compare as compared
 from errormotion.compare.repeats import labels
@@ -41,7 +42,7 @@ def compare(
     since: float | None,
     same_start: bool,
     out: Path | None,
-    report: Path | None,
+    page: Page | None,
     as_json: bool,
 ) -> xr.Dataset:
     """Compare error datasets, print the result, and write what was asked for.
@@ -51,8 +52,9 @@ def compare(
     DatasetError
         The datasets cannot be read or compared, or a file exists already.
     """
-    for path in (out, report):
-        if path is not None and path.exists():
+    files = [each for each in (out, *(page.files if page else ())) if each is not None]
+    for path in files:
+        if path.exists():
             raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
     results, left_out = load(paths, _named(stated.names), every=stated.by is not None)
     results = _completed(results, stated)
@@ -66,17 +68,16 @@ def compare(
         found.attrs["notes"] = [*filter(None, found.attrs["notes"]), *left_out]
     if out is not None:
         datasets.save(found, out)
-    if report is not None:
+    if page is not None:
         from errormotion.compare.report import write
 
-        write(found, report)
+        write(found, page.file, page.form)
     if as_json:
         show_json(as_plain(found))
         return found
     show(text(found))
-    for path in (out, report):
-        if path is not None:
-            show(f"written: {path}")
+    for path in files:
+        show(f"written: {path}")
     return found
 
 

@@ -14,6 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 import errormotion
 from errormotion.cli.commands.model import dataset_of, source_of
 from errormotion.cli.output import show, show_json
+from errormotion.cli.page import Page
 from errormotion.compensation.correction import Correction, correction
 from errormotion.compensation.program import LEFT, ByTool, Offsets, Outcome, Settings, compensate
 from errormotion.compensation.program.reading.offsets import read_parameters, read_tools
@@ -43,7 +44,7 @@ class Choice:
     reader: str
     check: bool
     partial: bool
-    report: Path | None
+    page: Page | None
 
 
 def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, as_json: bool) -> None:
@@ -57,8 +58,6 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
     target = out or part.with_name(f"{part.stem}.corrected{part.suffix}")
     if target.exists():
         raise ProgramError(f"{target}: exists already, and is not replaced; give another name to --out")
-    if choice.report is not None and choice.report.suffix != ".html":
-        raise ProgramError(f"{choice.report}: expected a name that ends in .html (a page)")
     settings = Settings(
         tolerance=_quantity("--tolerance", choice.tolerance, Length),
         step=_quantity("--sampling", choice.sampling, Length),
@@ -88,19 +87,20 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
         assert covariance is not None
         variance = np.diagonal(covariance, axis1=1, axis2=2)
         expanded = 2 * np.sqrt(np.where(variance >= 0, variance, np.nan))
-        if choice.report is not None:
+        if choice.page is not None:
             from errormotion.compensation.program.report import write_program_report
 
             at = np.arange(len(summary.places))
             uncertainty = np.stack([np.interp(at, at[pick], expanded[:, k] / 2) for k in range(3)], axis=1)
             write_program_report(
-                choice.report,
+                choice.page.file,
                 errors[0],
                 outcome,
                 settings,
                 program=part.name,
                 uncertainty=uncertainty,
                 notes=found.notes,
+                form=choice.page.form,
             )
     _show(target, outcome, found, expanded, time, choice, as_json)
 
@@ -175,7 +175,9 @@ def _show(
             name: {"number": value[0], "first_line": value[1]}
             for name, value in (("outside", summary.outside), ("uncorrected", summary.uncorrected))
         }
-        page = {"report": str(choice.report)} if choice.report is not None else {}
+        page = {}
+        if choice.page is not None:
+            page = {"report": str(choice.page.file), "files": [str(each) for each in choice.page.files]}
         show_json(
             {
                 "ok": True,
@@ -208,8 +210,8 @@ def _show(
         show(f"  WARNING: {count} moves outside of what was measured, the first in line {line}: held at its edge")
     for note in found.notes:
         show(f"  note: {note}")
-    if choice.report is not None:
-        show(str(choice.report))
+    for path in choice.page.files if choice.page is not None else ():
+        show(str(path))
 
 
 def _one_of(option: str, text: str, allowed: tuple[str, ...]) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from errormotion.cli.commands.compare import Stated, over_one
 from errormotion.cli.output import show, show_json, table
+from errormotion.cli.page import Page
 from errormotion.cli.results import load
 from errormotion.cli.tolerances import exit_code
 from errormotion.compensation.effect import Effect, effect
@@ -28,7 +29,7 @@ def run(
     freedoms: list[str],
     since: float | None,
     tolerances: Path | None,
-    report: Path | None,
+    page: Page | None,
     as_json: bool,
 ) -> int:
     """Compare two results, print the effect, and write the page. Return the exit code of the limits.
@@ -40,23 +41,24 @@ def run(
     BenchError
         The file of tolerances is damaged.
     """
-    if report is not None and report.exists():
-        raise DatasetError(f"{report}: exists already, and a result is never overwritten; give another name")
+    for path in page.files if page is not None else ():
+        if path.exists():
+            raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
     limited = None if tolerances is None else load_tolerances(tolerances)
     results, _ = load([], {"before": before, "after": after})
     stated = Stated([], [], {}, None, over=over, select=select)
     results = {name: over_one(name, ds, stated) for name, ds in results.items()}
     found = effect(results["before"], results["after"], at=at, freedoms=freedoms, since=since, tolerances=limited)
-    if report is not None:
+    if page is not None:
         from errormotion.compensation.effect.report import write
 
-        write(found, results["after"], report)
+        write(found, results["after"], page.file, page.form)
     if as_json:
         show_json(plain(found))
     else:
         show(text(found))
-        if report is not None:
-            show(f"written: {report}")
+        for path in page.files if page is not None else ():
+            show(f"written: {path}")
     return code_of(found)
 
 

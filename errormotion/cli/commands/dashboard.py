@@ -26,6 +26,8 @@ def run(
     cert: Path | None,
     key: Path | None,
     browser: bool,
+    campaigns: Path,
+    control: bool,
 ) -> None:
     """Serve the dashboard until Ctrl-C.
 
@@ -58,6 +60,6 @@ def run(
             threading.Thread(target=webbrowser.open, args=[address], daemon=True).start()
 
     try:
-        run(Options(runs, host, port, tuple(names), cert, key, bench, step), started)
+        run(Options(runs, host, port, tuple(names), cert, key, bench, step, control, campaigns), started)
     except KeyboardInterrupt:  # the way to end it
         show()

@@ -11,6 +11,7 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.cli.commands.runs import note_lines, plain_note
 from errormotion.cli.output import show, show_json, table
+from errormotion.cli.page import Page
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.errors import DatasetError, RunError
 from errormotion.record.history import history as followed
@@ -27,7 +28,7 @@ def history(
     method: str | None,
     test: str | None,
     out: Path | None,
-    report: Path | None,
+    page: Page | None,
     as_json: bool,
 ) -> None:
     """Print a figure of a machine over time, with its trend, steps and control limits, and write what was asked for.
@@ -39,8 +40,9 @@ def history(
     DatasetError
         A file exists already, or cannot be written.
     """
-    for path in (out, report):
-        if path is not None and path.exists():
+    files = [each for each in (out, *(page.files if page else ())) if each is not None]
+    for path in files:
+        if path.exists():
             raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
     runs = list_runs(paths or [Path("runs")], machine=machine, method=method, test=test)
     if not runs.runs and machine.casefold() not in map(str.casefold, runs.machines):
@@ -49,10 +51,10 @@ def history(
     found = followed(runs, machine, figure, at)
     if out is not None:
         datasets.save(found, out)
-    if report is not None:
+    if page is not None:
         from errormotion.record.page import write
 
-        write(found, report)
+        write(found, page.file, page.form)
     if as_json:
         left_out = {"figures_not_read": runs.waiting, "skipped": list(runs.skipped)}
         notes = [plain_note(note) for note in runs.notes]
@@ -68,9 +70,8 @@ def history(
         show(f"{runs.waiting} runs without figures: not yet read from the error datasets; repeat the command")
     for reason in runs.skipped:
         show(f"could not be read: {reason}")
-    for path in (out, report):
-        if path is not None:
-            show(f"written: {path}")
+    for path in files:
+        show(f"written: {path}")
 
 
 def _values(ds: xr.Dataset) -> str:

@@ -11,6 +11,7 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.output import show, show_json, table
+from errormotion.cli.page import Page
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.compensation.thermal_model import SCHEMA as MODEL_SCHEMA
@@ -83,32 +84,32 @@ def predict(model: Path, data: Path, out: Path, as_json: bool) -> None:
         show(f"  note: {note}")
 
 
-def check_model(model: Path, errors: Path, report: Path | None, as_json: bool) -> None:
+def check_model(model: Path, errors: Path, page: Page | None, as_json: bool) -> None:
     """Compare what the model predicts of a campaign with what was measured in it.
 
     Raises
     ------
     DatasetError
-        The model or the errors cannot be read, or do not belong together, or the page is to have another name.
+        The model or the errors cannot be read, or do not belong together.
     """
-    if report is not None and report.suffix != ".html":
-        raise DatasetError(f"{report}: expected a name that ends in .html (a page)")
     used, measured = ThermalModel.load(model), errors_of(errors)
     with reading(f"{errors} with {model}"):
         found = check(used, measured)
     figures = {name: getattr(found, name) for name in ("rms", "remaining", "removed", "held")}
-    if report is not None:
+    if page is not None:
         from errormotion.compensation.thermal_model.report import write_model_report
 
-        write_model_report(used.dataset, measured, report, predicted=found.predicted, figures=figures)
+        write_model_report(
+            used.dataset, measured, page.file, predicted=found.predicted, figures=figures, form=page.form
+        )
     if as_json:
         numbers = {name: dict(zip(DOF, values.tolist(), strict=True)) for name, values in figures.items()}
-        page = {"report": str(report)} if report is not None else {}
-        show_json({"ok": True, "outside": found.outside, **numbers, **page})
+        written = {"report": str(page.file), "files": [str(each) for each in page.files]} if page is not None else {}
+        show_json({"ok": True, "outside": found.outside, **numbers, **written})
         return
     show(text(found))
-    if report is not None:
-        show(str(report))
+    for path in page.files if page is not None else ():
+        show(str(path))
 
 
 def text(found: Check) -> str:

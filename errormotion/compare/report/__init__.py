@@ -13,14 +13,14 @@ from errormotion.compare.report.picture import abscissa, common, field, height, 
 from errormotion.compare.text import SPREAD_HEAD, cause_text, probability, spreads, verdict
 from errormotion.report.canvas import WIDTH, draw
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text
-from errormotion.report.write import write_page
+from errormotion.report.page.language import texts_of
+from errormotion.report.write import PLAIN, Form, write_page
 
 
-def write(comparison: xr.Dataset, out: Path) -> Path:
+def write(comparison: xr.Dataset, out: Path, form: Form = PLAIN) -> Path:
     """Write the page of a comparison; an older one is replaced in one step."""
     source = Source(comparison, None, {}, {})
-    path: Path = write_page([source], [part(comparison, source.key)], out)
-    return path
+    return write_page([source], lambda: [part(comparison, source.key)], out, form=form)
 
 
 def part(ds: xr.Dataset, key: str) -> Part:
@@ -144,3 +144,8 @@ def _ground(ds: xr.Dataset) -> str:
 def chapters(source: Any) -> list[Part]:
     """Return the chapters of a stored comparison."""
     return [part(source.errors, source.key)]
+
+
+def texts(language: str) -> dict[str, str]:
+    """Return the catalogue of these pages: English text = text in the language."""
+    return texts_of(__name__, language)

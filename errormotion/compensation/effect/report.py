@@ -16,7 +16,8 @@ from errormotion.compensation.effect import text
 from errormotion.compensation.effect.result import Effect
 from errormotion.report.canvas import BLUE, VERMILLION, WIDTH, curve, draw, style
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text
-from errormotion.report.write import write_page
+from errormotion.report.page.language import texts_of
+from errormotion.report.write import PLAIN, Form, write_page
 from errormotion.tolerances.conformity import FIELD_UNITS
 
 PANEL = 1.55
@@ -30,7 +31,7 @@ SEVERAL = 6
 Rows = list[Sequence[Cell | str]]
 
 
-def write(found: Effect, after: xr.Dataset, out: Path) -> Path:
+def write(found: Effect, after: xr.Dataset, out: Path, form: Form = PLAIN) -> Path:
     """Write the page; an older one is replaced in one step.
 
     Parameters
@@ -39,12 +40,17 @@ def write(found: Effect, after: xr.Dataset, out: Path) -> Path:
     after : Dataset
         The result with the compensation, for machine and date in the head.
     out : Path
+    form : Form, optional
+        Language, paper, and what is written beside the page.
     """
     source = Source(after, None, {}, {})
-    path: Path = write_page(
-        [source], [part(found, source.key)], out, f"Effect of a compensation: {found.ground.machine}"
-    )
-    return path
+    title = f"Effect of a compensation: {found.ground.machine}"
+    return write_page([source], lambda: [part(found, source.key)], out, title, form=form, texts=texts)
+
+
+def texts(language: str) -> dict[str, str]:
+    """Return the catalogue of the page: English text = text in the language."""
+    return texts_of("errormotion.compensation.effect", language)
 
 
 def part(found: Effect, key: str) -> Part:

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import CompensationError
 
 START = "0" * 64
@@ -68,6 +69,49 @@ class AuditLog:
             raise CompensationError(f"{self.path}: the audit log cannot be written: {error}") from None
 
 
+class AuditReader:
+    """Reads an audit log while it is written, and checks its chain of hashes.
+
+    Parameters
+    ----------
+    path : Path
+
+    Attributes
+    ----------
+    count : int
+        Entries so far.
+    hash : str
+        Of the last of them.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.count, self.hash = path, 0, START
+        self._at = 0
+
+    def read(self, most: int) -> list[dict[str, Any]]:
+        """Return the next entries, ``most`` of them at the most; a line that is not complete yet is left for later.
+
+        Raises
+        ------
+        CompensationError
+            A line was changed, removed or added, or the log cannot be read; every later call raises it as well.
+        """
+        found: list[dict[str, Any]] = []
+        try:
+            require_regular(self.path)
+            with self.path.open("rb") as file:
+                file.seek(self._at)
+                while len(found) < most and (line := file.readline(LONGEST_LINE)):
+                    if not line.endswith(b"\n") and len(line) < LONGEST_LINE:
+                        break
+                    last, text = _follows(self.path, self.count, self.hash, line)
+                    found.append(_entry(text))
+                    self.hash, self.count, self._at = last, self.count + 1, self._at + len(line)
+        except OSError as error:
+            raise CompensationError(f"{self.path}: cannot be read: {error.strerror}") from None
+        return found
+
+
 def verify(path: Path) -> tuple[int, str]:
     """Return how many entries an audit log has, and its last hash.
 
@@ -79,16 +123,31 @@ def verify(path: Path) -> tuple[int, str]:
     count, last = 0, START
     with path.open("rb") as file:
         while line := file.readline(LONGEST_LINE):
-            text = line.decode("utf-8", "replace")
-            head, entry = text[: len('{"hash":"') + 64], text[len('{"hash":"') + 64 + len('","entry":') : -2]
-            last = _next(last, entry)
-            if text != f'{{"hash":"{last}","entry":{entry}}}\n' or head[-64:] != last:
-                raise CompensationError(
-                    f"{path}: line {count + 1} does not follow from the lines before it: the log was altered, or its "
-                    "last line was cut off. Keep it, and start a new one."
-                )
+            last, _ = _follows(path, count, last, line)
             count += 1
     return count, last
+
+
+def _follows(path: Path, count: int, before: str, line: bytes) -> tuple[str, str]:
+    """Return hash and entry of the line after ``count`` others, the last of which has the hash ``before``."""
+    text = line.decode("utf-8", "replace")
+    head, entry = text[: len('{"hash":"') + 64], text[len('{"hash":"') + 64 + len('","entry":') : -2]
+    last = _next(before, entry)
+    if text != f'{{"hash":"{last}","entry":{entry}}}\n' or head[-64:] != last:
+        raise CompensationError(
+            f"{path}: line {count + 1} does not follow from the lines before it: the log was altered, or its "
+            "last line was cut off. Keep it, and start a new one."
+        )
+    return last, entry
+
+
+def _entry(text: str) -> dict[str, Any]:
+    """Return an entry; an empty one where a stranger wrote a chain of something else."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _next(before: str, text: str) -> str:

@@ -14,8 +14,9 @@ from errormotion.arrays import Array
 from errormotion.compensation.program.compensating import Outcome, Settings
 from errormotion.compensation.program.reading.items import LEFT
 from errormotion.compensation.program.writing.rewriting import Summary
-from errormotion.report import canvas, provenance, write_page
+from errormotion.report import Form, canvas, provenance, write_page
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text
+from errormotion.report.page.language import texts_of
 from errormotion.report.text import DASH, fixed, integer, minutes, significant
 
 _AXES = "XYZ"
@@ -33,6 +34,7 @@ def write_program_report(
     program: str,
     uncertainty: Array | None = None,
     notes: tuple[str, ...] = (),
+    form: Form | None = None,
 ) -> Path:
     """Write the page.
 
@@ -50,6 +52,8 @@ def write_program_report(
         Standard uncertainty of the correction at ``outcome.summary.places``, m; NaN where it is not known.
     notes : tuple of str
         On the correction.
+    form : Form, optional
+        Language, paper, and what is written beside the page.
 
     Returns
     -------
@@ -57,8 +61,19 @@ def write_program_report(
         ``out``.
     """
     source = Source(errors, None, {}, provenance.read(errors) if "provenance" in errors.attrs else {})
-    part = _part(outcome, settings, program, uncertainty, notes)
-    return write_page([source], [part], out, f"Corrected program {program}")
+    return write_page(
+        [source],
+        lambda: [_part(outcome, settings, program, uncertainty, notes)],
+        out,
+        f"Corrected program {program}",
+        form=form or Form(),
+        texts=texts,
+    )
+
+
+def texts(language: str) -> dict[str, str]:
+    """Return the catalogue of the page: English text = text in the language."""
+    return texts_of("errormotion.compensation.program", language)
 
 
 def _part(

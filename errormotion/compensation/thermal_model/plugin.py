@@ -18,5 +18,6 @@ class ThermalModelDataset:
     )
     violations = lazy("errormotion.compensation.thermal_model.model:violations")
     chapters = lazy("errormotion.compensation.thermal_model.report:chapters")
+    texts = lazy("errormotion.compensation.thermal_model.report:texts")
     predictor = lazy("errormotion.compensation.thermal_model.predictor:ThermalPredictor")
     figures = lazy("errormotion.compensation.thermal_model.figures:figures")

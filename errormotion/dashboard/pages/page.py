@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -47,6 +48,10 @@ class Context:
     """Paths and titles of the pages in the bar."""
     watch: Watch | None = None
     """Of the bench, where one was given."""
+    control: bool = False
+    """Whether pages may start and stop what moves or changes a machine."""
+    campaigns: Path = Path()
+    """Folder of the campaign files."""
     environment: Environment = field(
         default_factory=lambda: Environment(
             loader=PackageLoader("errormotion.dashboard"),
@@ -67,6 +72,8 @@ class Guarded(RequestHandler):
     """Refuses foreign names and origins; a subclass that is not ``public`` needs the session of the token as well."""
 
     public = False
+    controls = False
+    """Whether requests start, stop or change something: refused unless the dashboard was started for that."""
 
     def initialize(self, context: Context) -> None:
         """Take what the server knows."""
@@ -95,6 +102,8 @@ class Guarded(RequestHandler):
         ):
             raise HTTPError(403, reason="The request comes from another page")
         if self.public or access.knows(self.get_cookie(self.context.cookie)):
+            if self.controls and not self.context.control:
+                raise HTTPError(403, reason="The dashboard was started without --allow-control")
             return
         if self.request.method in ("GET", "HEAD") and "text/html" in self.request.headers.get("Accept", ""):
             self.redirect("/login")

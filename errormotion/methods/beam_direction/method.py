@@ -33,6 +33,7 @@ class BeamDirection:
     Settings: ClassVar[type[PluginSettings]] = BeamSettings
     raw_schemas = lazy("errormotion.methods.beam_direction.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.beam_direction.report:chapters")
+    texts = lazy("errormotion.methods.beam_direction.report:texts")
     figures = lazy("errormotion.methods.beam_direction.figures:figures")
     calibrations = lazy("errormotion.methods.beam_direction.identification.inclination.figures:CALIBRATIONS")
     simulate = lazy("errormotion.methods.beam_direction.simulation:simulate")

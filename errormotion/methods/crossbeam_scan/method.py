@@ -37,6 +37,7 @@ class CrossbeamScan:
     Settings: ClassVar[type[PluginSettings]] = ScanSettings
     raw_schemas = lazy("errormotion.methods.crossbeam_scan.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.crossbeam_scan.report:chapters")
+    texts = lazy("errormotion.methods.crossbeam_scan.report:texts")
     figures = lazy("errormotion.methods.crossbeam_scan.report.figures:figures")
     simulate = lazy("errormotion.methods.crossbeam_scan.simulation:simulate")
     truth = lazy("errormotion.methods.crossbeam_scan.simulation:truth_of")

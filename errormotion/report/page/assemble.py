@@ -62,8 +62,8 @@ def page(
     appended = [t.section(each) for each in annex.values(sources)] + [t.section(each, rows=False) for each in appended]
     decision = _translated(decision, t)
     shown = {
-        "title": title or f"{machine}: {body[0].title}",
-        "heading": title or body[0].title,
+        "title": t.word(title) or f"{machine}: {body[0].title}",
+        "heading": t.word(title) or body[0].title,
         "language": t.language,
         "head": head,
         "facts": [(name, t(name), t.word(fact) if name in _COMPOSED else fact) for name, fact in found],

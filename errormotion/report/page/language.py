@@ -32,6 +32,7 @@ _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-ZÄÖÜ(|±])")
 _DECIMAL = re.compile(r"[+−-]?\d+\.\d+")
 _WORD = re.compile(r"[a-z]{3}")
 _LETTERS = re.compile(r"[a-z]{2}")
+_LIST = re.compile(r"(, | und )")
 _UNITS = re.compile(r"\b(?:arcsec|min|rad|days)\b")
 _SVG_TEXT = re.compile(r"(?<=>)([^<>]*[^<>\s][^<>]*)(?=</text>)")
 _SVG_NAME = re.compile(r'(?<= data-(?:x-name)=")([^"]+)(?=")')
@@ -92,7 +93,14 @@ class Catalogue:
         if self.language == "en" or not isinstance(text, str) or isinstance(text, Markup):
             return text
         found = self._found(text)
-        return text if found is None else found
+        if found is not None:
+            return found
+        pieces = _LIST.split(text)
+        made = [self._found(piece) for piece in pieces[::2]]
+        if len(made) < 2 or all(each is None for each in made):
+            return text
+        pieces[::2] = [piece if each is None else each for piece, each in zip(pieces[::2], made, strict=True)]
+        return "".join(pieces)
 
     def _found(self, text: str) -> str | None:
         plain = " ".join(text.split()) if len(text) <= LONGEST else ""

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from errormotion.datasets.files.tomltext import key, value
 from errormotion.plugins import PluginSettings
-
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass
@@ -89,21 +86,3 @@ def _settings(stated: Mapping[str, Any], model: type[PluginSettings] | None) -> 
         meaning = " ".join((fields[name].description or "").split()) if name in fields else ""
         lines.append(f"{key(name)} = {value(each)}" + (f"   # {meaning}" if meaning else ""))
     return lines
-
-
-def key(name: str) -> str:
-    """Return a key of TOML, in quotes where it needs them."""
-    return name if _BARE.fullmatch(name) else value(name)
-
-
-def value(content: Any) -> str:
-    """Return a value of TOML on one line."""
-    if isinstance(content, str):
-        return json.dumps(content, ensure_ascii=False).replace("\x7f", "\\u007F")
-    if isinstance(content, bool):
-        return str(content).lower()
-    if isinstance(content, Mapping):
-        return "{ " + ", ".join(f"{key(str(name))} = {value(each)}" for name, each in content.items()) + " }"
-    if isinstance(content, (list, tuple)):
-        return "[" + ", ".join(value(each) for each in content) + "]"
-    return repr(content) if isinstance(content, float) else str(content)

@@ -9,8 +9,9 @@ from typing import Any
 import xarray as xr
 
 from errormotion.compensation.thermal_model.report import chapter, check
-from errormotion.report import provenance, write_page
+from errormotion.report import Form, provenance, write_page
 from errormotion.report.document import Part, Source
+from errormotion.report.page.language import texts_of
 
 
 def chapters(source: Source) -> list[Part]:
@@ -18,8 +19,19 @@ def chapters(source: Source) -> list[Part]:
     return [chapter.part(source, source.key)] if chapter.is_prediction(source.errors) else []
 
 
+def texts(language: str) -> dict[str, str]:
+    """Return the catalogue of these chapters: English text = text in the language."""
+    return texts_of(__name__, language)
+
+
 def write_model_report(
-    model: xr.Dataset, measured: xr.Dataset, out: Path, *, predicted: xr.Dataset, figures: Mapping[str, Any]
+    model: xr.Dataset,
+    measured: xr.Dataset,
+    out: Path,
+    *,
+    predicted: xr.Dataset,
+    figures: Mapping[str, Any],
+    form: Form | None = None,
 ) -> Path:
     """Write a page that compares a thermal model with a measured campaign.
 
@@ -35,6 +47,8 @@ def write_model_report(
         Prediction of the model for this campaign.
     figures : mapping
         Results of the comparison: ``rms``, ``remaining``, ``removed`` and ``held``, six numbers each.
+    form : Form, optional
+        Language, paper, and what is written beside the page.
 
     Returns
     -------
@@ -42,6 +56,9 @@ def write_model_report(
         ``out``.
     """
     source = Source(predicted, None, {}, provenance.read(model))
-    part = check.part(source, source.key, model, measured, figures)
-    path: Path = write_page([Source(measured, None, {}, provenance.read(measured)), source], [part], out)
-    return path
+    return write_page(
+        [Source(measured, None, {}, provenance.read(measured)), source],
+        lambda: [check.part(source, source.key, model, measured, figures)],
+        out,
+        form=form or Form(),
+    )

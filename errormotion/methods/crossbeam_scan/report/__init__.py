@@ -15,3 +15,10 @@ def chapters(source: Source) -> list[Part]:
     if view.is_campaign(source.errors):
         return [chapter.part(source, source.key)]
     return [pose.part(source, source.key)] if view.is_pose(source.errors) else []
+
+
+def texts(language: str) -> dict[str, str]:
+    """Return the catalogue of these chapters: English text = text in the language."""
+    from errormotion.report.page.language import texts_of
+
+    return texts_of(__name__, language)

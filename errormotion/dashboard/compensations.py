@@ -1,0 +1,281 @@
+"""Compensations for the dashboard: benches and models to choose from, starts, and what each compensation does.
+
+A compensation is a command of its own. It is found by its run folder, whoever started it.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from errormotion import datasets
+from errormotion.campaign.files import BenchPlan, load_bench
+from errormotion.campaign.following import AUDIT, STATUS, Status, compensations, is_working, read_status
+from errormotion.compensation.online.audit import AuditReader
+from errormotion.compensation.online.prediction import predictor
+from errormotion.dashboard.kept import Kept, stamp
+from errormotion.datasets.storage import reading
+from errormotion.errors import CompensationError, ErrormotionError
+
+SHOWN = 20
+"""Compensations in the list, the newest; those at work are always in it."""
+ENTRIES = 200
+"""Last entries of an audit log on the page: those that change state or cause."""
+POINTS = 20_000
+"""Last entries of an audit log in the curves."""
+READ_AT_ONCE = 20_000
+"""Entries of an audit log that are checked for one answer."""
+MOST_FILES = 300
+"""Files of a folder that are offered, at most."""
+LARGEST_MODEL = 64 << 20
+"""Bytes of a file that is looked at whether it is a model."""
+LONGEST_OUTPUT = 4000
+"""Bytes at the end of what a command printed."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A bench file that can be chosen; ``plan`` is None where it has mistakes, ``wrong`` says which."""
+
+    name: str
+    path: Path
+    plan: BenchPlan | None
+    wrong: str = ""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model that predicts errors from readings."""
+
+    name: str
+    path: Path
+    machine: str
+    inputs: tuple[str, ...]
+
+
+@dataclass
+class Following:
+    """One compensation, read again at each question: its state, its entries, its curves."""
+
+    folder: Path
+    reader: AuditReader = field(init=False)
+    first: dict[str, Any] = field(default_factory=dict)
+    entries: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=ENTRIES))
+    points: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=POINTS))
+    broken: str = ""
+    complete: bool = False
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    _last: tuple[Any, Any] = ("", "")
+
+    def __post_init__(self) -> None:
+        self.reader = AuditReader(self.folder / AUDIT)
+
+    def read(self) -> None:
+        """Check and take what was written since the last time, up to a bound."""
+        with self.lock:
+            try:
+                new = self.reader.read(READ_AT_ONCE)
+            except CompensationError as error:
+                self.broken, self.complete = str(error), True
+                return
+            self.complete = len(new) < READ_AT_ONCE
+            for entry in new:
+                self.first = self.first or entry
+                if "offset" in entry and "elapsed" in entry:
+                    self.points.append(entry)
+                now = (entry.get("state"), entry.get("cause"))
+                if "event" in entry or now != self._last:
+                    self.entries.append(entry)
+                self._last = now
+
+
+@dataclass
+class Start:
+    """A command that this dashboard started; ``code`` is None while it works."""
+
+    bench: str
+    model: str
+    armed: bool
+    time: datetime
+    process: subprocess.Popen[bytes]
+    output: Path
+
+    @property
+    def code(self) -> int | None:
+        """Exit code; None while it works."""
+        return self.process.poll()
+
+    def printed(self) -> str:
+        """Return the end of what it printed."""
+        try:
+            with self.output.open("rb") as file:
+                file.seek(max(0, os.fstat(file.fileno()).st_size - LONGEST_OUTPUT))
+                return file.read(LONGEST_OUTPUT).decode("utf-8", "replace")
+        except OSError:
+            return ""
+
+
+class Compensations:
+    """Of one folder of runs.
+
+    Parameters
+    ----------
+    runs : Path
+    folder : Path
+        Of the bench files and models that are offered.
+    bench : Path, optional
+        A further bench file.
+    """
+
+    def __init__(self, runs: Path, folder: Path, bench: Path | None = None) -> None:
+        self.runs, self.folder, self.bench = runs, folder, bench
+        self.starts: deque[Start] = deque(maxlen=10)
+        self._following: Kept[Following] = Kept(SHOWN)
+        self._models: Kept[Model | None] = Kept(MOST_FILES)
+        self._benches: Kept[Bench] = Kept(MOST_FILES)
+
+    def following(self, key: str) -> Following:
+        """Return a compensation by the name of its run folder.
+
+        Raises
+        ------
+        CompensationError
+            There is none.
+        """
+        if not key or len(key) > 255 or key != Path(key).name or not (self.runs / key / AUDIT).is_file():
+            raise CompensationError(f"There is no compensation {key[:100]!r} in {self.runs}.")
+        return self._following.get(key, lambda: Following(self.runs / key))
+
+    def listed(self) -> list[tuple[str, bool, Status | None, str]]:
+        """Return name, whether it is at work, state and what is wrong with it; those at work first, then the newest."""
+        found: list[tuple[str, bool, Status | None, str]] = []
+        for folder in compensations(self.runs):
+            working = is_working(folder)
+            if not working and len(found) >= SHOWN:
+                continue
+            try:
+                found.append((folder.name, working, read_status(folder), ""))
+            except CompensationError as error:
+                found.append((folder.name, working, None, str(error) if (folder / STATUS).exists() else ""))
+        return sorted(found, key=lambda each: not each[1])
+
+    def benches(self) -> list[Bench]:
+        """Return the bench files of the folder."""
+        found = {path.name: path for path in _files(self.folder, ".toml") if _states(path, "errormotion.bench/1")}
+        if self.bench is not None:
+            found[str(self.bench)] = self.bench
+            if (self.folder / self.bench.name).resolve() == self.bench.resolve():
+                found.pop(self.bench.name, None)
+        return [
+            self._benches.get((name, *stamp(path)), lambda n=name, p=path: _bench(n, p)) for name, path in found.items()
+        ]
+
+    def models(self) -> list[Model]:
+        """Return the models of the folder and of the folder of runs."""
+        paths = [*_files(self.folder, ".nc"), *_files(self.runs, ".nc")]
+        found = [self._models.get(stamp(path), lambda p=path: _model(p)) for path in paths]
+        return [each for each in found if each is not None]
+
+    def start(self, bench: str, model: str, arm: str | None) -> Start:
+        """Start ``errormotion compensate run`` as a process of its own, which goes on when the dashboard ends.
+
+        Parameters
+        ----------
+        bench, model : str
+            Of those that are offered.
+        arm : str, optional
+            Name of the machine as a person typed it; without it the compensation is a shadow.
+
+        Raises
+        ------
+        CompensationError
+            They are not offered, or the machine has another name. Nothing is started.
+        """
+        benches = {each.name: each for each in self.benches()}
+        models = {each.name: each for each in self.models()}
+        if bench not in benches or model not in models:
+            raise CompensationError("Choose a bench and a model of those that are offered.")
+        plan = benches[bench].plan
+        if plan is None:
+            raise CompensationError(benches[bench].wrong)
+        if arm is not None and arm != plan.machine:
+            raise CompensationError(
+                f"'{arm[:100]}' is not the name of the machine of {bench}. Nothing was started, nothing was written."
+            )
+        command = [sys.executable, "-m", "errormotion", "compensate", "run", str(benches[bench].path)]
+        command += ["--model", str(models[model].path), "--runs", str(self.runs)]
+        command += [] if arm is None else ["--arm", arm]
+        descriptor, name = tempfile.mkstemp(prefix="errormotion-compensate-", suffix=".log")
+        try:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=descriptor, stderr=descriptor, start_new_session=True
+            )
+        finally:
+            os.close(descriptor)
+        started = Start(bench, model, arm is not None, datetime.now(UTC), process, Path(name))
+        self.starts.appendleft(started)
+        return started
+
+
+def _files(folder: Path, ending: str) -> Sequence[Path]:
+    """Return the files of a folder by their names, as many as are offered."""
+    if not folder.is_dir():
+        return ()
+    return sorted(path for path in folder.glob(f"*{ending}") if path.is_file())[:MOST_FILES]
+
+
+def _states(path: Path, schema: str) -> bool:
+    """Return whether a text file states a schema in its first lines."""
+    try:
+        with path.open("rb") as file:
+            return schema.encode() in file.read(4096)
+    except OSError:
+        return False
+
+
+def _bench(name: str, path: Path) -> Bench:
+    try:
+        return Bench(name, path, load_bench(path))
+    except ErrormotionError as error:
+        return Bench(name, path, None, str(error))
+
+
+def _model(path: Path) -> Model | None:
+    try:
+        if path.stat().st_size > LARGEST_MODEL:
+            return None
+        with reading(path), datasets.load(path) as found:
+            inputs = predictor(found)
+            machine = str(found.attrs.get("machine", "unknown"))
+            return Model(str(path), path, machine, (*inputs.temperatures, *inputs.parameters))
+    except (ErrormotionError, OSError):
+        return None
+
+
+def rows(entries: Sequence[dict[str, Any]]) -> Iterator[dict[str, str]]:
+    """Yield entries of an audit log as text for a table, the newest first."""
+    for entry in reversed(entries):
+        event, state = str(entry.get("event") or ""), str(entry.get("state") or "")
+        yield {
+            "time": str(entry.get("time") or "")[:40],
+            "what": (event or state)[:40],
+            "offset": ", ".join(_um(each) for each in _three(entry.get("offset"))),
+            "cause": str(entry.get("cause") or "")[:300],
+        }
+
+
+def _three(values: Any) -> list[Any]:
+    return list(values)[:3] if isinstance(values, list) else []
+
+
+def _um(value: Any) -> str:
+    return f"{1e6 * value:+.2f}" if isinstance(value, int | float) else "unknown"

@@ -1,0 +1,194 @@
+"""TOML as text: values written, and single values changed in a file that a person wrote, comments kept."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from errormotion.datasets.files.tomlfile import Key, dotted, parse_toml
+from errormotion.errors import DatasetError
+
+LONGEST_TEXT = 1 << 16
+"""Characters of a text in which single values are changed."""
+
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+_HEADER = re.compile(r"[ \t]*(\[\[?)([^\n]*?)\]\]?[ \t]*(?:#[^\n]*)?")
+_KEYS = re.compile(
+    r"""[ \t]*((?:[\w-]+|"[^"\n]*"|'[^'\n]*')(?:[ \t]*\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*'))*)[ \t]*="""
+)
+
+
+def key(name: str) -> str:
+    """Return a key of TOML, in quotes where it needs them."""
+    return name if _BARE.fullmatch(name) else value(name)
+
+
+def value(content: Any) -> str:
+    """Return a value of TOML on one line."""
+    if isinstance(content, str):
+        return json.dumps(content, ensure_ascii=False).replace("\x7f", "\\u007F")
+    if isinstance(content, bool):
+        return str(content).lower()
+    if isinstance(content, Mapping):
+        return "{ " + ", ".join(f"{key(str(name))} = {value(each)}" for name, each in content.items()) + " }"
+    if isinstance(content, (list, tuple)):
+        return "[" + ", ".join(value(each) for each in content) + "]"
+    return repr(content) if isinstance(content, float) else str(content)
+
+
+def value_of(text: str) -> Any:
+    """Return a value in TOML, or the text where it is none."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        return text
+
+
+def with_value(text: str, place: Sequence[Key], content: Any) -> str:
+    """Return a text in which one value is another; comments, order and all other values remain.
+
+    Parameters
+    ----------
+    text : str
+        TOML.
+    place : sequence of str or int
+        Keys from the top, numbers in arrays of tables: ``("test", 0, "settings", "duration")``.
+    content : object
+        The new value; None removes the key.
+
+    Raises
+    ------
+    DatasetError
+        The text is not TOML, is too long, or states the value in a form that cannot be changed alone.
+    """
+    if len(text) > LONGEST_TEXT:
+        raise DatasetError(f"expected at most {LONGEST_TEXT} characters; found {len(text)}")
+    before = parse_toml(text, "text")
+    expected = copy.deepcopy(before)
+    _put(expected, place, content)
+    if expected == before:
+        return text
+    changed = _changed(text, tuple(place), content, expected)
+    with suppress(DatasetError):
+        if parse_toml(changed, "text") == expected:
+            return changed
+    raise DatasetError(f"{dotted(place)}: is written in a form that cannot be changed alone; change it in the text")
+
+
+@dataclass(frozen=True)
+class _Statement:
+    """A header or a key with its value: where its lines and its value are, the table it is in, and its own place."""
+
+    start: int
+    end: int
+    table: tuple[Key, ...]
+    place: tuple[Key, ...]
+    value: tuple[int, int] | None = None
+
+
+def _changed(text: str, place: tuple[Key, ...], content: Any, expected: Any) -> str:
+    found = list(_statements(text))
+    for each in found:
+        if each.value is None or each.place != place[: len(each.place)]:
+            continue
+        if content is None and each.place == place:
+            return text[: each.start] + text[each.end :]
+        return text[: each.value[0]] + value(_at(expected, each.place)) + text[each.value[1] :]
+    if content is None:
+        return text
+    beside = [each for each in found if each.value is not None and each.place[:-1] == place[:-1]]
+    table = beside[-1].table if beside else place[:-1]  # another one where the keys beside it are dotted
+    line = f"{'.'.join(key(str(name)) for name in place[len(table) :])} = {value(content)}\n"
+    own = beside or [each for each in found if each.table == table]
+    if not own and table:
+        own = [each for each in found if each.table[: len(table) - 1] == table[:-1]]
+        line = f"[{'.'.join(key(name) for name in table if isinstance(name, str))}]\n{line}"
+    at = own[-1].end if own else 0
+    lead = "" if at == 0 or text[at - 1 : at] == "\n" else "\n"
+    return text[:at] + lead + line + text[at:]
+
+
+def _statements(text: str) -> Iterator[_Statement]:
+    table: tuple[Key, ...] = ()
+    counts: dict[tuple[Key, ...], int] = {}
+    at = 0
+    while at < len(text):
+        end = _line_end(text, at)
+        line = text[at:end]
+        if not line.strip() or line.lstrip().startswith("#"):
+            at = end
+            continue
+        header, keys = _HEADER.fullmatch(line.rstrip("\r\n")), _KEYS.match(line)
+        if header is not None and keys is None:
+            names, table = _names(header[2]), ()
+            for name in names:
+                table = (*table, name)
+                if header[1] == "[[" and len(table) - len([k for k in table if isinstance(k, int)]) == len(names):
+                    counts[table] = counts.get(table, -1) + 1
+                if table in counts:
+                    table = (*table, counts[table])
+            yield _Statement(at, end, table, table)
+        elif keys is not None:
+            start = at + keys.end()
+            while (parsed := _parsed(text[start:end])) is None and end < len(text):
+                end = _line_end(text, end)
+            yield _Statement(
+                at, end, table, (*table, *_names(keys[1])), (start + 1, start + parsed) if parsed else None
+            )
+        at = end
+
+
+def _line_end(text: str, at: int) -> int:
+    found = text.find("\n", at)
+    return len(text) if found < 0 else found + 1
+
+
+def _names(keys: str) -> list[str]:
+    """Return the parts of a dotted key."""
+    found, names = tomllib.loads(f"{keys} = 0"), []
+    while isinstance(found, dict):
+        name, found = next(iter(found.items()))
+        names.append(name)
+    return names
+
+
+def _parsed(rest: str) -> int | None:
+    """Return the length of the value that a text begins with, without a comment after it; None where it is none yet."""
+    if not rest.rstrip().endswith(("]", "}", '"', "'")) and "\n" in rest.rstrip() and "#" not in rest:
+        return None  # within an array: the next line is needed, and parsing would only take time
+    try:
+        whole = tomllib.loads(f"value = {rest}")["value"]
+    except ValueError:
+        return None
+    for mark in re.finditer("#", rest):
+        try:
+            if tomllib.loads(f"value = {rest[: mark.start()]}")["value"] == whole:
+                return len(rest[: mark.start()].rstrip())
+        except ValueError:
+            continue
+    return len(rest.rstrip())
+
+
+def _at(content: Any, place: Sequence[Key]) -> Any:
+    for each in place:
+        content = content[each]
+    return content
+
+
+def _put(content: Any, place: Sequence[Key], new: Any) -> None:
+    """Set or remove a value; tables on the way are made."""
+    try:
+        for each in place[:-1]:
+            content = content.setdefault(each, {}) if isinstance(content, dict) else content[each]
+        if new is None:
+            content.pop(place[-1], None)
+        else:
+            content[place[-1]] = new
+    except (KeyError, IndexError, TypeError, AttributeError):
+        raise DatasetError(f"{dotted(place)}: there is no such place in the text") from None
