@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import altered
 import altered_datasets
 import file_kinds
 import file_trials
@@ -154,6 +155,26 @@ def test_links_do_not_lead_out_of_a_run_folder(tmp_path: Path, name: str) -> Non
     folder = RunFolder.open(tmp_path / "run")
     with pytest.raises(RunError, match="expected a file in this folder"):
         _ = folder.raw if name == "raw.zarr" else folder.errors
+
+
+@pytest.mark.timeout(30)
+def test_an_alteration_does_not_follow_what_another_has_put_in_place(tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.write_text("x = 1")
+
+    def put(path: Path, chance: random.Random) -> str:
+        path.unlink()
+        if chance.random() < 0.5:
+            os.mkfifo(path)
+        else:
+            path.symlink_to(outside)
+        return "put"
+
+    for number in range(40):
+        (folder := tmp_path / str(number)).mkdir()
+        (folder / "a.toml").write_text("x = 1")
+        altered.alter(folder / "a.toml", [put, altered.bytes_of, altered.text], random.Random(number))
+    assert outside.read_text() == "x = 1"
 
 
 def test_pipes_and_devices_are_no_files(tmp_path: Path) -> None:
