@@ -173,11 +173,12 @@ def chapters(source: Source) -> list[Part]:
             return own
         return [COMPONENTS.get(str(source.errors.attrs.get("component")), generic.part)(source, source.key)]
     except _DO_NOT_FIT as error:
+        file = Path(str(source.errors.encoding.get("source", ""))).name
         by = f"method '{source.errors.attrs['method']}'" if "method" in source.errors.attrs else "the plugin"
         raise DatasetError(
-            f"The chapter of {by} cannot be written from this dataset ({type(error).__name__}: {error}). Its schema is "
-            "followed; what the plugin adds to it is missing or has another form. If nobody changed the dataset, this "
-            "is a defect of the plugin: the traceback is in the log."
+            f"The chapter of {by} cannot be written from {file or 'this dataset'} ({type(error).__name__}: {error}). "
+            "Its schema is followed; what the plugin adds to it is missing or has another form. If nobody changed the "
+            "dataset, this is a defect of the plugin: the traceback is in the log."
         ) from error
 
 
