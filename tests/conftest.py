@@ -7,7 +7,10 @@ Every worker keeps its linear algebra to one thread: there are more workers than
 """
 
 import os
+import tomllib
 from collections.abc import Generator
+from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
@@ -16,6 +19,7 @@ from xdist.scheduler import LoadFileScheduling
 for _library in ("OPENBLAS", "OMP", "MKL"):  # before anything imports numpy
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
+PACKAGE = Path(__file__).parents[1] / "errormotion"
 IN_CI = os.environ.get("CI", "").lower() not in ("", "0", "false")
 
 hypothesis.settings.register_profile(
@@ -67,3 +71,28 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
     report = yield
     _refuse_skip(report)
     return report
+
+
+@pytest.fixture(scope="module")
+def translated(request: pytest.FixtureRequest) -> Generator[None]:
+    """Translate every page that a module's tests write into German too: none of its texts may be missing."""
+    from errormotion.report import write
+    from errormotion.report.page import annex
+    from errormotion.report.untranslated import missing_of
+
+    catalogues = [tomllib.loads(file.read_text(encoding="utf-8")) for file in PACKAGE.rglob("de.toml")]
+    missing, page = [], write.page
+
+    def translating(sources: Any, parts: Any, *rest: Any, **more: Any) -> Any:
+        missing.extend(missing_of(parts, annex.values(sources), "de", catalogues))
+        return page(sources, parts, *rest, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(write, "page", translating)
+        yield
+    own = request.path.read_text(encoding="utf-8")  # what a test makes up has no translation
+    assert [text for text in missing if text not in own and not text.startswith(FROM_ELSEWHERE)] == []
+
+
+FROM_ELSEWHERE = ("Did you mean one of", "Searched: ")
+"""Beginnings of texts that other packages write, or that are paths."""

@@ -1,9 +1,10 @@
 """Runs under faults: ``make faults`` ends and disturbs real processes, and writes a section of ``docs/reliability.md``.
 
-Each trial starts a short campaign on a virtual machine, an identification, a report, a batch or a monitor, and kills
-it at a random instant, takes the disk away at a random write, sets the clocks, suspends it, or starts it twice. Then
-it is continued or repeated, and the raw data are compared with those of an undisturbed run. ``ARGS="--kills 30 --seed
-5"`` tries other numbers of trials and other instants; ``--only disk`` the kinds whose name has these letters.
+Each trial starts a short campaign on a virtual machine, an identification, a report, a batch, a monitor, a compensation
+or the fit of a model, and kills it at a random instant, takes the disk away at a random write, sets the clocks,
+suspends it, or starts it twice. Then it is continued or repeated, and the raw data are compared with those of an
+undisturbed run. ``ARGS="--kills 30 --seed 5"`` tries other numbers of trials and other instants; ``--only disk`` the
+kinds whose name has these letters.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ SHARES = {
     "kill_command": 0.04,
     "kill_batch": 0.04,
     "kill_monitor": 0.04,
+    "kill_compensation": 0.08,
+    "kill_fit": 0.02,
     "disk": 0.20,
     "disk_command": 0.08,
     "disk_monitor": 0.04,
@@ -49,6 +52,7 @@ SHARES = {
     "moved": 0.06,
 }
 """Trials of each kind for one kill."""
+FOLLOWING = "errormotion compensate run"
 SHIMMED = ("disk", "disk_command", "disk_monitor", "clock_running", "clock_between", "suspend", "suspend_monitor")
 """Kinds that need a C compiler."""
 
@@ -109,17 +113,17 @@ class Programme:
         total = sum(row.trials for row in self.rows.values())
         kills = sum(row.trials for (fault, _), row in self.rows.items() if fault.startswith("kill"))
         inside = sum(row.trials for (fault, _), row in self.rows.items() if fault == "kill -9, acquisition")
+        following = sum(row.trials for (_, what), row in self.rows.items() if what == FOLLOWING)
         lines = [
-            TEXT.format(total=total, kills=kills, inside=inside, load=self.load),
+            TEXT.format(total=total, kills=kills, inside=inside, following=following, load=self.load),
             "",
             "| fault | what it meets | trials | survived | worst loss | identical raw data | ended with a sentence |",
             "|---|---|---|---|---|---|---|",
         ]
         for (fault, what), row in sorted(self.rows.items()):
             loss = f"{row.lost:.2f} s, {row.samples} samples" if fault.startswith("kill -9, acq") else "-"
-            loss = (
-                f"{row.lost:.2f} s, {row.samples} rows" if what == "errormotion monitor" and "kill" in fault else loss
-            )
+            logged = fault.startswith("kill") and what in ("errormotion monitor", FOLLOWING)
+            loss = f"{row.lost:.2f} s, {row.samples} rows" if logged else loss
             same = f"{row.identical} of {row.compared}" if row.compared else "-"
             lines.append(
                 f"| {fault} | {what} | {row.trials} | {row.survived} | {loss} | {same} | {row.sentences or '-'} |"
@@ -134,9 +138,9 @@ class Programme:
 
 TEXT = """\
 {total} trials with short campaigns on virtual machines, each in processes of its own; {kills} of them kills at random
-instants, {inside} in an acquisition. After the fault the run is continued, in every third trial of an acquisition by
-two processes at once, of which one must finish it and the other must be refused; a command is repeated. A trial is
-survived when
+instants, {inside} in an acquisition, {following} in a compensation that writes to a simulated PLC over TCP. After the
+fault the run is continued, in every third trial of an acquisition by two processes at once, of which one must finish it
+and the other must be refused; a command is repeated. A trial is survived when
 
 * nothing that was delivered to the recorder more than a second before a kill is lost (longer only where more processes
   want a processor than the computer has; here {load:.1f} on each);
@@ -145,7 +149,10 @@ survived when
   clock of the computer, and differ.) Every method repeats its values on a virtual machine; what it cannot repeat is
   stated in [Run and resume a campaign](how-to/run-and-resume.md#on-a-virtual-machine);
 * the interruptions that the raw data state (`joins`) agree with the clocks that were set: the duration is right where
-  the computer was not restarted, and unknown where the clocks contradict each other.
+  the computer was not restarted, and unknown where the clocks contradict each other;
+* every offset that reached the PLC is in the audit log of the compensation, whose chain of hashes is valid up to its
+  last entry; without a sign of life the PLC's offset is zero; and the compensation that is started next goes on from
+  the offset that the PLC then has, within the slew limit.
 
 A method delivers what belongs together: samples of a drift, the scans of a beam detection and lines of a crossbeam at
 least every 0.4 s, a face of the gauge (`beam_direction`), a set-up of the tracker (`multilateration`), a cycle of

@@ -306,6 +306,32 @@ def compensate_run(
     raise typer.Exit(code)
 
 
+@compensate_app.command("status")
+@guarded
+def compensate_status(
+    folder: Annotated[Path, typer.Argument(help="A folder of runs, or the run folder of one compensation.")] = Path(
+        "runs"
+    ),
+    json_: Json = False,
+) -> None:
+    """Show what compensations do now, whoever started them, and check their audit logs."""
+    from errormotion.cli.commands import following as command
+
+    raise typer.Exit(command.status(folder, json_))
+
+
+@compensate_app.command("stop")
+@guarded
+def compensate_stop(
+    folder: Annotated[Path, typer.Argument(help="The run folder of a compensation.")],
+    json_: Json = False,
+) -> None:
+    """Ask a compensation to ramp to zero and end, as Ctrl-C in its terminal does."""
+    from errormotion.cli.commands import following as command
+
+    command.stop(folder, json_)
+
+
 @app.command()
 @guarded
 def simulate(

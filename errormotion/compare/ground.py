@@ -351,7 +351,9 @@ def _in_place(datasets: Mapping[str, xr.Dataset], dim: str, notes: list[str]) ->
             for name, match in matches.items():
                 rows[name].append(int(match or 0))
     if not rows[names[0]]:
-        raise DatasetError(f"The datasets have no {dim} in common (within {SAME_POINT * 1e6:g} um)")
+        raise DatasetError(
+            f"The datasets {', '.join(map(repr, names))} have no {dim} in common (within {SAME_POINT * 1e6:g} um)"
+        )
     left = {name: ds.sizes[dim] - len(rows[name]) for name, ds in datasets.items()}
     if any(left.values()):
         notes.append(

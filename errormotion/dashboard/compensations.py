@@ -180,8 +180,9 @@ class Compensations:
 
     def models(self) -> list[Model]:
         """Return the models of the folder and of the folder of runs."""
-        paths = [*_files(self.folder, ".nc"), *_files(self.runs, ".nc")]
-        found = [self._models.get(stamp(path), partial(_model, path)) for path in paths]
+        paths = {path.name: path for path in _files(self.folder, ".nc")}
+        paths |= {f"{self.runs.name}/{path.name}": path for path in _files(self.runs, ".nc")}
+        found = [self._models.get((name, *stamp(path)), partial(_model, name, path)) for name, path in paths.items()]
         return [each for each in found if each is not None]
 
     def start(self, bench: str, model: str, arm: str | None) -> Start:
@@ -220,6 +221,7 @@ class Compensations:
             )
         finally:
             os.close(descriptor)
+        threading.Thread(target=process.wait, daemon=True).start()  # no zombie stays, whether anybody asks or not
         started = Start(bench, model, arm is not None, datetime.now(UTC), process, Path(name))
         self.starts.appendleft(started)
         return started
@@ -248,14 +250,14 @@ def _bench(name: str, path: Path) -> Bench:
         return Bench(name, path, None, str(error))
 
 
-def _model(path: Path) -> Model | None:
+def _model(name: str, path: Path) -> Model | None:
     try:
         if path.stat().st_size > LARGEST_MODEL:
             return None
         with reading(path), datasets.load(path) as found:
             inputs = predictor(found)
             machine = str(found.attrs.get("machine", "unknown"))
-            return Model(str(path), path, machine, (*inputs.temperatures, *inputs.parameters))
+            return Model(name, path, machine, (*inputs.temperatures, *inputs.parameters))
     except (ErrormotionError, OSError):
         return None
 
@@ -277,4 +279,4 @@ def _three(values: Any) -> list[Any]:
 
 
 def _um(value: Any) -> str:
-    return f"{1e6 * value:+.2f}" if isinstance(value, int | float) else "unknown"
+    return f"{round(1e6 * value, 2) + 0.0:+.2f}" if isinstance(value, int | float) else "unknown"

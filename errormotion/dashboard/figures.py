@@ -108,12 +108,13 @@ def following_item() -> dict[str, Any]:
     looks = (("asked", "from the prediction", 0), ("offset", "offset", 1), ("applied", "in effect", 2))
     for axis in "XYZ":
         plot = _axes(f"{axis} / µm", None, last=axis == "Z", x_axis_type="datetime")
-        plot.height = 170 + 40 * (axis == "X") + 30 * (axis == "Z")
+        plot.height = 150 + 35 * (axis == "X") + 40 * (axis == "Z")
+        plot.xaxis.visible = axis == "Z"
         columns = ("x", "asked", "low", "high", "offset", "applied")
         source = ColumnDataSource({name: [] for name in columns}, name=axis)
         plot.varea("x", "low", "high", source=source, color=_look(0)[0], alpha=0.18)
         for name, title, number in looks:
-            dash = [6.0, 4.0] if name == "applied" else []
+            dash = [6, 4] if name == "applied" else []
             given = {"legend_label": title} if axis == "X" else {}
             line = plot.line("x", name, source=source, color=_look(number)[0], line_width=2.0, line_dash=dash, **given)
             tips = [("time", "@x{%H:%M:%S}"), (title, f"@{name}{{0.00}} µm")]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.datasets import hash_dataset
 from errormotion.datasets.compression import as_stored
-from errormotion.datasets.schemas import ERROR_ROWS
+from errormotion.datasets.schemas import DOF, ERROR_ROWS
 from errormotion.errors import DatasetError
 from errormotion.montecarlo.adaptive import Summary
 from errormotion.montecarlo.validation import NOT_VALIDATED, UNDECIDED, VALIDATED, WORDS, Validation
@@ -36,6 +36,7 @@ TABLE: dict[str, tuple[tuple[str, ...], str]] = {
     "missing": (_ONE, "trials without a value"),
 }
 """Variables: dimensions, ``...`` those of the error dataset, and meaning."""
+LABELS = {"dof": (*DOF, "deviation"), "limit": ("low", "high")}
 ATTRIBUTES = ("method", "method_version", "machine", "component", "frame", "functional_point", "reference", "sign")
 NUMBERS = ("trials", "probability", "digits", "seed")
 
@@ -144,9 +145,18 @@ def violations(ds: xr.Dataset) -> list[str]:
         expected = tuple(part for dim in dims for part in (own if dim == "..." else [dim]))
         if ds.variables[name].dims != expected:
             found.append(f"{name}: expected dims ({', '.join(expected)}); found {ds.variables[name].dims}")
-    for name in ("dof", "limit"):
-        if name not in ds.coords:
-            found.append(f"{name}: missing; expected its labels")
+        if ds.variables[name].dtype.kind not in "iuf":
+            found.append(f"{name}: expected numbers; found {ds.variables[name].dtype}")
+    for name, known in LABELS.items():
+        labels = [str(label) for label in np.ravel(ds.coords[name].values)] if name in ds.coords else []
+        if not labels or len(set(labels)) < len(labels) or not set(labels) <= set(known):
+            found.append(
+                f"{name}: expected labels of {', '.join(known)}, each once; found {', '.join(labels) or 'none'}"
+            )
+    for name in NUMBERS:
+        stated = ds.attrs.get(name, 0)
+        if not isinstance(stated, int | float | np.number) or not np.isfinite(stated):
+            found.append(f"attribute '{name}': expected a number; found {stated!r:.80}")
     if not found and not np.isin(ds["verdict"].values, (VALIDATED, NOT_VALIDATED, UNDECIDED)).all():
         found.append("verdict: expected 1, 0 or -1")
     return found

@@ -116,7 +116,7 @@ def write_report(
         parts = [part for source in sources for part in chapters(source)]
         parts[:1] = [_noted(part, run or {}) for part in parts[:1]]
         decision = verdict(_judged(sources, tolerances)) if tolerances is not None else None
-        texts = [_texts(source, head.language) for source in sources]
+        texts = [catalogue_of(source, head.language) for source in sources]
         found = page(sources, parts, title, head=head, decision=decision, texts=texts)
     return _finished(found, Path(out), form, head)
 
@@ -135,7 +135,7 @@ def _finished(found: Page, out: Path, form: Form, head: Head) -> Path:
     return target
 
 
-def _texts(source: Source, language: str) -> Mapping[str, str]:
+def catalogue_of(source: Source, language: str) -> Mapping[str, str]:
     """Return the catalogue of the plugin that made a dataset; empty where it brings none."""
     owner = _owner(source.errors)
     return owner.texts(language) if language and hasattr(owner, "texts") else {}
@@ -173,11 +173,12 @@ def chapters(source: Source) -> list[Part]:
             return own
         return [COMPONENTS.get(str(source.errors.attrs.get("component")), generic.part)(source, source.key)]
     except _DO_NOT_FIT as error:
+        file = Path(str(source.errors.encoding.get("source", ""))).name
         by = f"method '{source.errors.attrs['method']}'" if "method" in source.errors.attrs else "the plugin"
         raise DatasetError(
-            f"The chapter of {by} cannot be written from this dataset ({type(error).__name__}: {error}). Its schema is "
-            "followed; what the plugin adds to it is missing or has another form. If nobody changed the dataset, this "
-            "is a defect of the plugin: the traceback is in the log."
+            f"The chapter of {by} cannot be written from {file or 'this dataset'} ({type(error).__name__}: {error}). "
+            "Its schema is followed; what the plugin adds to it is missing or has another form. If nobody changed the "
+            "dataset, this is a defect of the plugin: the traceback is in the log."
         ) from error
 
 
@@ -218,7 +219,7 @@ def write_page(
         The page was written, and a PDF of it could not be.
     """
     head = form.of(Head())
-    catalogues = [_texts(source, head.language) for source in sources]
+    catalogues = [catalogue_of(source, head.language) for source in sources]
     catalogues += [texts(head.language)] if texts is not None else []
     with written_in(head.language):
         found = page(sources, make(), title, head=head, texts=catalogues)

@@ -13,6 +13,8 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.cli.app import app
 from errormotion.compare import compare as compared
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 FEW = ("--freedoms", "EX,EY,EZ")
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import fault_compensation
 import fault_processes
 import fault_trials as trials
 import pytest
@@ -43,6 +44,19 @@ def test_run_survives(kinds: Kinds, kind: str) -> None:
     result = getattr(kinds, kind)(0)
     assert result.faults == []
     assert result.different == []
+
+
+@pytest.mark.timeout(120)
+def test_a_killed_compensation_has_said_what_it_wrote_and_starts_again_without_a_jump(kinds: Kinds) -> None:
+    assert kinds.kill_compensation(0).faults == []
+
+
+def test_jumps_and_orders_that_are_not_in_the_audit_log_are_found(tmp_path: Path) -> None:
+    steps = [(k * 1e-6, 0.0, 0.0) for k in range(4)]
+    assert fault_compensation._course(steps, steps[0]) == []
+    assert len(fault_compensation._course([steps[3]], steps[0])) == 1
+    assert len(fault_compensation._course([(0.0, 30e-6, 0.0)], (0.0, 29e-6, 0.0))) == 1
+    assert len(fault_compensation._audited(tmp_path, steps)) == len(steps)
 
 
 @pytest.mark.timeout(120)

@@ -4,8 +4,10 @@ import json
 import os
 import random
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
+import altered
 import altered_datasets
 import file_kinds
 import file_trials
@@ -15,8 +17,12 @@ from file_kinds import Kind, Library
 
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
+from errormotion.compensation.program.reading import offsets
 from errormotion.datasets.files import tomlfile
-from errormotion.errors import DatasetError, RunError
+from errormotion.errors import DatasetError, ErrormotionError, RunError
+from errormotion.instruments.compensator.offset_file import OffsetFile
+from errormotion.instruments.line_profiler.profile_files import ProfileFiles
+from errormotion.instruments.transports import recording
 
 FEW = 2
 """Alterations of each kind."""
@@ -151,6 +157,26 @@ def test_links_do_not_lead_out_of_a_run_folder(tmp_path: Path, name: str) -> Non
         _ = folder.raw if name == "raw.zarr" else folder.errors
 
 
+@pytest.mark.timeout(30)
+def test_an_alteration_does_not_follow_what_another_has_put_in_place(tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.write_text("x = 1")
+
+    def put(path: Path, chance: random.Random) -> str:
+        path.unlink()
+        if chance.random() < 0.5:
+            os.mkfifo(path)
+        else:
+            path.symlink_to(outside)
+        return "put"
+
+    for number in range(40):
+        (folder := tmp_path / str(number)).mkdir()
+        (folder / "a.toml").write_text("x = 1")
+        altered.alter(folder / "a.toml", [put, altered.bytes_of, altered.text], random.Random(number))
+    assert outside.read_text() == "x = 1"
+
+
 def test_pipes_and_devices_are_no_files(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.nc")
     (tmp_path / "device.toml").symlink_to("/dev/zero")
@@ -158,6 +184,26 @@ def test_pipes_and_devices_are_no_files(tmp_path: Path) -> None:
         datasets.load(tmp_path / "pipe.nc")
     with pytest.raises(DatasetError, match="not a regular file"):
         tomlfile.read_toml(tmp_path / "device.toml")
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize(
+    "read",
+    [
+        recording.read_recording,
+        recording.read_index,
+        recording.parts_of,
+        recording.read_note,
+        offsets.read_tools,
+        lambda path: ProfileFiles(f"replay://{path}").open(),
+        lambda path: OffsetFile(str(path)).open(),
+    ],
+    ids=["recording", "index", "parts", "note", "tools", "list of scans", "offset"],
+)
+def test_pipes_do_not_stop_a_reader(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ErrormotionError, match="not a regular file"):
+        read(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize("change", ["negative", "asymmetric", "not positive", "gap"])

@@ -21,6 +21,8 @@ from errormotion.montecarlo.store import Store
 from errormotion.plugins import MethodInfo, Needs, PluginSettings, Redraw, Redrawing
 from errormotion.report.document import Source
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 TRIALS = 40
 NOISE, OFFSET = 0.5e-6, 0.9e-6  # m
 
@@ -259,6 +261,9 @@ def test_the_command_prints_and_stores_the_verdicts(measured, tmp_path):
     answer = json.loads(result.stdout)
     stored = datasets.load(answer["monte_carlo"])
     assert not list(datasets.violations(stored))
+    again = [str(stored["dof"].values[0])] * stored.sizes["dof"]
+    for wrong in (stored.assign_coords(dof=again), stored.assign_attrs(probability="most")):
+        assert len(list(datasets.violations(wrong))) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["errors.monte_carlo.nc", "errors.nc"]
     assert [verdict["freedom"] for verdict in answer["verdicts"]] == ["EX", "EY"]
     assert {verdict["verdict"] for verdict in answer["verdicts"]} <= {"validated", "not validated", "undecided"}

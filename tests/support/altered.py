@@ -33,6 +33,8 @@ def alter(path: Path, alterations: Sequence[Alteration], chance: random.Random) 
     """Apply one alteration, one in six times two, and return what was done."""
     done = []
     for _ in range(1 + (chance.random() < 1 / 6)):
+        if done and not all(map(is_plain, (path, *path.rglob("*")))):
+            break  # reading a pipe or a device would not end; writing to a link would change what it leads to
         for _ in range(30):
             try:
                 done.append(chance.choice(alterations)(path, chance))
@@ -42,11 +44,16 @@ def alter(path: Path, alterations: Sequence[Alteration], chance: random.Random) 
     return ", ".join(done)
 
 
+def is_plain(path: Path) -> bool:
+    """Whether a path is a regular file or a folder, and no link."""
+    return not path.is_symlink() and (path.is_file() or path.is_dir())
+
+
 def inside(path: Path, chance: random.Random, ending: str = "") -> Path:
-    """Return a file: the path itself, or one of those below it."""
-    if path.is_file():
+    """Return a file: the path itself, or one of those below it; never a link."""
+    if not path.is_symlink() and path.is_file():
         return path
-    files = sorted(each for each in path.rglob("*") if each.is_file() and each.name.endswith(ending))
+    files = sorted(each for each in path.rglob(f"*{ending}") if not each.is_symlink() and each.is_file())
     if not files:
         raise UnsuitableError
     return chance.choice(files)

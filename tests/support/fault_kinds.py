@@ -18,11 +18,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import fault_compensation
 import fault_examples
 import fault_trials as trials
 import numpy as np
 from fault_processes import Clock, Disk, Forked
 from fault_trials import Ended
+from warm_ups import warm_up
 
 from errormotion import datasets
 from errormotion.campaign.folder import list_runs
@@ -233,6 +235,35 @@ class Kinds:
         result.faults += again.faults
         if again.code:
             result.faults.append(f"the next monitor ended with {again.code}: {again.message[-300:]}")
+        return result
+
+    def kill_compensation(self, number: int) -> Result:
+        """End a compensation that writes to a simulated PLC, and start it again."""
+        chance, _, runs, journal = self._place("kill_compensation", number)
+        ended, faults = fault_compensation.kill(chance, runs.parent, runs, journal)
+        result = Result("kill -9", "errormotion compensate run", faults, ended.lost, ended.samples)
+        if ended.lost > longest_loss():
+            result.faults.append(f"{ended.samples} rows of the last {ended.lost:.2f} s are lost")
+        for folder in list_runs(runs):
+            if (folder.raw / "zarr.json").exists():
+                result.faults += _rows(folder.raw)
+        return result
+
+    def kill_fit(self, number: int) -> Result:
+        """End ``model fit``, and repeat it."""
+        chance, _, runs, journal = self._place("kill_fit", number)
+        files, out = [runs / "warm1.nc", runs / "warm2.nc"], runs / "model.nc"
+        for seed, file in enumerate(files, 1):
+            datasets.save(warm_up(seed), file)
+        words = ["model", "fit", *files, "--out", out]
+        trials.kill_when(Forked(words, journal), lambda: True, chance.uniform(0.0, 3.0))
+        result = Result("kill -9", "errormotion model fit", trials.half_files(runs))
+        ended = trials.finish(Forked(words, journal))
+        if ended.code and "exists" not in ended.message:  # it had ended before the kill
+            result.faults.append(f"the repetition ended with {ended.code}: {ended.message[-300:]}")
+        if not out.exists():
+            result.faults.append(f"{out.name} is missing after the repetition")
+        result.faults += [*ended.faults, *trials.half_files(runs)]
         return result
 
     def _monitor(self, runs: Path, duration: float) -> list[Any]:

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import altered
 import file_trials
-import numpy as np
 from altered import JSON, TEXT, TOML, Alteration
 from altered_datasets import NETCDF, ZARR
 from file_trials import Ended
 from text_files import DRIFT, DRIFT_MAP, LOG, MAP
+from warm_ups import warm_up
 
 from errormotion import datasets, plugins
 from errormotion.plugins import load_object
@@ -257,7 +257,7 @@ def runs(library: Library) -> list[Kind]:
             (raws if alterations is ZARR else made).append((place, file, words))
     thermal = library.new("thermal model")
     for number in (1, 2):
-        datasets.save(_warm_up(number), thermal / f"warm{number}.nc")
+        datasets.save(warm_up(number), thermal / f"warm{number}.nc")
     library.command(thermal, "model", "fit", "warm1.nc", "warm2.nc", "--out", "model.nc")
     predict = [("model", "predict", "model.nc", "warm1.nc", "--out", "errors.nc"), ("validate", "model.nc"),
                ("model", "check", "model.nc", "warm2.nc", "--report", "page.html"), ("report", "model.nc")]  # fmt: skip
@@ -279,18 +279,6 @@ def runs(library: Library) -> list[Kind]:
         Kind("errors for a thermal model", NETCDF, [(thermal, "warm1.nc", [
             ("model", "fit", "warm1.nc", "warm2.nc", "--out", "new.nc"), predict[0]])]),
     ]  # fmt: skip
-
-
-def _warm_up(seed: int):
-    from errormotion.twin import Event, VirtualMachine
-
-    machine = VirtualMachine("cframe", 3)
-    speeds = np.random.default_rng(seed).permutation([3000.0, 6000.0, 12000.0])
-    machine.start([Event(3600.0 * k, speed, dict.fromkeys("XYZ", False)) for k, speed in enumerate(speeds)])
-    ds = machine.truth_spindle(np.arange(0.0, 3 * 3600.0 + 1, 360.0)).load()
-    covariance = np.tile(np.diag([9e-14] * 3 + [1e-12] * 3), (ds.sizes["time"], 1, 1))
-    ds["covariance"] = (ds["covariance"].dims, covariance)
-    return ds
 
 
 MAKERS: tuple[Callable[[Library], list[Kind]], ...] = (texts, results, runs)

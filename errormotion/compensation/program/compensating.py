@@ -18,6 +18,7 @@ from errormotion.compensation.program.reading.reader import Reader
 from errormotion.compensation.program.reading.words import LONGEST_LINE, lines_of
 from errormotion.compensation.program.writing.dividing import Correcting
 from errormotion.compensation.program.writing.rewriting import Rewriting, Summary
+from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import ProgramError
 
 LARGEST_PROGRAM = 1 << 29
@@ -112,7 +113,7 @@ def compensate(
     chosen = settings or Settings()
     if chosen.route not in ROUTES:
         raise ProgramError(f"reader '{chosen.route}': expected one of {', '.join(ROUTES)}")
-    if program.stat().st_size > LARGEST_PROGRAM:
+    if require_regular(program).st_size > LARGEST_PROGRAM:
         raise ProgramError(f"{program}: expected a file of at most {LARGEST_PROGRAM} bytes")
     why = ""
     beside = out.with_name(out.name + ".part")

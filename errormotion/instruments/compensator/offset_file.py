@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
+from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator.door import OffsetDoor
@@ -140,6 +141,7 @@ class OffsetFile:
 
     def _content(self, path: Path) -> dict[str, Any]:
         try:
+            require_regular(path)
             with path.open("rb") as file:
                 text = file.read(LONGEST + 1)
             if len(text) > LONGEST:

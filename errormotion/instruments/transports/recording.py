@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 from zlib import crc32
 
+from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
 from errormotion.instruments.transports.base import Transport
 
@@ -127,6 +128,7 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
         No such file, not a recording, a changed byte, a missing end; with the line number.
     """
     try:
+        require_regular(path)
         lines = path.read_text(encoding="ascii").splitlines()
     except OSError as error:
         raise ReplayError(f"The recording {path} cannot be read: {error.strerror}") from None
@@ -258,7 +260,7 @@ def write_index(path: Path, parts: Sequence[str]) -> dict[str, Path]:
 def read_index(path: Path) -> dict[str, Path]:
     """Return the recordings that a list names, by part; ReplayError where it is not such a list."""
     try:
-        if (size := path.stat().st_size) > MOST_INDEX:
+        if (size := require_regular(path).st_size) > MOST_INDEX:
             raise ReplayError(f"{path}: expected a list of recordings of at most {MOST_INDEX} bytes; found {size}")
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -282,6 +284,7 @@ def _is_name(text: str) -> bool:
 def parts_of(path: Path, levels: int = 2) -> list[Path]:
     """Return the files of a recording that have frames: itself, or those that it names, and those that these name."""
     try:
+        require_regular(path)
         with path.open(encoding="utf-8", errors="replace") as file:
             word = file.readline(MOST_NOTE_BYTES).split(" ")[0].strip()
     except OSError as error:
@@ -306,6 +309,7 @@ def add_note(path: Path, note: Mapping[str, Any]) -> None:
 def read_note(path: Path) -> dict[str, Any] | None:
     """Return the note of a recording; None without one. ReplayError where it cannot be read."""
     try:
+        require_regular(path)
         with path.open(encoding="utf-8") as file:
             file.readline(MOST_NOTE_BYTES)
             line = file.readline(MOST_NOTE_BYTES)

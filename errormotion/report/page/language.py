@@ -33,7 +33,7 @@ _DECIMAL = re.compile(r"[+−-]?\d+\.\d+")
 _WORD = re.compile(r"[a-z]{3}")
 _LETTERS = re.compile(r"[a-z]{2}")
 _LIST = re.compile(r"(, | und )")
-_UNITS = re.compile(r"\b(?:arcsec|min|rad|days)\b")
+_UNITS = re.compile(r"\b(?:arcsec|min|m?rad|days)\b")
 _SVG_TEXT = re.compile(r"(?<=>)([^<>]*[^<>\s][^<>]*)(?=</text>)")
 _SVG_NAME = re.compile(r'(?<= data-(?:x-name)=")([^"]+)(?=")')
 _AnyBlock = TypeVar("_AnyBlock", bound=Block)
@@ -126,8 +126,12 @@ class Catalogue:
         """Return a drawing with its texts in the language."""
         if self.language == "en":
             return drawing
-        text = _SVG_TEXT.sub(lambda found: escape(str(self.word(unescape(found[1]))), quote=False), str(drawing))
+        text = _SVG_TEXT.sub(lambda found: escape(str(self._label(unescape(found[1]))), quote=False), str(drawing))
         return Markup(_SVG_NAME.sub(lambda found: escape(str(self.word(unescape(found[1])))), text))
+
+    def _label(self, text: str) -> Any:
+        """Return a text of a drawing: an axis has a quantity and a unit, anything else may be a name of the data."""
+        return self(text) if " / " in text else self.word(text)
 
     def cell(self, cell: Cell | str) -> Cell | str:
         """Return a cell with its text and its reason in the language."""

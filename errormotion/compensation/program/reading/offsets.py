@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from errormotion.arrays import Array
+from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import ProgramError
 
 SYSTEMS = ("G54", "G55", "G56", "G57", "G58", "G59", "G59.1", "G59.2", "G59.3")
@@ -131,9 +132,11 @@ def read_tools(path: Path, unit: str = "mm") -> dict[int, Array]:
 
 
 def _lines(path: Path) -> list[str]:
-    if path.stat().st_size > LARGEST_FILE:
-        raise ProgramError(f"{path}: expected a file of at most {LARGEST_FILE} bytes")
     try:
+        if require_regular(path).st_size > LARGEST_FILE:
+            raise ProgramError(f"{path}: expected a file of at most {LARGEST_FILE} bytes")
         return path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise ProgramError(f"{path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise ProgramError(f"{path}: expected text; found other bytes at {error.start}") from None

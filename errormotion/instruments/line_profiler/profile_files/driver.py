@@ -172,6 +172,7 @@ def _write_list(path: Path, files: dict[Path, str]) -> None:
 
 def _read_list(path: Path) -> dict[Path, str]:
     try:
+        require_regular(path)
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ReplayError(f"The recording {path} cannot be read: {error}") from None
