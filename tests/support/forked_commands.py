@@ -9,9 +9,11 @@ import contextlib
 import gc
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -90,15 +92,47 @@ class Commands:
     def start(self, *arguments: Any, cwd: Path | None = None, environment: Mapping[str, str] | None = None) -> Command:
         """Start a command in a folder, with further variables of its environment."""
         (out, theirs_out), (err, theirs_err) = os.pipe(), os.pipe()
+        try:
+            return Command(self._server, self._fork(arguments, cwd, environment, theirs_out, theirs_err), out, err)
+        finally:
+            os.close(theirs_out)
+            os.close(theirs_err)
+
+    def run(
+        self,
+        *arguments: Any,
+        cwd: Path | None = None,
+        environment: Mapping[str, str] | None = None,
+        timeout: float = 300.0,
+    ) -> subprocess.CompletedProcess[str]:
+        """Run a command to its end; return its exit status and what it wrote, however much."""
+        with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+            pid = self._fork(arguments, cwd, environment, out.fileno(), err.fileno())
+            until = time.monotonic() + timeout
+            while (status := _ask(self._server, {"poll": pid})) is None:
+                if time.monotonic() > until:
+                    os.kill(pid, signal.SIGKILL)
+                time.sleep(POLL_INTERVAL)
+            texts = []
+            for each in (out, err):
+                each.seek(0)
+                texts.append(each.read().decode(errors="replace"))
+        return subprocess.CompletedProcess(["errormotion", *map(str, arguments)], status, *texts)
+
+    def _fork(
+        self,
+        arguments: Sequence[Any],
+        cwd: Path | None,
+        environment: Mapping[str, str] | None,
+        out: int,
+        err: int,
+    ) -> int:
         request = {
             "arguments": list(map(str, arguments)),
             "cwd": str(cwd or Path.cwd()),
             "environment": dict(environment or {}),
         }
-        pid = _ask(self._server, request, [theirs_out, theirs_err])
-        os.close(theirs_out)
-        os.close(theirs_err)
-        return Command(self._server, pid, out, err)
+        return int(_ask(self._server, request, [out, err]))
 
 
 def _ask(server: socket.socket, request: Any, descriptors: Sequence[int] = ()) -> Any:
