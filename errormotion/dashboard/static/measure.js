@@ -133,7 +133,10 @@ async function check(change) {
   }
 }
 
-const changed = (place, value) => check({ place, value });
+let queue = Promise.resolve(); // fields change one after the other, each the text of the one before
+function changed(place, value) {
+  queue = queue.then(() => check({ place, value }));
+}
 text.addEventListener("input", () => {
   ready();
   clearTimeout(timer);
