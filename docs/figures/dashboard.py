@@ -68,6 +68,59 @@ period = "0.5 s"
 """
 OFF = {"X": False, "Y": False, "Z": False}
 """The control's own compensation."""
+MEASURING = """\
+schema = "errormotion.bench/1"
+name = "Virtual C-frame"
+[machine]
+name = "C-frame (virtual)"
+chain = "workpiece-X-Y-bed-Z-spindle-tool"
+travel.X = ["-305 mm", "305 mm"]
+travel.Y = ["-255 mm", "255 mm"]
+travel.Z = ["0 mm", "460 mm"]
+[instruments.control]
+driver = "virtual_controller"
+arm = true
+address = "sim://cframe/controller?seed=3"
+[instruments.frame]
+driver = "five_sensor_frame"
+address = "sim://cframe?seed=3&pace=30"
+rate = "1.5 kHz"
+[instruments.probe]
+driver = "controller_probe"
+arm = true
+address = "sim://cframe/controller?seed=3"
+tip_radius = "3 mm"
+noise = "0.18 um"
+approach_feed = "12 m/min"
+"""
+CAMPAIGN = """\
+schema = "errormotion.campaign/1"
+name = "Warm-up"
+bench = "measuring.toml"
+operator = "B. Keller"
+
+[[test]]
+name = "drift"
+method = "spindle_drift"
+[test.settings]
+duration = "10 min"
+average = "4 s"
+schedule = [{ at = "0 s", spindle_speed = "15000 /min" }]
+
+[[test]]
+name = "balls"
+method = "normal_vector"
+[test.settings]
+balls = [
+    { centre = ["-244 mm", "-204 mm", "55.2 mm"] },
+    { centre = ["244 mm", "-191.25 mm", "230 mm"] },
+    { centre = ["228.75 mm", "204 mm", "92 mm"] },
+]
+duration = "15 min"
+interval = "5 min"
+schedule = [{ at = "0 s", spindle_speed = "15000 /min" }]
+functional_point = ["0 mm", "0 mm", "0 mm"]
+"""
 COMPARED = ("drift", "balls")
 """Tests of the demonstration that state the same errors."""
 SECONDS = 40
@@ -137,7 +190,7 @@ def main(made: Path) -> None:
         shutil.copytree(made, Path(place) / runs)
         os.chdir(place)
         bench.write_text(BENCH)
-        address = start(runs, bench)
+        address = start(runs, bench, control=True)
         control = next(each for each in load_bench(bench).instruments if each.name == "control")
         with control.driver(control.address, control.settings) as machine:
             machine.spindle(15000)
@@ -163,7 +216,27 @@ def main(made: Path) -> None:
         page.wait_for_timeout(500)
         page.screenshot(path=pictures / "dashboard_compare.png", clip=clip, full_page=True)
         compensate(browser, pictures, Path("compensated"), SECONDS)
+        _measure(page, address, pictures)
         browser.close()
+
+
+def _measure(page: Any, address: str, pictures: Path) -> None:
+    """Take the pictures of a campaign before and while it runs."""
+    Path("measuring.toml").write_text(MEASURING)
+    Path("warm-up.toml").write_text(CAMPAIGN)
+    page.goto(address + "measure")
+    page.wait_for_selector(".count.good")
+    page.click("#plan")
+    page.wait_for_selector(".planned >> nth=1")
+    page.wait_for_timeout(500)
+    clip = {"x": 0, "y": 0, "width": 1280, "height": 1600}
+    page.screenshot(path=pictures / "dashboard_measure.png", clip=clip, full_page=True)
+    page.click("#start")
+    page.wait_for_selector("#live[data-drawn] canvas")
+    page.wait_for_timeout(8000)
+    page.screenshot(path=pictures / "dashboard_measuring.png")
+    page.click(".process button:text-is('Stop')")
+    page.wait_for_selector("#ended .interrupted", timeout=60_000)
 
 
 if __name__ == "__main__":
