@@ -852,9 +852,9 @@ class Bridge:
     async def spindle(self, speed: Any) -> None:
         """Turn the spindle at a speed in 1/min, backwards where it is negative; 0 stops it."""
         await self._demand(homed=False)
-        number, most = _number(speed, "spindle speed in 1/min"), self._fastest_spindle(speed)
+        number, most = _number(speed, "spindle speed in /min"), self._fastest_spindle(speed)
         if abs(number) > most:
-            raise RefusedError(f"expected a spindle speed of at most {most:g} 1/min; found {number:g}")
+            raise RefusedError(f"expected a spindle speed of at most {most:g} /min; found {number:g} /min")
         await self._mdi("M5" if number == 0 else f"{'M3' if number > 0 else 'M4'} S{abs(number):.3f}")
         if self.stat.state == self.cnc.RCS_ERROR:
             raise RefusedError(f"the spindle does not turn{await self._texts()}")
