@@ -93,12 +93,10 @@ tip_radius = "3 mm"
 noise = "0.18 um"
 approach_feed = "12 m/min"
 """
-CAMPAIGN = """\
+DRIFT = """\
 schema = "errormotion.campaign/1"
-name = "Warm-up"
+name = "Spindle drift"
 bench = "measuring.toml"
-operator = "B. Keller"
-
 [[test]]
 name = "drift"
 method = "spindle_drift"
@@ -106,6 +104,12 @@ method = "spindle_drift"
 duration = "10 min"
 average = "4 s"
 schedule = [{ at = "0 s", spindle_speed = "15000 /min" }]
+"""
+BALLS = """\
+schema = "errormotion.campaign/1"
+name = "Warm-up"
+bench = "measuring.toml"
+operator = "B. Keller"
 
 [[test]]
 name = "balls"
@@ -223,14 +227,16 @@ def main(made: Path) -> None:
 def _measure(page: Any, address: str, pictures: Path) -> None:
     """Take the pictures of a campaign before and while it runs."""
     Path("measuring.toml").write_text(MEASURING)
-    Path("warm-up.toml").write_text(CAMPAIGN)
-    page.goto(address + "measure")
-    page.wait_for_selector(".count.good")
-    page.click("#plan")
-    page.wait_for_selector(".planned >> nth=1")
-    page.wait_for_timeout(500)
-    clip = {"x": 0, "y": 0, "width": 1280, "height": 1600}
-    page.screenshot(path=pictures / "dashboard_measure.png", clip=clip, full_page=True)
+    for name, text in (("balls", BALLS), ("drift", DRIFT)):
+        Path(f"{name}.toml").write_text(text)
+        page.goto(f"{address}measure?file={name}.toml")
+        page.wait_for_selector(".count.good")
+        page.click("#plan")
+        page.wait_for_selector(".planned img")
+        page.wait_for_timeout(500)
+        if name == "balls":
+            clip = {"x": 0, "y": 0, "width": 1280, "height": 1500}
+            page.screenshot(path=pictures / "dashboard_measure.png", clip=clip, full_page=True)
     page.click("#start")
     page.wait_for_selector("#live[data-drawn] canvas")
     page.wait_for_timeout(8000)

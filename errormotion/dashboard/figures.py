@@ -57,7 +57,6 @@ def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
     freedoms, panels = [str(name) for name in ds["dof"].values], list[figure]()
     for k, freedom in enumerate(freedoms):
         factor, unit = field(freedom)
-        unit = unit.replace("um", "µm")
         values = factor * ds["value"].values[..., k].reshape(len(names), -1)
         bands = factor * expanded[..., k].reshape(len(names), -1)
         curves = [Curve(freedom, *each) for each in zip(names, [unit] * len(names), values, bands, strict=True)]
