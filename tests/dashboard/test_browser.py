@@ -140,4 +140,11 @@ def test_two_results_are_compared(
     page.wait_for_selector("#figure[data-drawn] canvas")
     assert "contradict each other" in page.inner_text("h2.bad")
     accessible()
+    page.click("text=Compensate")
+    page.click("text=What a compensation took off")
+    for name, number in (("before", 1), ("after", 2)):
+        page.select_option(f"#{name}", index=number)
+    page.click("button:has-text('Compare')")
+    page.wait_for_selector("#verdict-title")
+    accessible()
     assert page.evaluate("window.taken") is None

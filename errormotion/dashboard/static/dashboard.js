@@ -40,7 +40,7 @@ function follow(form) {
       drawn.id = `${target.id}-${own}`;
       target.replaceChildren(drawn);
       const before = views;
-      views = await Bokeh.embed.embed_item(found.item, drawn.id);
+      views = await Bokeh.embed.embed_item(sized(found.item), drawn.id);
       if (before) before.clear?.();
       const place = (found.point || []).map((each) => each.toLocaleString("en", { maximumFractionDigits: 4 }));
       note.textContent = form.querySelector("[data-home]") && place.length && !found.point.includes(null) ? `At the functional point X ${place[0]}, Y ${place[1]}, Z ${place[2]} mm.` : "";

@@ -321,7 +321,7 @@ async function live() { // the errors of the run that measures; the pause grows 
         place.id = `live-${Date.now()}`;
         const last = views;
         byId("live").replaceChildren(place);
-        views = await Bokeh.embed.embed_item(found.item, place.id);
+        views = await Bokeh.embed.embed_item(sized(found.item), place.id);
         if (last) {
           last.clear?.();
           Bokeh.documents.splice(0, Bokeh.documents.length - 1);
