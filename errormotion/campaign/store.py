@@ -24,6 +24,8 @@ from xarray.conventions import encode_cf_variable
 from zarr.codecs import BloscCodec
 
 from errormotion.campaign.folder import Presence, replace_text
+from errormotion.datasets.files.containers import LARGEST_METADATA
+from errormotion.datasets.files.reading import parse_json, read_bytes
 from errormotion.errors import RunError
 
 BLOCK_BYTES = 24 * 2**20
@@ -313,7 +315,7 @@ def committed_length(path: Path, dim: str) -> int:
     """
     file = path / "zarr.json"
     try:
-        root = json.loads(file.read_text(encoding="utf-8"))
+        root = parse_json(read_bytes(file, LARGEST_METADATA))
         if set(root) <= BEFORE_COMMIT and root["zarr_format"] == 3:
             return 0
         for metadata in root["consolidated_metadata"]["metadata"].values():
@@ -324,7 +326,7 @@ def committed_length(path: Path, dim: str) -> int:
         raise ValueError(f"no variable has a length along '{dim}'")
     except OSError as error:
         raise RunError(f"{file}: cannot be read: {error.strerror}") from error
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise RunError(f"{file}: is damaged; restore it from a copy ({error})") from error
 
 

@@ -233,10 +233,14 @@ def test_damaged_metadata_are_an_error_and_never_an_empty_store(tmp_path):
     shapeless = json.loads(good)
     for metadata in shapeless["consolidated_metadata"]["metadata"].values():
         metadata["shape"] = [float("nan")] * 2
+    flat = json.loads(good)
+    for metadata in flat["consolidated_metadata"]["metadata"].values():
+        metadata["shape"] = []
     damaged = (
         *("", "[]", "{}", "[" * 5000, good[:-20], good.replace("consolidated_metadata", "consolidated_metadatb")),
         json.dumps({**root, "consolidated_metadata": {"metadata": {}}}),
         json.dumps(shapeless),
+        json.dumps(flat),
     )
     for text in damaged:
         file.write_text(text)

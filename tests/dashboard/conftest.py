@@ -157,6 +157,7 @@ def browser() -> Iterator[Any]:
         pytest.skip("apt-get install chromium")
     if not AXE.is_file():
         pytest.skip("npm ci --prefix tests/peers")
+    sync_api.expect.set_options(timeout=30_000)
     with sync_api.sync_playwright() as playwright:
         started = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
         yield started

@@ -16,7 +16,10 @@ pytestmark = pytest.mark.slow
 BENCH = """\
 schema = "errormotion.bench/1"
 name = "Virtual C-frame"
-machine = "C-frame (virtual) {markup}"
+[machine]
+name = "C-frame (virtual) {markup}"
+chain = "workpiece-X-Y-bed-Z-spindle-tool"
+travel = {X = ["-300 mm", "300 mm"], Y = ["-200 mm", "200 mm"], Z = ["0 mm", "400 mm"]}
 [instruments.modules]
 driver = "dcon_temperature"
 address = "sim://cframe/thermometer?seed=3&sensors=spindle_front,column,ambient"
@@ -86,6 +89,9 @@ def test_values_live_and_a_sensor_that_is_unplugged(
     page.wait_for_selector(".tiles li.answers >> nth=1")
     assert "spindle front<script>" in page.inner_text("#temperatures")
     assert page.locator("#map svg").count() == 2
+    assert page.locator("#map .head + text").all_text_contents() == ["head: Z"] * 2
+    sync_api.expect(page.locator(".tiles .rate").first).to_contain_text("readings/s")
+    _shows_the_same(page, served.address)
     before = page.inner_text("#clock")
     sync_api.expect(page.locator("#clock")).not_to_have_text(before)
     accessible()
@@ -109,6 +115,19 @@ def test_values_live_and_a_sensor_that_is_unplugged(
         tmp_path / "runs", bench=bench, interval=0.5, port=int(served.address.rstrip("/").rpartition(":")[2])
     )
     page.wait_for_selector("body:not(.lost) .tiles li.answers >> nth=1")
+
+
+def _shows_the_same(page: Any, address: str) -> None:
+    """Require that another client has the same values at the same row of the log."""
+    shown = "() => [document.querySelector('#clock').innerText, document.querySelector('#temperatures').innerText]"
+    other = page.context.new_page()
+    other.goto(address)
+    end = time.monotonic() + 60
+    while (mine := page.evaluate(shown))[0] != (others := other.evaluate(shown))[0]:
+        assert time.monotonic() < end, "the clients never showed the same row"
+        time.sleep(0.1)
+    assert mine == others
+    other.close()
 
 
 def test_two_results_are_compared(

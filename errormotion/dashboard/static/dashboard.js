@@ -44,6 +44,8 @@ function follow(form) {
       if (before) before.clear?.();
       const place = (found.point || []).map((each) => each.toLocaleString("en", { maximumFractionDigits: 4 }));
       note.textContent = form.querySelector("[data-home]") && place.length && !found.point.includes(null) ? `At the functional point X ${place[0]}, Y ${place[1]}, Z ${place[2]} mm.` : "";
+      const space = document.getElementById("space");
+      if (space && own > 1) space.src = `${space.dataset.base}?${question}`;
       if (link) link.href = `${link.dataset.base}?${question}`;
       target.dataset.drawn = String(own);
     } catch (error) {

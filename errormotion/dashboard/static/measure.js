@@ -206,8 +206,7 @@ if (control) {
     const found = await order("/measure/start", { file: byId("name").value, text: text.value, before });
     if (found) {
       before = found.before;
-      byId("processes-card").hidden = false;
-      byId("processes-card").scrollIntoView();
+      reveal = found.process;
     }
     ready();
   });
@@ -277,7 +276,7 @@ function process(each) { // made anew only when something but the progress has c
   return card;
 }
 
-let running = null;
+let running = null, reveal = ""; // the run that measures, and the process that was started here just now
 
 async function processes() {
   try {
@@ -288,6 +287,10 @@ async function processes() {
       const made = own.map(process), place = byId(id);
       if (made.length !== place.children.length || made.some((card, k) => place.children[k] !== card)) place.replaceChildren(...made);
       byId(`${id}-card`).hidden = !own.length;
+    }
+    if (names.has(reveal)) {
+      byId("processes-card").scrollIntoView();
+      reveal = "";
     }
     const now = found.find((each) => each.alive && each.stage === "measuring" && each.tests.length);
     running = now ? now.tests.find((test) => test.name === now.test)?.run ?? null : null;
