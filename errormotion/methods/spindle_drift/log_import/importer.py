@@ -159,6 +159,7 @@ def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
             f"The map states no uncertainty of the beams: {1e3 * _ORIGIN:g} mm and {1e3 * _DIRECTION:g} mrad are "
             "assumed, as for a frame that was not calibrated."
         )
+        attrs["beam_uncertainty"] = "assumed"
     if notes:
         attrs[NOTES] = json.dumps(notes)
     return xr.Dataset(variables, coords, attrs)
