@@ -352,12 +352,12 @@ class Offsets:
         route = self.route
         if not route:
             raise RefusedError("LinuxCNC has not loaded compensation.tcl; name it in the INI file")
-        planned = self._three("errormotion-limit-{}.out")
-        offset, asked = planned, planned
+        before = self._three("errormotion-limit-{}.out")
+        offset, asked = before, before
         if route == "external":
             # The servo thread goes on meanwhile: both are compared with what was planned before and after.
             offset, asked = self._three("axis.{}.eoffset"), self._three("axis.{}.eoffset-request")
-        planned = [planned, self._three("errormotion-limit-{}.out")]
+        planned = [before, self._three("errormotion-limit-{}.out")]
         return {
             "route": route,
             "offset": [unit * x for x in offset],
@@ -434,7 +434,8 @@ class Offsets:
 
 def _distance(values: list[float], bounds: list[list[float]]) -> float:
     """Return by how much a value is farthest outside of its two bounds; 0 within them."""
-    return max(max(min(a, b) - x, x - max(a, b), 0.0) for x, a, b in zip(values, *bounds))  # noqa: B905
+    first, second = bounds
+    return max(max(min(a, b) - x, x - max(a, b), 0.0) for x, a, b in zip(values, first, second))  # noqa: B905
 
 
 class Bridge:
