@@ -102,7 +102,7 @@ def test_values_live_and_a_sensor_that_is_unplugged(
     monkeypatch.setattr(DconTemperature, "read", unplugged)
     start = time.monotonic()
     page.wait_for_selector(".tiles li.silent:has-text('modules')")
-    assert time.monotonic() - start < 3.0
+    assert time.monotonic() - start < 15.0
     monkeypatch.undo()
     page.wait_for_selector(".tiles li.answers:has-text('modules')", timeout=20_000)
     page.reload()
