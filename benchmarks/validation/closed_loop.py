@@ -49,8 +49,9 @@ def section(seeds: int) -> Iterator[str]:
         "",
         "The machines of both tables are different ones. One warm-up determines few coefficients, and left-out blocks "
         "of it have its speeds: they do not show what the coefficients are worth at others. The selection therefore "
-        "adds the variance of the prediction with sources of heat that act each by itself, and takes one sensor at least. "
-        "Without both, models were chosen that are not followed (limit of U: 20 um), or that knew the speed alone.",
+        "adds the variance of the prediction with sources of heat that act each by itself, and takes one sensor at "
+        "least. Without both, models were chosen that are not followed (limit of U: 20 um), or that knew the speed "
+        "alone.",
     )
 
 
