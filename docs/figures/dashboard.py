@@ -131,19 +131,22 @@ SECONDS = 40
 """Time that the bench is watched before the picture is taken, s: as many minutes of the virtual machine."""
 
 
-def start(runs: Path, bench: Path | None, **more: Any) -> str:
-    """Serve in a thread that ends with this program; return the address."""
-    found: list[str] = []
+def start(page: Any, runs: Path, bench: Path | None, **more: Any) -> str:
+    """Serve in a thread that ends with this program, to a page that knows the token; return the address."""
+    found: list[tuple[str, str]] = []
     ready = threading.Event()
 
-    def started(address: str, _: Any) -> None:
-        found.append(address)
+    def started(address: str, access: Any) -> None:
+        found.append((address, access.session))
         ready.set()
 
     options = Options(runs, port=0, bench=bench, interval=0.5, **more)
     threading.Thread(target=lambda: asyncio.run(serve(options, started)), daemon=True).start()
     ready.wait()
-    return found[0]
+    ((address, session),) = found
+    name = f"errormotion-{address.rstrip('/').rpartition(':')[2]}"
+    page.context.add_cookies([{"name": name, "value": session, "url": address}])
+    return address
 
 
 def model(path: Path) -> None:
@@ -180,7 +183,7 @@ def compensate(browser: Any, pictures: Path, runs: Path, seconds: float) -> None
     """Take the picture of the page Compensate while a compensation is armed."""
     with compensating(runs):
         page = browser.new_page(viewport={"width": 1280, "height": 800})
-        page.goto(start(runs, None, control=True) + "compensate")
+        page.goto(start(page, runs, None, control=True) + "compensate")
         page.wait_for_selector(".at-work.armed")
         page.wait_for_timeout(1000 * seconds)
         clip = {"x": 0, "y": 0, "width": 1280, "height": 1450}
@@ -194,12 +197,12 @@ def main(made: Path) -> None:
         shutil.copytree(made, Path(place) / runs)
         os.chdir(place)
         bench.write_text(BENCH)
-        address = start(runs, bench, control=True)
         control = next(each for each in load_bench(bench).instruments if each.name == "control")
         with control.driver(control.address, control.settings) as machine:
             machine.spindle(15000)
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1280, "height": 800})
+        address = start(page, runs, bench, control=True)
         page.goto(address + "now")
         page.wait_for_timeout(1000 * SECONDS)
         page.screenshot(path=pictures / "dashboard_now.png", full_page=True)

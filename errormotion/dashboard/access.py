@@ -59,12 +59,16 @@ class Access:
         return not self.token or _equal(session or "", self.session)
 
 
-def access_for(host: str, names: Iterable[str] = (), *, secure: bool = False) -> Access:
-    """Return the rules of a server that listens on an address: without loopback, a new token is required."""
+def access_for(host: str, names: Iterable[str] = (), *, secure: bool = False, control: bool = False) -> Access:
+    """Return the rules of a server that listens on an address.
+
+    A new token is required where other computers reach it, and where it may start what moves a machine: every user of
+    this computer reaches loopback.
+    """
     known = {"localhost", host, platform.node(), *names}
     return Access(
         frozenset(name.casefold() for name in known if name),
-        "" if is_loopback(host) else secrets.token_urlsafe(24),
+        "" if is_loopback(host) and not control else secrets.token_urlsafe(24),
         secure,
     )
 

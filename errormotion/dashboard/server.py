@@ -144,7 +144,7 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
     """
     context_of_tls = _encryption(options)
     watch = Watch(load_bench(options.bench), options.runs, options.interval) if options.bench is not None else None
-    access = access_for(options.host, options.names, secure=context_of_tls is not None)
+    access = access_for(options.host, options.names, secure=context_of_tls is not None, control=options.control)
     with (
         ThreadPoolExecutor(WORKERS, thread_name_prefix="errormotion-dashboard") as workers,
         ThreadPoolExecutor(SLOW_WORKERS, thread_name_prefix="errormotion-dashboard-slow") as slow,

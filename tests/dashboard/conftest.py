@@ -32,13 +32,22 @@ class Served:
     address: str
     access: Access
     stop: Callable[[], None]
+    cookie: str = ""
+    """Session of a client that has presented the token; empty: `ask` is one that has not."""
+
+    def enter(self, page: Any, path: str) -> None:
+        """Open a page in a browser that has presented the token."""
+        name, _, value = self.cookie.partition("=")
+        page.context.add_cookies([{"name": name, "value": value, "url": self.address}])
+        page.goto(self.address + path)
 
     def ask(self, path: str, method: str = "GET", body: str = "", **headers: str) -> tuple[int, dict[str, str], str]:
         """Return status, headers and text of an answer."""
         where = urlsplit(self.address)
         connection = http.client.HTTPConnection(str(where.hostname), where.port, timeout=20)
         try:
-            connection.request(method, path, body or None, {"Accept": "text/html", **headers})
+            own = {"Accept": "text/html"} | ({"Cookie": self.cookie} if self.cookie else {})
+            connection.request(method, path, body or None, {**own, **headers})
             answer = connection.getresponse()
             return answer.status, dict(answer.getheaders()), answer.read().decode()
         finally:
@@ -99,7 +108,10 @@ def key(runs: Path) -> str:
 
 @pytest.fixture(scope="module")
 def serving() -> Iterator[Callable[..., Served]]:
-    """Return a function that serves a folder of runs in a thread until the tests of a module end."""
+    """Return a function that serves a folder of runs in a thread until the tests of a module end.
+
+    Where control is allowed on this computer, its client has presented the token.
+    """
     from errormotion.dashboard.server import Options, serve
 
     stops: list[Callable[[], None]] = []
@@ -117,7 +129,9 @@ def serving() -> Iterator[Callable[..., Served]]:
                     thread.join(20)
 
             def started(address: str, access: Access) -> None:
-                found.append(Served(address, access, stop))
+                known = access.token and "host" not in options
+                port = urlsplit(address).port
+                found.append(Served(address, access, stop, f"errormotion-{port}={access.session}" if known else ""))
                 stops.append(stop)
                 ready.set()
 

@@ -46,8 +46,8 @@ schedule = [{ at = "0 s", spindle_speed = "15000 /min" }]
 
 
 @pytest.fixture
-def mortal(tmp_path: Path) -> Iterator[tuple[Any, str]]:
-    """Return the process of a dashboard that can be killed, and its address; at the end nothing runs."""
+def mortal(tmp_path: Path) -> Iterator[tuple[Any, str, str]]:
+    """Return the process of a dashboard that can be killed, its address and its token; at the end nothing runs."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     options = ["--campaigns", str(tmp_path), "--allow-control", "--port", str(port), "--no-browser"]
@@ -60,7 +60,8 @@ def mortal(tmp_path: Path) -> Iterator[tuple[Any, str]]:
     assert process.stdout is not None
     address = re.search(r"http://\S+", process.stdout.readline())
     assert address
-    yield process, address[0]
+    token = process.stdout.readline().rpartition(" ")[2].strip()
+    yield process, address[0], token
     process.kill()
     process.communicate()
     end = time.monotonic() + 30.0
@@ -75,7 +76,7 @@ def mortal(tmp_path: Path) -> Iterator[tuple[Any, str]]:
 def test_a_campaign_is_corrected_planned_run_stopped_resumed_and_outlives_the_dashboard(
     page: Any,
     accessible: Callable[[], None],
-    mortal: tuple[Any, str],
+    mortal: tuple[Any, str, str],
     serving: Callable[..., Any],
     tmp_path: Path,
     markup: str,
@@ -83,8 +84,12 @@ def test_a_campaign_is_corrected_planned_run_stopped_resumed_and_outlives_the_da
     expect, name = sync_api.expect, markup.replace("'", "")
     (tmp_path / "bench.toml").write_text(MEASURING.replace("{markup}", markup.replace("'", "").replace('"', "")))
     (tmp_path / "drift.toml").write_text(CAMPAIGN.replace("{markup}", name))
-    dashboard, address = mortal
+    dashboard, address, token = mortal
+    page.expected_errors = ("403",)
     page.goto(address + "measure")
+    page.fill("#token", token)
+    page.keyboard.press("Enter")
+    page.click("nav >> text=Measure")
     duration = page.locator("""[data-place='["test",0,"settings","duration"]']""")
     expect(duration).to_have_value("40 s")
     duration.fill("2")
@@ -117,13 +122,15 @@ def test_a_campaign_is_corrected_planned_run_stopped_resumed_and_outlives_the_da
     page.click(".process button:text-is('Stop')")
     page.click("#ended .process:has(.interrupted) button:text-is('Resume')")
     page.wait_for_selector(".process.alive")
-    page.expected_errors = ("ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_EMPTY_RESPONSE")
+    page.expected_errors = ("403", "ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_EMPTY_RESPONSE")
     dashboard.kill()
     dashboard.wait()
     page.wait_for_selector("body.lost")
     assert processes.found(tmp_path / "runs")[0].alive
     port = int(address.rstrip("/").rpartition(":")[2])
-    serving(tmp_path / "runs", campaigns=tmp_path, control=True, port=port)
+    again = serving(tmp_path / "runs", campaigns=tmp_path, control=True, port=port)
+    expect(page.locator("#lost")).to_have_text("The token is required")
+    again.enter(page, "measure")
     page.wait_for_selector("body:not(.lost) .process:has(.finished)", timeout=90_000)
     page.click("#ended .process:has(.finished) >> text=Report of drift")
     page.locator("iframe").scroll_into_view_if_needed()

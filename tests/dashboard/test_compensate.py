@@ -101,7 +101,7 @@ def test_a_shadow_then_armed_then_zero(
     from playwright.sync_api import expect
 
     page.expected_errors = ("400",)
-    page.goto(served.address + "compensate")
+    served.enter(page, "compensate")
     assert page.locator("#none").inner_text() == "No compensation is at work."
 
     # A shadow writes nothing.
@@ -126,13 +126,13 @@ def test_a_shadow_then_armed_then_zero(
     # The name of the machine arms. The dashboard that started it ends; another one finds it, and without control it
     # shows the same without a button.
     second = serving(place.runs, control=True, campaigns=place.folder)
-    page.goto(second.address + "compensate")
+    second.enter(page, "compensate")
     page.check("input[value=armed]")
     page.fill("#machine", MACHINE)
     page.click("button:has-text('Start')")
     page.wait_for_selector(".at-work.armed:has-text('following')")
     second.stop()
-    page.goto(served.address + "compensate")
+    served.enter(page, "compensate")
     page.wait_for_selector(".at-work.armed:has-text('following')")
     until(lambda: place.plc.machine.offset[0] != 0.0)
     run = next(folder for folder in compensations(place.runs) if is_working(folder))
@@ -165,7 +165,7 @@ def test_the_stop_of_the_machine_and_an_altered_log_are_shown(
     model = place.folder / "model.nc"
     thread = threading.Thread(target=follow)
     thread.start()
-    page.goto(served.address + "compensate")
+    served.enter(page, "compensate")
     page.wait_for_selector(".at-work.armed:has-text('following')")
     place.plc.machine.fault = "emergency stop"
     page.wait_for_selector("#alarms li:has-text('the PLC states stop')")

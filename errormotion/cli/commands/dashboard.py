@@ -53,7 +53,7 @@ def run(
         show(f"The dashboard is at {address}  (Ctrl-C ends it)")
         if access.token:
             show(f"Token, shown only here: {access.token}")
-            if not access.secure:
+            if not access.secure and not is_loopback(host):
                 show("The connection is not encrypted: anyone on the network can read it. Give --cert and --key.")
         sys.stdout.flush()
         if browser and is_loopback(host) and sys.stdout.isatty():  # in a thread: some browsers return when they end
