@@ -57,7 +57,7 @@ def main() -> None:
     if unknown := set(options.parts) - set(PARTS):
         parser.error(f"expected parts of {', '.join(PARTS)}; found {', '.join(sorted(unknown))}")
     found = sections(options.out)
-    for name in options.parts or PARTS:
+    for name in options.parts or [name for name, part in PARTS.items() if getattr(part, "DEFAULT", True)]:
         part, start = PARTS[name], time.perf_counter()
         seeds = options.seeds or part.SEEDS
         given = {"workers": options.workers, "cache": options.cache}

@@ -50,7 +50,7 @@ def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
     model = fit([with_warm_sensors(before)], MODEL)
     compensation = Compensation(plan.bench, model.dataset, runs, arm=plan.bench.machine)
     states: Counter[str] = Counter()
-    with _following(compensation, states):
+    with following(compensation, states):
         (second,) = work(plan, runs=runs, quiet=as_json)
     found = effect(before, _errors(second))
     model.save(compensation.folder.path / "model.nc")
@@ -79,7 +79,7 @@ def _errors(folder: RunFolder) -> xr.Dataset:
 
 
 @contextmanager
-def _following(compensation: Compensation, states: Counter[str]) -> Iterator[None]:
+def following(compensation: Compensation, states: Counter[str]) -> Iterator[None]:
     """Compensate in another thread; after the block the offset ramps to zero.
 
     Raises

@@ -1,0 +1,195 @@
+"""The closed loop with the real LinuxCNC: it probes a warm-up and, with offsets in its servo thread, another one.
+
+``python benchmarks/validate.py closed_loop_linuxcnc --cache FOLDER``; of a single machine (several at a time need a
+network and IPC namespace each): ``PYTHONPATH=benchmarks python -m validation.closed_loop_linuxcnc SEED FOLDER``.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from itertools import chain, count, islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from errormotion import datasets
+from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.files import load_campaign
+from errormotion.cli.commands.run import work
+from errormotion.cli.demo import compensated_probing
+from errormotion.cli.demo.closed_loop import DISPLACEMENTS, with_warm_sensors
+from errormotion.compensation.online.prediction import predictor
+from errormotion.compensation.thermal_model import Settings, fit
+from errormotion.instruments.simulators import world
+from validation.closed_loop import VARIATION, individual
+
+TITLE = "Closed loop on LinuxCNC"
+SEEDS = 10
+DEFAULT = False
+"""Takes hours of real time, and needs LinuxCNC: only where it is named."""
+FIRST = 48
+"""Seed of the first machine."""
+INTERVAL = 420.0
+"""From one cycle to the next, simulated s."""
+CYCLES = {"training": 8, "compensated": 6}
+MODEL = Settings(variant="lagged", lags=(), most_sensors=2)
+"""Present temperatures alone: simulated minutes pass at once, and the compensation would take them for seconds."""
+BALLS = (0, 2, 3)
+ROUTES = {"feedback": "linuxcnc_feedback", "external": "linuxcnc_offset"}
+
+
+class Keeper:
+    """Keeps the world of a machine between two runs."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def section(seeds: int, cache: Path | None = None) -> Iterator[str]:
+    """Yield the lines of the section; machines whose result is in the cache are not run again."""
+    folder = cache or Path(tempfile.mkdtemp(prefix="closed-loop-"))
+    yield (
+        f"{seeds} virtual C-frame machines, varied as above (up to {VARIATION:.0%}), under the real LinuxCNC on "
+        "simulated joints. Each touch is a motion of LinuxCNC in real time; between two cycles "
+        f"{INTERVAL / 60:g} simulated minutes pass at once, and the slew limit is therefore 20 um/s. A first warm-up "
+        f"of {CYCLES['training']} cycles at 15000, then 5000 /min is probed (3 balls, 4 touches each) and a model "
+        "fitted to it: present temperatures, of at most 2 sensors. In the second warm-up, from the cold state, with "
+        f"random speeds and {CYCLES['compensated']} cycles, the code of `errormotion compensate run` reads the "
+        "thermometers in Modbus and writes to LinuxCNC: in the feedback path, or as external offsets. `without`: root "
+        "mean square of the true displacement (EX, EY, EZ together) of the second warm-up, without compensation, at "
+        "the times of the cycles after the cold one; `with`: the same as LinuxCNC probed it with the compensation, the "
+        "scatter of the probe (0.4 um a touch) included."
+    )
+    yield from ("", "| machine | route | sensors | without/um | with/um | remaining | following |")
+    yield "|---|---|---|---|---|---|---|"
+    found: list[dict[str, Any]] = []
+    kept = sorted(int(file.stem) for file in folder.glob("[0-9]*.json"))
+    new = (seed for seed in count(FIRST) if seed not in kept)
+    for seed in islice(chain(kept, new), seeds):
+        file = folder / f"{seed}.json"
+        if not file.exists():
+            subprocess.run(
+                [sys.executable, "-m", "validation.closed_loop_linuxcnc", str(seed), str(folder)], check=True
+            )
+        each = json.loads(file.read_text())
+        found.append(each)
+        yield (
+            f"| {seed} | {each['route']} | {', '.join(each['sensors'])} | {each['without']:.2f} | {each['with']:.2f} "
+            f"| {each['with'] / each['without']:.1%} | {each['following']:.0%} |"
+        )
+    remaining = [each["with"] / each["without"] for each in found]
+    yield (
+        f"\nMean of `remaining`: {np.mean(remaining):.1%}, largest {np.max(remaining):.1%}; larger than without: "
+        f"{sum(each > 1 for each in remaining)} of {len(remaining)}."
+    )
+
+
+def closed(seed: int, folder: Path) -> dict[str, Any]:
+    """Return the figures of one machine."""
+    rng = np.random.default_rng([seed, 16])
+    route = list(ROUTES)[seed % 2]
+    here = world("cframe", seed)
+    here.attach(Keeper())
+    here.machine.state = individual("cframe", seed, np.random.default_rng([seed, 15])).state
+    at, further = 0.0, []
+    while at < INTERVAL * CYCLES["compensated"]:
+        further.append((at, float(np.round(rng.uniform(3000, here.machine.top_speed), -2))))
+        at += rng.uniform(600, 1500)
+    half = INTERVAL * CYCLES["training"] / 2
+
+    def measured(name: str, schedule: list[tuple[float, float]]) -> tuple[Any, np.ndarray]:
+        plan = load_campaign(_written(folder, name, seed, route, schedule))
+        (run,) = work(plan, runs=folder, quiet=True, with_report=False)
+        with datasets.load(run.errors or run.path) as errors:
+            errors.load()
+        truth = here.machine.truth_probing(errors["time"].values, errors.attrs["functional_point"])
+        true = np.stack([truth[each].values for each in DISPLACEMENTS], axis=-1)
+        return errors, true[1:] - true[0]
+
+    kept = folder / f"{seed}-training.nc"  # of a run that was interrupted
+    if not kept.exists():
+        here.start([])
+        datasets.save(measured("training", [(0.0, 15000.0), (half, 5000.0)])[0], kept)
+    with datasets.load(kept) as training:
+        model = fit([with_warm_sensors(training.load())], MODEL)
+    bench = load_campaign(_written(folder, "compensated", seed, route, further)).bench
+    here.start([])  # cold: the first readings are the reference
+    compensation = Compensation(bench, model.dataset, folder, arm=bench.machine)
+    states: Counter[str] = Counter()
+    with compensated_probing.following(compensation, states):
+        after, without = measured("compensated", further)
+    return {
+        "seed": seed,
+        "route": route,
+        "sensors": list(predictor(model.dataset).temperatures),
+        "without": 1e6 * _size(without),
+        "with": 1e6 * _size(_displacement(after)),
+        "following": states["following"] / states.total(),
+    }
+
+
+def _displacement(errors: Any) -> np.ndarray:
+    """Return the measured displacement after the cold cycle, (n, 3)."""
+    values = np.stack([errors[each].values for each in DISPLACEMENTS], axis=-1)
+    return np.asarray(values[1:] - values[0])
+
+
+def _size(displacement: np.ndarray) -> float:
+    return float(np.sqrt((displacement**2).sum(axis=1).mean()))
+
+
+def _written(folder: Path, name: str, seed: int, route: str, schedule: list[tuple[float, float]]) -> Path:
+    """Write the demonstration's bench and campaign for a machine."""
+    source = compensated_probing.CAMPAIGN
+    bench = (source.parent / "compensated_bench.toml").read_text()
+    bench = bench.replace("seed=3", f"seed={seed}").replace("route=feedback", f"route={route}")
+    bench = bench.replace("linuxcnc_feedback", ROUTES[route])
+    bench = bench.replace('driver = "linuxcnc"', 'driver = "linuxcnc"\ntimeout = "10 s"')  # a busy computer
+    bench = bench.replace("repeats = 1", 'repeats = 1\ncontroller_settings = { timeout = "10 s" }')
+    (folder / f"{seed}-bench.toml").write_text(bench)
+    nominal = 1e3 * world("cframe", seed).machine.balls.nominal
+    balls = ", ".join(
+        f'{{ name = "B{k + 1}", centre = [{", ".join(f"""{chr(34)}{x:.3f} mm{chr(34)}""" for x in nominal[k])}] }}'
+        for k in BALLS
+    )
+    speeds = ", ".join(f'{{ at = "{at:.0f} s", spindle_speed = "{speed:.0f} /min" }}' for at, speed in schedule)
+    file = folder / f"{seed}-{name}.toml"
+    file.write_text(f"""schema = "errormotion.campaign/1"
+name = "Closed loop, {name}"
+bench = "{seed}-bench.toml"
+
+[[test]]
+name = "probing"
+method = "normal_vector"
+[test.settings]
+balls = [{balls}]
+touches = 4
+approach = "2 mm"
+overtravel = "1 mm"
+duration = "{INTERVAL * (CYCLES[name] - 1):.0f} s"
+interval = "{INTERVAL:.0f} s"
+schedule = [{speeds}]
+tool_axes = "Z"
+""")
+    return file
+
+
+def main() -> None:
+    """Run one machine, and write its figures."""
+    seed, folder = int(sys.argv[1]), Path(sys.argv[2]).resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(closed(seed, folder))
+    partial = folder / f"{seed}.part"
+    partial.write_text(text)
+    partial.rename(folder / f"{seed}.json")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
