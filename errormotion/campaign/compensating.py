@@ -255,7 +255,7 @@ class Compensation:
             watchdog then ramps to zero.
         """
         able = 0.0  # the last time when the machine took offsets, or no stop had been asked for
-        readings = 0  # since the last offset
+        readings = 0  # since the last offset was written
         for snapshot in self._monitor.watch():
             if snapshot.time >= duration or (self.folder.path / STOP).exists():
                 self.stop()
@@ -266,9 +266,10 @@ class Compensation:
             if stuck and snapshot.time - able >= self.limits.hold:
                 return
             if self.state is State.OFF:
-                readings += 1
-                if not self.armed or readings > CONFIRMATIONS or (moment.applied and is_zero(moment.applied)):
+                zero = readings > 0 and moment.applied is not None and is_zero(moment.applied)
+                if not self.armed or zero or readings == CONFIRMATIONS:
                     return
+                readings += 1
 
     def _moment(self, snapshot: Snapshot) -> Moment:
         prediction, cause = self._predict(snapshot)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
@@ -124,6 +124,14 @@ class CampaignTable(BaseModel):
         return value
 
 
+class MistakesError(BenchError):
+    """A file with mistakes, each of which begins with its key; ``more`` is the message of a second file."""
+
+    def __init__(self, source: Path, mistakes: Sequence[str], more: str = "") -> None:
+        super().__init__("\n".join(filter(None, [tomlfile.report(source, mistakes), more])))
+        self.source, self.mistakes, self.more = source, tuple(mistakes), more
+
+
 @dataclass(frozen=True)
 class BenchInstrument:
     """One instrument of a bench: the driver's class and its checked settings."""
@@ -235,7 +243,7 @@ def load_bench(path: str | Path) -> BenchPlan:
     _refuse_other(path, tomlfile.read_toml(path, error=BenchError), "bench")
     plan = parse_bench(path.read_text(encoding="utf-8-sig"), path)
     if mistakes := head.logo_mistakes(plan.laboratory, path.parent):
-        raise BenchError(tomlfile.report(path, mistakes))
+        raise MistakesError(path, mistakes)
     return plan
 
 
@@ -248,7 +256,19 @@ def load_campaign(path: str | Path) -> CampaignPlan:
         A file cannot be read, or contains errors; all errors of a file in one message.
     """
     path = Path(path)
-    data = tomlfile.read_toml(path, error=BenchError)
+    tomlfile.read_toml(path, error=BenchError)
+    return campaign_of(path.read_text(encoding="utf-8-sig"), path)
+
+
+def campaign_of(text: str, path: Path) -> CampaignPlan:
+    """Check the text of a campaign file, and the bench file that it names; ``path`` is where it stands or will stand.
+
+    Raises
+    ------
+    BenchError
+        The bench file cannot be read, or one of both contains errors; all errors of a file in one message.
+    """
+    data = tomlfile.parse_toml(text, path, error=BenchError)
     _refuse_other(path, data, "campaign")
     bench = data.get("bench")
     plan, bench_error = None, None
@@ -259,13 +279,15 @@ def load_campaign(path: str | Path) -> CampaignPlan:
             there = os.path.isfile(path.parent / bench)
             bench_error = error if there else BenchError(f"{path}: bench: {error}")
     try:
-        campaign = parse_campaign(path.read_text(encoding="utf-8-sig"), path, plan)
-    except BenchError as error:
+        campaign = parse_campaign(text, path, plan)
+    except MistakesError as error:
         if bench_error is None:
             raise
-        raise bench_error if not str(error).strip() else BenchError(f"{error}\n{bench_error}") from None
+        raise MistakesError(path, error.mistakes, str(bench_error)) from None
+    except BenchError:
+        raise bench_error or BenchError(f"{path}: the bench cannot be read") from None
     if mistakes := list(_missing(campaign)):
-        raise BenchError(tomlfile.report(path, mistakes))
+        raise MistakesError(path, mistakes)
     return campaign
 
 
@@ -321,7 +343,7 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
     mistakes += found
     mistakes += head.until_mistakes(table.calibrated_until, table.instruments) if table else []
     if table is None or mistakes:
-        raise BenchError(tomlfile.report(source, mistakes))
+        raise MistakesError(source, mistakes)
     return BenchPlan(
         name=table.name,
         machine=table.machine,
@@ -364,7 +386,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         earlier.append(test.name)
     mistakes += _timeline_mistakes(table, bench) if table else []
     if table is None or mistakes:
-        raise BenchError(tomlfile.report(source, mistakes))
+        raise MistakesError(source, mistakes)
     if bench is None:
         raise BenchError("")
     tests = []

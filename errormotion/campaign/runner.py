@@ -139,6 +139,7 @@ def run(
 def resume(
     campaign: CampaignPlan | None = None,
     *,
+    run_id: str = "",
     runs: Path | None = None,
     progress: Progress | None = None,
     ask: Callable[[str], None] | None = None,
@@ -150,6 +151,8 @@ def resume(
     ----------
     campaign : CampaignPlan, optional
         Continue only this one. Its files must not have changed since it was started.
+    run_id : str, optional
+        Continue only the campaign with this ``id`` in its ``run.json``.
     runs, progress, ask, report
         As for :func:`run`.
 
@@ -162,7 +165,7 @@ def resume(
     groups: dict[str, list[RunFolder]] = {}
     skipped: list[str] = []
     for folder in list_runs(runs, skipped):
-        if "campaign" not in folder.data:  # a log
+        if "campaign" not in folder.data or (run_id and folder.data["id"] != run_id):  # a log, or another one
             continue
         groups.setdefault(str(folder.data["id"]), []).append(folder)
     changed = ""
@@ -175,7 +178,7 @@ def resume(
                 if campaign.name == stated["name"]:
                     changed = changed or folders[-1].path.name
                 continue
-            plan = _stored_plan(folders[0])
+            plan = stored_plan(folders[0])
         except (ErrormotionError, KeyError, TypeError, AttributeError) as error:
             if campaign and isinstance(error, ErrormotionError):  # it is the one that was asked for
                 raise
@@ -528,7 +531,7 @@ def settings_hash(settings: Mapping[str, Any], method: str, method_version: str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def _stored_plan(folder: RunFolder) -> CampaignPlan:
+def stored_plan(folder: RunFolder) -> CampaignPlan:
     """Return the plan of a run as of its start."""
     campaign, bench = folder.data["campaign"], folder.data["bench"]
     plan = parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})")

@@ -37,6 +37,12 @@ app.add_typer(model_app, name="model")
 compensate_app = typer.Typer(no_args_is_help=True, help="Compensate measured errors.", rich_markup_mode=None)
 app.add_typer(compensate_app, name="compensate")
 
+background_app = typer.Typer(
+    no_args_is_help=True, help="Campaigns that 'errormotion run --detach' or the dashboard has started.",
+    rich_markup_mode=None,
+)  # fmt: skip
+app.add_typer(background_app, name="background")
+
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
 Runs = Annotated[
     Path | None, typer.Option("--runs", help="Folder for run folders; default: the folder that the campaign names.")
@@ -135,7 +141,8 @@ def init(
 @guarded
 def run(
     campaign: Annotated[
-        Path | None, typer.Argument(help="A campaign file; optional with --resume.", show_default=False)
+        Path | None,
+        typer.Argument(help="A campaign file; with --resume optional, or a run folder.", show_default=False),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the newest unfinished campaign.")] = False,
     runs: Runs = None,
@@ -146,6 +153,12 @@ def run(
         bool, typer.Option("--dry-run", help="Report path and duration only; nothing is opened or moved.")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="With --dry-run: a folder for pictures of the path.")] = None,
+    detach: Annotated[
+        bool, typer.Option("--detach", help="Run in a process of its own, which outlives this terminal.")
+    ] = False,
+    publish: Annotated[
+        Path | None, typer.Option(help="Publish the progress in this folder, and wait there for answers.")
+    ] = None,
     json_: Json = False,
 ) -> None:
     """Run the tests of a campaign: acquire, identify, report."""
@@ -162,7 +175,13 @@ def run(
         raise typer.Exit(USAGE)
     from errormotion.cli.commands import run as command
 
-    command.run(campaign, resume=resume, runs=runs, yes=yes, with_report=report, tolerances=tolerances, as_json=json_)
+    if detach:
+        command.detach(campaign, resume=resume, runs=runs, as_json=json_)
+        return
+    command.run(
+        campaign, resume=resume, runs=runs, yes=yes, with_report=report, tolerances=tolerances, as_json=json_,
+        publish=publish,
+    )  # fmt: skip
 
 
 @app.command()
@@ -285,6 +304,32 @@ def compensate_run(
         bench, model, runs, arm=arm, since=since, functional_point=point, duration=duration, as_json=json_
     )
     raise typer.Exit(code)
+
+
+@compensate_app.command("status")
+@guarded
+def compensate_status(
+    folder: Annotated[Path, typer.Argument(help="A folder of runs, or the run folder of one compensation.")] = Path(
+        "runs"
+    ),
+    json_: Json = False,
+) -> None:
+    """Show what compensations do now, whoever started them, and check their audit logs."""
+    from errormotion.cli.commands import following as command
+
+    raise typer.Exit(command.status(folder, json_))
+
+
+@compensate_app.command("stop")
+@guarded
+def compensate_stop(
+    folder: Annotated[Path, typer.Argument(help="The run folder of a compensation.")],
+    json_: Json = False,
+) -> None:
+    """Ask a compensation to ramp to zero and end, as Ctrl-C in its terminal does."""
+    from errormotion.cli.commands import following as command
+
+    command.stop(folder, json_)
 
 
 @app.command()
@@ -577,6 +622,37 @@ def dashboard(
     from errormotion.cli.commands import dashboard as command
 
     command.run(runs, bench, interval, host, port, name or [], cert, key, browser, campaigns, allow_control)
+
+
+Process = Annotated[str | None, typer.Option(help="Name of the process; needed if there are several.")]
+OfRuns = Annotated[Path, typer.Argument(help="The folder of runs.")]
+
+
+@background_app.command("list")
+@guarded
+def background_list(runs: OfRuns = Path("runs"), json_: Json = False) -> None:
+    """List the processes of a folder of runs: where they are, and what they request."""
+    from errormotion.cli.commands import background as command
+
+    command.listed(runs, json_)
+
+
+@background_app.command("answer")
+@guarded
+def background_answer(runs: OfRuns = Path("runs"), process: Process = None) -> None:
+    """State that the request to the operator is done."""
+    from errormotion.cli.commands import background as command
+
+    command.answer(runs, process)
+
+
+@background_app.command("stop")
+@guarded
+def background_stop(runs: OfRuns = Path("runs"), process: Process = None) -> None:
+    """Stop a campaign, as Ctrl-C does; it can be resumed."""
+    from errormotion.cli.commands import background as command
+
+    command.stop(runs, process)
 
 
 @app.command()

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -175,14 +176,13 @@ class Compensations:
             found[str(self.bench)] = self.bench
             if (self.folder / self.bench.name).resolve() == self.bench.resolve():
                 found.pop(self.bench.name, None)
-        return [
-            self._benches.get((name, *stamp(path)), lambda n=name, p=path: _bench(n, p)) for name, path in found.items()
-        ]
+        return [self._benches.get((name, *stamp(path)), partial(_bench, name, path)) for name, path in found.items()]
 
     def models(self) -> list[Model]:
         """Return the models of the folder and of the folder of runs."""
-        paths = [*_files(self.folder, ".nc"), *_files(self.runs, ".nc")]
-        found = [self._models.get(stamp(path), lambda p=path: _model(p)) for path in paths]
+        paths = {path.name: path for path in _files(self.folder, ".nc")}
+        paths |= {f"{self.runs.name}/{path.name}": path for path in _files(self.runs, ".nc")}
+        found = [self._models.get((name, *stamp(path)), partial(_model, name, path)) for name, path in paths.items()]
         return [each for each in found if each is not None]
 
     def start(self, bench: str, model: str, arm: str | None) -> Start:
@@ -221,6 +221,7 @@ class Compensations:
             )
         finally:
             os.close(descriptor)
+        threading.Thread(target=process.wait, daemon=True).start()  # no zombie stays, whether anybody asks or not
         started = Start(bench, model, arm is not None, datetime.now(UTC), process, Path(name))
         self.starts.appendleft(started)
         return started
@@ -249,14 +250,14 @@ def _bench(name: str, path: Path) -> Bench:
         return Bench(name, path, None, str(error))
 
 
-def _model(path: Path) -> Model | None:
+def _model(name: str, path: Path) -> Model | None:
     try:
         if path.stat().st_size > LARGEST_MODEL:
             return None
         with reading(path), datasets.load(path) as found:
             inputs = predictor(found)
             machine = str(found.attrs.get("machine", "unknown"))
-            return Model(str(path), path, machine, (*inputs.temperatures, *inputs.parameters))
+            return Model(name, path, machine, (*inputs.temperatures, *inputs.parameters))
     except (ErrormotionError, OSError):
         return None
 
@@ -278,4 +279,4 @@ def _three(values: Any) -> list[Any]:
 
 
 def _um(value: Any) -> str:
-    return f"{1e6 * value:+.2f}" if isinstance(value, int | float) else "unknown"
+    return f"{round(1e6 * value, 2) + 0.0:+.2f}" if isinstance(value, int | float) else "unknown"

@@ -57,7 +57,6 @@ def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
     freedoms, panels = [str(name) for name in ds["dof"].values], list[figure]()
     for k, freedom in enumerate(freedoms):
         factor, unit = field(freedom)
-        unit = unit.replace("um", "µm")
         values = factor * ds["value"].values[..., k].reshape(len(names), -1)
         bands = factor * expanded[..., k].reshape(len(names), -1)
         curves = [Curve(freedom, *each) for each in zip(names, [unit] * len(names), values, bands, strict=True)]
@@ -108,12 +107,13 @@ def following_item() -> dict[str, Any]:
     looks = (("asked", "from the prediction", 0), ("offset", "offset", 1), ("applied", "in effect", 2))
     for axis in "XYZ":
         plot = _axes(f"{axis} / µm", None, last=axis == "Z", x_axis_type="datetime")
-        plot.height = 170 + 40 * (axis == "X") + 30 * (axis == "Z")
+        plot.height = 150 + 35 * (axis == "X") + 40 * (axis == "Z")
+        plot.xaxis.visible = axis == "Z"
         columns = ("x", "asked", "low", "high", "offset", "applied")
         source = ColumnDataSource({name: [] for name in columns}, name=axis)
         plot.varea("x", "low", "high", source=source, color=_look(0)[0], alpha=0.18)
         for name, title, number in looks:
-            dash = [6.0, 4.0] if name == "applied" else []
+            dash = [6, 4] if name == "applied" else []
             given = {"legend_label": title} if axis == "X" else {}
             line = plot.line("x", name, source=source, color=_look(number)[0], line_width=2.0, line_dash=dash, **given)
             tips = [("time", "@x{%H:%M:%S}"), (title, f"@{name}{{0.00}} µm")]
@@ -165,7 +165,7 @@ def _axes(unit: str, label: str | None, *, last: bool, **options: Any) -> figure
     )
     for axis in plot.axis:
         axis.axis_label_text_font, axis.major_label_text_font = FONT, FONT
-        axis.axis_label_text_font_style, axis.axis_label_text_font_size = "normal", "13px"
+        axis.axis_label_text_font_style, axis.axis_label_text_font_size = "normal", "14px"
         axis.major_label_text_font_size, axis.major_label_text_color = "12px", SOFT
         axis.axis_label_text_color, axis.axis_line_color = INK, SOFT
         axis.minor_tick_line_color, axis.major_tick_line_color = None, SOFT
@@ -184,7 +184,7 @@ def _legend(plot: figure) -> None:
     plot.center.remove(legend)
     plot.add_layout(legend, "above")
     legend.orientation, legend.border_line_color, legend.padding = "horizontal", None, 2
-    legend.ncols, legend.label_text_font, legend.label_text_font_size = 8, FONT, "13px"
+    legend.ncols, legend.label_text_font, legend.label_text_font_size = 8, FONT, "14px"
     legend.label_text_color = INK
 
 

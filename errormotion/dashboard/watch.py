@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -37,13 +38,18 @@ PARAMETERS = (
 _STATES = ("spindle_speed", "spindle_load", "feed")
 LONGEST_TEXT = 200
 """Characters of a text from a device."""
+RATE_SPAN = 10.0
+"""Time over which the rate of readings is counted, s."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """One instrument: ``state`` is ``answers``, ``waiting`` or ``silent``; since when, and why."""
+    """One instrument: ``state`` is ``answers``, ``waiting`` or ``silent``; since when, and why.
+
+    ``rate`` is the number of readings per second lately, ``missed`` that of rows of the log without a reading.
+    """
 
     name: str
     kind: str
@@ -52,6 +58,7 @@ class Instrument:
     since: datetime
     why: str = ""
     missed: int = 0
+    rate: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -148,6 +155,8 @@ class Watch:
         self._last: Snapshot | None = None
         self._known: tuple[tuple[Any, ...], Present] | None = None
         self._since: dict[str, tuple[str, datetime]] = {}
+        most = 1 + max(2, math.ceil(RATE_SPAN / interval))
+        self._counts = {each.name: deque[tuple[float, int]](maxlen=most) for each in self._monitor.sources}
         self._began, self._error, self._running = _now(), "", False
         self._thread = threading.Thread(target=self._work, name="errormotion-watch", daemon=True)
 
@@ -236,6 +245,7 @@ class Watch:
                 self._began = _now() - timedelta(seconds=snapshot.time)
             self._last = snapshot
             for source in self._monitor.sources:
+                self._counts[source.name].append((snapshot.time, source.readings))
                 self._instrument(source)
             self._history.put(snapshot.time, row)
             first, low, high = self._extremes
@@ -254,7 +264,8 @@ class Watch:
         model = f"{identity.manufacturer} {identity.model}" if identity is not None else ""
         missed = self._last.gaps.get(source.name, 0) if self._last is not None else 0
         kind = str(source.instrument.driver.info.kind)
-        return Instrument(source.name, kind, _text(model), state, since, _text(why), missed)
+        rate = _rate(self._counts[source.name])
+        return Instrument(source.name, kind, _text(model), state, since, _text(why), missed, rate)
 
     def _place(self, name: str) -> tuple[float, ...] | None:
         place = self._places.get(name)
@@ -263,6 +274,13 @@ class Watch:
     def _run_name(self) -> str:
         folder = getattr(self._monitor, "folder", None)
         return folder.path.name if folder is not None else ""
+
+
+def _rate(counts: Sequence[tuple[float, int]]) -> float:
+    """Return the readings per second between the first and the last of (time, number); NaN if unknown."""
+    if len(counts) < 2 or not counts[-1][0] > counts[0][0]:
+        return math.nan
+    return (counts[-1][1] - counts[0][1]) / (counts[-1][0] - counts[0][0])
 
 
 def _row(snapshot: Snapshot, names: Mapping[str, str]) -> list[float]:

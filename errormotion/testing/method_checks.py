@@ -27,6 +27,7 @@ from errormotion.testing.instrument_checks import check_settings
 from errormotion.testing.kit import Checks, require
 from errormotion.testing.redraw_checks import sources_as_stated, sources_drawn, why_no_redrawing
 from errormotion.testing.results import covariance, functional_point, names, sigma, values
+from errormotion.testing.text_checks import chapters_translated, why_no_texts
 
 METHOD_CHECKS: Checks[MethodSubject] = Checks()
 
@@ -144,6 +145,7 @@ METHOD_CHECKS.add(limit=300.0)(coverage)
 METHOD_CHECKS.add(limit=300.0)(differences)
 METHOD_CHECKS.add(limit=60.0, why_not=why_no_redrawing)(sources_drawn)
 METHOD_CHECKS.add(limit=300.0, why_not=why_no_redrawing)(sources_as_stated)
+METHOD_CHECKS.add(why_not=why_no_texts)(chapters_translated)
 
 
 @METHOD_CHECKS.add()

@@ -17,6 +17,8 @@ from errormotion.methods.normal_vector import simulation
 from errormotion.report import write_report, write_run_report
 from errormotion.twin import VirtualMachine
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 MEANINGS = ["known", "open", "shorted", "out of range", "no answer", "unknown"]
 
 

@@ -12,6 +12,8 @@ from errormotion.cli.app import app
 from errormotion.compensation.thermal_model import Settings, fit
 from errormotion.twin import Event, VirtualMachine
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 PROGRAM = """%
 N10 G21 G90 G17 G54
 N20 G0 X0 Y0

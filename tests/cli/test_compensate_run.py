@@ -11,10 +11,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.files import load_bench
 from errormotion.cli.app import app
+from errormotion.compensation.online.follower import State
 from errormotion.compensation.thermal_model import ThermalModel
 from errormotion.compensation.thermal_model.features import Feature
 from errormotion.compensation.thermal_model.model import Parts
+from errormotion.datasets import load
 
 MACHINE = "Mill 5"
 BENCH = f"""
@@ -39,7 +43,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     Path("bench.toml").write_text(BENCH, encoding="utf-8")
-    from errormotion.campaign.files import load_bench
     from errormotion.campaign.monitor.watch import Monitor
 
     sensor = Monitor(load_bench("bench.toml"), Path("runs")).sensors[0]
@@ -113,3 +116,27 @@ def test_ctrl_c_ramps_to_zero_a_second_one_ends_at_once(place: Path, signals: in
     process.stdout.close()
     if process.stderr is not None:
         process.stderr.close()
+
+
+def test_another_command_sees_it_and_has_it_ramp_to_zero(place: Path) -> None:
+    def call(*arguments: str, code: int = 0) -> str:
+        result = CliRunner().invoke(app, ["compensate", *arguments])
+        assert result.exit_code == code, result.output
+        return result.output
+
+    with Compensation(load_bench("bench.toml"), load("model.nc"), Path("runs"), arm=MACHINE) as compensation:
+        folder = compensation.folder.path
+        moments = compensation.follow()
+        assert any(moment.step.state is State.FOLLOWING and moment.step.offset.any() for moment in moments)
+        (found,) = json.loads(call("status", "--json"))["compensations"]
+        assert (found["working"], found["status"]["state"], found["status"]["armed"]) == (True, "following", True)
+        call("stop", str(folder))
+        rest = list(moments)
+    assert rest[-1].step.state is State.OFF
+    assert rest[-1].applied == (0.0, 0.0, 0.0)
+    assert json.loads((place / "offset.json").read_text())["X"] == 0.0
+    assert "ended: off" in call("status")
+    assert "nothing to stop" in call("stop", str(folder), code=1)
+    lines = (folder / "audit.jsonl").read_text().splitlines(keepends=True)
+    (folder / "audit.jsonl").write_text("".join(lines[:1] + lines[2:]))
+    assert "line 2 does not follow" in call("status", str(folder), code=1)

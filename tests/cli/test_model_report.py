@@ -12,6 +12,8 @@ from errormotion.cli.app import app
 from errormotion.compensation.thermal_model import Settings, fit
 from errormotion.twin import Event, VirtualMachine
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 OFF = {"X": False, "Y": False, "Z": False}
 
 

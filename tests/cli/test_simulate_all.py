@@ -6,8 +6,6 @@ import os
 import random
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from forked_commands import Commands
 
 from errormotion import plugins
 from errormotion.campaign.files import load_bench
@@ -89,15 +88,18 @@ def free_port() -> int:
             return port
 
 
+@pytest.fixture(scope="module")
+def commands() -> Iterator[Commands]:
+    with Commands() as commands:
+        yield commands
+
+
 @contextmanager
-def simulated(plugin_id: str, *arguments: str) -> Iterator[tuple[dict[str, Any], int]]:
+def simulated(commands: Commands, plugin_id: str, *arguments: str) -> Iterator[tuple[dict[str, Any], int]]:
     """Start a device; yield what was printed and its port. It must end at SIGTERM and leave nothing."""
     port = free_port()
-    command = [sys.executable, "-m", "errormotion", "simulate", plugin_id, "--port", str(port), *arguments, "--json"]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as process:
-        assert process.stdout is not None
+    process = commands.start("simulate", plugin_id, "--port", port, *arguments, "--json")
+    with contextlib.closing(process):
         try:
             text = ""
             while not text.rstrip().endswith("\n}"):
@@ -110,7 +112,7 @@ def simulated(plugin_id: str, *arguments: str) -> Iterator[tuple[dict[str, Any],
             assert (process.returncode, rest) == (0, "")
             assert "Traceback" not in complaints
         finally:
-            process.kill()
+            process.send_signal(signal.SIGKILL)
     assert nobody_left_of(process.pid)
     with socket.create_server(("127.0.0.1", port)):  # the port is free again
         pass
@@ -142,7 +144,7 @@ def test_every_simulated_instrument_is_here() -> None:
 
 @pytest.mark.parametrize("plugin_id", CASES)
 def test_a_bench_with_the_printed_address_reads_a_device_in_another_process(
-    plugin_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    plugin_id: str, commands: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "token").write_text("x" * 64)
@@ -150,7 +152,7 @@ def test_a_bench_with_the_printed_address_reads_a_device_in_another_process(
     if plugin_id == "linuxcnc" and (reason := linuxcnc_process.why_not()):
         pytest.skip(reason)
     case = CASES[plugin_id]
-    with simulated(plugin_id, *case.arguments) as (printed, port):
+    with simulated(commands, plugin_id, *case.arguments) as (printed, port):
         assert str(port) in printed["url"]
         assert [url.rpartition(":")[2] for url in printed["lines"].values()] == [
             str(port + number) for number in range(1, case.lines + 1)

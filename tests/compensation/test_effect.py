@@ -21,6 +21,8 @@ from errormotion.errors import DatasetError
 from errormotion.methods.normal_vector import simulation
 from errormotion.twin import Event, VirtualMachine
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 UM = 1e-6
 TIMES = np.linspace(0.0, 7200.0, 13)
 START = "2026-03-02T07:00:00+00:00"

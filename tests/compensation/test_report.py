@@ -14,6 +14,8 @@ from errormotion.report import write_report
 from errormotion.report.text import fixed
 from errormotion.twin import Event, VirtualMachine
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 OFF = {"X": False, "Y": False, "Z": False}
 SPEEDS = ((4000.0, 8000.0), (9000.0, 3000.0), (6000.0, 7000.0), (15000.0, 15000.0))
 SIZE = [1e-6] * 3 + [np.pi / 180 / 3600] * 3

@@ -2,6 +2,8 @@
 
 import asyncio
 import http.client
+import re
+import shutil
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,6 +20,7 @@ from errormotion.dashboard.access import Access
 from errormotion.datasets import provenance
 from errormotion.datasets.results.build import build_errors
 
+AXE = Path(__file__).parents[1] / "peers" / "node_modules" / "axe-core" / "axe.min.js"
 MARKUP = "<script>window.taken='yes'</script>&amp;\"'"
 """What stands in each name that comes from a file."""
 
@@ -142,3 +145,53 @@ def open_to_the_network(serving: Callable[..., Served], runs: Path) -> Served:
     served = serving(runs, host="0.0.0.0")
     served.address = served.address.replace("0.0.0.0", "127.0.0.1")
     return served
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Return Chromium."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+    names = ("chromium", "chromium-browser", "google-chrome")
+    found = next(filter(None, map(shutil.which, names)), None)
+    if found is None:
+        pytest.skip("apt-get install chromium")
+    if not AXE.is_file():
+        pytest.skip("npm ci --prefix tests/peers")
+    sync_api.expect.set_options(timeout=30_000)
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    """Return an empty page; at the end nobody else was asked, and nothing failed in it."""
+    context = browser.new_context(viewport={"width": 1280, "height": 800}, accept_downloads=True)
+    context.set_default_timeout(30_000)
+    found = context.new_page()
+    asked: list[str] = []
+    wrong: list[str] = []
+    found.on("request", lambda request: asked.append(request.url))
+    found.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
+    found.on("pageerror", lambda error: wrong.append(str(error)))
+    found.expected_errors = ()
+    yield found
+    left = [text for text in wrong if not any(part in text for part in found.expected_errors)]
+    foreign = [url for url in asked if not re.match(r"(https?://127\.0\.0\.1:\d+/|data:|blob:)", url)]
+    context.close()
+    assert (foreign, left) == ([], [])
+    assert asked
+
+
+@pytest.fixture
+def accessible(page: Any) -> Callable[[], None]:
+    """Return a function that refuses what axe-core finds wrong on the page by WCAG 2.2 AA."""
+
+    def check() -> None:
+        page.evaluate(AXE.read_text())
+        options = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]}
+        found = page.evaluate("options => axe.run(document, options)", options)
+        assert [(each["id"], each["nodes"][0]["html"]) for each in found["violations"]] == []
+
+    return check

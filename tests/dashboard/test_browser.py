@@ -1,9 +1,7 @@
 """The dashboard in Chromium: what a person sees, without a request to others or an error in the console."""
 
-import re
-import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +11,15 @@ from errormotion.errors import InstrumentTimeoutError
 from errormotion.instruments.thermometer.dcon import DconTemperature
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-AXE = Path(__file__).parents[1] / "peers" / "node_modules" / "axe-core" / "axe.min.js"
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="apt-get install chromium"),
-    pytest.mark.skipif(not AXE.is_file(), reason="npm ci --prefix tests/peers"),
-]
+pytestmark = pytest.mark.slow
 
 BENCH = """\
 schema = "errormotion.bench/1"
 name = "Virtual C-frame"
-machine = "C-frame (virtual) {markup}"
+[machine]
+name = "C-frame (virtual) {markup}"
+chain = "workpiece-X-Y-bed-Z-spindle-tool"
+travel = {X = ["-300 mm", "300 mm"], Y = ["-200 mm", "200 mm"], Z = ["0 mm", "400 mm"]}
 [instruments.modules]
 driver = "dcon_temperature"
 address = "sim://cframe/thermometer?seed=3&sensors=spindle_front,column,ambient"
@@ -37,53 +32,19 @@ address = "sim://cframe/controller?seed=3&clock=60"
 """
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield started
-        started.close()
-
-
-@pytest.fixture
-def page(browser: Any) -> Iterator[Any]:
-    """Return an empty page; at the end nobody else was asked, and nothing failed in it."""
-    context = browser.new_context(viewport={"width": 1280, "height": 800}, accept_downloads=True)
-    context.set_default_timeout(30_000)
-    found = context.new_page()
-    asked: list[str] = []
-    wrong: list[str] = []
-    found.on("request", lambda request: asked.append(request.url))
-    found.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
-    found.on("pageerror", lambda error: wrong.append(str(error)))
-    found.expected_errors = ()
-    yield found
-    left = [text for text in wrong if not any(part in text for part in found.expected_errors)]
-    foreign = [url for url in asked if not re.match(r"(https?://127\.0\.0\.1:\d+/|data:|blob:)", url)]
-    context.close()
-    assert (foreign, left) == ([], [])
-    assert asked
-
-
-def accessible(page: Any) -> None:
-    """Refuse what axe-core finds wrong by WCAG 2.2 AA."""
-    page.evaluate(AXE.read_text())
-    options = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]}
-    found = page.evaluate("options => axe.run(document, options)", options)
-    assert [(each["id"], each["nodes"][0]["html"]) for each in found["violations"]] == []
-
-
-def test_results_and_a_run_at_another_functional_point(page: Any, open_to_this_computer: Any) -> None:
+def test_results_and_a_run_at_another_functional_point(
+    page: Any, accessible: Callable[[], None], open_to_this_computer: Any
+) -> None:
     page.goto(open_to_this_computer.address + "results")
     assert "Mill <script>" in page.inner_text("table")
-    accessible(page)
+    accessible()
     page.select_option("#status", "finished")
     page.keyboard.press("Tab")
     page.click("button[type=submit]")
     assert page.inner_text(".count").startswith("1 of 2 runs")
     page.click("tbody a")
     page.wait_for_selector("#figure[data-drawn='1'] canvas")
-    accessible(page)
+    accessible()
     with page.expect_download() as download:
         page.click("text=NetCDF")
     assert download.value.suggested_filename.endswith("errors.nc")
@@ -99,10 +60,10 @@ def test_results_and_a_run_at_another_functional_point(page: Any, open_to_this_c
     assert page.evaluate("window.taken") is None
 
 
-def test_the_token_is_asked_for(page: Any, open_to_the_network: Any) -> None:
+def test_the_token_is_asked_for(page: Any, accessible: Callable[[], None], open_to_the_network: Any) -> None:
     page.expected_errors = ("403",)
     page.goto(open_to_the_network.address + "results")
-    accessible(page)
+    accessible()
     page.keyboard.type("wrong")
     page.keyboard.press("Enter")
     page.wait_for_selector("text=This is not the token")
@@ -113,7 +74,12 @@ def test_the_token_is_asked_for(page: Any, open_to_the_network: Any) -> None:
 
 
 def test_values_live_and_a_sensor_that_is_unplugged(
-    page: Any, serving: Callable[..., Any], tmp_path: Path, markup: str, monkeypatch: pytest.MonkeyPatch
+    page: Any,
+    accessible: Callable[[], None],
+    serving: Callable[..., Any],
+    tmp_path: Path,
+    markup: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bench = tmp_path / "bench.toml"
     bench.write_text(BENCH.replace("{markup}", markup.replace("'", "").replace('"', "")))
@@ -123,9 +89,12 @@ def test_values_live_and_a_sensor_that_is_unplugged(
     page.wait_for_selector(".tiles li.answers >> nth=1")
     assert "spindle front<script>" in page.inner_text("#temperatures")
     assert page.locator("#map svg").count() == 2
+    assert page.locator("#map .head + text").all_text_contents() == ["head: Z"] * 2
+    sync_api.expect(page.locator(".tiles .rate").first).to_contain_text("readings/s")
+    _shows_the_same(page, served.address)
     before = page.inner_text("#clock")
     sync_api.expect(page.locator("#clock")).not_to_have_text(before)
-    accessible(page)
+    accessible()
 
     def unplugged(self: Any) -> Any:
         raise InstrumentTimeoutError("no answer within 0.5 s")
@@ -133,7 +102,7 @@ def test_values_live_and_a_sensor_that_is_unplugged(
     monkeypatch.setattr(DconTemperature, "read", unplugged)
     start = time.monotonic()
     page.wait_for_selector(".tiles li.silent:has-text('modules')")
-    assert time.monotonic() - start < 3.0
+    assert time.monotonic() - start < 15.0
     monkeypatch.undo()
     page.wait_for_selector(".tiles li.answers:has-text('modules')", timeout=20_000)
     page.reload()
@@ -148,12 +117,34 @@ def test_values_live_and_a_sensor_that_is_unplugged(
     page.wait_for_selector("body:not(.lost) .tiles li.answers >> nth=1")
 
 
-def test_two_results_are_compared(page: Any, serving: Callable[..., Any], pair_of_runs: tuple[Path, list[str]]) -> None:
+def _shows_the_same(page: Any, address: str) -> None:
+    """Require that another client has the same values at the same row of the log."""
+    shown = "() => [document.querySelector('#clock').innerText, document.querySelector('#temperatures').innerText]"
+    other = page.context.new_page()
+    other.goto(address)
+    end = time.monotonic() + 60
+    while (mine := page.evaluate(shown))[0] != (others := other.evaluate(shown))[0]:
+        assert time.monotonic() < end, "the clients never showed the same row"
+        time.sleep(0.1)
+    assert mine == others
+    other.close()
+
+
+def test_two_results_are_compared(
+    page: Any, accessible: Callable[[], None], serving: Callable[..., Any], pair_of_runs: tuple[Path, list[str]]
+) -> None:
     page.goto(serving(pair_of_runs[0]).address + "compare")
     for box in page.locator("input[name=run]").all():
         box.check()
     page.click("button:has-text('Compare')")
     page.wait_for_selector("#figure[data-drawn] canvas")
     assert "contradict each other" in page.inner_text("h2.bad")
-    accessible(page)
+    accessible()
+    page.click("text=Compensate")
+    page.click("text=What a compensation took off")
+    for name, number in (("before", 1), ("after", 2)):
+        page.select_option(f"#{name}", index=number)
+    page.click("button:has-text('Compare')")
+    page.wait_for_selector("#verdict-title")
+    accessible()
     assert page.evaluate("window.taken") is None

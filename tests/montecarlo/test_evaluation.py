@@ -21,6 +21,8 @@ from errormotion.montecarlo.store import Store
 from errormotion.plugins import MethodInfo, Needs, PluginSettings, Redraw, Redrawing
 from errormotion.report.document import Source
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 TRIALS = 40
 NOISE, OFFSET = 0.5e-6, 0.9e-6  # m
 

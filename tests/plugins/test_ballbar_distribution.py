@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forked_commands import Commands
 
 from errormotion import datasets
 
@@ -43,11 +44,16 @@ def installed(tmp_path_factory):
     for name in ("bench.toml", "campaign.toml", "import.toml"):
         shutil.copy(EXAMPLE / name, work)
 
-    def command(*arguments, code=0):
-        return run("-m", "errormotion", *arguments, folder=work, site=site, code=code)
+    with Commands([site, ROOT]) as commands:
 
-    command.work, command.site = work, site
-    return command
+        def command(*arguments, code=0):
+            """Return what a command prints; it runs in a process of its own, forked from one with this path."""
+            done = commands.run(*arguments, cwd=work, environment={"COLUMNS": "200"})
+            assert done.returncode == code, done.stdout + done.stderr
+            return done.stdout
+
+        command.work, command.site = work, site
+        yield command
 
 
 @pytest.fixture(scope="module")

@@ -25,6 +25,8 @@ from errormotion.record.history import history
 from errormotion.record.listing import list_runs
 from errormotion.report import write_run_report
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 FIRST = datetime(2024, 1, 10, 8, tzinfo=UTC)
 BEFORE = 14
 """Runs before the step of 10 um; the machine was hit between this one and the one before."""

@@ -16,6 +16,8 @@ from errormotion.report.page.verdict import share, verdict
 from errormotion.tolerances.conformity import Conformity, Row
 from errormotion.tolerances.table import Tolerances
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 HOSTILE = '</style><script>alert("1")</script>'
 HEAD = {
     "laboratory": "Measuring room",

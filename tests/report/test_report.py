@@ -15,6 +15,8 @@ from errormotion.report import provenance, write_report
 from errormotion.report.document import Source
 from errormotion.report.series import commanded_speed
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 VOID = {"meta", "br", "hr", "img", "link", "input", "col", "wbr"}
 
 

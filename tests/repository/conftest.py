@@ -5,6 +5,7 @@
 ``code-block`` with a ``:caption:`` is a file and is written. Other languages (``text``, ``sh``) are only shown.
 ``% skip: next`` leaves out one block.
 
+``make demo``, with which two pages begin, runs once: each gets what was printed, and a copy of the files.
 A call of ``errormotion`` runs in this process, which has its libraries loaded already: that takes seconds a command.
 Anything else runs in a shell, as does every command of the README. Workers share the pages by files of tests.
 """
@@ -14,10 +15,13 @@ import glob
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
+import tempfile
 import traceback
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -32,12 +36,12 @@ from errormotion.instruments import simulators
 
 ROOT = Path(__file__).parents[2]
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+SLOW = ("README.md", "docs/tutorial/index.md", "docs/how-to/measure-a-crossbeam.md")
+"""Pages that take more than about 10 s."""
 
 
 def _line_of_make(command: str) -> str:
-    """Return the command to run: ``make TARGET`` becomes what the Makefile does, here instead of in the repository."""
-    if not command.startswith("make "):
-        return command
+    """Return what the Makefile does for ``make TARGET``, to be run here instead of in the repository."""
     outside = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
     recipe = subprocess.run(
         ["make", "-n", "-s", *command.split()[1:]], cwd=ROOT, env=outside, capture_output=True, text=True, check=True
@@ -70,7 +74,23 @@ def _here(command: str) -> tuple[int, str]:
     return result.exit_code, output
 
 
+@cache
+def _made(command: str) -> tuple[int, str, Path]:
+    """Run a command in the current folder; return its exit code, its output and a folder with a copy of its files."""
+    code, output = _in_a_shell(command)
+    kept = Path(tempfile.mkdtemp(prefix="made-", dir=Path.cwd().parent))
+    shutil.copytree(Path.cwd(), kept, dirs_exist_ok=True)
+    return code, output, kept
+
+
 def _run(command: str, page: Path) -> tuple[int, str]:
+    if command.startswith("make "):
+        command = _line_of_make(command)
+        if any(Path.cwd().iterdir()):
+            return _in_a_shell(command)
+        code, output, kept = _made(command)
+        shutil.copytree(kept, Path.cwd(), dirs_exist_ok=True)
+        return code, output
     plain = re.match(r"errormotion [^|&;<>$`]*$", command)
     return _here(command) if plain and page.name != "README.md" else _in_a_shell(command)
 
@@ -82,7 +102,7 @@ def run_console(example: Example) -> str | None:
         return "A console block starts with '$ ' and a command."
     for part in parts:
         command, _, want = part.replace("\\\n", "").partition("\n")
-        code, output = _run(_line_of_make(command), Path(example.path))
+        code, output = _run(command, Path(example.path))
         if code:
             return f"$ {command}\nended with exit code {code}:\n{output}"
         if want.strip() and not doctest.OutputChecker().check_output(want.strip(), output.strip(), FLAGS):
@@ -127,7 +147,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
     file = Path(metafunc.module.__file__).stem
     mine = [page for page in pages if page.exists() and home(page) == file and list(parse(page))]
-    metafunc.parametrize("documented", [pytest.param(page, id=str(page.relative_to(ROOT))) for page in mine])
+    names = {str(page.relative_to(ROOT)): page for page in mine}
+    marks = {name: [pytest.mark.slow] if name in SLOW else [] for name in names}
+    metafunc.parametrize("documented", [pytest.param(names[name], id=name, marks=marks[name]) for name in names])
 
 
 @pytest.fixture

@@ -60,6 +60,8 @@ class Source:
         Its identity when it was last opened.
     error : str
         Cause of a missing reading; empty while readings arrive.
+    readings : int
+        Number of readings so far.
     """
 
     def __init__(self, instrument: BenchInstrument, interval: float, clock: Clock) -> None:
@@ -69,6 +71,7 @@ class Source:
         self.interval = interval
         self.answer: Answer | None = None
         self.error = "has not answered yet"
+        self.readings = 0
         self._driver: Any = None
         self._reading: Reading | None = None
         self._stop = threading.Event()
@@ -119,6 +122,7 @@ class Source:
                     self._open()
                     values = dict(self._driver.read())
                     self._reading = Reading(self._clock.now(), values, _flags(self._driver, values))
+                    self.readings += 1
                 except Exception as error:  # noqa: BLE001 - reported to the operator, and retried
                     failed += 1
                     self._note(cause_of(error))

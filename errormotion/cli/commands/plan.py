@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-import xarray as xr
 
 from errormotion import datasets
 from errormotion.campaign.files import load_campaign
+from errormotion.campaign.planning.expected import expected, planned
 from errormotion.cli.output import show, show_json, table, working
-from errormotion.cli.summary import FIELD_UNITS, notes_of
-from errormotion.datasets.files.folders import looking_beside
+from errormotion.cli.summary import notes_of
 from errormotion.errors import BenchError
 
 
@@ -32,13 +28,13 @@ def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) ->
         )
     if out is not None and len(chosen) > 1:
         raise BenchError(f"{campaign}: one file holds the plan of one test; name it with --test")
-    with working("Computing the uncertainty to expect"), looking_beside(plan.folder):
-        planned = [(entry, entry.method().plan(entry.settings)) for entry in chosen]
+    with working("Computing the uncertainty to expect"):
+        found = [(entry, planned(plan, entry)) for entry in chosen]
     if out is not None:
-        datasets.save(planned[0][1], out)
+        datasets.save(found[0][1], out)
     plans = [
-        {"test": entry.name, "method": entry.method.info.id, "expected": _expected(ds), "notes": notes_of(ds)}
-        for entry, ds in planned
+        {"test": entry.name, "method": entry.method.info.id, "expected": expected(ds), "notes": notes_of(ds)}
+        for entry, ds in found
     ]
     if as_json:
         show_json({"ok": True, "plans": plans, "out": str(out) if out else None})
@@ -49,16 +45,3 @@ def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) ->
         show(table(["", "U (k=2)", ""], rows))
         for note in part["notes"]:
             show(f"note: {note}")
-
-
-def _expected(errors: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the expanded uncertainty (k = 2) of every known estimate, the largest in the dataset."""
-    variances = np.diagonal(errors.em.covariance().values, axis1=-2, axis2=-1)
-    found = []
-    for k, name in enumerate(errors.em.names):
-        seen = variances[..., k][np.isfinite(variances[..., k])]
-        if seen.size:
-            factor, unit = FIELD_UNITS[errors[name].attrs["units"]]
-            largest = 2.0 * float(np.sqrt(seen.max())) * factor
-            found.append({"name": name, "expanded_uncertainty": largest, "unit": unit})
-    return found

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import asdict
-from typing import Any, get_args
-
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
+from typing import Any
 
 from errormotion import plugins
+from errormotion.campaign.form.written import default_of
 from errormotion.cli.output import show, show_json, table
-from errormotion.datasets.units import Quantity, format_quantity
 from errormotion.errors import PluginError
 
 
@@ -64,58 +60,9 @@ def show_plugin(plugin_id: str, as_json: bool) -> None:
         stated.append(["needs", f"{', '.join(cls.needs.instruments)}; raw schema {cls.needs.raw_schema}"])
     show(table(["plugin", plugin_id], stated))
     fields = settings.model_fields if settings else {}
-    rows = [[name, _default(field), str(field.description or "")] for name, field in fields.items()]
+    rows = [[name, default_of(field), str(field.description or "")] for name, field in fields.items()]
     show()
     show(table(["setting", "default", "meaning"], rows) if rows else "This plugin has no settings.")
-
-
-_FIELD_UNITS = {"m": ("mm", "um", "m"), "rad": ("arcsec", "deg"), "s": ("s", "min", "h", "ms"), "Hz": ("Hz", "kHz")}
-"""Units that people use, by the inside unit; of two alike the first."""
-
-
-def _default(field: FieldInfo) -> str:
-    """Return the default of a setting as a person writes it in a campaign, with its unit; else what is expected."""
-    quantity = _quantity(field)
-    kind = f" ({quantity.kind})" if quantity is not None else ""
-    if field.is_required():
-        return f"required{kind}"
-    default = field.get_default(call_default_factory=True)
-    if default in (None, (), [], {}):
-        return f"-{kind}"
-    if isinstance(default, BaseModel):
-        default = default.model_dump()
-    if quantity is not None and isinstance(default, (int, float)) and not isinstance(default, bool):
-        return _written(float(default), quantity)
-    if (
-        quantity is not None
-        and isinstance(default, (tuple, list))
-        and all(isinstance(x, (int, float)) for x in default)
-    ):
-        return textwrap.shorten(", ".join(_written(float(x), quantity) for x in default), 30, placeholder=" ...")
-    shown = str(default).lower() if isinstance(default, bool) else str(default)
-    return textwrap.shorten(shown, 30, placeholder=" ...")
-
-
-def _written(value: float, quantity: Quantity) -> str:
-    """Return a value in the unit in which it is a short number."""
-    units = _FIELD_UNITS.get(quantity.unit, ())
-    texts = [format_quantity(value, unit, 6) for unit in units] if value and units else []
-    short = min(texts, key=lambda text: (len(text.split()[0].strip("-")), texts.index(text)), default="")
-    unit = {"1/min": "/min"}.get(quantity.unit, quantity.unit)
-    return short or f"{value:g} {unit}"
-
-
-def _quantity(field: FieldInfo) -> Quantity | None:
-    """Return the quantity of a setting, or that of its elements."""
-    found = [note for note in field.metadata if isinstance(note, Quantity)]
-    pending = [field.annotation]
-    while pending and not found:
-        each = pending.pop()
-        if isinstance(each, type) and issubclass(each, BaseModel):
-            continue
-        found += [note for note in getattr(each, "__metadata__", ()) if isinstance(note, Quantity)]
-        pending += [argument for argument in get_args(each) if argument is not Ellipsis]
-    return found[0] if found else None
 
 
 def check_plugin(plugin_id: str, address: str | None, mutants: int | None, as_json: bool) -> bool:

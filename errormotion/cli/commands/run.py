@@ -11,8 +11,11 @@ import typer
 
 from errormotion import datasets
 from errormotion.campaign import runner
+from errormotion.campaign.background import processes
+from errormotion.campaign.background.publishing import Published
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
+from errormotion.cli.commands import background as command
 from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
@@ -32,6 +35,7 @@ def run(
     with_report: bool,
     tolerances: Path | None,
     as_json: bool,
+    publish: Path | None = None,
 ) -> None:
     """Run or resume a campaign and print its results."""
     if campaign is None and not resume:
@@ -44,10 +48,16 @@ def run(
         )
         raise typer.Exit(USAGE)
     limits = load_tolerances(tolerances) if tolerances else None
+    run_id = ""
+    if resume and campaign is not None and campaign.is_dir():
+        run_id, runs, campaign = str(RunFolder.open(campaign).data["id"]), runs or campaign.parent, None
     plan = load_campaign(campaign) if campaign else None
     if plan is not None and limits is not None:
         plan = replace(plan, tolerances=limits)
-    folders = work(plan, resume=resume, runs=runs, yes=yes, with_report=with_report, quiet=as_json, announcing=True)
+    folders = work(
+        plan, resume=resume, runs=runs, yes=yes, with_report=with_report, quiet=as_json, announcing=True,
+        run_id=run_id, publish=publish,
+    )  # fmt: skip
     decisions = [folder.data["conformity"] for folder in folders if folder.data.get("conformity")]
     if as_json:
         show_json({"ok": True, "tests": [describe(folder) for folder in folders]})
@@ -71,14 +81,29 @@ def work(
     with_report: bool = True,
     quiet: bool = False,
     announcing: bool = False,
+    run_id: str = "",
+    publish: Path | None = None,
 ) -> list[RunFolder]:
     """Run or resume a campaign with progress bars on a terminal; without a plan, the newest unfinished one."""
-    with Bars(quiet, announcing=announcing) as bars:
-        ask = _agree if yes else bars.ask if sys.stdin.isatty() and sys.stderr.isatty() else None
+    with Bars(quiet, announcing=announcing) if publish is None else Published(publish) as bars:
+        answered = publish is not None or (sys.stdin.isatty() and sys.stderr.isatty())
+        ask = _agree if yes else bars.ask if answered else None
         report = report_of_run if with_report else None
         if resume or plan is None:
-            return runner.resume(plan, runs=runs, progress=bars, ask=ask, report=report)
+            return runner.resume(plan, run_id=run_id, runs=runs, progress=bars, ask=ask, report=report)
         return runner.run(plan, runs=runs, progress=bars, ask=ask, report=report)
+
+
+def detach(campaign: Path | None, *, resume: bool, runs: Path | None, as_json: bool) -> None:
+    """Start or resume a campaign in a process of its own, and print its name."""
+    if campaign is None:
+        typer.echo("--detach: expected a campaign file, or with --resume a run folder.", err=True)
+        raise typer.Exit(USAGE)
+    if resume:
+        command.started(processes.resume(campaign), campaign.parent, as_json)
+        return
+    runs = runs or load_campaign(campaign).runs
+    command.started(processes.start(campaign, runs), runs, as_json)
 
 
 def report_of_run(folder: Path) -> Path:

@@ -203,7 +203,7 @@ def _chosen(known: Compensations, key: str) -> dict[str, Any]:
             "complete": following.complete,
             "broken": following.broken,
             "hash": following.reader.hash,
-            "model": str(first.get("model") or "")[:64],
+            "model": str(first.get("model") or "")[:200],
             "started": str(first.get("time") or "")[:40],
         },
         "rows": entries,

@@ -15,6 +15,7 @@ from tornado.web import HTTPError
 from errormotion.dashboard.figures import live_item
 from errormotion.dashboard.pages.page import Guarded
 from errormotion.dashboard.watch import SPAN, Present, Watch
+from errormotion.kinematics.description import MachineDescription
 
 SPANS = (("10 min", 600), ("1 h", 3600), ("8 h", int(SPAN)))
 """Lengths of the history that a reader chooses from, s."""
@@ -41,7 +42,8 @@ class Now(_OfTheBench):
         groups: dict[str, list[str]] = {}
         for name, unit in names:
             groups.setdefault(unit, []).append(name)
-        self.show("now.html.j2", bench=watch.plan.name, groups=groups, spans=SPANS, shown=SHOWN)
+        outline = machine_outline(watch.plan.description)
+        self.show("now.html.j2", bench=watch.plan.name, groups=groups, spans=SPANS, shown=SHOWN, outline=outline)
 
 
 class Values(_OfTheBench):
@@ -79,6 +81,21 @@ class History(_OfTheBench):
             raise HTTPError(400, reason="Unknown span, or too many names")
         self.set_header("Content-Type", "application/json")
         self.finish(await self.apart(_curves, watch, names, float(text)))
+
+
+def machine_outline(machine: MachineDescription | None) -> dict[str, Any] | None:
+    """Return what a drawing of a machine needs: travel of X, Y, Z in mm, axes that carry workpiece and tool, spindle.
+
+    None without a description, or where the travel of one of these axes is not known.
+    """
+    if machine is None or any(axis not in machine.travel for axis in "XYZ"):
+        return None
+    return {
+        "travel": [[1e3 * end for end in machine.travel[axis]] for axis in "XYZ"],
+        "table": [axis for axis in "XYZ" if axis not in machine.tool_axes],
+        "head": list(machine.tool_axes),
+        "spindle": "XYZ".index(machine.spindle_axis),
+    }
 
 
 def _curves(watch: Watch, names: list[str], seconds: float) -> str:

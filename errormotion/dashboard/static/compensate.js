@@ -131,7 +131,7 @@ function showChosen(found) {
   byId("chain").className = audit.broken ? "bad" : "good";
   byId("chain").textContent = audit.broken ? "✕ The chain of hashes is broken."
     : audit.complete ? `✓ ${audit.entries} entries, the chain of hashes is unbroken.` : `${audit.entries} entries are checked so far.`;
-  byId("hash").textContent = `Last hash ${audit.hash.slice(0, 16)}…, model ${audit.model.slice(0, 16)}…, started ${audit.started}`;
+  byId("hash").textContent = `Last hash ${audit.hash.slice(0, 16)}…, model ${audit.model.split(":").at(-1).slice(0, 16)}…, started ${audit.started}`;
   byId("log").replaceChildren(...found.rows.map((each) => {
     return cells(element("tr"), [[each.time.replace("T", " ").slice(0, 19), "time"], [each.what], [each.offset, "number"], [each.cause]]);
   }));
@@ -169,7 +169,7 @@ async function frame() {
   const place = element("div");
   place.id = "curves-drawn";
   byId("curves").replaceChildren(place);
-  await Bokeh.embed.embed_item(found.item, place.id);
+  await Bokeh.embed.embed_item(sized(found.item), place.id);
   figure = Bokeh.documents.at(-1);
 }
 

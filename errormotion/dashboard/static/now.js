@@ -25,7 +25,8 @@ function show(found) {
     const words = { answers: "● answers", waiting: "○ waiting", silent: `■ silent since ${clock(each.since)}` };
     tile.append(element("strong", each.name), element("span", words[each.state], "said"), element("small", each.model || each.kind));
     if (each.why) tile.append(element("small", each.why));
-    if (each.missed) tile.append(element("small", `${each.missed} rows without a reading`));
+    if (each.rate !== null) tile.append(element("small", `${number(each.rate, each.rate < 10 ? 2 : 0)} readings/s`, "rate"));
+    if (each.missed) tile.append(element("small", `${each.missed} of ${found.rows} rows without a reading`, "drops"));
     return tile;
   }));
   byId("parameters-card").hidden = !found.parameters.length;
@@ -37,7 +38,8 @@ function show(found) {
     return row;
   }));
   byId("program").textContent = [found.mode && `mode ${found.mode}`, found.program && `program ${found.program}`].filter(Boolean).join(", ");
-  map(found.temperatures);
+  const position = "XYZ".split("").map((axis) => found.parameters.find((each) => each.name === axis)?.value ?? null);
+  map(found.temperatures, position);
   byId("temperatures-card").hidden = !found.temperatures.length;
   byId("temperatures").replaceChildren(...found.temperatures.map((each) => {
     const row = element("tr"), name = element("th", each.name);
@@ -59,16 +61,42 @@ function shape(name, attributes, text) {
   return made;
 }
 
-function view(sensors, [h, v], low, high) { // one view of the machine, with the same scale along both axes
-  const at = (k) => sensors.map((each) => 1e3 * each.place[k]);
-  const span = (values) => [Math.min(...values), Math.max(...values)];
-  const [h0, h1] = span(at(h)), [v0, v1] = span(at(v));
-  const scale = Math.min((WIDTH - 3.4 * MARGIN) / Math.max(h1 - h0, 1), (HEIGHT - 2 * MARGIN) / Math.max(v1 - v0, 1));
+const MACHINE = JSON.parse(byId("map").dataset.machine);
+
+function bodies([h, v], position) { // bed, table, frame and head in one view, mm; only a scheme: sizes follow the travel
+  if (!MACHINE) return [];
+  const [[h0, h1], [v0, v1]] = [MACHINE.travel[h], MACHINE.travel[v]], size = 0.16 * Math.max(h1 - h0, v1 - v0);
+  const at = (k, low, high) => position[k] ?? (low + high) / 2;
+  const tool = [at(h, h0, h1), at(v, v0, v1)], k = MACHINE.spindle;
+  const head = k === v ? [tool[0] - size / 2, tool[1], size, 1.6 * size] : k === h ? [tool[0], tool[1] - size / 2, 1.6 * size, size] : [tool[0] - size / 2, tool[1] - size / 2, size, size];
+  const nose = k === v ? [tool[0] - size / 8, tool[1], size / 4, size / 4] : k === h ? [tool[0], tool[1] - size / 8, size / 4, size / 4] : [tool[0] - size / 8, tool[1] - size / 8, size / 4, size / 4];
+  const named = (name, axes) => (axes.length ? `${name}: ${axes.join(" ")}` : name);
+  return [
+    { kind: "frame", name: "frame", box: h === 1 ? [h1 + 0.5 * size, v0 - 1.5 * size, 1.6 * size, v1 - v0 + 4 * size] : [(h0 + h1) / 2 - 2 * size, v0 - 0.4 * size, 4 * size, v1 - v0 + 2.9 * size] },
+    { kind: "bed", name: "bed", box: [h0 - 0.5 * size, v0 - 1.5 * size, h1 - h0 + size, 0.9 * size] },
+    { kind: "table", name: named("table", MACHINE.table), box: [h0, v0 - 0.6 * size, h1 - h0, 0.4 * size] },
+    { kind: "travel", name: "", box: [h0, v0, h1 - h0, v1 - v0] },
+    { kind: "head", name: named("head", MACHINE.head), box: [head[0], head[1] + (k === v ? size / 4 : 0), head[2], head[3]] },
+    { kind: "nose", name: "", box: nose },
+  ];
+}
+
+function view(sensors, [h, v], low, high, position) { // one view of the machine, with the same scale along both axes
+  const drawn = bodies([h, v], position);
+  const span = (places, ends) => [Math.min(...places, ...ends), Math.max(...places, ...ends)];
+  const [h0, h1] = span(sensors.map((each) => 1e3 * each.place[h]), drawn.flatMap(({ box }) => [box[0], box[0] + box[2]]));
+  const [v0, v1] = span(sensors.map((each) => 1e3 * each.place[v]), drawn.flatMap(({ box }) => [box[1], box[1] + box[3]]));
+  const tall = drawn.length ? HEIGHT + 120 : HEIGHT, margin = drawn.length ? 30 : MARGIN;
+  const scale = Math.min((WIDTH - 3.4 * MARGIN) / Math.max(h1 - h0, 1), (tall - 2 * margin) / Math.max(v1 - v0, 1));
   const x = (mm) => 1.4 * MARGIN + ((WIDTH - 3.4 * MARGIN) - scale * (h1 - h0)) / 2 + scale * (mm - h0);
-  const y = (mm) => HEIGHT - MARGIN - ((HEIGHT - 2 * MARGIN) - scale * (v1 - v0)) / 2 - scale * (mm - v0);
-  const svg = shape("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}` }), axes = "XYZ";
-  svg.append(shape("rect", { x: 1, y: 1, width: WIDTH - 2, height: HEIGHT - 2, rx: 4 }));
-  svg.append(shape("text", { x: WIDTH - 12, y: HEIGHT - 12, "text-anchor": "end", class: "axis" }, `${axes[h]} →`));
+  const y = (mm) => tall - margin - ((tall - 2 * margin) - scale * (v1 - v0)) / 2 - scale * (mm - v0);
+  const svg = shape("svg", { viewBox: `0 0 ${WIDTH} ${tall}` }), axes = "XYZ";
+  svg.append(shape("rect", { x: 1, y: 1, width: WIDTH - 2, height: tall - 2, rx: 4 }));
+  for (const { kind, name, box } of drawn) {
+    svg.append(shape("rect", { x: x(box[0]), y: y(box[1] + box[3]), width: scale * box[2], height: scale * box[3], rx: 2, class: `body ${kind}` }));
+    if (name) svg.append(shape("text", { x: x(box[0]) + 5, y: kind === "frame" || kind === "head" ? y(box[1] + box[3]) + 14 : y(box[1] + box[3] / 2) + 4, class: "axis" }, name));
+  }
+  svg.append(shape("text", { x: WIDTH - 12, y: tall - 12, "text-anchor": "end", class: "axis" }, `${axes[h]} →`));
   svg.append(shape("text", { x: 12, y: 22, class: "axis" }, `↑ ${axes[v]}`));
   const labels = [];
   for (const each of sensors) {
@@ -78,19 +106,20 @@ function view(sensors, [h, v], low, high) { // one view of the machine, with the
     while (labels.some(([px, py]) => Math.abs(px - place[0]) < 150 && Math.abs(py - row) < 15)) row += 15;
     labels.push([place[0], row]);
     svg.append(shape("circle", { cx: place[0], cy: place[1], r: 8, fill: shade }));
-    svg.append(shape("text", { x: place[0] + 13, y: row }, `${each.name.slice(0, 24)} ${each.flag || number(each.value, 1)}`));
+    svg.append(shape("text", { x: place[0] + 13, y: row, class: "sensor" }, `${each.name.slice(0, 24)} ${each.flag || number(each.value, 1)}`));
   }
   return svg;
 }
 
-function map(temperatures) {
+function map(temperatures, position) {
   const sensors = temperatures.filter((each) => each.place);
-  byId("map-card").hidden = !sensors.length;
-  if (!sensors.length) return;
+  byId("map-card").hidden = !sensors.length && !MACHINE;
+  if (byId("map-card").hidden) return;
   const known = sensors.map((each) => each.value).filter((value) => value !== null);
   const low = Math.min(...known), high = Math.max(...known);
-  byId("map").replaceChildren(view(sensors, [0, 2], low, high), view(sensors, [1, 2], low, high));
-  byId("map-note").textContent = known.length ? `Dark is ${number(low, 1)} °C, bright ${number(Math.max(high, low + 0.5), 1)} °C; white is unknown.` : "No temperature is known.";
+  byId("map").replaceChildren(view(sensors, [0, 2], low, high, position), view(sensors, [1, 2], low, high, position));
+  const scheme = MACHINE ? " A scheme of the machine: the dashed frame is the travel, the head is where the axes are." : "";
+  byId("map-note").textContent = (known.length ? `Dark is ${number(low, 1)} °C, bright ${number(Math.max(high, low + 0.5), 1)} °C; white is unknown.` : sensors.length ? "No temperature is known." : "No sensor has a place in the bench file.") + scheme;
 }
 
 async function ask(path) {
@@ -126,7 +155,7 @@ async function frame(names) { // the axes, without data; drawn anew only when ot
     drawn.views.clear();
     Bokeh.documents.splice(Bokeh.documents.indexOf(drawn.document), 1);
   }
-  const views = await Bokeh.embed.embed_item(found.item, place.id);
+  const views = await Bokeh.embed.embed_item(sized(found.item), place.id);
   drawn = { key, views, document: Bokeh.documents.at(-1) };
 }
 

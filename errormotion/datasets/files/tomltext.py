@@ -185,6 +185,8 @@ def _put(content: Any, place: Sequence[Key], new: Any) -> None:
     """Set or remove a value; tables on the way are made."""
     try:
         for each in place[:-1]:
+            if new is None and isinstance(content, dict) and each not in content:
+                return
             content = content.setdefault(each, {}) if isinstance(content, dict) else content[each]
         if new is None:
             content.pop(place[-1], None)

@@ -32,8 +32,10 @@ _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-ZÄÖÜ(|±])")
 _DECIMAL = re.compile(r"[+−-]?\d+\.\d+")
 _WORD = re.compile(r"[a-z]{3}")
 _LETTERS = re.compile(r"[a-z]{2}")
+_BEFORE_UNIT = re.compile(r"(?<![\w.])\d+\.\d+(?= (?:[uµ]?m|mm|[uµm]?rad|arcsec|%|K|min|s|±)(?!\w))")
+_MICRO = re.compile(r"(?<!\w)u(?=(?:m|rad)(?!\w))")
 _LIST = re.compile(r"(, | und )")
-_UNITS = re.compile(r"\b(?:arcsec|min|rad|days)\b")
+_UNITS = re.compile(r"\b(?:arcsec|min|m?rad|days)\b")
 _SVG_TEXT = re.compile(r"(?<=>)([^<>]*[^<>\s][^<>]*)(?=</text>)")
 _SVG_NAME = re.compile(r'(?<= data-(?:x-name)=")([^"]+)(?=")')
 _AnyBlock = TypeVar("_AnyBlock", bound=Block)
@@ -98,9 +100,15 @@ class Catalogue:
         pieces = _LIST.split(text)
         made = [self._found(piece) for piece in pieces[::2]]
         if len(made) < 2 or all(each is None for each in made):
-            return text
+            return self._with_units(text)
         pieces[::2] = [piece if each is None else each for piece, each in zip(pieces[::2], made, strict=True)]
         return "".join(pieces)
+
+    def _with_units(self, text: str) -> str:
+        """Return a text with the decimal sign of the language before units, and with micrometres as on all pages."""
+        if self.language in COMMA:
+            text = _BEFORE_UNIT.sub(lambda found: found[0].replace(".", ","), text)
+        return _MICRO.sub("µ", text)
 
     def _found(self, text: str) -> str | None:
         plain = " ".join(text.split()) if len(text) <= LONGEST else ""
@@ -126,8 +134,12 @@ class Catalogue:
         """Return a drawing with its texts in the language."""
         if self.language == "en":
             return drawing
-        text = _SVG_TEXT.sub(lambda found: escape(str(self.word(unescape(found[1]))), quote=False), str(drawing))
+        text = _SVG_TEXT.sub(lambda found: escape(str(self._label(unescape(found[1]))), quote=False), str(drawing))
         return Markup(_SVG_NAME.sub(lambda found: escape(str(self.word(unescape(found[1])))), text))
+
+    def _label(self, text: str) -> Any:
+        """Return a text of a drawing: an axis has a quantity and a unit, anything else may be a name of the data."""
+        return self(text) if " / " in text else self.word(text)
 
     def cell(self, cell: Cell | str) -> Cell | str:
         """Return a cell with its text and its reason in the language."""
@@ -169,7 +181,7 @@ class Catalogue:
             title=self(part.title),
             kind=self(part.kind),
             key_figures=[
-                KeyFigure(self(each.label), Cell(**vars(self.cell(each.value))), each.unit, self(each.note))
+                KeyFigure(self(each.label), Cell(**vars(self.cell(each.value))), self.word(each.unit), self(each.note))
                 for each in part.key_figures
             ],
             summary=[self(sentence) for sentence in part.summary],

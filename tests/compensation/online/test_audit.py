@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from errormotion.compensation.online.audit import AuditLog, verify
+from errormotion.compensation.online.audit import AuditLog, AuditReader, verify
 from errormotion.errors import CompensationError
 
 
@@ -43,3 +43,24 @@ def test_an_altered_log_is_recognised_and_not_continued(log: Path, alter: object
     for use in (verify, AuditLog):
         with pytest.raises(CompensationError, match="does not follow"):
             use(log)  # type: ignore[operator]
+
+
+def test_a_log_is_checked_while_it_grows(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    reader = AuditReader(path)
+    with pytest.raises(CompensationError, match="cannot be read"):
+        reader.read(10)
+    with AuditLog(path) as log:
+        for k in range(5):
+            log.write({"k": k})
+        assert [entry["k"] for entry in reader.read(3)] == [0, 1, 2]
+        log.write({"k": 5})
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-20])  # the last line is being written
+    assert [entry["k"] for entry in reader.read(10)] == [3, 4]
+    path.write_bytes(whole)
+    assert [entry["k"] for entry in reader.read(10)] == [5]
+    assert (reader.count, reader.hash) == verify(path)
+    path.write_bytes(whole + whole.splitlines(keepends=True)[-1])
+    with pytest.raises(CompensationError, match="line 7"):
+        reader.read(10)

@@ -16,6 +16,8 @@ from errormotion.methods.beam_direction.settings import Settings
 from errormotion.report import write_report
 from errormotion.twin import VirtualMachine
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 ARCSEC = np.pi / 180 / 3600
 DEGREE = np.pi / 180
 PLANES = ((20, 0), (20, 90), (25, 180), (30, 270))

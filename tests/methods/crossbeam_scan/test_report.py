@@ -17,6 +17,8 @@ from errormotion.report.fields import remarks
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts.pieces import swept
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 MINUTES = (0, 7, 15, 30, 45, 60, 90, 120, 150, 180)
 PLACES = 0.35 + 0.2 * np.arange(8) - 1.05
 POSE = ("a", "b", "g", "dx", "dy", "dz")

@@ -16,6 +16,8 @@ from errormotion.report import write_report
 from errormotion.report.turntable import Ellipsoids, Lines, Scene, camera, draw, enlargement
 from errormotion.twin import VirtualMachine
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 UM = 1e-6
 WRONG = 320 * UM
 HEADINGS = [

@@ -17,6 +17,8 @@ from errormotion.report.text import fixed
 from errormotion.report.timeline import clock
 from errormotion.twin import Event, VirtualMachine
 
+pytestmark = pytest.mark.usefixtures("translated")
+
 UM, ARCSEC = 1e-6, np.pi / 180 / 3600
 HEADINGS = [
     "Errors and temperatures",

@@ -10,9 +10,9 @@ from typing import Any
 from errormotion import plugins
 from errormotion.cli.commands.init.writing import Answers, Instrument, Test
 from errormotion.cli.output import show
-from errormotion.cli.settings import value_of
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.files.tomlfile import nearest
+from errormotion.datasets.files.tomltext import value_of
 from errormotion.datasets.units import ANGLE, LENGTH
 from errormotion.kinematics.chains import parse_chain
 

@@ -16,7 +16,7 @@ from errormotion.cli.commands.init import asking
 from errormotion.cli.commands.init.writing import Answers, Instrument, Test, bench_text, campaign_text
 from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json
-from errormotion.cli.settings import value_of
+from errormotion.datasets.files.tomltext import value_of
 from errormotion.errors import BenchError, ErrormotionError
 
 BENCH, CAMPAIGN = "bench.toml", "campaign.toml"

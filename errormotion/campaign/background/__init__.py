@@ -1,0 +1,1 @@
+"""Campaigns that run in a process of their own: started, followed, answered and stopped from elsewhere."""

@@ -1,0 +1,55 @@
+"""The errors of a run that is still measuring, from the samples that are stored so far."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.campaign.files import TestPlan
+from errormotion.campaign.folder import RunFolder
+from errormotion.campaign.runner import stored_plan
+from errormotion.campaign.store import committed_length
+from errormotion.datasets.files.folders import looking_beside
+from errormotion.errors import DatasetError, RunError
+
+
+def samples(folder: RunFolder) -> int:
+    """Return the number of samples that a reader of a run sees; 0 before the first."""
+    if not folder.raw.exists():
+        return 0
+    test = _test(folder)
+    return committed_length(folder.raw, test.method().append_dim(test.settings))
+
+
+def preliminary(folder: RunFolder) -> xr.Dataset:
+    """Return the errors that the samples so far determine, with the settings of the run.
+
+    Raises
+    ------
+    RunError
+        The run states no test of its campaign, or has no samples yet.
+    MethodError
+        The samples so far do not determine the errors.
+    DatasetError
+        The samples so far are no complete record.
+    """
+    test = _test(folder)
+    if not samples(folder):
+        raise RunError(f"{folder.path.name}: has no samples yet")
+    with looking_beside(Path(str(folder.data["campaign"].get("folder", folder.path)))):
+        try:
+            with datasets.load(folder.raw) as raw:
+                errors: xr.Dataset = test.method().identify(raw, test.settings).load()
+        except (ArithmeticError, LookupError, ValueError) as error:  # half a record is no defect of a method
+            raise DatasetError(f"the samples so far do not determine the errors ({error})") from error
+    datasets.validate(errors)
+    return errors
+
+
+def _test(folder: RunFolder) -> TestPlan:
+    try:
+        return next(test for test in stored_plan(folder).tests if test.name == folder.data["test"])
+    except (StopIteration, KeyError, TypeError, AttributeError):
+        raise RunError(f"{folder.path}: expected a run of a campaign; found something else") from None

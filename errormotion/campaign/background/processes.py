@@ -1,0 +1,324 @@
+"""The side of the operator: start a campaign in a process of its own, find it again, answer it and stop it.
+
+A process lives on when the one that started it ends. It holds a lock on a file of its folder
+``RUNS/.background/TIME-NUMBER``, which ends with it however it ends: who finds the lock free knows that nothing runs.
+Only the user who started it may enter the folder, and thus answer or stop it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from errormotion.campaign.background.publishing import ANSWER, STATUS
+from errormotion.campaign.files import load_campaign
+from errormotion.campaign.folder import RunFolder, now, replace_text
+from errormotion.datasets.files.reading import read_bytes
+from errormotion.errors import RunError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+FOLDER = ".background"
+"""In the folder of runs."""
+MOST = 50
+"""Ended processes whose state is kept."""
+LARGEST_STATE = 1 << 20
+"""Bytes of a state."""
+LONGEST_OUTPUT = 4000
+"""Bytes at the end of the output that are shown."""
+STOP_INTERVAL = 30.0
+"""Time after which a process that was asked to stop is asked again, s."""
+_NAME = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}")
+
+_children: list[subprocess.Popen[bytes]] = []
+"""Processes that this one has started; they are waited for when they have ended."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """A request to the operator that waits for an answer."""
+
+    number: int
+    text: str
+
+
+@dataclass(frozen=True)
+class Background:
+    """A campaign in a process of its own, as it is now.
+
+    Attributes
+    ----------
+    name : str
+        Of its folder.
+    campaign, machine, started : str
+    alive : bool
+        Whether the process lives.
+    ended : str
+        ``finished``, ``interrupted``, ``failed``, ``killed``; empty while it lives.
+    message : str
+        Why it ended, or the end of its output.
+    test, stage, note : str
+        Where it is, and its last intermediate result.
+    number, total : int
+        Number of the test from 0, and of all tests.
+    done, expected : float
+        Part of the stage that is done, and its whole, in the same unit; NaN where unknown.
+    tests : dict of str to str
+        Run folders by the names of the tests.
+    request : Request, optional
+    stopping : bool
+        Whether it was asked to stop.
+    """
+
+    name: str
+    campaign: str
+    machine: str
+    started: str
+    alive: bool
+    ended: str = ""
+    message: str = ""
+    test: str = ""
+    stage: str = ""
+    note: str = ""
+    number: int = 0
+    total: int = 0
+    done: float = math.nan
+    expected: float = math.nan
+    tests: dict[str, str] = field(default_factory=dict)
+    announcements: tuple[str, ...] = ()
+    request: Request | None = None
+    stopping: bool = False
+
+
+def start(campaign: Path, runs: Path) -> str:
+    """Run a campaign in a process of its own; return its name.
+
+    Raises
+    ------
+    BenchError
+        The campaign or its bench has mistakes.
+    RunError
+        A process measures on the same machine, or none can be started.
+    """
+    plan = load_campaign(campaign)
+    return _start(runs, plan.name, plan.bench.machine, [str(campaign.resolve())])
+
+
+def resume(folder: Path) -> str:
+    """Continue the campaign of a run folder in a process of its own; return its name.
+
+    Raises
+    ------
+    RunError
+        No run folder of a campaign, a process that measures on the same machine, or none can be started.
+    """
+    data = RunFolder.open(folder).data
+    try:
+        campaign, machine = str(data["campaign"]["name"]), str(data["bench"]["machine"])
+    except (KeyError, TypeError):
+        raise RunError(f"{folder}: expected a run of a campaign; found something else") from None
+    return _start(folder.parent, campaign, machine, ["--resume", str(folder.resolve())])
+
+
+def found(runs: Path) -> list[Background]:
+    """Return the processes of a folder of runs, the newest first."""
+    for child in list(_children):
+        if child.poll() is not None:
+            _children.remove(child)
+    root = runs / FOLDER
+    names = sorted((path.name for path in root.iterdir()), reverse=True) if root.is_dir() else []
+    return [each for each in (_read(root / name) for name in names if _NAME.fullmatch(name)) if each is not None]
+
+
+def answer(runs: Path, name: str, number: int) -> None:
+    """State that a request is done.
+
+    Raises
+    ------
+    RunError
+        This request does not wait: it was answered, or the process has ended.
+    """
+    process = _one(runs, name)
+    if not process.alive or process.request is None or process.request.number != number:
+        raise RunError(f"{process.campaign}: request {number} does not wait for an answer any more")
+    replace_text(runs / FOLDER / name / ANSWER, f"{number}\n")
+
+
+def stop(runs: Path, name: str) -> None:
+    """Ask a process to stop, as Ctrl-C does in a terminal; its run folder is complete and can be resumed.
+
+    Raises
+    ------
+    RunError
+        It has ended, or belongs to another user.
+    """
+    process = _one(runs, name)
+    folder = runs / FOLDER / name
+    pid = _state(folder / "process.json").get("pid")
+    if not process.alive or not isinstance(pid, int):
+        raise RunError(f"{process.campaign}: has ended; nothing is to be stopped")
+    asked = folder / "stop"
+    if asked.exists() and time.time() - asked.stat().st_mtime < STOP_INTERVAL:
+        return  # a second request would end it while it closes its instruments
+    asked.touch()
+    try:
+        os.kill(pid, signal.SIGTERM)
+    except OSError as error:
+        raise RunError(f"{process.campaign}: cannot be stopped: {error.strerror}") from error
+
+
+def _start(runs: Path, campaign: str, machine: str, arguments: list[str]) -> str:
+    if fcntl is None:
+        raise RunError("A process of its own needs a system with file locks (Linux, macOS). Use 'errormotion run'.")
+    try:
+        runs.mkdir(parents=True, exist_ok=True)
+        root = runs / FOLDER
+        root.mkdir(mode=0o700, exist_ok=True)
+        with _alone(root):
+            for each in found(runs):
+                if each.alive and each.machine == machine:
+                    raise RunError(f"'{each.campaign}' is measuring on {machine} since {each.started}; stop it first")
+            _tidy(root)
+            name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{uuid4().hex[:8]}"
+            _spawn(root / name, runs, {"campaign": campaign, "machine": machine, "started": now()}, arguments)
+    except OSError as error:
+        raise RunError(f"{runs}: the process cannot be started: {error.strerror}") from error
+    return name
+
+
+def _spawn(folder: Path, runs: Path, state: dict[str, Any], arguments: list[str]) -> None:
+    folder.mkdir(mode=0o700)
+    command = [sys.executable, "-P", "-m", "errormotion", "run", *arguments]
+    command += ["--runs", str(runs.resolve()), "--publish", str(folder.resolve())]
+    lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with (folder / "output.txt").open("wb") as output:
+            child = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                pass_fds=[lock],
+            )
+        _children.append(child)
+        replace_text(folder / "process.json", json.dumps({**state, "pid": child.pid}))
+    finally:
+        os.close(lock)  # the process holds it from now on
+
+
+@contextmanager
+def _alone(root: Path) -> Iterator[None]:
+    """Let one start after the other, so that two never find the machine free together."""
+    lock = os.open(root / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)
+
+
+def _tidy(root: Path) -> None:
+    """Remove the states of the oldest processes that have ended."""
+    names = sorted(path.name for path in root.iterdir() if _NAME.fullmatch(path.name))
+    for name in names[:-MOST]:
+        if not _alive(root / name):
+            shutil.rmtree(root / name, ignore_errors=True)
+
+
+def _alive(folder: Path) -> bool:
+    """Return whether the lock of a process is held; looking does not hold it against others who look."""
+    try:
+        lock = os.open(folder / "lock", os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(lock)
+    return False
+
+
+def _one(runs: Path, name: str) -> Background:
+    process = _read(runs / FOLDER / name) if _NAME.fullmatch(name) else None
+    if process is None:
+        raise RunError(f"{runs}: there is no process {name[:60]!r}")
+    return process
+
+
+def _read(folder: Path) -> Background | None:
+    alive = _alive(folder)  # before its state, which is complete if it has ended
+    process, state = _state(folder / "process.json"), _state(folder / STATUS)
+    if not process:
+        return None
+    ended = "" if alive else str(state.get("ended") or "killed")
+    message = str(state.get("message", ""))
+    if ended in ("failed", "killed"):
+        message = _output(folder) or message
+    request = state.get("request")
+    waits = alive and isinstance(request, dict) and isinstance(request.get("number"), int)
+    return Background(
+        name=folder.name,
+        campaign=str(process.get("campaign", "")),
+        machine=str(process.get("machine", "")),
+        started=str(process.get("started", "")),
+        alive=alive,
+        ended=ended,
+        message=message,
+        test=str(state.get("test", "")),
+        stage=str(state.get("stage", "") or "starting"),
+        note=str(state.get("note", "")),
+        number=_whole(state.get("number")),
+        total=_whole(state.get("total")),
+        done=_number(state.get("done")),
+        expected=_number(state.get("expected")),
+        tests={str(k): str(v) for k, v in state["tests"].items()} if isinstance(state.get("tests"), dict) else {},
+        announcements=tuple(map(str, state["announcements"])) if isinstance(state.get("announcements"), list) else (),
+        request=Request(request["number"], str(request.get("text", ""))) if waits and request else None,
+        stopping=alive and (folder / "stop").exists(),
+    )
+
+
+def _state(path: Path) -> dict[str, Any]:
+    """Return what a file states; empty where it cannot be read."""
+    with suppress(OSError, ValueError, RecursionError):
+        content = json.loads(read_bytes(path, LARGEST_STATE))
+        if isinstance(content, dict):
+            return content
+    return {}
+
+
+def _output(folder: Path) -> str:
+    """Return the end of what a process has printed."""
+    with suppress(OSError), (folder / "output.txt").open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - LONGEST_OUTPUT))
+        return file.read().decode("utf-8", "replace").strip()
+    return ""
+
+
+def _whole(value: Any) -> int:
+    return value if isinstance(value, int) else 0
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan

@@ -1,0 +1,234 @@
+"""The fields of a campaign: one for each key that its tables and the settings of its methods may have.
+
+A form is made from the text of a campaign and knows nothing but the text: a changed field changes the text, and the
+form of the new text is shown. Text and form therefore always agree.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from errormotion import plugins
+from errormotion.campaign.files import CampaignPlan, CampaignTable, MistakesError, TestTable, campaign_of
+from errormotion.campaign.form.written import default_of, quantity_of
+from errormotion.datasets.files.tomlfile import Key, dotted, parse_toml
+from errormotion.datasets.files.tomltext import value, value_of, with_value
+from errormotion.errors import BenchError, DatasetError, PluginError
+
+DEEPEST = 3
+"""Levels of tables that become fields of their own."""
+_CAMPAIGN = ("name", "bench", "operator")
+_TEST = ("name", "method", "at", "inputs", "instruments", "monte_carlo")
+
+
+@dataclass(frozen=True)
+class Field:
+    """One key of a campaign.
+
+    Attributes
+    ----------
+    place : tuple of str or int
+        Keys from the top of the file.
+    label, meaning : str
+    unit : str
+        How a person writes a quantity, such as ``5 mm``; empty where the value has no unit.
+    default : str
+        Value without this key.
+    text : str
+        What the file states, as it is written in a field; empty where it does not state the key.
+    choices : tuple of str
+        The values that there are; empty where any may be written.
+    plain : bool
+        Whether the text is a string of TOML, and not a number, an array or a table.
+    mistakes : tuple of str
+    """
+
+    place: tuple[Key, ...]
+    label: str
+    meaning: str
+    unit: str
+    default: str
+    text: str
+    choices: tuple[str, ...]
+    plain: bool
+    required: bool
+    mistakes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Group:
+    """Fields of one table, and the mistakes that belong to none of them."""
+
+    title: str
+    fields: tuple[Field, ...]
+    mistakes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Form:
+    """A campaign as a form; ``plan`` is None while there are mistakes, of which ``mistakes`` belong to no group."""
+
+    text: str
+    groups: tuple[Group, ...]
+    mistakes: tuple[str, ...]
+    plan: CampaignPlan | None
+
+    @property
+    def count(self) -> int:
+        """Number of mistakes."""
+        inside = sum(len(group.mistakes) + sum(len(each.mistakes) for each in group.fields) for group in self.groups)
+        return len(self.mistakes) + inside
+
+
+def form_of(text: str, source: Path) -> Form:
+    """Return the form of a campaign's text; ``source`` is the file in which it stands or will stand."""
+    try:
+        data = parse_toml(text, source.name, error=BenchError)
+    except BenchError as error:
+        return Form(text, (), (str(error),), None)
+    plan, mistakes, general = _checked(text, source)
+    groups = []
+    for title, place, fields in _groups(data):
+        own, rest = [], list[str]()
+        for each in fields:
+            here, mistakes = _split(mistakes, each.place)
+            own.append(Field(**{**each.__dict__, "mistakes": tuple(here)}))
+        if place:
+            rest, mistakes = _split(mistakes, place, whole=True)
+        groups.append(Group(title, tuple(own), tuple(rest)))
+    return Form(text, tuple(groups), (*general, *mistakes), plan)
+
+
+def with_field(text: str, place: Sequence[Key], written: str) -> str:
+    """Return the text of a campaign after a person has changed a field; an empty field removes its key.
+
+    Raises
+    ------
+    DatasetError
+        There is no such field, or the text states it in a form that cannot be changed alone.
+    """
+    data = parse_toml(text, "text")
+    known = {each.place: each for _, _, fields in _groups(data) for each in fields}
+    found = known.get(tuple(place))
+    if found is None:
+        raise DatasetError(f"{dotted(place)}: there is no such field")
+    if written.strip() == "" and not (found.required and found.plain):
+        return with_value(text, place, None)
+    return with_value(text, place, written if found.plain else value_of(written.strip()))
+
+
+def _checked(text: str, source: Path) -> tuple[CampaignPlan | None, list[str], list[str]]:
+    """Return the plan, the mistakes that begin with a key of this file, and the others."""
+    try:
+        return campaign_of(text, source), [], []
+    except MistakesError as error:
+        if error.source != source:  # of the bench alone
+            return None, [], [str(error)]
+        return None, list(error.mistakes), [error.more] if error.more else []
+    except BenchError as error:
+        return None, [], [str(error)]
+
+
+def _split(mistakes: Sequence[str], place: Sequence[Key], *, whole: bool = False) -> tuple[list[str], list[str]]:
+    """Return the mistakes at a place or below it, without its key, and the others; ``whole``: with their keys."""
+    key = dotted(place)
+    here, others = [], []
+    for each in mistakes:
+        found, sign, text = each.partition(": ")
+        if not sign or not (found == key or found.startswith((f"{key}.", f"{key}["))):
+            others.append(each)
+        elif whole:
+            here.append(each)
+        else:
+            here.append(text if found == key else f"{found[len(key) :].lstrip('.')}: {text}")
+    return here, others
+
+
+def _groups(data: Mapping[str, Any]) -> Iterator[tuple[str, tuple[Key, ...], list[Field]]]:
+    yield "Campaign", (), list(_fields(CampaignTable, (), data, _CAMPAIGN))
+    tests = data.get("test")
+    for number, test in enumerate(tests if isinstance(tests, list) else []):
+        if not isinstance(test, dict):
+            continue
+        place = ("test", number)
+        fields = list(_fields(TestTable, place, test, _TEST))
+        settings = test.get("settings", {})
+        try:
+            model = plugins.get("methods", str(test.get("method"))).Settings
+        except PluginError:
+            model = None
+        if model is not None and isinstance(settings, dict):
+            fields += _fields(model, (*place, "settings"), settings)
+        yield f"Test {number + 1}: {test.get('name', '')}", place, fields
+
+
+def _fields(
+    model: type[BaseModel], place: tuple[Key, ...], data: Mapping[str, Any], names: Sequence[str] = (), label: str = ""
+) -> Iterator[Field]:
+    for name, field in model.model_fields.items():
+        if names and name not in names:
+            continue
+        key = field.alias or name
+        stated = data.get(key)
+        inner = _table(field)
+        if inner is not None and len(label.split(".")) < DEEPEST and (stated is None or isinstance(stated, dict)):
+            yield from _fields(inner, (*place, key), stated or {}, label=f"{label}{key}.")
+        else:
+            yield _field(field, (*place, key), f"{label}{key}", stated)
+
+
+def _field(field: FieldInfo, place: tuple[Key, ...], label: str, stated: Any) -> Field:
+    options = [each for each in _options(field.annotation) if each is not type(None)]
+    quantity = quantity_of(field)
+    choices = _choices(options)
+    single = all(option in (str, Path) or get_origin(option) is Literal for option in options)
+    plain = single or (quantity is not None and options == [float])
+    if place[-1] == "method":
+        choices, plain = tuple(each.id for each in plugins.available("methods") if each.cls is not None), True
+    written = "" if stated is None else stated if plain and isinstance(stated, str) else value(stated)
+    if written and choices and written not in choices:  # a mistake is shown as it is
+        choices = (*choices, written)
+    return Field(
+        place=place,
+        label=label,
+        meaning=str(field.description or ""),
+        unit="" if quantity is None else quantity.example,
+        default="required" if field.is_required() else default_of(field),
+        text=written,
+        choices=choices,
+        plain=plain,
+        required=field.is_required(),
+    )
+
+
+def _choices(options: Sequence[Any]) -> tuple[str, ...]:
+    if options == [bool]:
+        return ("true", "false")
+    if options and all(get_origin(option) is Literal for option in options):
+        found = tuple(each for option in options for each in get_args(option))
+        return found if all(isinstance(each, str) for each in found) else ()
+    return ()
+
+
+def _table(field: FieldInfo) -> type[BaseModel] | None:
+    """Return the model of a field that is always a table of its own; None for anything else."""
+    options = _options(field.annotation)
+    only = options[0] if len(options) == 1 else None
+    return only if isinstance(only, type) and issubclass(only, BaseModel) else None
+
+
+def _options(annotation: Any) -> list[Any]:
+    """Return the members of unions and annotated types, flattened."""
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        return _options(get_args(annotation)[0])
+    if origin is Union or origin is types.UnionType:
+        return [option for member in get_args(annotation) for option in _options(member)]
+    return [annotation]

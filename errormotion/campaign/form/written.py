@@ -1,0 +1,59 @@
+"""Settings as a person writes them: default, unit, quantity."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from errormotion.datasets.units import Quantity, format_quantity
+
+_USUAL_UNITS = {"m": ("mm", "um", "m"), "rad": ("arcsec", "deg"), "s": ("s", "min", "h", "ms"), "Hz": ("Hz", "kHz")}
+"""Units that people use, by the inside unit; of two alike the first."""
+
+
+def default_of(field: FieldInfo) -> str:
+    """Return the default of a setting as a person writes it in a campaign, with its unit; else what is expected."""
+    quantity = quantity_of(field)
+    kind = f" ({quantity.kind})" if quantity is not None else ""
+    if field.is_required():
+        return f"required{kind}"
+    default = field.get_default(call_default_factory=True)
+    if default in (None, (), [], {}):
+        return f"-{kind}"
+    if isinstance(default, BaseModel):
+        default = default.model_dump()
+    if quantity is not None and isinstance(default, (int, float)) and not isinstance(default, bool):
+        return _written(float(default), quantity)
+    if (
+        quantity is not None
+        and isinstance(default, (tuple, list))
+        and all(isinstance(x, (int, float)) for x in default)
+    ):
+        return textwrap.shorten(", ".join(_written(float(x), quantity) for x in default), 30, placeholder=" ...")
+    shown = str(default).lower() if isinstance(default, bool) else str(default)
+    return textwrap.shorten(shown, 30, placeholder=" ...")
+
+
+def _written(value: float, quantity: Quantity) -> str:
+    """Return a value in the unit in which it is a short number."""
+    units = _USUAL_UNITS.get(quantity.unit, ())
+    texts = [format_quantity(value, unit, 6) for unit in units] if value and units else []
+    short = min(texts, key=lambda text: (len(text.split()[0].strip("-")), texts.index(text)), default="")
+    unit = {"1/min": "/min"}.get(quantity.unit, quantity.unit)
+    return short or f"{value:g} {unit}"
+
+
+def quantity_of(field: FieldInfo) -> Quantity | None:
+    """Return the quantity of a setting, or that of its elements."""
+    found = [note for note in field.metadata if isinstance(note, Quantity)]
+    pending = [field.annotation]
+    while pending and not found:
+        each = pending.pop()
+        if isinstance(each, type) and issubclass(each, BaseModel):
+            continue
+        found += [note for note in getattr(each, "__metadata__", ()) if isinstance(note, Quantity)]
+        pending += [argument for argument in get_args(each) if argument is not Ellipsis]
+    return found[0] if found else None

@@ -1,0 +1,32 @@
+"""The uncertainty to expect of the tests of a campaign."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.campaign.files import CampaignPlan, TestPlan
+from errormotion.datasets.files.folders import looking_beside
+from errormotion.tolerances.conformity import FIELD_UNITS
+
+
+def planned(plan: CampaignPlan, test: TestPlan) -> xr.Dataset:
+    """Return the error dataset that a method plans: its covariance is the one to expect."""
+    with looking_beside(plan.folder):
+        found: xr.Dataset = test.method().plan(test.settings)
+    return found
+
+
+def expected(errors: xr.Dataset) -> list[dict[str, Any]]:
+    """Return the expanded uncertainty (k = 2) of every known estimate, the largest in the dataset."""
+    variances = np.diagonal(errors.em.covariance().values, axis1=-2, axis2=-1)
+    found = []
+    for k, name in enumerate(errors.em.names):
+        seen = variances[..., k][np.isfinite(variances[..., k])]
+        if seen.size:
+            factor, unit = FIELD_UNITS[errors[name].attrs["units"]]
+            largest = 2.0 * float(np.sqrt(seen.max())) * factor
+            found.append({"name": name, "expanded_uncertainty": largest, "unit": unit})
+    return found

@@ -1,0 +1,198 @@
+"""The campaign files of one folder: read, checked as a form, planned, saved, and started."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+from errormotion.campaign.files import CampaignPlan, TestPlan
+from errormotion.campaign.folder import replace_text
+from errormotion.campaign.form.fields import Form, form_of, with_field
+from errormotion.campaign.planning.expected import expected, planned
+from errormotion.campaign.planning.motions import beside_limits, headline, motions, picture
+from errormotion.dashboard.lab import NotFoundError
+from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.tomlfile import Key, parse_toml, read_toml
+from errormotion.datasets.files.tomltext import LONGEST_TEXT, value
+from errormotion.errors import BenchError, ErrormotionError
+from errormotion.report.text import rounded
+
+MOST_FILES = 200
+"""Campaign files that are offered."""
+MOST_LOOKED_AT = 2000
+"""Files of the folder that are looked at."""
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,80}\.toml")
+"""Of a file that a page may write."""
+DPI = 100
+NEW = """\
+schema = "errormotion.campaign/1"
+name = "New campaign"
+bench = {bench}
+
+[[test]]
+name = "test"
+method = ""
+"""
+
+
+@dataclass(frozen=True)
+class Campaigns:
+    """A folder of campaign files; ``control``: whether pages may write into it.
+
+    Without control, a text may name files outside the folder only where the saved file of this name does, so that
+    nobody learns of other files by checking texts.
+    """
+
+    folder: Path
+    control: bool = False
+    bench: Path | None = None
+
+    def names(self) -> list[str]:
+        """Return the names of the campaign files."""
+        looked_at = sorted(self.folder.glob("*.toml"))[:MOST_LOOKED_AT]
+        return [path.name for path in looked_at if _is_campaign(path)][:MOST_FILES]
+
+    def read(self, name: str) -> str:
+        """Return the text of a file; of no name, that of a new campaign.
+
+        Raises
+        ------
+        NotFoundError
+            There is no such campaign file.
+        """
+        if not name:
+            bench = "bench.toml" if self.bench is None else os.path.relpath(self.bench, self.folder)
+            return NEW.format(bench=value(bench))
+        if Path(name).name != name or "\0" in name or not _is_campaign(self.folder / name):
+            raise NotFoundError(f"There is no campaign file {name[:100]!r} in {self.folder}.")
+        try:
+            return read_bytes(self.folder / name, LONGEST_TEXT).decode("utf-8-sig")
+        except (OSError, UnicodeDecodeError) as error:
+            raise BenchError(f"{self.folder / name}: cannot be read: {error}") from error
+
+    def form(self, name: str, text: str, place: tuple[Key, ...] = (), written: str = "") -> Form:
+        """Return the form of a text, after a field was changed where ``place`` is not empty.
+
+        Raises
+        ------
+        DatasetError
+            The text is too long, or the field cannot be changed alone.
+        BenchError
+            It names files that this page may not look at.
+        """
+        if len(text) > LONGEST_TEXT:
+            raise BenchError(f"expected a campaign of at most {LONGEST_TEXT} characters; found {len(text)}")
+        if place:
+            text = with_field(text, place, written)
+        self._inside(name, text)
+        return form_of(text, self._path(name))
+
+    def plan(self, name: str, text: str) -> list[dict[str, Any]]:
+        """Return what each test will do and how well it will measure, as text and pictures.
+
+        Raises
+        ------
+        BenchError
+            The text has mistakes.
+        """
+        form = self.form(name, text)
+        if form.plan is None:
+            raise BenchError(f"The campaign has {form.count} mistakes; correct them first.")
+        return [_planned(form.plan, test) for test in form.plan.tests]
+
+    def save(self, name: str, text: str, before: str) -> Path:
+        """Write a campaign file without mistakes; ``before`` is the hash of the text that was edited.
+
+        Raises
+        ------
+        BenchError
+            The name is none for such a file, the text has mistakes, or the file was changed by others.
+        """
+        if not NAME.fullmatch(name):
+            raise BenchError(f"expected a file name such as drift.toml; found {name[:100]!r}")
+        form = self.form(name, text)
+        if form.plan is None:
+            raise BenchError(f"The campaign has {form.count} mistakes; correct them first.")
+        path = self._path(name)
+        if path.exists() or path.is_symlink():
+            found = self.read(name)
+            if found == text:
+                return path
+            if hash_of(found) != before:
+                raise BenchError(f"{name} was changed by others since it was opened here; choose another name")
+        try:
+            replace_text(path, text)
+        except OSError as error:
+            raise BenchError(f"{path}: cannot be written: {error.strerror}") from error
+        return path
+
+    def _path(self, name: str) -> Path:
+        return self.folder / (name if NAME.fullmatch(name) else "new.toml")
+
+    def _inside(self, name: str, text: str) -> None:
+        if self.control:
+            return
+        try:
+            known = set(_strings(parse_toml(self.read(name), "text")))
+            new = set(_strings(parse_toml(text, "text"))) - known
+        except ErrormotionError:
+            return  # the form states what is wrong with it
+        for each in new:
+            windows = PureWindowsPath(each)
+            if PurePosixPath(each).is_absolute() or windows.drive or windows.root or ".." in windows.parts:
+                raise BenchError(
+                    f"{each[:100]!r}: this dashboard was started without --allow-control, and looks at files of its "
+                    "folder only"
+                )
+
+
+def hash_of(text: str) -> str:
+    """Return the hash of a text, by which a later change is seen."""
+    return sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _is_campaign(path: Path) -> bool:
+    try:
+        return path.suffix == ".toml" and str(read_toml(path).get("schema", "")).startswith("errormotion.campaign/")
+    except ErrormotionError:
+        return False
+
+
+def _strings(content: Any) -> Iterator[str]:
+    if isinstance(content, str):
+        yield content
+    elif isinstance(content, (dict, list)):
+        for each in content.values() if isinstance(content, dict) else content:
+            yield from _strings(each)
+
+
+def _planned(plan: CampaignPlan, test: TestPlan) -> dict[str, Any]:
+    """Return the plan of a test; what a method cannot tell is stated in its place."""
+    found: dict[str, Any] = {"test": test.name, "method": test.method.info.id, "notes": []}
+    try:
+        asked = motions(plan, test)
+        drawn = io.BytesIO()
+        picture(plan, asked).savefig(drawn, format="png", dpi=DPI)
+        image = base64.b64encode(drawn.getvalue()).decode()
+        found |= {"headline": headline(asked), "limits": beside_limits(asked.extent, plan.bench.limits)}
+        found |= {"picture": f"data:image/png;base64,{image}"}
+    except ErrormotionError as error:
+        found |= {"headline": str(error), "limits": [], "picture": ""}
+    try:
+        errors = planned(plan, test)
+        rows = expected(errors)
+        texts = [rounded(row["expanded_uncertainty"], row["expanded_uncertainty"])[1] for row in rows]
+        found["expected"] = [
+            [row["name"], text, row["unit"].replace("um", "µm")] for row, text in zip(rows, texts, strict=True)
+        ]
+        found["notes"] = [str(note) for note in errors.em.notes]
+    except ErrormotionError as error:
+        found |= {"expected": [], "notes": [f"The uncertainty to expect is not known: {error}"]}
+    return found

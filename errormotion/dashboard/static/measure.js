@@ -1,0 +1,343 @@
+// The page "Measure": form and text of a campaign are made by the server from one text. Text is only set as text.
+"use strict";
+
+const INTERVAL = 1000, LIVE_INTERVAL = 3000; // ms
+const byId = (id) => document.getElementById(id);
+const text = byId("text"), control = Boolean(byId("processes-card").dataset.control);
+let before = text.dataset.before, asked = 0, timer = 0, shown = "", planned = null;
+
+function element(name, content, className) {
+  const made = document.createElement(name);
+  if (content !== undefined) made.textContent = content;
+  if (className) made.className = className;
+  return made;
+}
+
+async function ask(path, body) {
+  const options = body === undefined ? {} : { method: "POST", body: JSON.stringify(body) };
+  let answer;
+  try {
+    answer = await fetch(path, { ...options, headers: { Accept: "application/json", "Content-Type": "application/json" } });
+  } catch {
+    throw new Error("The dashboard does not answer.");
+  }
+  const found = await answer.json();
+  if (!answer.ok) throw new Error(found.error);
+  return found;
+}
+
+function button(label, work, className) {
+  const made = element("button", label, className);
+  made.type = "button";
+  made.addEventListener("click", work);
+  return made;
+}
+
+// The form
+
+const keyOf = (place) => JSON.stringify(place);
+
+function fieldOf(each, number) {
+  const row = element("div", undefined, "field"), id = `field-${number}`;
+  const label = element("label", each.label);
+  label.htmlFor = id;
+  let input;
+  if (each.choices.length) {
+    input = element("select");
+    if (each.default !== "required" || !each.text) input.append(new Option(each.default === "required" ? "" : `${each.default} (default)`, ""));
+    for (const choice of each.choices) input.append(new Option(choice, choice));
+  } else {
+    input = element(each.text.length > 48 || each.text.startsWith("[") ? "textarea" : "input");
+    input.placeholder = each.default === "-" ? each.unit && `such as ${each.unit}` : each.default;
+    input.spellcheck = false;
+  }
+  input.id = id;
+  input.dataset.place = keyOf(each.place);
+  input.addEventListener("change", () => changed(each.place, input.value));
+  const wrong = element("p", "", "wrong"), meaning = element("p", each.meaning, "meaning");
+  [wrong.id, meaning.id] = [`${id}-wrong`, `${id}-meaning`];
+  input.setAttribute("aria-describedby", `${wrong.id} ${meaning.id}`);
+  row.append(label, input, wrong, meaning);
+  return row;
+}
+
+function fill(each) { // values and messages, in the fields that are there
+  const input = document.querySelector(`[data-place="${CSS.escape(keyOf(each.place))}"]`);
+  if (input !== document.activeElement || input.tagName === "SELECT" || !each.mistakes.length) input.value = each.text;
+  const wrong = byId(`${input.id}-wrong`), message = each.mistakes.join("\n");
+  wrong.textContent = message;
+  wrong.hidden = !message;
+  input.setAttribute("aria-invalid", message ? "true" : "false");
+  if (message) input.closest("details")?.setAttribute("open", "");
+}
+
+function show(form) {
+  const fields = form.groups.flatMap((group) => group.fields);
+  const frame = JSON.stringify(fields.map((each) => [each.place, each.choices]));
+  if (frame !== shown && form.groups.length) {
+    shown = frame;
+    let number = 0;
+    byId("form").replaceChildren(...form.groups.map((group, k) => {
+      const card = element("fieldset", undefined, "group"), more = element("details"), rest = [];
+      card.append(element("legend", group.title));
+      for (const each of group.fields) {
+        const row = fieldOf(each, number++);
+        (k === 0 || each.text || each.mistakes.length || each.default === "required" ? card : { append: (made) => rest.push(made) }).append(row);
+      }
+      if (rest.length) {
+        more.append(element("summary", `${rest.length} further settings`), ...rest);
+        card.append(more);
+      }
+      const mistakes = element("ul", undefined, "mistakes");
+      card.append(mistakes);
+      return card;
+    }));
+  }
+  form.groups.forEach((group, k) => {
+    const card = byId("form").children[k];
+    card.firstChild.textContent = group.title;
+    card.lastChild.replaceChildren(...group.mistakes.map((each) => element("li", each)));
+    group.fields.forEach(fill);
+  });
+  byId("mistakes").replaceChildren(...form.mistakes.map((each) => element("li", each)));
+  byId("count").textContent = form.count ? `${form.count} ${form.count === 1 ? "mistake" : "mistakes"}` : "The campaign has no mistakes.";
+  byId("count").className = form.count ? "count bad" : "count good";
+  byId("plan").disabled = form.count > 0;
+  ready();
+}
+
+function ready() {
+  if (control) {
+    byId("start").disabled = byId("plan").disabled || planned !== text.value;
+    byId("start-note").hidden = !byId("start").disabled;
+  }
+  byId("plan-card").hidden = planned !== text.value;
+}
+
+function complain(error) {
+  byId("wrong").textContent = error ? error.message : "";
+  byId("wrong").hidden = !error;
+}
+
+async function check(change) {
+  clearTimeout(timer);
+  const own = ++asked;
+  try {
+    const found = await ask("/measure/form.json", { file: text.dataset.file, text: text.value, ...change });
+    if (own !== asked) return;
+    if (change) text.value = found.text;
+    complain();
+    show(found);
+  } catch (error) {
+    if (own === asked) complain(error);
+  }
+}
+
+let queue = Promise.resolve(); // fields change one after the other, each the text of the one before
+function changed(place, value) {
+  queue = queue.then(() => check({ place, value }));
+}
+text.addEventListener("input", () => {
+  ready();
+  clearTimeout(timer);
+  asked++;
+  timer = setTimeout(check, 400);
+});
+
+// The plan
+
+function table(heads, rows) {
+  const made = element("table"), head = element("tr");
+  head.append(...heads.map((each, k) => Object.assign(element("th", each, k ? "number" : ""), { scope: "col" })));
+  made.append(element("thead"), element("tbody"));
+  made.tHead.append(head);
+  made.tBodies[0].append(...rows.map((row) => {
+    const line = element("tr");
+    line.append(...row.map((each, k) => (k ? element("td", each, "number") : Object.assign(element("th", each), { scope: "row" }))));
+    return line;
+  }));
+  return made;
+}
+
+function plan(test) {
+  const card = element("section", undefined, "planned"), beside = element("div", undefined, "beside"), tables = element("div");
+  card.append(element("h3", `${test.test} (${test.method})`), element("p", test.headline));
+  if (test.limits.length) tables.append(element("h4", "Motions"), table(["", "planned", "limits"], test.limits));
+  if (test.expected.length) tables.append(element("h4", "Largest uncertainty to expect"), table(["", "U (k=2)", "unit"], test.expected));
+  beside.append(tables);
+  if (test.picture) beside.append(Object.assign(element("img"), { src: test.picture, alt: `Path of ${test.test} in three views, and the spindle speed over time; the extent is in the table` }));
+  card.append(beside, ...test.notes.map((each) => element("p", each, "note")));
+  return card;
+}
+
+byId("plan").addEventListener("click", async () => {
+  const own = text.value;
+  byId("plan").textContent = "Planning";
+  try {
+    const found = await ask("/measure/plan.json", { file: text.dataset.file, text: own });
+    complain();
+    byId("planned").replaceChildren(...found.tests.map(plan));
+    planned = own;
+    ready();
+  } catch (error) {
+    complain(error);
+  } finally {
+    byId("plan").textContent = "Show the plan";
+  }
+});
+
+// Save and start
+
+async function order(path, body) {
+  try {
+    const found = await ask(path, body);
+    complain();
+    return found;
+  } catch (error) {
+    complain(error);
+    return null;
+  }
+}
+
+if (control) {
+  byId("save").addEventListener("click", async () => {
+    const found = await order("/measure/save", { file: byId("name").value, text: text.value, before });
+    if (found) location.assign(`/measure?${new URLSearchParams({ file: found.file })}`);
+  });
+  byId("start").addEventListener("click", async () => {
+    byId("start").disabled = true;
+    const found = await order("/measure/start", { file: byId("name").value, text: text.value, before });
+    if (found) {
+      before = found.before;
+      reveal = found.process;
+    }
+    ready();
+  });
+}
+
+// Processes
+
+const WORDS = { finished: "✓ finished", interrupted: "■ stopped", failed: "✕ failed", killed: "✕ ended without a word" };
+const cards = new Map();
+
+async function command(path, body, pressed) {
+  pressed.disabled = true;
+  try {
+    await ask(path, body);
+    byId("refused").hidden = true;
+  } catch (error) {
+    byId("refused").textContent = error.message;
+    byId("refused").hidden = false;
+  }
+  pressed.disabled = false;
+}
+
+function process(each) { // made anew only when something but the progress has changed, so that buttons keep the focus
+  const { done, expected, note, ...rest } = each, key = JSON.stringify(rest);
+  let card = cards.get(each.name);
+  if (!card || card.dataset.key !== key) {
+    const made = element("section", undefined, each.alive ? "card process alive" : "card process");
+    made.dataset.key = key;
+    made.dataset.process = each.name;
+    const where = each.test ? `test ${each.number + 1} of ${each.total}, ${each.test}: ` : "";
+    made.append(element("h3", `${each.campaign} on ${each.machine}`), element("p", `started ${new Date(each.started).toLocaleString("en-GB")}`, "note"));
+    made.append(element("p", each.alive ? `${where}${each.stopping ? "stopping" : each.stage}` : WORDS[each.ended], `state ${each.ended || "live"}`));
+    if (each.alive) {
+      const bar = element("progress");
+      bar.setAttribute("aria-label", "Part of this stage that is done");
+      made.append(bar, element("p", "", "note course"));
+      if (each.announcements.length) made.append(...each.announcements.map((line) => element("p", line, "note")));
+    } else if (each.message) {
+      made.append(element("p", each.message, "message"));
+    }
+    if (each.request) {
+      const request = element("div", undefined, "request");
+      request.setAttribute("role", "alert");
+      request.append(element("p", each.request.text));
+      if (control) request.append(button("Done", (event) => command("/measure/answer", { process: each.name, number: each.request.number }, event.target), "start"));
+      made.append(request);
+    }
+    const links = element("p", undefined, "links");
+    for (const test of each.tests) {
+      if (test.status !== "finished") continue;
+      const link = element("a", `Report of ${test.name}`);
+      link.href = `/run?${new URLSearchParams({ run: test.run })}`;
+      links.append(link, " ");
+    }
+    if (control && each.alive) links.append(button("Stop", (event) => command("/measure/stop", { process: each.name }, event.target), "stop"));
+    if (control && each.resume) links.append(button("Resume", (event) => command("/measure/resume", { run: each.resume }, event.target)));
+    if (links.childNodes.length) made.append(links);
+    if (card) card.replaceWith(made);
+    cards.set(each.name, (card = made));
+  }
+  if (each.alive) {
+    const bar = card.querySelector("progress"), part = expected > 0 && done !== null ? Math.min(done / expected, 1) : null;
+    if (part === null) bar.removeAttribute("value");
+    else bar.value = part;
+    card.querySelector(".course").textContent = [part === null ? "" : `${Math.round(100 * part)} %`, note].filter(Boolean).join("  ");
+  }
+  return card;
+}
+
+let running = null, reveal = ""; // the run that measures, and the process that was started here just now
+
+async function processes() {
+  try {
+    const found = (await ask("/measure/processes.json")).processes;
+    const names = new Set(found.map((each) => each.name));
+    for (const name of cards.keys()) if (!names.has(name)) cards.delete(name);
+    for (const [id, own] of [["processes", found.filter((each) => each.alive)], ["ended", found.filter((each) => !each.alive)]]) {
+      const made = own.map(process), place = byId(id);
+      if (made.length !== place.children.length || made.some((card, k) => place.children[k] !== card)) place.replaceChildren(...made);
+      byId(`${id}-card`).hidden = !own.length;
+    }
+    if (names.has(reveal)) {
+      byId("processes-card").scrollIntoView();
+      reveal = "";
+    }
+    const now = found.find((each) => each.alive && each.stage === "measuring" && each.tests.length);
+    running = now ? now.tests.find((test) => test.name === now.test)?.run ?? null : null;
+    document.body.classList.remove("lost");
+  } catch (error) {
+    document.body.classList.add("lost");
+    byId("lost").textContent = error.message;
+  }
+  byId("lost").hidden = !document.body.classList.contains("lost");
+  setTimeout(processes, INTERVAL);
+}
+
+let drawn = "", views = null;
+
+async function live() { // the errors of the run that measures; the pause grows with the time that they take
+  const began = performance.now();
+  if (running) {
+    try {
+      const run = running, found = await ask(`/measure/live.json?${new URLSearchParams({ run })}`);
+      byId("live-card").hidden = false;
+      byId("live-note").textContent = `${found.samples} samples. ${found.why ? `No errors yet: ${found.why}` : "Preliminary: from the samples so far, with U (k = 2)."}`;
+      const key = `${run} ${found.samples}`;
+      if (found.item && key !== drawn) {
+        const place = element("div");
+        place.id = `live-${Date.now()}`;
+        const last = views;
+        byId("live").replaceChildren(place);
+        views = await Bokeh.embed.embed_item(sized(found.item), place.id);
+        if (last) {
+          last.clear?.();
+          Bokeh.documents.splice(0, Bokeh.documents.length - 1);
+        }
+        drawn = key;
+        byId("live").dataset.drawn = key;
+      }
+    } catch (error) {
+      byId("live-note").textContent = error.message;
+    }
+  } else {
+    byId("live-card").hidden = true;
+  }
+  setTimeout(live, Math.max(LIVE_INTERVAL, 4 * (performance.now() - began)));
+}
+
+check();
+processes();
+live();

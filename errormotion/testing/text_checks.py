@@ -1,0 +1,32 @@
+"""Whether a method that brings catalogues of its texts brings them whole."""
+
+from __future__ import annotations
+
+from errormotion.plugins import MethodSubject
+from errormotion.report.page.language import LANGUAGES
+from errormotion.testing.kit import require
+
+
+def languages_of(subject: MethodSubject) -> list[str]:
+    """Return the languages in which a method brings texts."""
+    texts = getattr(subject.plugin(), "texts", None)
+    return [language for language in LANGUAGES if texts is not None and texts(language)]
+
+
+def why_no_texts(subject: MethodSubject) -> str:
+    """Return why the texts are not examined; empty where they are."""
+    return "" if languages_of(subject) else "the method brings no texts in another language"
+
+
+def chapters_translated(subject: MethodSubject) -> str:
+    """In each language for which the method brings texts, no text of its chapters is left in English."""
+    from errormotion.report.untranslated import untranslated
+
+    raw, _ = subject.make(0)
+    errors, _ = subject.outcome(0)
+    languages = languages_of(subject)
+    for language in languages:
+        missing = untranslated(subject.plugin(), errors, raw, language=language)
+        listed = "".join(f"\n  {text}" for text in missing[:20])
+        require(not missing, f"texts('{language}') lacks {len(missing)} texts of the chapters:{listed}")
+    return f"the chapters are whole in {', '.join(languages)}"

@@ -1,0 +1,131 @@
+"""The page Measure in Chromium: a campaign from its form to its report, past the end of the dashboard."""
+
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from errormotion.campaign.background import processes
+from errormotion.errors import RunError
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+pytestmark = pytest.mark.slow
+
+MEASURING = """\
+schema = "errormotion.bench/1"
+name = "Virtual C-frame"
+machine = "C-frame (virtual) {markup}"
+[instruments.frame]
+driver = "five_sensor_frame"
+address = "sim://cframe?seed=3&pace=4"
+rate = "1.5 kHz"
+[instruments.control]
+driver = "virtual_controller"
+arm = true
+address = "sim://cframe/controller?seed=3"
+"""
+CAMPAIGN = """\
+schema = "errormotion.campaign/1"
+name = '{markup}'
+bench = "bench.toml"
+[[test]]
+name = "drift"
+method = "spindle_drift"
+[test.settings]
+duration = "40 s"   # of the record
+schedule = [{ at = "0 s", spindle_speed = "15000 /min" }]
+"""
+
+
+@pytest.fixture
+def mortal(tmp_path: Path) -> Iterator[tuple[Any, str]]:
+    """Return the process of a dashboard that can be killed, and its address; at the end nothing runs."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    options = ["--campaigns", str(tmp_path), "--allow-control", "--port", str(port), "--no-browser"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "errormotion", "dashboard", str(tmp_path / "runs"), *options],
+        env=os.environ | {"XDG_STATE_HOME": str(tmp_path / "state")},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    address = re.search(r"http://\S+", process.stdout.readline())
+    assert address
+    yield process, address[0]
+    process.kill()
+    process.communicate()
+    end = time.monotonic() + 30.0
+    while alive := [each.name for each in processes.found(tmp_path / "runs") if each.alive]:
+        with suppress(RunError):  # it has ended meanwhile
+            processes.stop(tmp_path / "runs", alive[0])
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+@pytest.mark.timeout(400)  # three programs start, slowly on a busy computer
+def test_a_campaign_is_corrected_planned_run_stopped_resumed_and_outlives_the_dashboard(
+    page: Any,
+    accessible: Callable[[], None],
+    mortal: tuple[Any, str],
+    serving: Callable[..., Any],
+    tmp_path: Path,
+    markup: str,
+) -> None:
+    expect, name = sync_api.expect, markup.replace("'", "")
+    (tmp_path / "bench.toml").write_text(MEASURING.replace("{markup}", markup.replace("'", "").replace('"', "")))
+    (tmp_path / "drift.toml").write_text(CAMPAIGN.replace("{markup}", name))
+    dashboard, address = mortal
+    page.goto(address + "measure")
+    duration = page.locator("""[data-place='["test",0,"settings","duration"]']""")
+    expect(duration).to_have_value("40 s")
+    duration.fill("2")
+    page.keyboard.press("Tab")
+    expect(page.locator("p.wrong:visible")).to_have_text("expected a time with its unit, such as '104 min'; found '2'")
+    assert 'duration = "2"   # of the record' in page.input_value("#text")
+    assert page.is_disabled("#start")
+    assert page.is_disabled("#plan")
+    accessible()
+    page.evaluate(  # two fields at once: none is lost
+        """for (const [key, value] of [['"operator"', "A"], ['"average"', "4 s"]]) {
+          const field = document.querySelector(`[data-place$='${key}]']`);
+          field.value = value;
+          field.dispatchEvent(new Event("change"));
+        }"""
+    )
+    expect(page.locator("#text")).to_have_value(re.compile('operator = "A"(.|\n)*average = "4 s"'))
+    page.fill("#text", page.input_value("#text").replace('"2"', '"40 s"'))
+    expect(duration).to_have_value("40 s")
+    expect(page.locator("#count")).to_have_text("The campaign has no mistakes.")
+    page.click("#plan")
+    page.wait_for_selector(".planned img")
+    expect(page.locator(".planned")).to_contain_text("0 min 40 s")
+    accessible()
+
+    page.click("#start")
+    page.wait_for_selector(".process.alive progress[value]")
+    page.wait_for_selector("#live[data-drawn] canvas")
+    accessible()
+    page.click(".process button:text-is('Stop')")
+    page.click("#ended .process:has(.interrupted) button:text-is('Resume')")
+    page.wait_for_selector(".process.alive")
+    page.expected_errors = ("ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_EMPTY_RESPONSE")
+    dashboard.kill()
+    dashboard.wait()
+    page.wait_for_selector("body.lost")
+    assert processes.found(tmp_path / "runs")[0].alive
+    port = int(address.rstrip("/").rpartition(":")[2])
+    serving(tmp_path / "runs", campaigns=tmp_path, control=True, port=port)
+    page.wait_for_selector("body:not(.lost) .process:has(.finished)", timeout=90_000)
+    page.click("#ended .process:has(.finished) >> text=Report of drift")
+    page.locator("iframe").scroll_into_view_if_needed()
+    expect(page.frame_locator("iframe").locator("h1")).to_have_text("Thermal drift of the spindle")
+    assert page.evaluate("window.taken") is None

@@ -1,0 +1,177 @@
+"""The page Measure over HTTP: fields, messages, plan, and what is refused without control."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
+
+from errormotion.campaign.background import processes
+from errormotion.dashboard.campaigns import hash_of
+from errormotion.dashboard.kept import Lately
+from errormotion.dashboard.pages import measure
+
+BENCH = """\
+schema = "errormotion.bench/1"
+name = "Virtual C-frame"
+machine = "C-frame (virtual)"
+[instruments.frame]
+driver = "five_sensor_frame"
+address = "sim://cframe?seed=3"
+rate = "1.5 kHz"
+[instruments.control]
+driver = "virtual_controller"
+arm = true
+address = "sim://cframe/controller?seed=3"
+"""
+CAMPAIGN = """\
+schema = "errormotion.campaign/1"
+name = '{name}'
+bench = "bench.toml"
+[[test]]
+name = "drift"
+method = "spindle_drift"
+[test.settings]
+duration = "1 min"   # of the record
+schedule = [{ at = "0 s", spindle_speed = "15000 /min" }]
+"""
+ORDERS = ["/measure/save", "/measure/start", "/measure/resume", "/measure/stop", "/measure/answer"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, markup: str) -> Path:
+    root = tmp_path_factory.mktemp("campaigns")
+    (root / "bench.toml").write_text(BENCH)
+    (root / "drift.toml").write_text(CAMPAIGN.replace("{name}", markup.replace("'", "")))
+    return root
+
+
+@pytest.fixture(scope="module")
+def reading(serving: Callable[..., Any], folder: Path) -> Any:
+    return serving(folder / "runs", campaigns=folder)
+
+
+@pytest.fixture(scope="module")
+def controlling(serving: Callable[..., Any], folder: Path) -> Any:
+    return serving(folder / "runs", campaigns=folder, control=True)
+
+
+def _post(served: Any, path: str, **body: Any) -> tuple[int, dict[str, Any]]:
+    headers = {"Origin": served.address.rstrip("/"), "Accept": "application/json"}
+    status, _, text = served.ask(path, "POST", json.dumps(body), **headers)
+    return status, json.loads(text)
+
+
+def _field(form: dict[str, Any], *place: str | int) -> dict[str, Any]:
+    fields = [each for group in form["groups"] for each in group["fields"]]
+    return next(each for each in fields if each["place"] == list(place))
+
+
+DURATION = ("test", 0, "settings", "duration")
+
+
+def test_a_wrong_value_has_its_message_at_its_field_and_the_text_follows(reading: Any, folder: Path) -> None:
+    text = (folder / "drift.toml").read_text()
+    status, form = _post(reading, "/measure/form.json", file="drift.toml", text=text, place=DURATION, value="2")
+    assert (status, form["count"], form["mistakes"]) == (200, 1, [])
+    assert form["text"] == text.replace('"1 min"   # of', '"2"   # of')
+    assert _field(form, *DURATION)["mistakes"] == ["expected a time with its unit, such as '104 min'; found '2'"]
+    _, form = _post(reading, "/measure/form.json", file="drift.toml", text=form["text"], place=DURATION, value="")
+    assert "duration" not in form["text"]
+    assert (form["count"], _field(form, *DURATION)["default"]) == (0, "5 h")
+    _, form = _post(reading, "/measure/form.json", file="drift.toml", text="name = ")
+    assert (form["groups"], form["count"]) == ([], 1)
+    _, form = _post(reading, "/measure/form.json", file="drift.toml", text=text, place=["test", 0, "method"], value="x")
+    assert "x" in _field(form, "test", 0, "method")["mistakes"][0]
+
+
+def test_the_page_shows_names_as_text(reading: Any) -> None:
+    status, _, text = reading.ask("/measure?file=drift.toml")
+    assert status == 200
+    assert "&lt;script&gt;" in text
+    assert "<script>window" not in text
+    assert reading.ask("/measure?file=bench.toml")[0] == 404
+    for name in ("..%2Fdrift.toml", "x%00.toml", "%2Fetc%2Fhostname", ".."):
+        assert reading.ask(f"/measure?file={name}")[0] == 404
+
+
+def test_the_plan_is_that_of_the_commands(reading: Any, folder: Path) -> None:
+    status, found = _post(reading, "/measure/plan.json", file="drift.toml", text=(folder / "drift.toml").read_text())
+    (test,) = found["tests"]
+    assert (status, test["headline"]) == (200, "1 min 00 s, 0 moves over 0.0 m, 0 touches")
+    assert ["spindle/(1/min)", "up to 15000", "-"] in test["limits"]
+    assert {row[0] for row in test["expected"]} == {"EX", "EY", "EZ", "EA", "EB"}
+    assert test["picture"].startswith("data:image/png;base64,")
+
+
+@pytest.mark.parametrize("path", ORDERS)
+def test_nothing_is_started_or_stopped_without_control(reading: Any, folder: Path, path: str) -> None:
+    text = (folder / "drift.toml").read_text()
+    body = {"file": "x.toml", "text": text, "before": "", "run": "x", "process": "x", "number": 1}
+    status, found = _post(reading, path, **body)
+    assert (status, found) == (403, {"error": "The dashboard was started without --allow-control"})
+    assert reading.ask(path, "POST", json.dumps(body), Origin="http://evil.example")[0] == 403
+    assert not (folder / "x.toml").exists()
+    assert not (folder / "runs").exists()
+
+
+@pytest.mark.parametrize("path", ORDERS)
+def test_orders_come_from_pages_of_this_server_only(controlling: Any, path: str) -> None:
+    assert controlling.ask(path, "POST", "{}", Origin="http://evil.example")[0] == 403
+    assert controlling.ask(path, "POST", "{}")[0] == 403
+    assert controlling.ask(path)[0] == 405
+
+
+def test_every_order_needs_control() -> None:
+    handlers = dict(measure.HANDLERS)
+    assert all(handlers[path].controls for path in ORDERS)
+    reads = {"/measure", r"/measure/form\.json", r"/measure/plan\.json"}
+    reads |= {r"/measure/processes\.json", r"/measure/live\.json"}
+    assert set(handlers) - set(ORDERS) == reads
+
+
+def test_a_file_is_saved_once_and_not_over_the_work_of_others(controlling: Any, folder: Path) -> None:
+    text = (folder / "drift.toml").read_text()
+    order = {"file": "other.toml", "text": text, "before": ""}
+    assert _post(controlling, "/measure/save", **order) == (200, {"file": "other.toml", "before": hash_of(text)})
+    changed = {**order, "text": text.replace("1 min", "2 min")}
+    assert "was changed by others" in _post(controlling, "/measure/save", **changed)[1]["error"]
+    assert _post(controlling, "/measure/save", **{**changed, "before": hash_of(text)})[0] == 200
+    assert (folder / "other.toml").read_text() == changed["text"]
+    for name in ("../x.toml", "x.txt", ".x.toml", "a/b.toml", "bench.toml"):
+        assert _post(controlling, "/measure/save", **{**order, "file": name})[0] in (400, 404)
+    assert (folder / "bench.toml").read_text() == BENCH
+    assert (
+        "1 mistakes"
+        in _post(controlling, "/measure/start", **{**order, "text": text.replace("1 min", "1")})[1]["error"]
+    )
+    assert processes.found(folder / "runs") == []
+
+
+def test_without_control_no_other_files_are_looked_at(reading: Any, folder: Path) -> None:
+    text = (folder / "drift.toml").read_text()
+    for path in ("/etc/hostname", "../bench.toml", "C:/x"):
+        status, found = _post(reading, "/measure/form.json", file="drift.toml", text=text.replace("bench.toml", path))
+        assert (status, "looks at files of its folder only" in found["error"]) == (400, True)
+
+
+@pytest.mark.parametrize("body", ["", "[]", "{}", '{"file": 1, "text": "x"}', "[" * 100_000, "\xff"])
+def test_a_request_that_is_none_is_refused(reading: Any, body: str) -> None:
+    headers = {"Origin": reading.address.rstrip("/"), "Accept": "application/json"}
+    assert reading.ask("/measure/form.json", "POST", body, **headers)[0] == 400
+
+
+def test_many_clients_do_not_keep_the_server_at_work() -> None:
+    made: list[int] = []
+    lately: Lately[int] = Lately(1000.0, most=2)
+
+    def make() -> int:
+        made.append(len(made))
+        return made[-1]
+
+    assert [lately.get("a", make) for _ in range(20)] == [0] * 20
+    assert [lately.get(key, make) for key in "bca"] == [1, 2, 3]
+    assert Lately(0.0).get("a", make) == 4
