@@ -8,19 +8,33 @@ of requirements.lock. A lower bound must therefore be a version that exists.
 from __future__ import annotations
 
 import argparse
+import platform
 import re
 import shutil
 import subprocess
 import sys
 import tomllib
 from collections.abc import Iterable
+from datetime import UTC, datetime
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 TOOLS = ("hypothesis", "packaging", "pytest", "pytest-timeout", "pytest-xdist")
 PEERS = ("canopen", "cesapi", "geocompy", "metrolopy", "minimalmodbus", "mtconnect", "pyvisa", "pyvisa-py")
-CORE = ("datasets", "campaign", "instruments", "kinematics", "plugins", "record", "tolerances", "twin", "montecarlo")
-"""Folders of tests that touch every package: files, instruments, fits, compiled loops."""
+CORE = (
+    *("test_compiling.py", "datasets/test_storage.py", "datasets/test_bounded_reading.py", "datasets/test_units.py"),
+    *("datasets/test_golden_datasets.py", "datasets/test_tomlfile.py", "campaign/test_store.py"),
+    *("campaign/test_batch.py", "campaign/test_files.py", "campaign/test_beam_campaign.py"),
+    *("compensation/test_thermal_model.py", "kinematics/test_fits.py", "methods/beam_direction/test_planning.py"),
+    *("methods/multilateration/test_layout.py", "methods/multilateration/test_solver.py"),
+    *("methods/crossbeam_registration/test_registration.py", "methods/spindle_drift"),
+    *("instruments/test_transports.py", "instruments/test_modbus_peers.py", "instruments/test_can_temperature.py"),
+    *("instruments/test_profile_files.py", "instruments/controller/test_opcua.py"),
+    *("report/test_exports.py", "report/test_canvas.py", "dashboard/test_server.py"),
+    *("cli/test_commands.py", "cli/test_progress.py"),
+)
+"""Tests that use every package: files, instruments, fits, compiled loops, pages, the command line."""
+TITLE = "Lowest versions"
 
 _REQUIREMENT = re.compile(r"([A-Za-z0-9._-]+)>=([0-9][0-9.]*)(\s*;.+)?")
 
@@ -82,6 +96,21 @@ def install(venv: Path, python: str) -> Path:
     return inside
 
 
+def section(result: str) -> str:
+    """Return the section of the page from the last line of pytest."""
+    own = pins()[: -len(TOOLS + PEERS)]
+    return "\n".join(
+        [
+            "Tests with packages at the lowest versions that `pyproject.toml` allows, all at once: "
+            + ", ".join(pin.partition(";")[0].replace("==", " ").strip() for pin in own) + ".",
+            "",
+            f"{result}.",
+            "",
+            f"`make lowest`, {datetime.now(UTC):%Y-%m-%d}, Python {platform.python_version()}.",
+        ]
+    )  # fmt: skip
+
+
 def main() -> None:
     """Make the environment and run the tests there."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -89,8 +118,16 @@ def main() -> None:
     parser.add_argument("--python", default=sys.executable, help="of the environment; the lowest is 3.11")
     options, words = parser.parse_known_args()
     python = install(options.venv, options.python)
-    words = words or ["-n", "auto", "--dist", "loadfile", "-m", "not slow", *(f"tests/{name}" for name in CORE)]
-    sys.exit(subprocess.run([python, "-m", "pytest", *words], cwd=ROOT, check=False).returncode)
+    whole = not words
+    words = words or ["-n", "auto", "--dist", "loadfile", "-q", "-m", "not slow", *(f"tests/{name}" for name in CORE)]
+    ended = subprocess.run([python, "-m", "pytest", *words], cwd=ROOT, check=False, stdout=subprocess.PIPE, text=True)
+    print(ended.stdout)
+    if whole:
+        sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT / "tools")]
+        from fuzz import PAGE, write_section
+
+        write_section(PAGE, TITLE, section(ended.stdout.strip().splitlines()[-1].strip("= ")))
+    sys.exit(ended.returncode)
 
 
 if __name__ == "__main__":

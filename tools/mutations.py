@@ -105,9 +105,10 @@ def section(rows: dict[str, Row], seed: int) -> str:
         f"{total.mutations} altered files, each read by one command: values, keys, dims, units, types and attributes "
         "changed, huge sizes stated, codecs and links exchanged, bytes changed, files cut off or replaced by folders, "
         "links, devices and pipes. The command must read the file, or refuse it with a message that names it, within "
-        f"{file_trials.LONGEST:.0f} s of processor time and {file_trials.MEMORY >> 20} MiB of memory and "
-        f"{file_trials.MEMORY_PER_BYTE} bytes for each byte of the files. A crash, a warning of Python, or markup of "
-        "the file in a page is a failure, too.",
+        f"{file_trials.LONGEST:.0f} s of processor time and {file_trials.MEMORY >> 20} MiB of memory, "
+        f"{file_trials.MEMORY_PER_BYTE} bytes for each byte of the files, and {file_trials.COPIES} bytes for each byte "
+        "of values that a NetCDF file states. A crash, a warning of Python, or markup of the file in a page is a "
+        "failure, too.",
         "",
         "| kind of file | mutations | refused | read | exit code 70 | slowest | largest memory |",
         "|---|---|---|---|---|---|---|",

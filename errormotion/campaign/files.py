@@ -7,6 +7,7 @@ reported in one message, each with its key, the expected and the found value.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -275,7 +276,8 @@ def campaign_of(text: str, path: Path) -> CampaignPlan:
         try:
             plan = load_bench(path.parent / bench)
         except BenchError as error:
-            bench_error = error
+            there = os.path.isfile(path.parent / bench)
+            bench_error = error if there else BenchError(f"{path}: bench: {error}")
     try:
         campaign = parse_campaign(text, path, plan)
     except MistakesError as error:

@@ -116,6 +116,30 @@ def test_netcdf_files_that_are_small_and_state_much_or_lead_elsewhere_are_refuse
         datasets.load(path)
 
 
+def test_a_file_may_not_state_much_more_than_it_has(tmp_path: Path) -> None:
+    path = tmp_path / "errors.nc"
+    with altered_datasets.h5py.File(path, "w") as file:
+        file["own"] = np.random.default_rng(1).integers(256, size=1_000_000, dtype=np.uint8)
+        file.create_dataset("EX", shape=(80_000_000,), chunks=(100_000,), dtype="f8", compression="gzip")
+    with pytest.raises(DatasetError, match=r"expected at most 603979776 bytes of values .* it states 641000000"):
+        datasets.load(path)
+
+
+@pytest.mark.slow
+def test_reading_takes_at_most_five_copies_of_the_values_that_a_file_states(tmp_path: Path) -> None:
+    good, rows = datasets.load(file_kinds.GOOD / "spindle_drift_drift.nc").load(), 40_000
+    many = good.isel(time=np.zeros(rows, int)).assign_coords(time=("time", np.arange(float(rows)), good["time"].attrs))
+    for variable in many.variables.values():
+        variable.encoding = {}
+    packed = {str(name): {"zlib": True} for name in many.variables if many[name].dtype.kind == "f"}
+    many.to_netcdf(tmp_path / "errors.nc", engine="h5netcdf", encoding=packed)
+    for words in (["validate", "errors.nc"], ["report", "errors.nc", "--out", "page.html"]):
+        file_trials.preload(words, tmp_path, tmp_path / "log")
+        ended = file_trials.run(words, tmp_path, tmp_path / "log")
+        assert ended.code == 0, ended.answer
+        assert ended.memory <= 5 * sum(each.nbytes for each in many.variables.values())
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import altered
 import file_trials
+import h5py
 from altered import JSON, TEXT, TOML, Alteration
 from altered_datasets import NETCDF, ZARR
 from file_trials import Ended
@@ -18,6 +19,8 @@ from text_files import DRIFT, DRIFT_MAP, LOG, MAP
 from warm_ups import warm_up
 
 from errormotion import datasets, plugins
+from errormotion.datasets.files.containers import check_netcdf
+from errormotion.errors import DatasetError
 from errormotion.plugins import load_object
 
 ROOT = Path(__file__).parents[2]
@@ -102,8 +105,20 @@ def trial(kind: Kind, number: int, seed: int, place: Path) -> Outcome:
     what = altered.alter(folder / target, kind.alterations, chance)
     size = sum(each.stat().st_size for each in folder.rglob("*") if each.is_file())
     ended = file_trials.run(words, folder, place / "log")
-    faults = file_trials.faults(ended, names(target), size) + file_trials.harm(folder)
+    faults = file_trials.faults(ended, names(target), size, stated(folder / target)) + file_trials.harm(folder)
     return Outcome(kind.name, number, what, tuple(words), ended, tuple(faults))
+
+
+def stated(path: Path) -> int:
+    """Return the bytes of values that a NetCDF file states, as far as it may; 0 for another file."""
+    if path.suffix != ".nc" or not altered.is_plain(path):  # opening a pipe would not end
+        return 0
+    try:
+        check_netcdf(path)
+        with h5py.File(path) as file:
+            return sum(each.size * each.dtype.itemsize for each in file.values() if isinstance(each, h5py.Dataset))
+    except (DatasetError, OSError, KeyError, RuntimeError, TypeError, ValueError):
+        return 0
 
 
 def copied(source: Path, folder: Path) -> None:
@@ -117,6 +132,8 @@ def names(target: str) -> tuple[str, ...]:
     parts = Path(target).parts
     labels = [f"'{Path(target).stem}'", "'monday'"]  # of a comparison
     labels += ["log.csv: "] * (target == "map.toml")  # a line of the log that does not fit the map
+    labels += ["has no NC programs"] * (target == "bench.toml")  # whatever the bench
+    labels += [" in 0 runs. "] * (Path(target).name == "run.json")  # of this machine
     return (*(part for part in parts if part not in ("runs", "errors")), *labels)
 
 

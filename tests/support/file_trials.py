@@ -36,6 +36,8 @@ MEMORY = 384 << 20
 """What a command may occupy beyond its parent, bytes."""
 MEMORY_PER_BYTE = 64
 """And for each byte of what it reads."""
+COPIES = 5
+"""And for each byte of the values that a dataset states, where it may state them."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,11 @@ def run(words: Sequence[str], folder: Path, place: Path, imports: Path | None = 
     )
 
 
-def faults(ended: Ended, names: Sequence[str], size: int) -> list[str]:
-    """Return what must not be: one of ``names`` (of the altered file) is in the message of a refusal."""
+def faults(ended: Ended, names: Sequence[str], size: int, stated: int = 0) -> list[str]:
+    """Return what must not be: one of ``names`` (of the altered file) is in the message of a refusal.
+
+    The files have ``size`` bytes, and state ``stated`` bytes of values.
+    """
     found = []
     if ended.code == INTERNAL_ERROR:
         found.append(f"internal error: {_last(ended)}")
@@ -124,8 +129,8 @@ def faults(ended: Ended, names: Sequence[str], size: int) -> list[str]:
         found.append(f"exit code {ended.code} without the name of the file: {ended.answer[:400]}")
     if ended.seconds > LONGEST:
         found.append(f"{ended.seconds:.0f} s of processor time")
-    if ended.memory > MEMORY + MEMORY_PER_BYTE * size:
-        found.append(f"{ended.memory >> 20} MiB of memory for {size} bytes")
+    if ended.memory > MEMORY + MEMORY_PER_BYTE * size + COPIES * stated:
+        found.append(f"{ended.memory >> 20} MiB of memory for {size} bytes that state {stated}")
     return found
 
 

@@ -17,7 +17,7 @@ import wire_proxy
 from wire_proxy import DOWN, HARMLESS, KINDS, UP, Fault
 
 from errormotion import plugins
-from errormotion.errors import InstrumentError
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.plugins import InstrumentSubject
 from errormotion.plugins.subjects import with_query
 from errormotion.testing.run import subjects_of
@@ -144,7 +144,14 @@ def subject_of(case: Case) -> InstrumentSubject:
 
 @cache
 def truth(case: Case) -> Truth:
-    """Return the session without a disturbance."""
+    """Return the session without a disturbance; on a busy computer it may miss a time limit, and is repeated."""
+    for _ in range(REPEATS):
+        with suppress(InstrumentTimeoutError):
+            return _undisturbed(case)
+    return _undisturbed(case)
+
+
+def _undisturbed(case: Case) -> Truth:
     found, subject = Truth(), subject_of(case)
     with wire_proxy.behind(Fault()) as line, subject.build() as instrument:
         session(instrument, subject, found)

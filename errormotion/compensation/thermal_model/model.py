@@ -319,6 +319,9 @@ def violations(dataset: xr.Dataset) -> list[str]:
     point: Any = dataset.attrs.get("functional_point")
     if np.shape(point) != (3,) or np.asarray(point).dtype.kind not in "fiu":
         found.append(f"attribute 'functional_point': expected three coordinates in m; found {point!r:.100}")
+    campaigns: Any = dataset.attrs.get("campaigns", 0)
+    if np.ndim(campaigns) or np.asarray(campaigns).dtype.kind not in "fiu":
+        found.append(f"attribute 'campaigns': expected a number; found {campaigns!r:.100}")
     if "feature_source" not in dataset.coords:
         found.append("feature_source(feature): missing; expected: sensor or working parameter of each feature")
     return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets.files.reading import parse_json
 from errormotion.datasets.schemas import DOF
 from errormotion.errors import DatasetError
 
@@ -70,6 +70,8 @@ def read_inputs(ds: xr.Dataset, what: str = "the data") -> Inputs:
     if "temperature" not in ds or set(ds["temperature"].dims) != {"time", "sensor"}:
         raise DatasetError(f"{what}: expected temperature(time, sensor); found none. Add a thermometer to the bench.")
     time = np.asarray(ds["time"].values, dtype=float)
+    if not time.size:
+        raise DatasetError(f"{what}: expected at least one time; found none")
     if time.size > 1 and not (np.diff(time) > 0).all():
         raise DatasetError(f"{what}: expected increasing times")
     values = np.asarray(ds["temperature"].transpose("time", "sensor").values, dtype=float)
@@ -109,12 +111,23 @@ def read_record(ds: xr.Dataset, what: str = "the errors") -> Record:
     return Record(inputs, errors, variance)
 
 
+def _stated(ds: xr.Dataset, name: str, kind: type[Any]) -> Any:
+    """Return what an attribute states in JSON; an empty object or list where it is missing."""
+    try:
+        found = parse_json(str(ds.attrs[name])) if name in ds.attrs else kind()
+    except ValueError as error:
+        raise DatasetError(f"attribute '{name}': expected JSON; {error}") from None
+    if not isinstance(found, kind):
+        raise DatasetError(f"attribute '{name}': expected a JSON {kind.__name__}; found {found!r:.100}")
+    return found
+
+
 def instruments_of(datasets: Iterable[xr.Dataset]) -> list[Any]:
     """Return the instruments of datasets, each once, so that simulated data remain marked as such."""
     found: list[Any] = []
     for ds in datasets:
-        stated = json.loads(str(ds.attrs.get("provenance", "{}"))).get("instruments")
-        for instrument in stated or json.loads(str(ds.attrs.get("instruments", "[]"))):
+        provenance = _stated(ds, "provenance", dict)
+        for instrument in provenance.get("instruments") or _stated(ds, "instruments", list):
             if instrument not in found:
                 found.append(instrument)
     return found

@@ -25,6 +25,10 @@ OWN_BYTES = 64 << 20
 """Bytes of values that any dataset may state."""
 PER_BYTE = 1100
 """Bytes of values for each byte of the file or folder; deflate, the codec of NetCDF, reaches 1032."""
+MUCH = 512 << 20
+"""Bytes of values that a file or folder may state whatever its compression, beyond `OWN_BYTES`; above, it needs"""
+PER_BYTE_OF_MUCH = 64
+"""one byte for each so many bytes of values. Reading takes up to five copies of the values."""
 MOST_VARIABLES = 2000
 LARGEST_METADATA = 16 << 20
 """Bytes of a zarr.json."""
@@ -91,6 +95,8 @@ def check_zarr(path: Path) -> None:
     for each in sorted(path.iterdir()):
         if (each / "zarr.json").exists():
             arrays[each.name] = _metadata(each / "zarr.json")
+        elif each.is_dir():
+            raise DatasetError(f"{path}: {each.name!r:.100}: expected an array (zarr.json); found a folder without it")
     held = root.get("consolidated_metadata")
     if held is not None:
         if not isinstance(held, dict) or not isinstance(held.get("metadata"), dict):
@@ -115,11 +121,15 @@ def check_zarr(path: Path) -> None:
     _raise(path, found, total, size)
 
 
+def _most(size: int) -> int:
+    """Return the bytes of values that a file or folder of some bytes may state."""
+    return OWN_BYTES + min(PER_BYTE * size, max(MUCH, PER_BYTE_OF_MUCH * size))
+
+
 def _raise(path: Path, found: list[str], total: int, size: int) -> None:
-    if total > OWN_BYTES + PER_BYTE * size:
+    if total > _most(size):
         found.append(
-            f"expected at most {OWN_BYTES} bytes of values and {PER_BYTE} for each byte on disk; it "
-            f"states {total} bytes and has {size}"
+            f"expected at most {_most(size)} bytes of values in a file or folder of {size} bytes; it states {total}"
         )
     if found:
         raise DatasetError(f"{path}: is damaged, or made to harm:", found)
@@ -207,7 +217,7 @@ def _wrong_chunks(folder: Path, metadata: Mapping[str, Any], size: int) -> Itera
     if not packed or not (folder / "c").exists():
         return
     items = math.prod(_chunk_shape(metadata))
-    largest = OWN_BYTES + PER_BYTE * size if metadata["data_type"] == _TEXT else items * _item(metadata)
+    largest = _most(size) if metadata["data_type"] == _TEXT else items * _item(metadata)
     for file in _below(folder / "c"):
         with open(file, "rb") as chunk:
             head = chunk.read(18)

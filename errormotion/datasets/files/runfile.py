@@ -48,9 +48,9 @@ class _Clock(_Table):
 
 
 class _Step(_Table):
-    step: str = ""
-    outcome: str = ""
-    time: str = ""
+    step: str
+    outcome: str
+    time: str
 
 
 class _Samples(_Table):

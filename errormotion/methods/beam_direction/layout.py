@@ -13,6 +13,10 @@ Point = tuple[Length, Length, Length]
 Vector = tuple[float, float, float]
 
 
+SHORTEST = 1e-6
+"""Largest component of a vector that states a direction; its reciprocal is the longest."""
+
+
 class Face(PluginSettings):
     """Setting of the sine gauge: inclination of its face, and rotation of its turntable about Z."""
 
@@ -107,8 +111,9 @@ class Layout(PluginSettings):
                 raise ValueError(f"{name}: expected the lower limit first; found {low:g} and {high:g}")
         for name in ("nominal_direction", "triangulation_normal"):
             vector = getattr(self, name)
-            if vector is not None and not any(vector):
-                raise ValueError(f"{name}: expected a direction; found (0, 0, 0)")
+            if vector is not None and not SHORTEST <= max(map(abs, vector)) <= 1 / SHORTEST:
+                found = ", ".join(f"{component:g}" for component in vector)
+                raise ValueError(f"{name}: expected a direction; found ({found})")
         if self.path and len(self.path) < 9:
             raise ValueError(f"path: expected 9 positions or more; found {len(self.path)}")
         return self

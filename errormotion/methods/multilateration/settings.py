@@ -21,6 +21,8 @@ Percent = Annotated[float, Quantity("a relative humidity", "%", "50 %")]
 Relative = Annotated[float, Quantity("a relative length", "m/m", "0.3 um/m")]
 Coefficient = Annotated[float, Quantity("a coefficient of expansion", "1/K", "11.5 um/m/K")]
 TemperatureStep = Annotated[float, Quantity("a difference of temperature", "K", "0.2 K")]
+Number = Annotated[int, Field(ge=1, le=100)]
+"""Points of a grid along one axis."""
 
 
 class Air(PluginSettings):
@@ -63,7 +65,7 @@ class Layout(PluginSettings):
 
     low: Position = Field(default=(-0.2, -0.2, 0.0), description="corner of the box of targets, axis positions")
     high: Position = Field(default=(0.2, 0.2, 0.3), description="opposite corner")
-    count: tuple[int, int, int] = Field(default=(5, 5, 4), description="targets along X, Y and Z")
+    count: tuple[Number, Number, Number] = Field(default=(5, 5, 4), description="targets along X, Y and Z")
     targets: tuple[Position, ...] = Field(
         default=(), description="axis positions of the targets instead of a grid, as a plan chooses them"
     )
@@ -95,7 +97,7 @@ class Choosing(PluginSettings):
     count: int | None = Field(default=None, ge=1, description="targets to choose")
     time: Time | None = Field(default=None, gt=0, description="time for one set-up, instead of count")
     time_per_target: Time = Field(default=15.0, gt=0, description="time for the move to a target, wait and reading")
-    candidates: tuple[int, int, int] = Field(default=(7, 7, 7), description="candidates along X, Y and Z")
+    candidates: tuple[Number, Number, Number] = Field(default=(7, 7, 7), description="candidates along X, Y and Z")
     low: Position | None = Field(
         default=None, description="corner of the box of candidates, axis positions; default: that of the layout"
     )

@@ -183,9 +183,9 @@ def inclinations(normals: Array, beam: Array) -> Array:
 
 def longest_strokes(normals: Array, limits: Limits) -> Array:
     """Return the longest strokes (k, 3), m, within the range, the travel and the plate."""
-    gradient = -normals / (normals @ limits.beam)[:, None]
-    spot = np.linalg.norm(np.eye(3) + gradient[:, :, None] * limits.beam, axis=-1)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # a plane along the beam has no strokes
+        gradient = -normals / (normals @ limits.beam)[:, None]
+        spot = np.linalg.norm(np.eye(3) + gradient[:, :, None] * limits.beam, axis=-1)
         longest = np.minimum(limits.reach / np.abs(gradient), limits.plate / spot)
     return np.asarray(np.minimum(longest, limits.travel))
 
