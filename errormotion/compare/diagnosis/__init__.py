@@ -63,11 +63,6 @@ class Cause:
     p: float
     alike: tuple[str, ...] = field(default=())
 
-    @property
-    def explains(self) -> bool:
-        """Whether what remains is compatible with the uncertainties."""
-        return self.p >= UNEXPLAINED
-
 
 def diagnose(
     a: Estimate,
