@@ -48,10 +48,19 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
     return _ByFile(config, log)
 
 
+LONGEST = ("linuxcnc", "test_builtin_instruments", "test_virtual_probing", "test_wire_checks", "test_docs")
+"""Names of the files that take longest, with or without slow tests: a minute and more, most of it waiting."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the files of slow tests, those of LinuxCNC first, so that no worker has a long file at the end."""
+    """Begin with the longest files, then those of slow tests, so that no worker has a long file at the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: ("linuxcnc" not in item.nodeid.partition("::")[0], item.path not in slow))
+
+    def place(item: pytest.Item) -> tuple[int, bool]:
+        file = item.nodeid.partition("::")[0]
+        return next((k for k, name in enumerate(LONGEST) if name in file), len(LONGEST)), item.path not in slow
+
+    items.sort(key=place)
 
 
 def pytest_collection_finish() -> None:

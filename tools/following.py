@@ -36,6 +36,7 @@ EXACT = 1e-6
 """Relative, of numbers that HAL prints with seven digits."""
 WATCHDOG = 5.0 / SPEEDUP  # s
 SLACK = 5.0  # s, of a computer with other work
+START_TIMEOUT = 300.0  # s, of a program on a computer with much other work
 NAMES = {
     "kill_program": "compensating program killed",
     "suspend_program": "compensating program suspended for 3 s",
@@ -92,7 +93,7 @@ class Following:
         )
         log.close()
         self.course.starts += 1
-        until(self.alive, 60.0)
+        until(self.alive, START_TIMEOUT)
 
     def alive(self) -> bool:
         """Whether signs of life arrive."""

@@ -47,13 +47,11 @@ def section(seeds: int) -> Iterator[str]:
         yield from _table(range(first, first + seeds), replace(duty, model=model))
     yield from (
         "",
-        "The machines of both tables are different ones. A warm-up of 19 cycles does not determine the 20 and more "
-        "coefficients of a model that the default selection may choose: its prediction is so uncertain at other speeds "
-        "that it is not followed (limit of U: 20 um). It does no harm, and takes nothing off. "
-        "Two warm-ups for the fit, or a smaller model, avoid it. The opposite happens too: left-out blocks of one "
-        "warm-up may favour a model without any sensor (`sensors` 0), which knows the speed alone and whose time "
-        "constants are not those of the machine. The largest residuals are of this kind; a small displacement can then "
-        "become larger (`least gain` above 100 %) while the whole becomes smaller.",
+        "The machines of both tables are different ones. One warm-up determines few coefficients, and left-out blocks "
+        "of it have its speeds: they do not show what the coefficients are worth at others. The selection therefore "
+        "adds the variance of the prediction with sources of heat that act each by itself, and takes one sensor at "
+        "least. Without both, models were chosen that are not followed (limit of U: 20 um), or that knew the speed "
+        "alone.",
     )
 
 

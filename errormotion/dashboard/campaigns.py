@@ -56,14 +56,8 @@ class Campaigns:
 
     def names(self) -> list[str]:
         """Return the names of the campaign files."""
-        found = []
-        for path in sorted(self.folder.glob("*.toml"))[:MOST_LOOKED_AT]:
-            try:
-                if str(read_toml(path).get("schema", "")).startswith("errormotion.campaign/"):
-                    found.append(path.name)
-            except ErrormotionError:
-                continue
-        return found[:MOST_FILES]
+        looked_at = sorted(self.folder.glob("*.toml"))[:MOST_LOOKED_AT]
+        return [path.name for path in looked_at if _is_campaign(path)][:MOST_FILES]
 
     def read(self, name: str) -> str:
         """Return the text of a file; of no name, that of a new campaign.
@@ -76,7 +70,7 @@ class Campaigns:
         if not name:
             bench = "bench.toml" if self.bench is None else os.path.relpath(self.bench, self.folder)
             return NEW.format(bench=value(bench))
-        if name not in self.names():
+        if Path(name).name != name or "\0" in name or not _is_campaign(self.folder / name):
             raise NotFoundError(f"There is no campaign file {name[:100]!r} in {self.folder}.")
         try:
             return read_bytes(self.folder / name, LONGEST_TEXT).decode("utf-8-sig")
@@ -162,6 +156,13 @@ class Campaigns:
 def hash_of(text: str) -> str:
     """Return the hash of a text, by which a later change is seen."""
     return sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _is_campaign(path: Path) -> bool:
+    try:
+        return path.suffix == ".toml" and str(read_toml(path).get("schema", "")).startswith("errormotion.campaign/")
+    except ErrormotionError:
+        return False
 
 
 def _strings(content: Any) -> Iterator[str]:

@@ -57,7 +57,6 @@ def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
     freedoms, panels = [str(name) for name in ds["dof"].values], list[figure]()
     for k, freedom in enumerate(freedoms):
         factor, unit = field(freedom)
-        unit = unit.replace("um", "µm")
         values = factor * ds["value"].values[..., k].reshape(len(names), -1)
         bands = factor * expanded[..., k].reshape(len(names), -1)
         curves = [Curve(freedom, *each) for each in zip(names, [unit] * len(names), values, bands, strict=True)]
@@ -166,7 +165,7 @@ def _axes(unit: str, label: str | None, *, last: bool, **options: Any) -> figure
     )
     for axis in plot.axis:
         axis.axis_label_text_font, axis.major_label_text_font = FONT, FONT
-        axis.axis_label_text_font_style, axis.axis_label_text_font_size = "normal", "13px"
+        axis.axis_label_text_font_style, axis.axis_label_text_font_size = "normal", "14px"
         axis.major_label_text_font_size, axis.major_label_text_color = "12px", SOFT
         axis.axis_label_text_color, axis.axis_line_color = INK, SOFT
         axis.minor_tick_line_color, axis.major_tick_line_color = None, SOFT
@@ -185,7 +184,7 @@ def _legend(plot: figure) -> None:
     plot.center.remove(legend)
     plot.add_layout(legend, "above")
     legend.orientation, legend.border_line_color, legend.padding = "horizontal", None, 2
-    legend.ncols, legend.label_text_font, legend.label_text_font_size = 8, FONT, "13px"
+    legend.ncols, legend.label_text_font, legend.label_text_font_size = 8, FONT, "14px"
     legend.label_text_color = INK
 
 

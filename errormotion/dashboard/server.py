@@ -7,6 +7,7 @@ import ssl
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 
 from bokeh.util.paths import bokehjs_path
@@ -111,7 +112,9 @@ def application(context: Context) -> Application:
             (r"/run", results.Run, one),
             (r"/run/figure\.json", results.Figure, one),
             (r"/run/values\.csv", results.Values, one),
+            (r"/run/space\.html", results.Space, one),
             (r"/run/file", results.File, one),
+            (r"/static/(report\.js)", Static, {**one, "path": str(files("errormotion.report") / "page" / "templates")}),
             (r"/static/(dashboard\.css|[a-z]+\.js|icon\.svg)", Static, {**one, "path": str(HERE / "static")}),
             (rf"/static/({scripts})", Static, {**one, "path": str(bokehjs_path() / "js")}),
         ],

@@ -88,7 +88,10 @@ def _axes(drawing: Drawing, ds: xr.Dataset, label: str) -> Axes:
     axes = drawing.add_axes((0.62 / wide, 0.42 / high, (wide - 0.72) / wide, (high - 0.87) / high))
     locator: Any = AutoDateLocator(minticks=4, maxticks=9)  # type: ignore[no-untyped-call]
     axes.xaxis.set_major_locator(locator)
-    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
+    formats = ["%Y", "%Y-%m", "%m-%d", "%H:%M", "%H:%M", "%H:%M:%S"]  # the same in every language
+    axes.xaxis.set_major_formatter(
+        ConciseDateFormatter(locator, formats=formats, zero_formats=formats, show_offset=False)  # type: ignore[no-untyped-call]
+    )
     axes.set_ylabel(label)
     t = ds["time"].values
     margin = 0.02 * float(t[-1] - t[0]) or 86400.0

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from errormotion.report.marks import Marks, marks, name_parts, state_uncertainty
-from errormotion.report.text import typographic
+from errormotion.report.text import laid_out, typographic
 
 #: After Okabe and Ito, distinguishable with any colour vision; light colours are darkened so that text is legible.
 BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE, BLACK = (
@@ -79,12 +79,19 @@ def draw(paint: Callable[[Figure], None], key: str, height: float, width: float 
     with style():
         figure = Figure(figsize=(width, height))
         paint(figure)
+        _translate_legends(figure)
         _spread_ticks(figure)
         name_parts(figure)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
         found = marks(figure)
     return inline(buffer.getvalue(), key, found)
+
+
+def _translate_legends(figure: Figure) -> None:
+    legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes)]
+    for text in [text for legend in legends if legend is not None for text in legend.get_texts()]:
+        text.set_text(laid_out(text.get_text()))
 
 
 def _spread_ticks(figure: Figure) -> None:

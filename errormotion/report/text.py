@@ -21,16 +21,27 @@ MINUTE = ("min", 60.0)
 
 _AND = {"en": "and", "de": "und"}
 _LANGUAGE: ContextVar[str] = ContextVar("language", default="en")
+_WORDS: ContextVar[Callable[[str], str]] = ContextVar("words", default=str)
 
 
 @contextmanager
-def written_in(language: str) -> Iterator[None]:
-    """Write numbers and enumerations in this language inside of the block: in German with a decimal comma."""
+def written_in(language: str, words: Callable[[str], str] = str) -> Iterator[None]:
+    """Write numbers and enumerations in this language inside of the block: in German with a decimal comma.
+
+    ``words`` translates what must be in the language before it is laid out: the legends of drawings.
+    """
     before = _LANGUAGE.set(language if language in _AND else "en")
+    used = _WORDS.set(words)
     try:
         yield
     finally:
+        _WORDS.reset(used)
         _LANGUAGE.reset(before)
+
+
+def laid_out(text: str) -> str:
+    """Return a text of a legend in the language of the page, so that its width is known when it is placed."""
+    return _WORDS.get()(text)
 
 
 def typographic(text: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import xarray as xr
 
@@ -11,16 +12,18 @@ from errormotion.report.document import Part, Section, Source
 from errormotion.report.page import annex
 from errormotion.report.page.language import Catalogue
 from errormotion.report.text import written_in
-from errormotion.report.write import catalogue_of, chapters
+from errormotion.report.write import chapters
 
 
-def untranslated(dataset: xr.Dataset, raw: xr.Dataset | None = None, *, language: str) -> list[str]:
+def untranslated(plugin: Any, dataset: xr.Dataset, raw: xr.Dataset | None = None, *, language: str) -> list[str]:
     """Return the texts of a dataset's chapters that neither the page nor the plugin has in a language.
 
     Parameters
     ----------
+    plugin : object
+        What made the dataset: its ``chapters`` and ``texts``, where it brings them.
     dataset : Dataset
-        Of a plugin that brings chapters, such as an error dataset.
+        Such as an error dataset.
     raw : Dataset, optional
         The raw dataset that it comes from.
     language : str
@@ -34,8 +37,10 @@ def untranslated(dataset: xr.Dataset, raw: xr.Dataset | None = None, *, language
     found = provenance.read(dataset) if "provenance" in dataset.attrs else {}
     source = Source(dataset, raw, {}, found)
     with written_in(language):
-        parts = chapters(source)
-    return missing_of(parts, annex.values([source]), language, [catalogue_of(source, language)])
+        own = list(plugin.chapters(source)) if hasattr(plugin, "chapters") else []
+        parts = own or chapters(source)
+    texts = plugin.texts(language) if hasattr(plugin, "texts") else {}
+    return missing_of(parts, annex.values([source]), language, [texts])
 
 
 def missing_of(

@@ -22,6 +22,7 @@ from errormotion.report.exports.tables import sheet, write_csv
 from errormotion.report.page import logo
 from errormotion.report.page.assemble import Page, page
 from errormotion.report.page.head import Head, head_of, moment
+from errormotion.report.page.language import Catalogue
 from errormotion.report.page.verdict import verdict
 from errormotion.report.parts import beams
 from errormotion.report.text import DASH, written_in
@@ -112,11 +113,11 @@ def write_report(
             Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {}), f"p{i + 1}", _limits(tolerances))
         )
     head = form.of(head_of(run or {}))
-    with written_in(head.language):
+    texts = [catalogue_of(source, head.language) for source in sources]
+    with written_in(head.language, Catalogue(head.language, texts).word):
         parts = [part for source in sources for part in chapters(source)]
         parts[:1] = [_noted(part, run or {}) for part in parts[:1]]
         decision = verdict(_judged(sources, tolerances)) if tolerances is not None else None
-        texts = [catalogue_of(source, head.language) for source in sources]
         found = page(sources, parts, title, head=head, decision=decision, texts=texts)
     return _finished(found, Path(out), form, head)
 
@@ -221,7 +222,7 @@ def write_page(
     head = form.of(Head())
     catalogues = [catalogue_of(source, head.language) for source in sources]
     catalogues += [texts(head.language)] if texts is not None else []
-    with written_in(head.language):
+    with written_in(head.language, Catalogue(head.language, catalogues).word):
         found = page(sources, make(), title, head=head, texts=catalogues)
     return _finished(found, Path(out), form, head)
 

@@ -10,6 +10,7 @@ Applications to Tracking and Navigation, 2001, section 5.4.)
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from scipy import stats
@@ -85,8 +86,9 @@ def tested_places(subject: MethodSubject) -> tuple[int, ...]:
     return tuple(sorted({int(uncertain[uncertain.size // 2]), int(uncertain[-1])}))
 
 
+@lru_cache(maxsize=4)
 def _samples(subject: MethodSubject, places: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors (seed, place, n) and stated covariances (seed, place, n, n)."""
+    """Return errors (seed, place, n) and stated covariances (seed, place, n, n); two checks share them."""
     freedoms = int(np.isfinite(values(subject.outcome(0)[0])[list(places)]).any(axis=0).sum())
     seeds = subject.seeds or max(FEWEST_SEEDS, math.ceil(degrees_needed(share=len(places)) / freedoms))
     errors, covariances = [], []

@@ -65,10 +65,13 @@ def truth_at_places(errors: xr.Dataset, truth: xr.Dataset) -> np.ndarray:
             low, high = float(truth[dim].min()), float(truth[dim].max())
             inside = bool(((errors[dim] >= low) & (errors[dim] <= high)).all())
             require(inside, f"the truth covers {dim} from {low:g} to {high:g} only")
-            known = known.interp({dim: errors[dim].values})
         else:
             known = known.sel({dim: errors[dim].values})
-    true = np.stack([known[name].transpose(*dims).values.ravel() for name in seen], axis=-1)
+    array = np.stack([known[name].transpose(*dims).values for name in seen], axis=-1)
+    for axis, dim in enumerate(dims):
+        if errors[dim].dtype.kind in "fiu":
+            array = _interpolated(array, axis, truth[dim].values, errors[dim].values)
+    true = array.reshape(-1, len(seen))
     if seen != DOF:
         return true
     moved = twists.move(true, functional_point(errors) - functional_point(truth))
@@ -76,3 +79,17 @@ def truth_at_places(errors: xr.Dataset, truth: xr.Dataset) -> np.ndarray:
         return moved
     sensitivity = errors["sensitivity"].broadcast_like(errors["deviation"]).transpose(*dims, "dof").values
     return np.asarray(np.einsum("pi,pi->p", sensitivity.reshape(-1, 6), moved))[:, None]
+
+
+def _interpolated(array: np.ndarray, axis: int, given: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return an array with the values at other places along an axis, linear between the given ones."""
+    if np.array_equal(given, wanted):
+        return array
+    order = np.argsort(given)
+    given, array = given[order].astype(float), np.take(array, order, axis)
+    after = np.clip(np.searchsorted(given, wanted), 1, max(1, len(given) - 1)) % len(given)
+    before = np.maximum(after - 1, 0)
+    span = np.where(given[after] > given[before], given[after] - given[before], 1.0)
+    share = np.reshape((wanted - given[before]) / span, [-1 if k == axis else 1 for k in range(array.ndim)])
+    low, high = np.take(array, before, axis), np.take(array, after, axis)
+    return np.where(share == 0.0, low, np.where(share == 1.0, high, low + share * (high - low)))

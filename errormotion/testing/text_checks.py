@@ -23,11 +23,10 @@ def chapters_translated(subject: MethodSubject) -> str:
     from errormotion.report.untranslated import untranslated
 
     raw, _ = subject.make(0)
-    subject.warm_up()
-    errors = subject.identify(raw)
+    errors, _ = subject.outcome(0)
     languages = languages_of(subject)
     for language in languages:
-        missing = untranslated(errors, raw, language=language)
+        missing = untranslated(subject.plugin(), errors, raw, language=language)
         listed = "".join(f"\n  {text}" for text in missing[:20])
         require(not missing, f"texts('{language}') lacks {len(missing)} texts of the chapters:{listed}")
     return f"the chapters are whole in {', '.join(languages)}"

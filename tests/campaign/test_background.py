@@ -13,10 +13,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from errormotion.campaign import runner
 from errormotion.campaign.background import processes
+from errormotion.campaign.background.preliminary import preliminary, samples
 from errormotion.campaign.background.publishing import Published
+from errormotion.campaign.files import CampaignPlan
+from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.cli.app import app
-from errormotion.errors import RunError
+from errormotion.errors import MethodError, RunError
 
 fcntl = pytest.importorskip("fcntl", reason="file locks")
 
@@ -127,3 +131,37 @@ def test_only_its_user_may_enter_the_folder_of_a_process(
     assert [stat.S_IMODE(path.stat().st_mode) for path in (root, root / name)] == [0o700, 0o700]
     wait(lambda: not processes.found(tmp_path / "runs")[0].alive)
     assert processes.found(tmp_path / "runs")[0].ended == "killed"
+
+
+def test_the_command_line_starts_and_stops_as_the_dashboard_does(
+    tmp_path: Path, write: Callable[..., Path], lab: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes.sys, "executable", "/bin/false")
+    campaign, runs = write('name = "a"'), tmp_path / "runs"
+    found = CliRunner().invoke(app, ["run", str(campaign), "--detach", "--json"])
+    assert json.loads(found.output)["process"] == processes.found(runs)[0].name
+    wait(lambda: not processes.found(runs)[0].alive)
+    found = CliRunner().invoke(app, ["background", "stop", str(runs)])
+    assert (found.exit_code, "expected one process that runs; found none" in found.output) == (1, True)
+    assert CliRunner().invoke(app, ["run", "--detach"]).exit_code == 2
+
+
+def test_errors_so_far_and_the_older_of_two_broken_campaigns_continues(
+    plan: Callable[..., CampaignPlan], tmp_path: Path
+) -> None:
+    (tmp_path / "broken").touch()
+    for number in range(2):
+        settings = f'settings = {{count = 5000, needs_file = "{tmp_path / "needed"}"}}'
+        broken = plan(f'name = "a{number}"\n{settings}', bench=f'breaks = "{tmp_path / "broken"}"')
+        with pytest.raises(RunError, match="fell off the table"):
+            runner.run(broken)
+    older, newer = list_runs(tmp_path / "runs")
+    assert samples(older) == 1000
+    with pytest.raises(MethodError, match="is missing"):
+        preliminary(older)
+    (tmp_path / "needed").touch()
+    assert preliminary(older).sizes["time"] == 2
+    (tmp_path / "broken").unlink()
+    found = CliRunner().invoke(app, ["run", "--resume", str(older.path), "--no-report"])
+    assert found.exit_code == 0, found.output
+    assert [RunFolder.open(each.path).data["status"] for each in (older, newer)] == ["finished", "failed"]

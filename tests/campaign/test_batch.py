@@ -277,6 +277,7 @@ def test_one_after_another_needs_no_dask() -> None:
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_threads_take_turns_where_numba_is_not_safe(raws: list[Path], tmp_path: Path) -> None:
     """With its 'workqueue' layer numba ends the process when two threads call a parallel kernel at once."""
     command = ["identify", *map(str, raws), "--method", "spindle_drift", "--out", str(tmp_path / "out")]

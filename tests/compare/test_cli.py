@@ -96,6 +96,22 @@ def test_files_are_compared_and_the_result_is_written(run, files):
     assert "drift - probing" in Path("again.html").read_text()
 
 
+def test_the_page_is_in_the_language_and_a_pdf_beside_it(run, files, monkeypatch):
+    from errormotion.report.exports import pdf
+
+    monkeypatch.setattr(pdf, "write", lambda page, out: out.write_bytes(page.read_bytes()))
+    form = ("--report", "c.html", "--pdf", "--paper", "Letter", "--language", "de")
+    assert "written: c.pdf" in run("compare", "drift.nc", "probing.nc", *FEW, *form).stdout
+    page = Path("c.html").read_text()
+    assert "Vergleich von drift, probing" in page
+    assert "stimmen im Rahmen ihrer Unsicherheiten überein" in page
+    assert "size: letter" in page
+    Path("d.pdf").write_text("mine")
+    again = run("compare", "drift.nc", "probing.nc", *FEW, "--report", "d.html", "--pdf", code=1)
+    assert "d.pdf: exists already" in again.stderr
+    assert "no page is asked for" in run("compare", "drift.nc", "probing.nc", *FEW, "--pdf", code=1).stderr
+
+
 def test_a_result_is_never_overwritten(run, files):
     for option, name in (("--out", "c.nc"), ("--report", "c.html")):
         Path(name).write_text("mine")

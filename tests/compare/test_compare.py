@@ -371,7 +371,7 @@ def test_a_comparison_is_drawn():
     values, en = figure.axes[4], figure.axes[5]  # of EZ
     shown = [line.get_ydata() for line in values.lines if len(line.get_ydata())]
     np.testing.assert_allclose(shown[0], 1e6 * found["value"].values[0, :, 2])
-    assert values.get_ylabel() == "EZ / um"
+    assert values.get_ylabel() == "EZ / µm"
     drawn = next(line.get_ydata() for line in en.lines if len(line.get_ydata()) == found.sizes["time"])
     np.testing.assert_allclose(drawn, found["en"].values[0, :, 2])
     legends = [axes.get_legend() for axes in figure.axes if axes.get_legend() is not None]

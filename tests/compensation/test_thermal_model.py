@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 from errormotion import datasets
+from errormotion.compensation.online.settings import Limits
 from errormotion.compensation.thermal_model import Settings, ThermalModel, check, fit
 from errormotion.compensation.thermal_model.fitting import FEWEST_SAMPLES
 from errormotion.compensation.thermal_model.model import ROWS
@@ -135,6 +136,30 @@ def test_sensors_are_chosen_where_the_heat_is(pair: list[xr.Dataset]) -> None:
 
 def test_one_campaign_alone_is_told(pair: list[xr.Dataset]) -> None:
     assert fit(pair[:1], LAGGED).dataset.attrs["validated"] == "blocks in time of one campaign"
+
+
+def test_a_model_of_one_warm_up_can_be_followed_at_other_speeds(warm_up: Callable[..., xr.Dataset]) -> None:
+    """Left-out blocks alone would choose one with 10 features, of which U is 17 um."""
+    model = fit([warm_up(29, 0).isel(time=slice(None, None, 2))], Settings(variant="dynamics"))
+    covariance = model.predict(warm_up(29, 2))["covariance"].values[:, :3, :3]
+    assert 2 * np.sqrt(np.einsum("tii->ti", covariance).max()) < Limits().uncertainty / 2
+
+
+def of_noise(ds: xr.Dataset, keep: int) -> xr.Dataset:
+    """Return errors whose temperatures are noise, but for some."""
+    noise = 20 + 0.02 * np.random.default_rng(5).normal(size=ds["temperature"].shape)
+    noise[:, :keep] = ds["temperature"].values[:, :keep]
+    return ds.assign(temperature=(ds["temperature"].dims, noise))
+
+
+@pytest.mark.parametrize("keep", [0, 1])
+def test_a_model_of_one_warm_up_has_a_sensor_where_one_shows_the_heat(
+    warm_up: Callable[..., xr.Dataset], keep: int
+) -> None:
+    """Left-out blocks would choose the speed alone on this machine, whatever the first sensor shows."""
+    settings = Settings(variant="dynamics", time_constants=("30 min",))
+    one = of_noise(warm_up(3, 0), keep)
+    assert fit([one], settings).sensors == tuple(map(str, one["sensor"].values[:keep]))
 
 
 def changed(ds: xr.Dataset, **attrs: object) -> xr.Dataset:

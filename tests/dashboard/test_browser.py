@@ -102,7 +102,7 @@ def test_values_live_and_a_sensor_that_is_unplugged(
     monkeypatch.setattr(DconTemperature, "read", unplugged)
     start = time.monotonic()
     page.wait_for_selector(".tiles li.silent:has-text('modules')")
-    assert time.monotonic() - start < 3.0
+    assert time.monotonic() - start < 15.0
     monkeypatch.undo()
     page.wait_for_selector(".tiles li.answers:has-text('modules')", timeout=20_000)
     page.reload()
@@ -139,5 +139,12 @@ def test_two_results_are_compared(
     page.click("button:has-text('Compare')")
     page.wait_for_selector("#figure[data-drawn] canvas")
     assert "contradict each other" in page.inner_text("h2.bad")
+    accessible()
+    page.click("text=Compensate")
+    page.click("text=What a compensation took off")
+    for name, number in (("before", 1), ("after", 2)):
+        page.select_option(f"#{name}", index=number)
+    page.click("button:has-text('Compare')")
+    page.wait_for_selector("#verdict-title")
     accessible()
     assert page.evaluate("window.taken") is None

@@ -94,6 +94,14 @@ def test_a_campaign_is_corrected_planned_run_stopped_resumed_and_outlives_the_da
     assert page.is_disabled("#start")
     assert page.is_disabled("#plan")
     accessible()
+    page.evaluate(  # two fields at once: none is lost
+        """for (const [key, value] of [['"operator"', "A"], ['"average"', "4 s"]]) {
+          const field = document.querySelector(`[data-place$='${key}]']`);
+          field.value = value;
+          field.dispatchEvent(new Event("change"));
+        }"""
+    )
+    expect(page.locator("#text")).to_have_value(re.compile('operator = "A"(.|\n)*average = "4 s"'))
     page.fill("#text", page.input_value("#text").replace('"2"', '"40 s"'))
     expect(duration).to_have_value("40 s")
     expect(page.locator("#count")).to_have_text("The campaign has no mistakes.")

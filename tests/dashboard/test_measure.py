@@ -11,6 +11,7 @@ pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
 
 from errormotion.campaign.background import processes
 from errormotion.dashboard.campaigns import hash_of
+from errormotion.dashboard.kept import Lately
 from errormotion.dashboard.pages import measure
 
 BENCH = """\
@@ -93,7 +94,8 @@ def test_the_page_shows_names_as_text(reading: Any) -> None:
     assert "&lt;script&gt;" in text
     assert "<script>window" not in text
     assert reading.ask("/measure?file=bench.toml")[0] == 404
-    assert reading.ask("/measure?file=..%2Fdrift.toml")[0] == 404
+    for name in ("..%2Fdrift.toml", "x%00.toml", "%2Fetc%2Fhostname", ".."):
+        assert reading.ask(f"/measure?file={name}")[0] == 404
 
 
 def test_the_plan_is_that_of_the_commands(reading: Any, folder: Path) -> None:
@@ -160,3 +162,16 @@ def test_without_control_no_other_files_are_looked_at(reading: Any, folder: Path
 def test_a_request_that_is_none_is_refused(reading: Any, body: str) -> None:
     headers = {"Origin": reading.address.rstrip("/"), "Accept": "application/json"}
     assert reading.ask("/measure/form.json", "POST", body, **headers)[0] == 400
+
+
+def test_many_clients_do_not_keep_the_server_at_work() -> None:
+    made: list[int] = []
+    lately: Lately[int] = Lately(1000.0, most=2)
+
+    def make() -> int:
+        made.append(len(made))
+        return made[-1]
+
+    assert [lately.get("a", make) for _ in range(20)] == [0] * 20
+    assert [lately.get(key, make) for key in "bca"] == [1, 2, 3]
+    assert Lately(0.0).get("a", make) == 4

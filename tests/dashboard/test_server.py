@@ -28,7 +28,15 @@ from errormotion.dashboard.server import Options, application, run
 from errormotion.errors import RunError
 
 PAGES = ["/", "/now", "/results", "/run", "/compare", "/compensate", "/compensate/effect", "/nowhere"]
-DATA = ["/now/values.json", "/now/figure.json", "/now/history.json", "/run/figure.json", "/run/values.csv", "/run/file"]
+DATA = [
+    "/now/values.json",
+    "/now/figure.json",
+    "/now/history.json",
+    "/run/figure.json",
+    "/run/values.csv",
+    "/run/file",
+    "/run/space.html",
+]
 DATA += ["/compensate/state.json", "/compensate/curves.json", "/compensate/figure.json", "/compensate/effect.html"]
 DATA += ["/compare/figure.json", "/compare/report.html", "/compare/history.html"]
 PATHS = [*PAGES, *DATA]

@@ -70,7 +70,7 @@ def test_two_columns_and_the_zone_serve_a_drift_too(run) -> None:
     raw = run("".join(f"27.10.2024;{time};1\n" for time in ("01:30", "02:30", "02:30", "03:30")), SPINDLE)
     np.testing.assert_array_equal(raw["time"], [0, 3600, 7200, 10800])
     assert raw.attrs["start"] == "2024-10-27T01:30:00+02:00"
-    assert notes(raw) == ["2 times of the hour that occurs twice in Europe/Berlin were resolved by their order"]
+    assert notes(raw)[0] == "2 times of the hour that occurs twice in Europe/Berlin were resolved by their order"
 
 
 def test_two_columns_without_a_date_are_refused(mistakes) -> None:

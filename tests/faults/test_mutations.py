@@ -38,6 +38,7 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> list[Kind]:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_altered_files_are_read_or_refused_by_name(tmp_path: Path, kinds: list[Kind]) -> None:
     outcomes = [file_kinds.trial(kind, number, 1, tmp_path) for kind in kinds for number in range(FEW)]

@@ -283,6 +283,30 @@ def test_a_recorded_cycle_plays_back(tmp_path: Path) -> None:
         assert list(probe.measure(orders)) == contacts
 
 
+@pytest.mark.parametrize("off", [-0.4e-6, 0.4e-6])
+def test_no_probing_move_is_shorter_than_controllers_accept(monkeypatch: pytest.MonkeyPatch, off: float) -> None:
+    """A machine rests a fraction of a micrometre beside its goal: LinuxCNC's bridge refuses to probe so short a way."""
+    with ControllerProbe(ADDRESS, PROBE) as probe:
+        control, moves = probe.control, []
+        state, move = control.state, control.probe
+
+        def beside() -> dict[str, Any]:
+            found = dict(state())
+            for name in ("position", "commanded_position"):
+                found[name] = [x + off for x in found[name]]
+            return found
+
+        def noted(target: Sequence[float], feed: float) -> dict[str, Any]:
+            moves.append(math.dist(target, beside()["commanded_position"]))
+            return dict(move(target, feed))
+
+        monkeypatch.setattr(control, "state", beside)
+        monkeypatch.setattr(control, "probe", noted)
+        list(probe.measure(touches()))
+        list(probe.measure(touches()))  # from where it has risen to
+    assert min(moves) > 1e-6
+
+
 # ---------------------------------------------------------------------- one touch, on a controller that misbehaves
 
 

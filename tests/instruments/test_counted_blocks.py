@@ -135,11 +135,11 @@ def test_decoding_takes_linear_time_and_bounded_memory(of: Controller) -> None:
     ]
     for data in worst:
         decoder = of.decoder()
-        start = time.perf_counter()
+        start = time.thread_time()
         for place in range(0, len(data), 65536):
             decoder.feed(data[place : place + 65536])
             assert len(decoder._buffer) <= MAX_BLOCK_BYTES + 4
-        assert time.perf_counter() - start < 5.0
+        assert time.thread_time() - start < 5.0
 
 
 @every

@@ -399,7 +399,7 @@ def test_silence_from_the_start_is_a_timeout_error_when_opening() -> None:
     start = time.monotonic()
     with pytest.raises(InstrumentTimeoutError, match="expected 4 bytes"):
         session(SMALL + "&fault=silence", settings=FAST)
-    assert time.monotonic() - start < 5.0
+    assert time.monotonic() - start < 30.0
 
 
 def test_silence_in_a_stream_is_a_timeout_error_and_so_are_commands_until_it_answers_again() -> None:

@@ -178,10 +178,10 @@ def test_no_bytes_do_anything_but_a_protocol_error(data: bytes) -> None:
     ],
 )
 def test_the_longest_lines_are_parsed_in_linear_time(line: bytes) -> None:
-    start = time.perf_counter()
+    start = time.thread_time()
     try:
         for each in parse_line(line):
             parse_numbers(each.value)
     except (ProtocolError, TypeError):  # TypeError: a command is no list
         pass
-    assert time.perf_counter() - start < 0.5  # quadratic: minutes
+    assert time.thread_time() - start < 2.0  # quadratic: minutes

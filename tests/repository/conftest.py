@@ -36,6 +36,8 @@ from errormotion.instruments import simulators
 
 ROOT = Path(__file__).parents[2]
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+SLOW = ("README.md", "docs/tutorial/index.md", "docs/how-to/measure-a-crossbeam.md")
+"""Pages that take more than about 10 s."""
 
 
 def _line_of_make(command: str) -> str:
@@ -145,7 +147,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
     file = Path(metafunc.module.__file__).stem
     mine = [page for page in pages if page.exists() and home(page) == file and list(parse(page))]
-    metafunc.parametrize("documented", [pytest.param(page, id=str(page.relative_to(ROOT))) for page in mine])
+    names = {str(page.relative_to(ROOT)): page for page in mine}
+    marks = {name: [pytest.mark.slow] if name in SLOW else [] for name in names}
+    metafunc.parametrize("documented", [pytest.param(names[name], id=name, marks=marks[name]) for name in names])
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from errormotion import datasets
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import cross_matrix
 from errormotion.plugins import MethodInfo, Needs, PluginSettings, Redraw, Redrawing
+from errormotion.report.document import Part
 from errormotion.testing import MethodConformance, MethodSubject, run_checks
 from errormotion.testing.kit import run_check
 from errormotion.testing.method_checks import METHOD_CHECKS
@@ -278,6 +279,14 @@ class Redrawn(Sound):
         return given
 
 
+class LeavesATextInEnglish(Sound):
+    def chapters(self, source):
+        return [Part("Drift of a body", [], ["It drifts."], [])]
+
+    def texts(self, language):
+        return {"Drift of a body": "Drift eines Körpers"} if language == "de" else {}
+
+
 class RollsItsOwnDice(Redrawn):
     def generator(self, given):
         return np.random.default_rng()
@@ -304,6 +313,7 @@ BROKEN = [
     ("sources_drawn", RollsItsOwnDice),
     ("sources_drawn", ForgetsItsCalibration),
     ("sources_as_stated", DrawsHalfOfItsCalibration),
+    ("chapters_translated", LeavesATextInEnglish),
     ("frame_invariance", KnowsOnlyItsOwnFrame),
     ("number_format", TakesSinglePrecisionForMicrometres),
     ("units", TakesMillimetresForMetres),

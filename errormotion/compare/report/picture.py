@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from errormotion.arrays import Array
 from errormotion.compare.pairs import COVERAGE_FACTOR
+from errormotion.kinematics.iso import DOF
 from errormotion.report.canvas import COLOURS, GREEN, curve, style
 
 PANEL = 1.6
@@ -52,7 +53,7 @@ def paint(figure: Figure, ds: xr.Dataset) -> None:
         factor, unit = field(name)
         _values(left, ds, factor * ds["value"].values[..., k], factor * band[..., k])
         _normalised(right, ds, ds["en"].values[..., k])
-        left.set_ylabel(f"{name} / {unit}")
+        left.set_ylabel(f"{name} / {unit}" if unit else name)
         right.set_ylabel(f"En of {name}")
         if name != names[-1]:
             left.tick_params(labelbottom=False)
@@ -145,6 +146,8 @@ def abscissa(ds: xr.Dataset) -> tuple[Array, str, bool]:
     return np.arange(ds.sizes[dim], dtype=float), f"{dim} number", False
 
 
-def field(freedom: str) -> tuple[float, str]:
-    """Return the factor from SI to the unit of a freedom in print, and this unit."""
-    return (1e6, "um") if freedom in ("EX", "EY", "EZ") else (648000 / np.pi, "arcsec")
+def field(name: str) -> tuple[float, str]:
+    """Return the factor from SI to the unit of a freedom in print, and this unit; what is no freedom stays in SI."""
+    if name not in DOF:
+        return 1.0, ""
+    return (1e6, "µm") if name in DOF[:3] else (648000 / np.pi, "arcsec")

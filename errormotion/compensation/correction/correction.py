@@ -221,9 +221,7 @@ def correction(
         notes.append(f"Not known, and left as they are: {', '.join(part)}.")
     for field in fields:
         if missing := _unknown_rotations(field):
-            notes.append(
-                f"{field.name}: {', '.join(missing)} is not known; the correction holds on the line of the measurement."
-            )
+            notes.append(f"{field.name}: {_not_known(missing)}; the correction holds on the line of the measurement.")
     if not partial:
         _check_rotations(fields)
     made = Correction(tuple(fields), unknown, partial, tuple(notes))
@@ -234,10 +232,16 @@ def _check_rotations(fields: Sequence[Field]) -> None:
     for field in fields:
         if missing := _unknown_rotations(field):
             raise DatasetError(
-                f"{field.name}: {', '.join(missing)} is not known, and displaces the tool at the functional point "
-                f"{np.round(field.point, 6).tolist()} m or along the travel. Use the functional point of the "
-                "measurement, or a source that knows the rotations"
+                f"{field.name}: {_not_known(missing)}, and displace{'s' if len(missing) == 1 else ''} the tool at the "
+                f"functional point {np.round(field.point, 6).tolist()} m or along the travel. Use the functional point "
+                "of the measurement, or a source that knows the rotations"
             )
+
+
+def _not_known(names: Sequence[str]) -> str:
+    """Return that these are not known: 'EA is not known', 'EA and EB are not known'."""
+    listed = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+    return f"{listed} {'is' if len(names) == 1 else 'are'} not known"
 
 
 def _unknown_rotations(field: Field) -> list[str]:

@@ -1,7 +1,10 @@
 """Fit of a thermal model: selection of sensors, lags or time constants, and regularisation.
 
 Everything is selected by cross-validation that leaves out whole campaigns: neighbouring samples of a warm-up are so
-similar that leaving out single samples would favour any model.
+similar that leaving out single samples would favour any model. A single campaign is left out by blocks in time, which
+have the speeds of the rest: they show neither what its coefficients are worth at other speeds, nor a model without
+sensors that knows nothing else of the heat. There the variance of the coefficients counts, too, and one sensor is the
+least.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import numpy as np
 import xarray as xr
 from scipy.stats import t as student
 
+from errormotion.arrays import Array
 from errormotion.compensation.thermal_model import regression
 from errormotion.compensation.thermal_model.features import Feature, dynamics, lagged
 from errormotion.compensation.thermal_model.model import Parts, ThermalModel
@@ -50,7 +54,8 @@ class Candidate:
         Lags or time constants, s.
     features : tuple of Feature
     score : float
-        Sum over the errors of the mean square residual over the mean square of the error.
+        Sum over the errors of the mean square residual over the mean square of the error; of a single campaign with
+        the mean variance by the coefficients where each source has any share of what it had in the training.
     """
 
     variant: str
@@ -119,6 +124,7 @@ def _chosen(columns: regression.Columns, seen: Sequence[int], settings: Settings
     records = columns.records
     temperatures = [r.inputs.temperature for r in records]
     common = [n for n in temperatures[0] if all(np.isfinite(known.get(n, np.nan)).any() for known in temperatures)]
+    warmed = [n for n in common if any(_has_signal(known[n]) for known in temperatures)]
     if settings.sensors is not None:
         missing = [name for name in settings.sensors if name not in common]
         if missing:
@@ -135,14 +141,25 @@ def _chosen(columns: regression.Columns, seen: Sequence[int], settings: Settings
     for variant in variants:
         given = settings.lags if variant == "lagged" else settings.time_constants
         for constants in (LAGS if variant == "lagged" else TIME_CONSTANTS) if given is None else (given,):
-            best = _with_sensors(columns, seen, variant, constants, common, parameters, settings)
+            best = _with_sensors(columns, seen, variant, constants, warmed, parameters, settings)
             if best is not None:
                 candidates.append(best)
     if not candidates:
         raise DatasetError(
-            "Expected a temperature sensor common to all campaigns, or the spindle speed; found neither."
+            "Expected a temperature sensor common to all campaigns that shows more than noise, or the spindle speed; "
+            "found neither."
         )
     return min(candidates, key=lambda candidate: candidate.score), candidates
+
+
+def _has_signal(temperature: Array) -> bool:
+    """Return whether a temperature changes by more than its noise: von Neumann's ratio below 1.
+
+    It is the sum of squared differences of neighbours over that of deviations from the mean: 2 for noise, and below
+    1.04 for 1 % of series of 20 values (von Neumann, 1941; table of Hart, 1942).
+    """
+    known = temperature[np.isfinite(temperature)]
+    return bool((np.diff(known) ** 2).sum() < ((known - known.mean()) ** 2).sum())
 
 
 def _with_sensors(
@@ -162,7 +179,9 @@ def _with_sensors(
 
     if settings.sensors is not None:
         return candidate(settings.sensors)
-    best = candidate(())
+    # One warm-up has one course of the speed: without a sensor it cannot be told from the heat.
+    sensed = len(columns.records) == 1 and bool(common) and settings.most_sensors > 0
+    best = None if sensed else candidate(())
     while len(best.sensors if best else ()) < settings.most_sensors:
         chosen = best.sensors if best else ()
         further = [found for name in common if name not in chosen and (found := candidate((*chosen, name)))]
@@ -179,13 +198,30 @@ def _with_sensors(
 def _score(columns: regression.Columns, seen: Sequence[int], features: Sequence[Feature]) -> float:
     X, _ = columns.of(features)
     group = regression.groups(columns.records)
+    use = _in_use(X, features) if len(columns.records) == 1 else None
     total = 0.0
     for freedom in seen:
         y, weight = regression.target(columns.records, freedom)
         size = regression.mean_square(y, weight)
         if size > 0:
-            total += regression.best_strength(X, y, weight, group)[1] / size
+            strength, square, residual = regression.best_strength(X, y, weight, group)
+            if use is not None:
+                variance = regression.covariance(X, weight, strength, square, residual, group)
+                square += float(np.sum(variance * use))
+            total += square / size
     return total
+
+
+def _in_use(X: Array, features: Sequence[Feature]) -> Array:
+    """Return the mean product of each two features where each source has a share of 0 to 1 of its training, (p, p).
+
+    In one warm-up all sources rise and fall together; at other speeds and in other air they do not. With shares s, each
+    uniform and independent, E[s_i s_j] is 1/3 for one source and 1/4 for two.
+    """
+    known = X[np.isfinite(X).all(axis=1)]
+    sources = [(feature.source, feature.power) for feature in features]
+    same = np.array([[one == other for other in sources] for one in sources])
+    return np.asarray(np.where(same, 1 / 3, 1 / 4) * (known.T @ known) / max(len(known), 1))
 
 
 def _made(
@@ -208,7 +244,6 @@ def _made(
         y, weight = regression.target(columns.records, k)
         strength, _, residual = regression.best_strength(X, y, weight, group)
         known = (weight > 0) & np.isfinite(X).all(axis=1)
-        A = (X[known] * weight[known, None]).T @ X[known]
         strengths[k] = strength
         coefficient[k] = regression.solve(X[known], y[known], weight[known], np.array([strength]))[0] / scale
         # The campaign with the largest residuals is taken for the uncertainty of a new one.
@@ -220,9 +255,8 @@ def _made(
         freedom = max(regression.effective_count(residual, group), 1.0)
         # Standard uncertainty with few degrees of freedom, enlarged so that k = 1.96 gives 95 %.
         misfit[k] = np.sqrt(square) * student.ppf(0.975, freedom) / student.ppf(0.975, np.inf)
-        inverse = np.linalg.inv(A + strength * weight[known].sum() * np.eye(p))
-        correlated = known.sum() / freedom  # rows for each independent one
-        covariance[k] = square * correlated * inverse / np.outer(scale, scale)
+        of_scaled = regression.covariance(X, weight, strength, square, residual, group)
+        covariance[k] = of_scaled / np.outer(scale, scale)
         share[k] = 1 - np.sqrt(regression.mean_square(residual, weight) / regression.mean_square(y, weight))
     physical = X[np.isfinite(X).all(axis=1)] * scale
     parts = Parts(

@@ -109,3 +109,14 @@ def effective_count(residual: Array, group: NDArray[np.int64]) -> float:
         correlation = float(np.clip((values[1:] * values[:-1]).sum() / (values**2).sum(), 0.0, 0.99))
         total += max(1.0, values.size * (1 - correlation) / (1 + correlation))
     return total
+
+
+def covariance(
+    X: Array, weight: Array, strength: float, square: float, residual: Array, group: NDArray[np.int64]
+) -> Array:
+    """Return the covariance of the coefficients for a mean square residual; neighbours in time count once, (p, p)."""
+    known = (weight > 0) & np.isfinite(X).all(axis=1)
+    normal = (X[known] * weight[known, None]).T @ X[known]
+    inverse = np.linalg.inv(normal + strength * weight[known].sum() * np.eye(X.shape[1]))
+    correlated = known.sum() / max(effective_count(residual, group), 1.0)  # rows for each independent one
+    return np.asarray(square * correlated * inverse)

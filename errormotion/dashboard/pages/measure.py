@@ -17,7 +17,7 @@ from errormotion.campaign.form.fields import Form
 from errormotion.dashboard.campaigns import Campaigns, hash_of
 from errormotion.dashboard.course import course
 from errormotion.dashboard.figures import errors_item
-from errormotion.dashboard.kept import Kept
+from errormotion.dashboard.kept import Lately
 from errormotion.dashboard.pages.page import Guarded
 from errormotion.datasets.files.reading import parse_json
 from errormotion.errors import ErrormotionError, RunError
@@ -161,7 +161,8 @@ class Processes(Guarded):
 
     async def get(self) -> None:
         """Send those that live, and the last ones that have ended."""
-        self.finish({"processes": await self.apart(_processes, self.context.lab.runs)})
+        runs = self.context.lab.runs
+        self.finish({"processes": await self.apart(_PROCESSES.get, runs, lambda: _processes(runs))})
 
 
 class Live(Guarded):
@@ -169,24 +170,22 @@ class Live(Guarded):
 
     async def get(self) -> None:
         """Identify the samples so far, and draw the errors with their uncertainty."""
-        self.finish(await self.apart_slow(_live, self.context.lab.folder(self.word("run", 600))))
+        path = self.context.lab.folder(self.word("run", 600))
+        self.finish(await self.apart_slow(_LIVE.get, path, lambda: _live(path)))
 
 
-_LIVE: Kept[dict[str, Any]] = Kept(4)
-"""Figures of growing runs, so that several clients do not identify the same samples."""
+_PROCESSES: Lately[list[dict[str, Any]]] = Lately(0.3)
+_LIVE: Lately[dict[str, Any]] = Lately(2.0)
+"""Figures of growing runs, so that many clients do not keep the server identifying."""
 
 
 def _live(path: Path) -> dict[str, Any]:
     folder = RunFolder.open(path)
     count = samples(folder)
-
-    def drawn() -> dict[str, Any]:
-        try:
-            return {"samples": count, "item": errors_item(course(preliminary(folder))), "why": ""}
-        except ErrormotionError as error:
-            return {"samples": count, "item": None, "why": str(error)}
-
-    return _LIVE.get((str(path), count), drawn)
+    try:
+        return {"samples": count, "item": errors_item(course(preliminary(folder))), "why": ""}
+    except ErrormotionError as error:
+        return {"samples": count, "item": None, "why": str(error)}
 
 
 def _processes(runs: Path) -> list[dict[str, Any]]:

@@ -17,7 +17,8 @@ from errormotion.dashboard.course import Course, as_csv, course
 from errormotion.dashboard.figures import errors_item
 from errormotion.dashboard.kept import Kept, stamp
 from errormotion.dashboard.lab import Choice, figure_text
-from errormotion.dashboard.pages.page import Guarded
+from errormotion.dashboard.pages.page import POLICY, Guarded
+from errormotion.dashboard.space import Drawing, drawing, has_volume
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError
@@ -100,6 +101,16 @@ class Figure(Guarded):
         return point, {dim: _whole(index, 0, 10**9) for dim, _, index in others}
 
 
+class Space(Figure):
+    """The errors of a volume in space, as a page for a frame."""
+
+    async def get(self) -> None:
+        """Draw the error vectors at the functional point that is asked for."""
+        found = await self.apart(_drawing, self.context.lab.file(self.word("run", 600), "errors"), *self.wanted())
+        self.set_header("Content-Security-Policy", POLICY.replace("frame-ancestors 'none'", "frame-ancestors 'self'"))
+        self.show("space.html.j2", found=found)
+
+
 class Values(Figure):
     """The values of a run at a functional point, as comma-separated text."""
 
@@ -158,6 +169,10 @@ def _course(path: Path, point: tuple[float, ...] | None, select: dict[str, int])
     return course(loaded(path), point, select)
 
 
+def _drawing(path: Path, point: tuple[float, ...] | None, select: dict[str, int]) -> Drawing:
+    return drawing(loaded(path), point, select)
+
+
 def _stated(path: Path) -> dict[str, Any]:
     """Return what the page of a run says of its result: freedoms, functional point (mm), further dimensions, notes."""
     ds = loaded(path)
@@ -171,6 +186,7 @@ def _stated(path: Path) -> dict[str, Any]:
         "point": point,
         "movable": ds.attrs.get("component") != "beam",
         "others": others,
+        "volume": has_volume(ds),
         "notes": ds.em.notes,
         "frame": str(ds.attrs.get("frame", "")),
     }

@@ -169,7 +169,7 @@ async function frame() {
   const place = element("div");
   place.id = "curves-drawn";
   byId("curves").replaceChildren(place);
-  await Bokeh.embed.embed_item(found.item, place.id);
+  await Bokeh.embed.embed_item(sized(found.item), place.id);
   figure = Bokeh.documents.at(-1);
 }
 

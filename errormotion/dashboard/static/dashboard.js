@@ -40,10 +40,12 @@ function follow(form) {
       drawn.id = `${target.id}-${own}`;
       target.replaceChildren(drawn);
       const before = views;
-      views = await Bokeh.embed.embed_item(found.item, drawn.id);
+      views = await Bokeh.embed.embed_item(sized(found.item), drawn.id);
       if (before) before.clear?.();
       const place = (found.point || []).map((each) => each.toLocaleString("en", { maximumFractionDigits: 4 }));
       note.textContent = form.querySelector("[data-home]") && place.length && !found.point.includes(null) ? `At the functional point X ${place[0]}, Y ${place[1]}, Z ${place[2]} mm.` : "";
+      const space = document.getElementById("space");
+      if (space && own > 1) space.src = `${space.dataset.base}?${question}`;
       if (link) link.href = `${link.dataset.base}?${question}`;
       target.dataset.drawn = String(own);
     } catch (error) {

@@ -133,7 +133,10 @@ async function check(change) {
   }
 }
 
-const changed = (place, value) => check({ place, value });
+let queue = Promise.resolve(); // fields change one after the other, each the text of the one before
+function changed(place, value) {
+  queue = queue.then(() => check({ place, value }));
+}
 text.addEventListener("input", () => {
   ready();
   clearTimeout(timer);
@@ -206,8 +209,7 @@ if (control) {
     const found = await order("/measure/start", { file: byId("name").value, text: text.value, before });
     if (found) {
       before = found.before;
-      byId("processes-card").hidden = false;
-      byId("processes-card").scrollIntoView();
+      reveal = found.process;
     }
     ready();
   });
@@ -277,7 +279,7 @@ function process(each) { // made anew only when something but the progress has c
   return card;
 }
 
-let running = null;
+let running = null, reveal = ""; // the run that measures, and the process that was started here just now
 
 async function processes() {
   try {
@@ -288,6 +290,10 @@ async function processes() {
       const made = own.map(process), place = byId(id);
       if (made.length !== place.children.length || made.some((card, k) => place.children[k] !== card)) place.replaceChildren(...made);
       byId(`${id}-card`).hidden = !own.length;
+    }
+    if (names.has(reveal)) {
+      byId("processes-card").scrollIntoView();
+      reveal = "";
     }
     const now = found.find((each) => each.alive && each.stage === "measuring" && each.tests.length);
     running = now ? now.tests.find((test) => test.name === now.test)?.run ?? null : null;
@@ -315,7 +321,7 @@ async function live() { // the errors of the run that measures; the pause grows 
         place.id = `live-${Date.now()}`;
         const last = views;
         byId("live").replaceChildren(place);
-        views = await Bokeh.embed.embed_item(found.item, place.id);
+        views = await Bokeh.embed.embed_item(sized(found.item), place.id);
         if (last) {
           last.clear?.();
           Bokeh.documents.splice(0, Bokeh.documents.length - 1);

@@ -155,7 +155,7 @@ async function frame(names) { // the axes, without data; drawn anew only when ot
     drawn.views.clear();
     Bokeh.documents.splice(Bokeh.documents.indexOf(drawn.document), 1);
   }
-  const views = await Bokeh.embed.embed_item(found.item, place.id);
+  const views = await Bokeh.embed.embed_item(sized(found.item), place.id);
   drawn = { key, views, document: Bokeh.documents.at(-1) };
 }
 

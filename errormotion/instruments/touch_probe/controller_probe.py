@@ -29,8 +29,7 @@ from errormotion.instruments.touch_probe.touching import (
 )
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, MachineLimits, Touch
 
-_SAME = 1e-9  # m
-_ROUNDING = 1e-6  # m
+_SAME = 1e-6  # m: below it no move is made, and controllers refuse to probe
 
 
 class ControllerProbeSettings(ArmedSettings, ProbeSettings):
@@ -284,9 +283,9 @@ class ControllerProbe:
 
         Within an item the tip rises above the starts of the item's touches, else above those of all touches.
         """
-        here = np.array(self.control.state()["position"], dtype=float)
+        here = np.array(self.control.state()["commanded_position"], dtype=float)
         start = np.array(touches[number].start, dtype=float)
-        if np.abs(here - start).max() <= _ROUNDING:
+        if np.abs(here - start).max() <= _SAME:
             return []
         before = touches[number - 1] if number else None
         within = before is not None and before.item == touches[number].item
@@ -299,7 +298,7 @@ class ControllerProbe:
 
     def _leave(self, touches: Sequence[Touch]) -> None:
         """Move up from the last touch."""
-        here = np.array(self.control.state()["position"], dtype=float)
+        here = np.array(self.control.state()["commanded_position"], dtype=float)
         height = max(touch.start[2] for touch in touches) + self.settings.clearance
         if here[2] < height - _SAME:
             Toucher(self.control, self.settings.strategy).travel(np.array([*here[:2], height]))

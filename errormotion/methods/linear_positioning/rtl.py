@@ -1,9 +1,10 @@
 """Files ``.rtl`` of laser calibration software: targets, and the deviation at each target of each run.
 
-The layout is that of five published programs that read or write such files (docs/how-to/measure-an-axis.md names them);
-no description by the maker was found. Sections start with ``NAME::``. ``TARGET DATA::`` holds ``Target-count:`` and,
-behind ``Targets :``, the positions in mm; ``RUNS::`` holds ``Run-count:``; ``DEVIATIONS::`` holds, behind ``Run Target
-Data:``, lines of run, target and deviation. A run is one pass; its lines are in the order in which it was measured.
+The layout is that of five published programs that read or write such files (docs/reference/positioning-files.md names
+them); no description by the maker was found. Sections start with ``NAME::``. ``TARGET DATA::`` holds ``Target-count:``
+and, behind ``Targets :``, the positions in mm; ``RUNS::`` holds ``Run-count:``; ``DEVIATIONS::`` holds, behind ``Run
+Target Data:``, lines of run, target and deviation. A run is one pass; its lines are in the order in which it was
+measured.
 """
 
 from __future__ import annotations

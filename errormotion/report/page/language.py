@@ -32,6 +32,8 @@ _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-ZÄÖÜ(|±])")
 _DECIMAL = re.compile(r"[+−-]?\d+\.\d+")
 _WORD = re.compile(r"[a-z]{3}")
 _LETTERS = re.compile(r"[a-z]{2}")
+_BEFORE_UNIT = re.compile(r"(?<![\w.])\d+\.\d+(?= (?:[uµ]?m|mm|[uµm]?rad|arcsec|%|K|min|s|±)(?!\w))")
+_MICRO = re.compile(r"(?<!\w)u(?=(?:m|rad)(?!\w))")
 _LIST = re.compile(r"(, | und )")
 _UNITS = re.compile(r"\b(?:arcsec|min|m?rad|days)\b")
 _SVG_TEXT = re.compile(r"(?<=>)([^<>]*[^<>\s][^<>]*)(?=</text>)")
@@ -98,9 +100,15 @@ class Catalogue:
         pieces = _LIST.split(text)
         made = [self._found(piece) for piece in pieces[::2]]
         if len(made) < 2 or all(each is None for each in made):
-            return text
+            return self._with_units(text)
         pieces[::2] = [piece if each is None else each for piece, each in zip(pieces[::2], made, strict=True)]
         return "".join(pieces)
+
+    def _with_units(self, text: str) -> str:
+        """Return a text with the decimal sign of the language before units, and with micrometres as on all pages."""
+        if self.language in COMMA:
+            text = _BEFORE_UNIT.sub(lambda found: found[0].replace(".", ","), text)
+        return _MICRO.sub("µ", text)
 
     def _found(self, text: str) -> str | None:
         plain = " ".join(text.split()) if len(text) <= LONGEST else ""
@@ -173,7 +181,7 @@ class Catalogue:
             title=self(part.title),
             kind=self(part.kind),
             key_figures=[
-                KeyFigure(self(each.label), Cell(**vars(self.cell(each.value))), each.unit, self(each.note))
+                KeyFigure(self(each.label), Cell(**vars(self.cell(each.value))), self.word(each.unit), self(each.note))
                 for each in part.key_figures
             ],
             summary=[self(sentence) for sentence in part.summary],

@@ -541,6 +541,7 @@ connection.disconnect()
 """
 
 
+@pytest.mark.slow
 def test_a_client_of_another_origin_works_in_mmhg_and_rectangular_coordinates(made: Made) -> None:
     pytest.importorskip("CESAPI", reason="the package CESAPI, another implementation, is not installed")
     device = SimulatedEmScon(parse_address(f"sim://cframe/tracker?seed=3&tracker=AT4xx&{EXACT}"))

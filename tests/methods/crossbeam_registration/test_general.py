@@ -38,6 +38,7 @@ def pair(shape, seed):
     return [cloud + rng.normal(0, NOISE, cloud.shape) for cloud in both]
 
 
+@pytest.mark.slow
 def test_motion_of_a_cloud_that_is_no_height_map_and_what_it_is_worth():
     squares = []
     for seed in range(16):

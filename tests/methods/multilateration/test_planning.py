@@ -64,7 +64,7 @@ def test_the_gain_over_the_layout_as_set_is_stated(ds):
     assert float(ds["gain"]) > 3  # three stations close together are bad
     assert ds["target_uncertainty"].values.max() == pytest.approx(own)
     assert ds["map_uncertainty"].sel(setup="best").values.max() == pytest.approx(best)
-    low, high = boxes_of(ROOM, np.array(CLOSE))[0]
+    low, high = boxes_of(ROOM, np.array(CLOSE), np.zeros((1, 3)))[0]
     assert np.all(ds["best_place"].values >= low)
     assert np.all(ds["best_place"].values <= high)
     text = "\n".join(ds.attrs["notes"])
@@ -123,7 +123,18 @@ def test_blocked_lines_of_sight_are_counted_and_targets_without_three_named():
 
 def test_boxes_for_another_number_of_stations_are_refused():
     with pytest.raises(MethodError, match="one box for all stations or one for each of 4; found 2"):
-        boxes_of(Planning(boxes=ROOM.boxes * 2), np.array(CLOSE))
+        boxes_of(Planning(boxes=ROOM.boxes * 2), np.array(CLOSE), np.zeros((1, 3)))
+
+
+def test_without_boxes_no_station_comes_nearer_to_the_targets():
+    targets = np.array([[-0.3, -0.2, 0.0], [0.3, 0.2, 0.4]])
+    stations = np.array([[-0.8, 0.1, 0.1], [0.7, -0.5, 0.2], [0.0, 0.6, 0.1], [0.1, 0.0, 0.2]])
+    boxes = boxes_of(Planning(), stations, targets)
+    for (low, high), station in zip(boxes[:3], stations, strict=False):
+        assert ((low <= station) & (station <= high)).all()
+        assert (low < high).any()  # it may move
+        assert ((high < targets.min(axis=0)) | (low > targets.max(axis=0))).any()  # on its side of the targets
+    np.testing.assert_array_equal(boxes[3], [stations[3], stations[3]])  # amid the targets: it stays
 
 
 def test_the_method_plans():

@@ -57,6 +57,14 @@ def complaints(run, tmp_path: Path):
     return complaints
 
 
+def test_beams_without_stated_uncertainty_are_those_of_a_frame_not_calibrated(run) -> None:
+    raw = run(GOOD, map_text())
+    variance = np.diagonal(raw["beam_covariance"], axis1=1, axis2=2)
+    np.testing.assert_allclose(variance[:, :3], 1e-4**2)
+    np.testing.assert_allclose(np.sort(variance[:, 3:], axis=1)[:, 1:], 5e-3**2, rtol=0.05)
+    assert "The map states no uncertainty of the beams: 0.1 mm and 5 mrad are assumed" in raw.attrs["import_notes"]
+
+
 @pytest.mark.parametrize("out", ["raw.nc", "raw.zarr"])
 def test_columns_become_a_raw_dataset_in_si(run, tmp_path, out) -> None:
     raw = run(GOOD, out=out)
@@ -235,5 +243,5 @@ def test_a_missing_log_is_told(tmp_path) -> None:
 
 def test_a_hole_in_the_rows_is_noted_in_seconds(run) -> None:
     log = GOOD[: GOOD.index("\n") + 1] + "".join(f"{t},1.1,1.2,1.3,1.4,1.5,20.5\n" for t in (0, 0.5, 1, 1.5, 2, 4.5))
-    (note,) = json.loads(run(log).attrs["import_notes"])
+    note, _beams = json.loads(run(log).attrs["import_notes"])
     assert note == "1 hole in the rows, where the usual interval is 30 s; the longest, of 150 s, ends in line 7"

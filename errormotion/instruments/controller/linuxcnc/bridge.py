@@ -65,6 +65,7 @@ MAX_TEXT = 500  # characters of an error text
 MIN_TOKEN = 32  # characters
 SIGN_INTERVAL = 0.02  # s between two signs of life, of several servo cycles
 THREAD_INTERVAL = 0.02  # s between two looks whether a thread is cut
+PROBING = 5  # motion.motion-type
 OFFSET_TOLERANCE = 1e-6  # m between LinuxCNC's offset and the one that was set
 MAX_FEED = 10.0  # m/s, where LinuxCNC states no limit
 MAX_SPINDLE = 1e6  # 1/min, where LinuxCNC states no limit
@@ -351,8 +352,12 @@ class Offsets:
         route = self.route
         if not route:
             raise RefusedError("LinuxCNC has not loaded compensation.tcl; name it in the INI file")
-        planned = [self._get(f"errormotion-limit-{each}.out") for each in "xyz"]
-        offset = [self._get(f"axis.{each}.eoffset") for each in "xyz"] if route == "external" else planned
+        before = self._three("errormotion-limit-{}.out")
+        offset, asked = before, before
+        if route == "external":
+            # The servo thread goes on meanwhile: both are compared with what was planned before and after.
+            offset, asked = self._three("axis.{}.eoffset"), self._three("axis.{}.eoffset-request")
+        planned = [before, self._three("errormotion-limit-{}.out")]
         return {
             "route": route,
             "offset": [unit * x for x in offset],
@@ -360,8 +365,8 @@ class Offsets:
             "slew": unit * self._get("errormotion-slew.in0"),
             "watchdog": self._get("errormotion-alive.width"),
             "alive": bool(self._get("errormotion-alive.out")),
-            "busy": self._busy(route, max(abs(unit * (x - y)) for x, y in zip(offset, planned))),  # noqa: B905
-            "fault": self._fault(route, unit, planned),
+            "busy": self._busy(route, unit * _distance(offset, planned)),
+            "fault": self._fault(unit * _distance(asked, planned)),
         }
 
     def set(self, offset: Any, unit: float) -> None:
@@ -400,6 +405,9 @@ class Offsets:
     def _get(self, pin: str) -> float:
         return float(self.hal.get_value(pin))
 
+    def _three(self, pin: str) -> list[float]:
+        return [self._get(pin.format(each)) for each in "xyz"]
+
     def _busy(self, route: str, behind: float) -> str:
         if self._get("errormotion-motion.out5"):
             return "the machine probes"
@@ -411,21 +419,23 @@ class Offsets:
             return "LinuxCNC limits the offset at an end of travel"
         return ""
 
-    def _fault(self, route: str, unit: float, planned: list[float]) -> str:
+    def _fault(self, wrong: float) -> str:
         if not self._get("motion.motion-enabled"):
             return "the machine is off or in e-stop"
         if not self._get("motion.is-all-homed"):
             return "the machine is not homed"
-        if route == "feedback":
-            return ""
-        asked = [self._get(f"axis.{each}.eoffset-request") for each in "xyz"]
-        wrong = max(unit * abs(x - y) for x, y in zip(asked, planned))  # noqa: B905
         if wrong > OFFSET_TOLERANCE:
             return (
                 f"LinuxCNC has an external offset that is {1e6 * wrong:.3g} um off the one that was set here: another "
                 "program, or an end of travel; switch the machine off and on"
             )
         return ""
+
+
+def _distance(values: list[float], bounds: list[list[float]]) -> float:
+    """Return by how much a value is farthest outside of its two bounds; 0 within them."""
+    first, second = bounds
+    return max(max(min(a, b) - x, x - max(a, b), 0.0) for x, a, b in zip(values, first, second))  # noqa: B905
 
 
 class Bridge:
@@ -479,6 +489,11 @@ class Bridge:
         self.job: Job | None = None
         self.program: Job | None = None
         self.outcome: dict[str, Any] | RefusedError = {"duration": 0.0}  # of the last program
+        self._probed_with = [
+            0.0,
+            0.0,
+            0.0,
+        ]  # external offset of the last probing, m; held in the servo thread meanwhile
         self._written = 0
         self._stops = 0
         self._stopping: dict[str, asyncio.Future[int]] = {}  # stops under way, which further ones join
@@ -654,11 +669,19 @@ class Bridge:
         return [self._unit * float(x) for x in places[:3]]
 
     def _place(self, position: Any) -> list[float]:
-        """Return a position of LinuxCNC, m, without the external offset, which LinuxCNC adds to what was commanded."""
-        return [x - offset for x, offset in zip(self._metres(position), self._external())]  # noqa: B905
+        """Return a position of LinuxCNC, m, without the external offset, which LinuxCNC adds to what was commanded.
+
+        The offset may have changed since the state was read. LinuxCNC takes it off its command in the servo cycle.
+        """
+        place = self._metres(position)
+        with contextlib.suppress(Exception):  # LinuxCNC 2.7 has no external offset
+            command = self._metres([self.hal.get_value(f"axis.{each}.pos-cmd") for each in "xyz"])
+            lag = [x - y for x, y in zip(place, self._metres(self.stat.position))]  # noqa: B905
+            return [x + y for x, y in zip(command, lag)]  # noqa: B905
+        return place
 
     def _external(self) -> list[float]:
-        """Return the external offset, m; it does not change while the machine probes."""
+        """Return the external offset, m."""
         with contextlib.suppress(Exception):  # LinuxCNC 2.7 has none
             return self._metres([self.hal.get_value(f"axis.{each}.eoffset") for each in "xyz"])
         return [0.0, 0.0, 0.0]
@@ -843,18 +866,21 @@ class Bridge:
             raise RefusedError("the probe is at the target already")
         if self.stat.spindle[0]["direction"]:
             raise RefusedError("the spindle turns; stop it before the machine probes")
+        self._probed_with = self._external()
         await self._mdi(f"{words} {_axis_words(self._in_work_frame(goal))}")
         if self.stat.probe_tripped:
-            return {"tripped": True, "position": self._place(self.stat.probed_position), "time": self.time}
+            found = self._metres(self.stat.probed_position)
+            place = [x - offset for x, offset in zip(found, self._probed_with)]  # noqa: B905
+            return {"tripped": True, "position": place, "time": self.time}
         await self._require_arrival(goal)
         return {"tripped": False, "position": None, "time": self.time}
 
     async def spindle(self, speed: Any) -> None:
         """Turn the spindle at a speed in 1/min, backwards where it is negative; 0 stops it."""
         await self._demand(homed=False)
-        number, most = _number(speed, "spindle speed in 1/min"), self._fastest_spindle(speed)
+        number, most = _number(speed, "spindle speed in /min"), self._fastest_spindle(speed)
         if abs(number) > most:
-            raise RefusedError(f"expected a spindle speed of at most {most:g} 1/min; found {number:g}")
+            raise RefusedError(f"expected a spindle speed of at most {most:g} /min; found {number:g} /min")
         await self._mdi("M5" if number == 0 else f"{'M3' if number > 0 else 'M4'} S{abs(number):.3f}")
         if self.stat.state == self.cnc.RCS_ERROR:
             raise RefusedError(f"the spindle does not turn{await self._texts()}")
@@ -1043,6 +1069,9 @@ class Bridge:
         await self._ended(self.job)  # it may have been aborted already
         await self._send("mdi", line)
         while not await self._ended(self.job):
+            offset = self._external()
+            if self._pin("motion.motion-type") == PROBING:
+                self._probed_with = offset
             await asyncio.sleep(POLL_INTERVAL)
 
     async def _ended(self, job: Job | None) -> bool:

@@ -209,7 +209,7 @@ def _spans(seen: Campaign) -> Table:
         spread = (np.median(stated), stated.max()) if stated.size else (math.nan, math.nan)
         cells = [fixed(values[known].min(), 2, signed=True), fixed(values[known].max(), 2, signed=True)]
         cells += [fixed(float(value), decimals_of(float(value), 2)) for value in spread]
-        rows.append([seen.names[freedom], unit, *cells, f"{integer(known.sum())} of {integer(known.size)}"])
+        rows.append([seen.names[freedom], unit, *cells, f"{integer(known.sum())} / {integer(known.size)}"])
     return Table(
         "Span of the six errors over the warm cycles and their expanded uncertainty, k = 2.",
         ["error", "unit", "lowest", "highest", "U, median", "U, largest", "determined"],

@@ -74,7 +74,7 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
     if planning.targets is None:
         found = _best(settings, planning, sight, own, expected)
     else:
-        found = choose(settings, planning, planning.targets, sight, boxes_of(planning, own), noise)
+        found = choose(settings, planning, planning.targets, sight, boxes_of(planning, own, target), noise)
     gain = _measure(planning, found.own) / _measure(planning, found.best) if found.better else 1.0
     text = layout_text(p, found.station, None if planning.targets is None else found.position[found.chosen])
     if planning.write is not None:
@@ -136,8 +136,11 @@ def reading_noise(settings: Settings) -> float:
     return float(np.hypot(settings.layout.displacement_noise, repeated))
 
 
-def boxes_of(planning: Planning, stations: Array) -> Array:
-    """Return the box of each station, (n, 2, 3), m: as stated, or the one around all stations of the layout.
+def boxes_of(planning: Planning, stations: Array, targets: Array) -> Array:
+    """Return the box of each station, (n, 2, 3), m: as stated, or without stated ones outside of the machine.
+
+    Such a box is that around all stations of the layout, on the station's own side of the targets (m, 3) and no nearer
+    to them than the station was set: nothing is known of what stands between. A station amid the targets stays.
 
     Raises
     ------
@@ -151,8 +154,16 @@ def boxes_of(planning: Planning, stations: Array) -> Array:
                 f"expected one box for all stations or one for each of {len(stations)}; found {len(boxes)}"
             )
         return np.tile(boxes, (len(stations), 1, 1)) if len(boxes) == 1 else boxes
-    around = np.stack([stations.min(axis=0), stations.max(axis=0)])
-    return np.tile(around, (len(stations), 1, 1))
+    boxes = np.tile(np.stack([stations.min(axis=0), stations.max(axis=0)]), (len(stations), 1, 1))
+    low, high = targets.min(axis=0), targets.max(axis=0)
+    for box, station in zip(boxes, stations, strict=True):
+        beyond = np.maximum(low - station, station - high)
+        axis = int(np.argmax(beyond))
+        if beyond[axis] <= 0:
+            box[:] = station
+        else:
+            box[1 if station[axis] < low[axis] else 0, axis] = station[axis]
+    return boxes
 
 
 def _measure(planning: Planning, sigma: Array) -> float:
@@ -167,7 +178,7 @@ def _best(settings: Settings, planning: Planning, sight: Sight, own: Array, expe
     coarse = p.model_copy(update={"count": tuple(min(k, _COARSE) for k in p.count)})
     place = layout.optimise(
         layout.grid(coarse)[1],
-        boxes_of(planning, own),
+        boxes_of(planning, own, target),
         sight,
         noise=noise,
         start=own,

@@ -289,6 +289,8 @@ def beams_of(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Arr
         return origin, direction, covariance, "nominal beams"
     if "beam_covariance" in raw:
         covariance = np.asarray(raw["beam_covariance"].transpose("channel", "p", "p_").values, np.float64)
+        if raw.attrs.get("beam_uncertainty") == "assumed":
+            notes.append("The uncertainty of the beams is assumed: the map of the imported log states none.")
         return origin, direction, covariance, "beam calibration"
     notes.append("The raw dataset states no beam_covariance: the beams are assumed to be exact.")
     return origin, direction, np.zeros((5, 6, 6)), "beam calibration"

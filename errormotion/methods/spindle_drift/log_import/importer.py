@@ -25,8 +25,11 @@ from errormotion.methods.spindle_drift.log_import.import_map import (
     TimeColumn,
 )
 from errormotion.methods.spindle_drift.schema import CHANNELS, RAW_SCHEMAS
+from errormotion.methods.spindle_drift.settings import Settings
 
 _DRIFT = RAW_SCHEMAS[0]
+_ORIGIN = float(Settings.model_fields["nominal_origin_uncertainty"].default)
+_DIRECTION = float(Settings.model_fields["nominal_direction_uncertainty"].default)
 _ROWS = {row.name: row for row in _DRIFT.rows}
 _VARIABLE = {
     "time": "time",
@@ -137,8 +140,7 @@ def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
         "height": ["L1", "L2"],
         "time": (("time",), inside["time"], {"units": "s"}),
     }
-    if channels[0].origin_uncertainty is not None:
-        variables["beam_covariance"] = (("channel", "p", "p_"), _beam_covariance(settings, direction))
+    variables["beam_covariance"] = (("channel", "p", "p_"), _beam_covariance(settings, direction))
     if settings.temperatures:
         temperature = np.stack([inside[f"temperatures.{name}"] for name in settings.temperatures], axis=1)
         variables["temperature"] = (("time", "sensor"), temperature, {"units": "degC"})
@@ -151,7 +153,14 @@ def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
         "missing_values": json.dumps({key: count for key, count in missing.items() if count}),
     }
     attrs |= {name: value for name, value in (("machine", settings.machine), ("start", columns.start)) if value}
-    if notes := [*holes(inside["time"], columns.lines), *columns.notes]:
+    notes = [*holes(inside["time"], columns.lines), *columns.notes]
+    if channels[0].origin_uncertainty is None:
+        notes.append(
+            f"The map states no uncertainty of the beams: {1e3 * _ORIGIN:g} mm and {1e3 * _DIRECTION:g} mrad are "
+            "assumed, as for a frame that was not calibrated."
+        )
+        attrs["beam_uncertainty"] = "assumed"
+    if notes:
         attrs[NOTES] = json.dumps(notes)
     return xr.Dataset(variables, coords, attrs)
 
@@ -161,6 +170,8 @@ def _beam_covariance(settings: ImportMap, direction: Array) -> Array:
     C = np.zeros((len(CHANNELS), 6, 6))
     for k, name in enumerate(CHANNELS):
         channel, u = settings.channels[name], direction[k]
-        C[k, :3, :3] = (channel.origin_uncertainty or 0.0) ** 2 * np.eye(3)
-        C[k, 3:, 3:] = (channel.direction_uncertainty or 0.0) ** 2 * (np.eye(3) - np.outer(u, u))
+        origin = _ORIGIN if channel.origin_uncertainty is None else channel.origin_uncertainty
+        across = _DIRECTION if channel.direction_uncertainty is None else channel.direction_uncertainty
+        C[k, :3, :3] = origin**2 * np.eye(3)
+        C[k, 3:, 3:] = across**2 * (np.eye(3) - np.outer(u, u))
     return C

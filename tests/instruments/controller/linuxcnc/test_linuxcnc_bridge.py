@@ -977,17 +977,61 @@ def test_no_client_sets_the_pins_of_the_compensation_directly(tmp_path: Path) ->
 def test_positions_are_those_without_an_external_offset(tmp_path: Path) -> None:
     async def test() -> None:
         fake, hal = FakeLinuxCNC(), FakeHAL()
-        hal.pins |= {"axis.x.eoffset": 0.02, "axis.y.eoffset": -0.01, "axis.z.eoffset": 0.0}
+        hal.pins |= {"axis.x.eoffset": 0.02, "axis.y.eoffset": -0.01, "axis.z.eoffset": 0.0, "motion.motion-type": 5.0}
+        hal.pins |= {"axis.x.pos-cmd": 10.0, "axis.y.pos-cmd": 20.0, "axis.z.pos-cmd": 30.0}
         wire = Wire(made(fake, tmp_path, hal=hal))
         fake.on_mdi = moving_to(fake, (10.02, 19.99, 30.0))
-        fake.values.actual_position = (10.02, 19.99, 30.0, *(0.0,) * 6)
+        fake.values.actual_position = (10.023, 19.99, 30.0, *(0.0,) * 6)
         fake.values.probe_tripped, fake.values.probed_position = True, (5.02, 4.99, 3.0, *(0.0,) * 6)
         assert "duration" in await wire.ask("move_to", position=[0.01, 0.02, 0.03])
         state = await wire.ask("state")
-        assert state["position"] == pytest.approx([0.01, 0.02, 0.03])
+        assert state["position"] == pytest.approx([0.010003, 0.02, 0.03], abs=1e-12)
         assert state["commanded_position"] == pytest.approx([0.01, 0.02, 0.03])
         touch = await wire.ask("probe", target=[0.0, 0.0, 0.0], feed=0.001)
         assert touch["position"] == pytest.approx([0.005, 0.005, 0.003])
+        await wire.disconnect()
+
+    asyncio.run(test())
+
+
+def test_an_offset_that_changes_after_the_state_was_read_moves_no_position(tmp_path: Path) -> None:
+    """The state is some milliseconds old when the pins are read; at 20 um/s that is a micrometre in 50 ms."""
+
+    async def test() -> None:
+        fake, hal = FakeLinuxCNC(), FakeHAL()
+        hal.pins |= {f"axis.{each}.eoffset": 0.0 for each in "xyz"} | {"motion.motion-type": 0.0}
+        hal.pins |= {f"axis.{each}.pos-cmd": 10.0 for each in "xyz"}
+        fake.on_mdi = moving_to(fake, (10.020, 10.0, 10.0))
+        fake.values.actual_position = (10.020, 10.0, 10.0, *(0.0,) * 6)
+        wire = Wire(made(fake, tmp_path, hal=hal))
+        hal.pins["axis.x.eoffset"] = 0.0216
+        assert "duration" in await wire.ask("move_to", position=[0.01, 0.01, 0.01])
+        state = await wire.ask("state")
+        assert state["position"] == state["commanded_position"] == pytest.approx([0.01] * 3, abs=1e-12)
+        await wire.disconnect()
+
+    asyncio.run(test())
+
+
+def test_a_contact_has_the_offset_that_was_held_while_the_machine_probed(tmp_path: Path) -> None:
+    async def test() -> None:
+        fake, hal = FakeLinuxCNC(), FakeHAL()
+        hal.pins |= {f"axis.{each}.pos-cmd": 10.0 for each in "xyz"} | {f"axis.{each}.eoffset": 0.0 for each in "xyz"}
+        hal.pins |= {"axis.x.eoffset": 0.02, "motion.motion-type": 5.0}
+
+        def probe(line: str) -> None:
+            fake.values.interp_state = fake.INTERP_READING
+            asyncio.get_running_loop().call_later(0.1, ended)
+
+        def ended() -> None:  # the offset follows again before the contact is read
+            hal.pins |= {"axis.x.eoffset": 0.03, "motion.motion-type": 0.0}
+            fake.values.probe_tripped, fake.values.probed_position = True, (5.02, 4.0, 3.0, *(0.0,) * 6)
+            fake.values.interp_state = fake.INTERP_IDLE
+
+        fake.on_mdi = probe
+        wire = Wire(made(fake, tmp_path, hal=hal))
+        touch = await wire.ask("probe", target=[0.0, 0.0, 0.0], feed=0.001)
+        assert touch["position"] == pytest.approx([0.005, 0.004, 0.003], abs=1e-12)
         await wire.disconnect()
 
     asyncio.run(test())

@@ -127,6 +127,22 @@ def test_a_held_offset_says_why(pins: Pins, changed: dict[str, Any], busy: str) 
     assert busy in Offsets(pins).state(UNIT)["busy"]
 
 
+def test_an_offset_that_moves_while_it_is_read_is_neither_limited_nor_that_of_another_program() -> None:
+    """A computer with other work reads the pins tens of milliseconds apart; the servo thread goes on."""
+
+    class Moving(Pins):
+        def get_value(self, name: str) -> Any:
+            if name.startswith("axis.y") or name == "errormotion-limit-y.out":
+                self.values[name] = self.time
+            self.time += 0.0015  # mm
+            return super().get_value(name)
+
+        time = 0.0
+
+    found = Offsets(Moving()).state(UNIT)
+    assert (found["busy"], found["fault"]) == ("", "")
+
+
 @pytest.mark.parametrize("pin", ["motion.debug-float-1", "spindle.0.index-enable"])
 def test_the_axes_follow_the_spindle(pins: Pins, pin: str) -> None:
     offsets = Offsets(pins)
