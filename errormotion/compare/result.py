@@ -15,7 +15,7 @@ from errormotion.compare.diagnosis import Cause
 from errormotion.compare.ground import Ground
 from errormotion.compare.pairs import Pair
 from errormotion.compare.repeats import KINDS, Repeats
-from errormotion.compare.stack import Estimate, shared
+from errormotion.compare.stack import shared
 from errormotion.datasets.checks import matrix_violations
 from errormotion.errors import DatasetError
 
@@ -228,13 +228,3 @@ _COVARIANCES = {
     "difference": "difference_covariance",
     "consensus": "consensus_covariance",
 }
-
-
-def estimate_of(ds: xr.Dataset, name: str) -> Estimate:
-    """Return one dataset of a result as an estimate without sources: value and total covariance at every point."""
-    one = ds.sel(dataset=name)
-    d = one.sizes["dof"]
-    value = np.asarray(one["value"].values).reshape(-1, d)
-    return Estimate(
-        name, value, np.asarray(one["covariance"].values).reshape(-1, d, d), np.zeros((0, *value.shape)), ()
-    )

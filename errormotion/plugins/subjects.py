@@ -33,8 +33,31 @@ LONGEST_WARM_UP = 240.0
 _WARM: set[type] = set()
 
 
+class _Simulated:
+    """What subjects of instruments and of compensators share: whether they are simulated, and with which faults."""
+
+    plugin: Any
+    address: str
+    faults: tuple[str, ...] | None
+
+    @property
+    def menu(self) -> tuple[str, ...]:
+        """Names of the faults to try; a real device or machine is spared them."""
+        if not self.simulated:
+            return ()
+        if self.faults is not None:
+            return self.faults
+        simulator = self.plugin.info.simulator
+        return tuple(getattr(load_object(simulator), "faults", ())) if simulator else ()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether a simulator answers, and not a device or a machine."""
+        return self.address.startswith("sim://")
+
+
 @dataclass(frozen=True)
-class InstrumentSubject:
+class InstrumentSubject(_Simulated):
     """An instrument plugin and an address at which its simulator answers.
 
     Attributes
@@ -102,21 +125,6 @@ class InstrumentSubject:
         return self.plugin(where, self.plugin.Settings(**self.settings), record=record)
 
     @property
-    def menu(self) -> tuple[str, ...]:
-        """Names of the faults to try; a real device is spared them."""
-        if not self.simulated:
-            return ()
-        if self.faults is not None:
-            return self.faults
-        simulator = self.plugin.info.simulator
-        return tuple(getattr(load_object(simulator), "faults", ())) if simulator else ()
-
-    @property
-    def simulated(self) -> bool:
-        """Whether a simulator answers, and not a device."""
-        return self.address.startswith("sim://")
-
-    @property
     def bounds(self) -> tuple[float, float] | None:
         """Lowest and highest plausible reading."""
         return self.plausible or kind_registry.plausible(self.plugin.info.kind)
@@ -128,7 +136,7 @@ class InstrumentSubject:
 
 
 @dataclass(frozen=True)
-class CompensatorSubject:
+class CompensatorSubject(_Simulated):
     """A compensator plugin, and a simulated machine that takes its offsets.
 
     A simulated machine is what ``start(address)`` returns: it has ``driver_url`` (or ``url``), where the compensator
@@ -191,21 +199,6 @@ class CompensatorSubject:
     def build(self, address: str, settings: Mapping[str, Any] | None = None) -> Any:
         """Return a new compensator, not yet opened; ``settings`` are those of a simulated machine."""
         return self.plugin(address, self.plugin.Settings(**{**(settings or {}), **self.settings}))
-
-    @property
-    def menu(self) -> tuple[str, ...]:
-        """Names of the faults to try; a real machine is spared them."""
-        if not self.simulated:
-            return ()
-        if self.faults is not None:
-            return self.faults
-        simulator = self.plugin.info.simulator
-        return tuple(getattr(load_object(simulator), "faults", ())) if simulator else ()
-
-    @property
-    def simulated(self) -> bool:
-        """Whether the machine is simulated."""
-        return self.address.startswith("sim://")
 
 
 @dataclass(frozen=True)

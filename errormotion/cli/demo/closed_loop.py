@@ -98,11 +98,6 @@ class WarmUp:
         """True root mean square displacement with the compensation, relative to that without."""
         return float(np.sqrt((self.true_after**2).sum() / (self.true_before**2).sum()))
 
-    @property
-    def remaining_of_axes(self) -> Array:
-        """The same for X, Y and Z, each relative to the whole displacement without, (3,)."""
-        return np.asarray(np.sqrt((self.true_after**2).sum(axis=0) / (self.true_before**2).sum()))
-
 
 @dataclass(frozen=True)
 class Loop:

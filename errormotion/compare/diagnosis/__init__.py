@@ -23,8 +23,6 @@ from errormotion.compare.stack import Estimate, difference
 
 CLOSE = 6.0
 """Difference of scores up to which the data cannot tell two causes apart: a likelihood ratio of 20."""
-UNEXPLAINED = 1e-3
-"""Probability of the rest below which a cause does not explain a difference."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +60,6 @@ class Cause:
     score: float
     p: float
     alike: tuple[str, ...] = field(default=())
-
-    @property
-    def explains(self) -> bool:
-        """Whether what remains is compatible with the uncertainties."""
-        return self.p >= UNEXPLAINED
 
 
 def diagnose(

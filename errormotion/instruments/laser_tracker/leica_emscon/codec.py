@@ -302,11 +302,6 @@ def encode_answer(number: int, status: int = 0, /, **values: Any) -> bytes:
     )
 
 
-def encode_error(number: int, status: int) -> bytes:
-    """Return an error packet; ``number`` is that of the command it is about, or `UNKNOWN`."""
-    return _packet(ERROR, struct.pack("<II", number, status))
-
-
 def encode_change(change: int) -> bytes:
     """Return the message of a status change."""
     return _packet(CHANGE, struct.pack("<I", change))

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import logging
-import threading
-from collections.abc import Coroutine
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from asyncua import ua
@@ -17,7 +13,8 @@ from asyncua.ua.status_codes import StatusCodes
 
 from errormotion.instruments.simulators.compensator.machine import MachinePart
 from errormotion.instruments.simulators.controller.opcua.listening import FaultyServer, Outgoing
-from errormotion.instruments.simulators.controller.opcua.space import Ids, SmallServer, Space, number
+from errormotion.instruments.simulators.controller.opcua.serving import ServingThread, prepare_server
+from errormotion.instruments.simulators.controller.opcua.space import Ids, Space, number
 from errormotion.instruments.simulators.faults import parse_fault
 from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.serving import listening_at, not_listening, reachable_at
@@ -29,7 +26,6 @@ WRITABLE = 3
 NAMESPACE = "urn:errormotion:machine"
 INDEX = 2
 """Of the namespace of the nodes."""
-Result = TypeVar("Result")
 
 
 class SimulatedNodes:
@@ -58,13 +54,11 @@ class SimulatedNodes:
         self._path = address.path or "nodes"
         self._host, self._port = listening_at()
         self._server: FaultyServer | None = None
+        self._closed = False
         self._beat: Any = None
-        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # what a client does wrong is no concern of the user
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="sim-nodes", daemon=True)
-        self._thread.start()
+        self._thread = ServingThread("sim-nodes")
         try:
-            self._run(self._start())
+            self._thread.run(self._start())
         except OSError as error:
             self.close()
             raise not_listening(self._host, self._port, error) from None
@@ -75,12 +69,9 @@ class SimulatedNodes:
 
     def close(self) -> None:
         """End the server; idempotent."""
-        if self._loop.is_closed():
-            return
-        self._run(self._end())
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
+        closed, self._closed = self._closed, True
+        if not closed:
+            self._thread.end(self._stop())
 
     def report_delivered(self, samples: int) -> None:
         """Take no note: nothing streams."""
@@ -106,20 +97,8 @@ class SimulatedNodes:
 
     # ------------------------------------------------------------------ in the thread of the server
 
-    def _run(self, work: Coroutine[Any, Any, Result]) -> Result:
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
-
     async def _start(self) -> None:
-        inner = SmallServer()
-        inner.disabled_clock = True  # its thread would delay the end by a second
-        inner.allow_remote_admin = False
-        server = FaultyServer(inner)
-        server.outgoing = self._outgoing
-        server.name = "errormotion"
-        server.socket_address = self._host, self._port
-        server.set_endpoint(f"opc.tcp://{reachable_at(self._host, self._port)}/{self._path}")
-        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
-        await server.init()
+        server, inner = await prepare_server(self._outgoing, self._host, self._port, self._path)
         await server.register_namespace(NAMESPACE)
         space = Space(inner)
         for axis in AXES:
@@ -164,16 +143,10 @@ class SimulatedNodes:
         value = space.read_attribute_value(self._id(name), AttributeIds.Value).Value
         return value.Value if value is not None else None
 
-    async def _end(self) -> None:
-        """Stop the server and everything that still runs in this thread."""
+    async def _stop(self) -> None:
         server, self._server = self._server, None
         if server is not None:
             await server.stop()
-        running = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in running:
-            task.cancel()
-        await asyncio.gather(*running, return_exceptions=True)
-        await asyncio.get_running_loop().shutdown_default_executor()
 
 
 class _Attributes(AttributeService):

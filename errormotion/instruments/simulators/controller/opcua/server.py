@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import threading
-from collections.abc import Coroutine
 from dataclasses import replace
 from importlib.metadata import version
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from asyncua import ua
@@ -18,6 +16,7 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.controller.opcua import cnc, sinumerik
 from errormotion.instruments.simulators.controller.opcua.listening import FaultyServer, Outgoing
 from errormotion.instruments.simulators.controller.opcua.machine import Machine
+from errormotion.instruments.simulators.controller.opcua.serving import ServingThread, prepare_server
 from errormotion.instruments.simulators.controller.opcua.space import UA, Attributes, Ids, SmallServer, Space
 from errormotion.instruments.simulators.controller.opcua.space import number as numeric
 from errormotion.instruments.simulators.device import DEFAULT_MACHINE
@@ -30,7 +29,6 @@ STYLES = ("cnc", "sinumerik")
 UNITS = ("model", "ua")
 REFRESH = 0.05
 """Time between two looks at the machine for subscriptions, s."""
-Result = TypeVar("Result")
 
 
 class SimulatedServer:
@@ -69,16 +67,13 @@ class SimulatedServer:
         self._host, self._port = listening_at()
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
         self.world.attach(self, address.number("pace", 0.0) or None)
-        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # what a client does wrong is no concern of the user
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="sim-opcua", daemon=True)
-        self._thread.start()
+        self._thread = ServingThread("sim-opcua")
         try:
             if moment := address.number("clock", 0.0):
                 self.world.tick(moment)
             self._machine = Machine(self.world, self._unavailable)
             try:
-                self._run(self._start())
+                self._thread.run(self._start())
             except OSError as error:
                 raise not_listening(self._host, self._port, error) from None
         except BaseException:
@@ -92,10 +87,7 @@ class SimulatedServer:
             closed, self._closed = self._closed, True
         if closed:
             return
-        self._run(self._end())
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
+        self._thread.end(self._stop())
         self.world.detach(self)
 
     def report_delivered(self, samples: int) -> None:
@@ -103,24 +95,12 @@ class SimulatedServer:
 
     # ------------------------------------------------------------------ in the thread of the server
 
-    def _run(self, work: Coroutine[Any, Any, Result]) -> Result:
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
-
     def _unavailable(self) -> bool:
         return self.fault.kind == "unavailable" and self._outgoing.reached
 
     async def _start(self) -> None:
         """Start a server at the port of the last one, with an address space of its own."""
-        inner = SmallServer()
-        inner.disabled_clock = True  # the time is read at each request
-        inner.allow_remote_admin = False
-        server = FaultyServer(inner)
-        server.outgoing = self._outgoing
-        server.name = "errormotion"
-        server.socket_address = self._host, self._port
-        server.set_endpoint(f"opc.tcp://{reachable_at(self._host, self._port)}/{self._path}")
-        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
-        await server.init()
+        server, inner = await prepare_server(self._outgoing, self._host, self._port, self._path)
         release = version("errormotion")
         await server.set_build_info(
             "urn:errormotion", "errormotion", "simulated control", release, "0", self._machine.time
@@ -196,12 +176,3 @@ class SimulatedServer:
         server, self._server = self._server, None
         if server is not None:
             await server.stop()
-
-    async def _end(self) -> None:
-        """Stop the server and everything that still runs in this thread."""
-        await self._stop()
-        running = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in running:
-            task.cancel()
-        await asyncio.gather(*running, return_exceptions=True)
-        await asyncio.get_running_loop().shutdown_default_executor()
