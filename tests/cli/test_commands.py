@@ -218,7 +218,7 @@ def test_import_says_what_it_made(run: Run, answer: Answer, tmp_path: Path) -> N
         )
     (tmp_path / "map.toml").write_text(head)
     found = answer("import", "log.csv", "--map", "map.toml", "--out", "raw.nc")
-    assert found["sizes"] == {"channel": 5, "time": 9, "direction": 3, "height": 2}
+    assert found["sizes"] == {"channel": 5, "time": 9, "direction": 3, "height": 2, "p": 6, "p_": 6}
     (tmp_path / "log.csv").write_text("t,X1\n")
     run("import", "log.csv", "--map", "map.toml", "--out", "other.nc", code=1)
 

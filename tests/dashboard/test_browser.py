@@ -87,7 +87,8 @@ def test_values_live_and_a_sensor_that_is_unplugged(
     page.goto(served.address)
     page.wait_for_selector("#curves[data-drawn] canvas")
     page.wait_for_selector(".tiles li.answers >> nth=1")
-    assert "spindle front<script>" in page.inner_text("#temperatures")
+    sync_api.expect(page.locator("#temperatures")).to_contain_text("spindle front<script>")
+    page.wait_for_selector("#map svg >> nth=1")
     assert page.locator("#map svg").count() == 2
     assert page.locator("#map .head + text").all_text_contents() == ["head: Z"] * 2
     sync_api.expect(page.locator(".tiles .rate").first).to_contain_text("readings/s")

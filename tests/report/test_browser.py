@@ -64,7 +64,7 @@ def chapter():
 
 
 def test_values_zoom_and_space(drift, tmp_path: Path) -> None:
-    page = write_page([Source(drift)], [chapter()], tmp_path / "page.html")
+    page = write_page([Source(drift)], lambda: [chapter()], tmp_path / "page.html")
     html = page.read_text(encoding="utf-8")
     html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", html)  # for the actions of the test
     page.write_text(html.replace("</body>", f"<script>{ACTIONS}</script></body>"), encoding="utf-8")
