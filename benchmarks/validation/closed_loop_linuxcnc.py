@@ -64,8 +64,8 @@ def section(seeds: int, cache: Path | None = None) -> Iterator[str]:
         "thermometers in Modbus and writes to LinuxCNC: in the feedback path, or as external offsets. `without`: root "
         "mean square of the true displacement (EX, EY, EZ together) of the second warm-up, without compensation, at "
         "the times of the cycles after the cold one; `with`: the same as LinuxCNC probed it with the compensation, the "
-        "scatter of the probe (0.4 um a touch) included. `following`: share of the decisions that move the offset; it is "
-        "held while the machine probes, and here probing takes most of the real time."
+        "scatter of the probe (0.4 um a touch) included. `following`: share of the decisions that move the offset; it "
+        "is held while the machine probes, and here probing takes most of the real time."
     )
     yield from ("", "| machine | route | sensors | without/um | with/um | remaining | following |")
     yield "|---|---|---|---|---|---|---|"
