@@ -235,6 +235,23 @@ class RunFolder:
             os.close(descriptor)
 
 
+def is_locked(path: Path) -> bool:
+    """Return whether a process holds the lock of a file or folder; looking does not hold it against others who look."""
+    import fcntl
+
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
 def list_runs(runs: Path, skipped: list[str] | None = None) -> list[RunFolder]:
     """Return the run folders in a folder, the oldest first; unreadable ones are logged, and appended to ``skipped``."""
     found = []

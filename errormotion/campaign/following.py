@@ -7,7 +7,6 @@ neither its process nor its terminal.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from errormotion.campaign.folder import is_locked
 from errormotion.compensation.online.settings import Limits
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.errors import CompensationError
@@ -144,24 +144,13 @@ def is_working(folder: Path) -> bool:
     if not (folder / AUDIT).is_file():  # it is made under the lock, so that the lock is never asked for before
         return False
     try:
-        import fcntl
+        return is_locked(folder)
     except ImportError:  # Windows: no lock; what was written lately is at work
         try:
             status = read_status(folder)
         except CompensationError:
             return False
         return not status.ended and (datetime.now(UTC) - status.time).total_seconds() < 10 * status.limits.period
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
 
 
 def compensations(runs: Path) -> Iterator[Path]:

@@ -26,7 +26,7 @@ from uuid import uuid4
 
 from errormotion.campaign.background.publishing import ANSWER, STATUS
 from errormotion.campaign.files import load_campaign
-from errormotion.campaign.folder import RunFolder, now, replace_text
+from errormotion.campaign.folder import RunFolder, is_locked, now, replace_text
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.errors import RunError
 
@@ -240,23 +240,8 @@ def _tidy(root: Path) -> None:
     """Remove the states of the oldest processes that have ended."""
     names = sorted(path.name for path in root.iterdir() if _NAME.fullmatch(path.name))
     for name in names[:-MOST]:
-        if not _alive(root / name):
+        if not is_locked(root / name / "lock"):
             shutil.rmtree(root / name, ignore_errors=True)
-
-
-def _alive(folder: Path) -> bool:
-    """Return whether the lock of a process is held; looking does not hold it against others who look."""
-    try:
-        lock = os.open(folder / "lock", os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(lock)
-    return False
 
 
 def _one(runs: Path, name: str) -> Background:
@@ -267,7 +252,7 @@ def _one(runs: Path, name: str) -> Background:
 
 
 def _read(folder: Path) -> Background | None:
-    alive = _alive(folder)  # before its state, which is complete if it has ended
+    alive = is_locked(folder / "lock")  # before its state, which is complete if it has ended
     process, state = _state(folder / "process.json"), _state(folder / STATUS)
     if not process:
         return None

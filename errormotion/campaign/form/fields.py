@@ -6,11 +6,10 @@ form of the new text is shown. Text and form therefore always agree.
 
 from __future__ import annotations
 
-import types
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -18,7 +17,7 @@ from pydantic.fields import FieldInfo
 from errormotion import plugins
 from errormotion.campaign.files import CampaignPlan, CampaignTable, MistakesError, TestTable, campaign_of
 from errormotion.campaign.form.written import default_of, quantity_of
-from errormotion.datasets.files.tomlfile import Key, dotted, parse_toml
+from errormotion.datasets.files.tomlfile import Key, dotted, options_of, parse_toml
 from errormotion.datasets.files.tomltext import value, value_of, with_value
 from errormotion.errors import BenchError, DatasetError, PluginError
 
@@ -185,7 +184,7 @@ def _fields(
 
 
 def _field(field: FieldInfo, place: tuple[Key, ...], label: str, stated: Any) -> Field:
-    options = [each for each in _options(field.annotation) if each is not type(None)]
+    options = [each for each in options_of(field.annotation) if each is not type(None)]
     quantity = quantity_of(field)
     choices = _choices(options)
     single = all(option in (str, Path) or get_origin(option) is Literal for option in options)
@@ -219,16 +218,6 @@ def _choices(options: Sequence[Any]) -> tuple[str, ...]:
 
 def _table(field: FieldInfo) -> type[BaseModel] | None:
     """Return the model of a field that is always a table of its own; None for anything else."""
-    options = _options(field.annotation)
+    options = options_of(field.annotation)
     only = options[0] if len(options) == 1 else None
     return only if isinstance(only, type) and issubclass(only, BaseModel) else None
-
-
-def _options(annotation: Any) -> list[Any]:
-    """Return the members of unions and annotated types, flattened."""
-    origin = get_origin(annotation)
-    if origin is Annotated:
-        return _options(get_args(annotation)[0])
-    if origin is Union or origin is types.UnionType:
-        return [option for member in get_args(annotation) for option in _options(member)]
-    return [annotation]

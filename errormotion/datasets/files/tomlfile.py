@@ -254,25 +254,25 @@ def _names(model: type[BaseModel]) -> list[str]:
     return [field.alias or name for name, field in model.model_fields.items()]
 
 
-def _options(annotation: Any) -> list[Any]:
+def options_of(annotation: Any) -> list[Any]:
     """Return the members of unions and annotated types, flattened."""
     origin = get_origin(annotation)
     if origin is Annotated:
-        return _options(get_args(annotation)[0])
+        return options_of(get_args(annotation)[0])
     if origin is Union or origin is types.UnionType:
-        return [option for member in get_args(annotation) for option in _options(member)]
+        return [option for member in get_args(annotation) for option in options_of(member)]
     return [annotation]
 
 
 def _models(annotations: Iterable[Any]) -> list[type[BaseModel]]:
-    options = [option for annotation in annotations for option in _options(annotation)]
+    options = [option for annotation in annotations for option in options_of(annotation)]
     return [option for option in options if isinstance(option, type) and issubclass(option, BaseModel)]
 
 
 def _step(annotations: Sequence[Any], key: Key) -> list[Any]:
     """Return what stands below a key; empty if there is no such key."""
     below: list[Any] = []
-    for option in (option for annotation in annotations for option in _options(annotation)):
+    for option in (option for annotation in annotations for option in options_of(annotation)):
         if isinstance(option, type) and issubclass(option, BaseModel):
             below += [field.annotation for name, field in option.model_fields.items() if key in (name, field.alias)]
         elif get_origin(option) in (dict, Mapping):
