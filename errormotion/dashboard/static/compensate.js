@@ -2,14 +2,6 @@
 "use strict";
 
 const INTERVAL = 1000, CURVES = 2000; // ms
-const byId = (id) => document.getElementById(id);
-
-function element(name, text, className) {
-  const made = document.createElement(name);
-  if (text !== undefined) made.textContent = text;
-  if (className) made.className = className;
-  return made;
-}
 
 const number = (value, digits) => (value === null || value === undefined ? "—" : value.toFixed(digits).replace("-", "−"));
 const signed = (value) => (value > 0 ? "+" : "") + number(value, 2);
@@ -137,16 +129,9 @@ function showChosen(found) {
   }));
 }
 
-async function ask(path) {
-  const answer = await fetch(path, { headers: { Accept: "application/json" }, signal: AbortSignal.timeout(10000) });
-  if (answer.status === 403) location.assign("/login");
-  if (!answer.ok) throw new Error((await answer.json()).error);
-  return answer.json();
-}
-
 async function states() {
   try {
-    const found = await ask(`/compensate/state.json?${new URLSearchParams({ run: chosen })}`);
+    const found = await answerOf(`/compensate/state.json?${new URLSearchParams({ run: chosen })}`);
     showStops(found.list);
     showList(found);
     showChosen(found.chosen);
@@ -165,7 +150,7 @@ let drawing = "", figure = null, asked = 0, timer = 0;
 
 async function frame() {
   if (figure) return;
-  const found = await ask("/compensate/figure.json");
+  const found = await answerOf("/compensate/figure.json");
   const place = element("div");
   place.id = "curves-drawn";
   byId("curves").replaceChildren(place);
@@ -180,7 +165,7 @@ async function curves() {
     if (drawing) {
       const question = new URLSearchParams(new FormData(form));
       question.set("run", drawing);
-      const found = await ask(`/compensate/curves.json?${question}`);
+      const found = await answerOf(`/compensate/curves.json?${question}`);
       if (own !== asked) return;
       await frame();
       for (const [axis, data] of Object.entries(found)) { // local time, as at the machine

@@ -2,16 +2,8 @@
 "use strict";
 
 const INTERVAL = 1000, LIVE_INTERVAL = 3000; // ms
-const byId = (id) => document.getElementById(id);
 const text = byId("text"), control = Boolean(byId("processes-card").dataset.control);
 let before = text.dataset.before, asked = 0, timer = 0, shown = "", planned = null;
-
-function element(name, content, className) {
-  const made = document.createElement(name);
-  if (content !== undefined) made.textContent = content;
-  if (className) made.className = className;
-  return made;
-}
 
 async function ask(path, body) {
   const options = body === undefined ? {} : { method: "POST", body: JSON.stringify(body) };

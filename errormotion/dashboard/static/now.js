@@ -2,14 +2,6 @@
 "use strict";
 
 const INTERVAL = 1000; // ms
-const byId = (id) => document.getElementById(id);
-
-function element(name, text, className) {
-  const made = document.createElement(name);
-  if (text !== undefined) made.textContent = text;
-  if (className) made.className = className;
-  return made;
-}
 
 const number = (value, digits) => (value === null ? "—" : value.toFixed(digits).replace("-", "−"));
 const signed = (value, digits) => (value > 0 ? "+" : "") + number(value, digits);
@@ -122,16 +114,9 @@ function map(temperatures, position) {
   byId("map-note").textContent = (known.length ? `Dark is ${number(low, 1)} °C, bright ${number(Math.max(high, low + 0.5), 1)} °C; white is unknown.` : sensors.length ? "No temperature is known." : "No sensor has a place in the bench file.") + scheme;
 }
 
-async function ask(path) {
-  const answer = await fetch(path, { headers: { Accept: "application/json" }, signal: AbortSignal.timeout(10000) });
-  if (answer.status === 403) location.assign("/login");
-  if (!answer.ok) throw new Error((await answer.json()).error);
-  return answer.json();
-}
-
 async function values() {
   try {
-    show(await ask("/now/values.json"));
+    show(await answerOf("/now/values.json"));
     document.body.classList.remove("lost");
   } catch (error) {
     document.body.classList.add("lost");
@@ -147,7 +132,7 @@ let drawn = null, asked = 0, timer = 0;
 async function frame(names) { // the axes, without data; drawn anew only when other quantities are chosen
   const key = names.join("\n");
   if (drawn && drawn.key === key) return;
-  const found = await ask(`/now/figure.json?${new URLSearchParams(names.map((name) => ["name", name]))}`);
+  const found = await answerOf(`/now/figure.json?${new URLSearchParams(names.map((name) => ["name", name]))}`);
   const place = element("div");
   place.id = `curves-${Date.now()}`;
   byId("curves").replaceChildren(place);
@@ -167,7 +152,7 @@ async function curves() {
   byId("history-note").textContent = names.length ? "" : "Nothing is chosen.";
   try {
     if (names.length) {
-      const found = await ask(`/now/history.json?${question}`);
+      const found = await answerOf(`/now/history.json?${question}`);
       if (own !== asked) return;
       await frame(names);
       for (const [name, curve] of Object.entries(found)) { // local time, as at the machine
