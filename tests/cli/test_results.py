@@ -87,6 +87,13 @@ def test_export_writes_a_table_in_field_units(run: Run, tmp_path: Path) -> None:
     xr.testing.assert_identical(datasets.load(tmp_path / "out.nc"), errors())
 
 
+def test_what_holds_no_errors_is_named_and_nothing_is_written(run: Run, tmp_path: Path) -> None:
+    xr.Dataset(attrs={"schema": "errormotion.raw.multilateration/1"}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    for out in ("out.csv", "out.nc"):
+        assert "other.nc: " in run("export", "other.nc", "-o", out, code=1).stderr
+        assert not (tmp_path / out).exists()
+
+
 def test_texts_of_strangers_are_no_formulas(run: Run, tmp_path: Path) -> None:
     datasets.save(errors(("=1+1", "<b>&")), tmp_path / "errors.nc")
     run("export", "errors.nc", "-o", "out.csv")
