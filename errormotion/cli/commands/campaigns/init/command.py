@@ -12,8 +12,8 @@ import typer
 
 from errormotion import plugins
 from errormotion.campaign.files import parse_bench, parse_campaign
-from errormotion.cli.commands.init import asking
-from errormotion.cli.commands.init.writing import Answers, Instrument, Test, bench_text, campaign_text
+from errormotion.cli.commands.campaigns.init import asking
+from errormotion.cli.commands.campaigns.init.writing import Answers, Instrument, Test, bench_text, campaign_text
 from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json
 from errormotion.datasets.files.tomltext import value_of

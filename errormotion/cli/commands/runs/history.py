@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.cli.commands.runs import note_lines, plain_note
+from errormotion.cli.commands.runs.listing import note_lines, plain_note
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.page import Page
 from errormotion.datasets.files.tomlfile import nearest

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from errormotion.cli.commands.compare import Stated, over_one
+from errormotion.cli.commands.results.compare import Stated, over_one
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.page import Page
 from errormotion.cli.results import load

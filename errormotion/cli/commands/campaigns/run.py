@@ -15,7 +15,7 @@ from errormotion.campaign.background import processes
 from errormotion.campaign.background.publishing import Published
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
-from errormotion.cli.commands import background as command
+from errormotion.cli.commands.campaigns import background as command
 from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars

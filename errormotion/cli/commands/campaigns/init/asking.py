@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from errormotion import plugins
-from errormotion.cli.commands.init.writing import Answers, Instrument, Test
+from errormotion.cli.commands.campaigns.init.writing import Answers, Instrument, Test
 from errormotion.cli.output import show
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.files.tomlfile import nearest

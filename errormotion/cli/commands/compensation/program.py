@@ -12,7 +12,7 @@ import xarray as xr
 from pydantic import TypeAdapter, ValidationError
 
 import errormotion
-from errormotion.cli.commands.model import dataset_of, source_of
+from errormotion.cli.commands.compensation.model import dataset_of, source_of
 from errormotion.cli.output import show, show_json
 from errormotion.cli.page import Page
 from errormotion.compensation.correction import Correction, correction

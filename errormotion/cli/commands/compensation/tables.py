@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from errormotion.cli.commands.model import errors_of
+from errormotion.cli.commands.compensation.model import errors_of
 from errormotion.cli.output import show, show_json
 from errormotion.cli.settings import read_settings
 from errormotion.compensation.tables import axis_table, export, get

@@ -132,7 +132,7 @@ def _show_outcomes(
     evaluations: Mapping[Path, xr.Dataset | str],
 ) -> None:
     """Print the outcome of each run; the exit code is that of a failure if one failed, else of the tolerances."""
-    from errormotion.cli.commands import monte_carlo
+    from errormotion.cli.commands.results import monte_carlo
 
     refused = [each for each in evaluations.values() if isinstance(each, str)]
     failed = [outcome for outcome in outcomes if outcome.reason]
@@ -187,7 +187,7 @@ def _identify_one(
 ) -> None:
     method, evaluation, file = plugins.get("methods", method_id), None, out
     if trials is not None:
-        from errormotion.cli.commands import monte_carlo
+        from errormotion.cli.commands.results import monte_carlo
         from errormotion.montecarlo.beside import evaluate_beside
 
         file = monte_carlo.beside(out)
