@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from errormotion import datasets
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import load_campaign
 from errormotion.cli.commands.campaigns.run import work
 from errormotion.cli.demo import compensated_probing

@@ -21,7 +21,7 @@ from errormotion import datasets
 from errormotion.campaign.files import load_bench, load_campaign
 from errormotion.campaign.folder import SCHEMA as RUN_SCHEMA
 from errormotion.campaign.folder import RunFolder
-from errormotion.campaign.store import committed_length
+from errormotion.campaign.storage.store import committed_length
 from errormotion.datasets.certificates import ATTRIBUTE, certificates_of
 from errormotion.datasets.clock import CLOCK, JOINS, age, notes
 from errormotion.datasets.files import events

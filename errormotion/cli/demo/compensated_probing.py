@@ -16,7 +16,7 @@ from pathlib import Path
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import load_campaign
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.commands.campaigns.run import describe, work

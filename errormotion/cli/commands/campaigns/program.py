@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from errormotion.campaign.files import load_campaign
-from errormotion.campaign.limits import announcement, steps_of
+from errormotion.campaign.sections.limits import announcement, steps_of
 from errormotion.cli.output import show, show_json, table
 from errormotion.errors import BenchError
 

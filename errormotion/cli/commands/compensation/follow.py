@@ -18,7 +18,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from errormotion.campaign.compensating import Compensation, Moment
+from errormotion.campaign.compensation.compensating import Compensation, Moment
 from errormotion.campaign.files import load_bench
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.output import show

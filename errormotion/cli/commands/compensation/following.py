@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from errormotion.campaign.following import AUDIT, compensations, is_working, read_status, request_stop
+from errormotion.campaign.compensation.following import AUDIT, compensations, is_working, read_status, request_stop
 from errormotion.cli.output import show, show_json, table
 from errormotion.compensation.online.audit import verify
 from errormotion.errors import CompensationError

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import typer
 
 from errormotion import datasets, plugins
-from errormotion.campaign.raw_paths import is_runs_folder, raw_of
+from errormotion.campaign.storage.raw_paths import is_runs_folder, raw_of
 from errormotion.cli.guard import ERROR, INTERNAL, log_file
 from errormotion.cli.output import show, show_json, working
 from errormotion.cli.progress import Bars

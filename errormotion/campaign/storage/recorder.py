@@ -14,7 +14,7 @@ from typing import Any, Self
 import xarray as xr
 
 from errormotion.campaign.folder import Presence
-from errormotion.campaign.store import RawStore
+from errormotion.campaign.storage.store import RawStore
 from errormotion.datasets.clock import RecordClock
 from errormotion.errors import RunError
 

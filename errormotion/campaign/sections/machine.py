@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from errormotion.campaign.limits import AXES, Limits
+from errormotion.campaign.sections.limits import AXES, Limits
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.units import Angle, Length, format_quantity
 from errormotion.kinematics.description import DescriptionError, MachineDescription

@@ -23,11 +23,11 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.campaign.compensation.following import AUDIT, STOP, Status, is_zero, numbers, write_status
 from errormotion.campaign.files import BenchPlan
-from errormotion.campaign.following import AUDIT, STOP, Status, is_zero, numbers, write_status
-from errormotion.campaign.journal import cause_of
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
+from errormotion.campaign.storage.journal import cause_of
 from errormotion.compensation.online.audit import AuditLog
 from errormotion.compensation.online.follower import Conditions, Follower, State, Step
 from errormotion.compensation.online.prediction import PARAMETERS, Prediction, predictor, refusal
