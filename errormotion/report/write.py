@@ -14,7 +14,7 @@ import xarray as xr
 from errormotion import plugins
 from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError, RunError
-from errormotion.report import generic, provenance
+from errormotion.report import provenance
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Part, Section, Source, Table
 from errormotion.report.exports import pdf, xlsx
@@ -24,7 +24,7 @@ from errormotion.report.page.assemble import Page, page
 from errormotion.report.page.head import Head, head_of, moment
 from errormotion.report.page.language import Catalogue
 from errormotion.report.page.verdict import verdict
-from errormotion.report.parts import beams
+from errormotion.report.parts import beams, generic
 from errormotion.report.text import DASH, written_in
 from errormotion.tolerances.conformity import Conformity, judge
 from errormotion.tolerances.table import Tolerances, from_run

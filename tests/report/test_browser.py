@@ -10,7 +10,7 @@ import pytest
 
 from errormotion.report import canvas, write_page
 from errormotion.report.document import Figure, Part, Section, Source
-from errormotion.report.turntable import Dots, Scene, draw
+from errormotion.report.drawings.turntable import Dots, Scene, draw
 
 BROWSER = shutil.which("chromium")
 NAME = "<script>alert(1)</script>"

@@ -17,7 +17,7 @@ from errormotion.arrays import Array
 from errormotion.report import canvas
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Table, estimate
-from errormotion.report.series import Event
+from errormotion.report.drawings.series import Event
 from errormotion.report.text import DASH, SECOND_OF_ARC, UM, finite, fixed, integer
 
 DOTTED = 80
