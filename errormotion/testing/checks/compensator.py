@@ -23,7 +23,8 @@ from errormotion.plugins import (
     kind_registry,
     load_object,
 )
-from errormotion.testing import fuzz_checks
+from errormotion.testing.checks import fuzz as fuzz_checks
+from errormotion.testing.checks.instrument import check_settings
 from errormotion.testing.compensator_sessions import (
     POLL,
     armed,
@@ -38,7 +39,6 @@ from errormotion.testing.compensator_sessions import (
     wait_for,
     write,
 )
-from errormotion.testing.instrument_checks import check_settings
 from errormotion.testing.kit import Checks, require
 from errormotion.testing.sessions import open_things
 

@@ -13,7 +13,7 @@ from numpy.random import SeedSequence
 
 from errormotion.montecarlo.trials import redrawing_of, sample, trial
 from errormotion.plugins import MethodSubject, Redrawing
-from errormotion.testing.coverage import require_honest, tested_places
+from errormotion.testing.checks.coverage import require_honest, tested_places
 from errormotion.testing.kit import require
 from errormotion.testing.results import covariance, influence, names, values
 

@@ -28,7 +28,8 @@ from errormotion.plugins import (
     kind_registry,
     load_object,
 )
-from errormotion.testing import fuzz_checks, wire_checks
+from errormotion.testing.checks import fuzz as fuzz_checks
+from errormotion.testing.checks import wire as wire_checks
 from errormotion.testing.kit import CheckFailedError, Checks, require
 from errormotion.testing.sessions import Session, first_blocks, leaves, numbers, open_things, require_same, run_session
 

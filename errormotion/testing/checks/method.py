@@ -22,12 +22,12 @@ from errormotion.errors import ErrormotionError
 from errormotion.kinematics import twists
 from errormotion.kinematics.iso import DOF
 from errormotion.plugins import MethodInfo, MethodSubject, Needs, Status, kind_registry
-from errormotion.testing.coverage import coverage, differences, recovers_truth
-from errormotion.testing.instrument_checks import check_settings
+from errormotion.testing.checks.coverage import coverage, differences, recovers_truth
+from errormotion.testing.checks.instrument import check_settings
+from errormotion.testing.checks.redraw import sources_as_stated, sources_drawn, why_no_redrawing
+from errormotion.testing.checks.text import chapters_translated, why_no_texts
 from errormotion.testing.kit import Checks, require
-from errormotion.testing.redraw_checks import sources_as_stated, sources_drawn, why_no_redrawing
 from errormotion.testing.results import covariance, functional_point, names, sigma, values
-from errormotion.testing.text_checks import chapters_translated, why_no_texts
 
 METHOD_CHECKS: Checks[MethodSubject] = Checks()
 
