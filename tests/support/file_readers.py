@@ -39,8 +39,8 @@ from errormotion.instruments.nc_limits import check_program
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret, title
 from errormotion.instruments.transports.address import parse_address
 from errormotion.plugins import MachineLimits
-from errormotion.record import index
-from errormotion.record.entry import read_entry
+from errormotion.record.runs import index
+from errormotion.record.runs.entry import read_entry
 from errormotion.tolerances.table import load_tolerances
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -22,7 +22,7 @@ from errormotion.dashboard.space import Drawing, drawing, has_volume
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError
-from errormotion.record.entry import MOST_FIGURES
+from errormotion.record.runs.entry import MOST_FIGURES
 
 PAGE = 100
 """Runs on one page of the table."""

@@ -15,7 +15,7 @@ from errormotion.cli.page import Page
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.errors import DatasetError, RunError
 from errormotion.record.history import history as followed
-from errormotion.record.listing import list_runs
+from errormotion.record.runs.listing import list_runs
 from errormotion.record.text import date, field_of, sentences
 from errormotion.report.text import rounded
 

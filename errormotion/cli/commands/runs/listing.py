@@ -15,9 +15,9 @@ from errormotion.cli.output import show, show_json, table
 from errormotion.cli.summary import as_printed, digits_of
 from errormotion.cli.tolerances import end_with, remarks
 from errormotion.datasets.files.tomlfile import nearest
-from errormotion.record.entry import Entry
-from errormotion.record.judging import judge_runs
-from errormotion.record.listing import Listing, Note, list_runs
+from errormotion.record.runs.entry import Entry
+from errormotion.record.runs.judging import judge_runs
+from errormotion.record.runs.listing import Listing, Note, list_runs
 from errormotion.tolerances.table import load_tolerances
 
 

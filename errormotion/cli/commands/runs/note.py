@@ -12,7 +12,7 @@ from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json
 from errormotion.datasets.files.events import append, event
 from errormotion.errors import RunError
-from errormotion.record.entry import read_entry
+from errormotion.record.runs.entry import read_entry
 
 
 def note(folder: Path, text: str, machine: str | None, at: str | None, by: str, as_json: bool) -> None:

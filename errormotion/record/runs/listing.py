@@ -11,9 +11,9 @@ from pathlib import Path
 
 from errormotion.datasets.files import events
 from errormotion.errors import ErrormotionError, RunError
-from errormotion.record import index
-from errormotion.record.entry import Entry, read_entry
-from errormotion.record.index import Stamp
+from errormotion.record.runs import index
+from errormotion.record.runs.entry import Entry, read_entry
+from errormotion.record.runs.index import Stamp
 
 DEEPEST = 3
 """Folders between the given one and a run folder, at most."""

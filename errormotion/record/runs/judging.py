@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from errormotion.errors import ErrormotionError
-from errormotion.record.entry import Entry
+from errormotion.record.runs.entry import Entry
 from errormotion.tolerances.conformity import Conformity, judge, judge_figures
 from errormotion.tolerances.table import Tolerances
 

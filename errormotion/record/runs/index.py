@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from errormotion.datasets.files.reading import read_bytes
-from errormotion.record.entry import Entry, from_plain
+from errormotion.record.runs.entry import Entry, from_plain
 
 FILE = ".errormotion-index.json"
 SCHEMA = "errormotion.index/1"
