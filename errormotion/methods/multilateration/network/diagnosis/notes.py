@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from errormotion.methods.multilateration.network import determinacy, outliers
+from errormotion.methods.multilateration.network.diagnosis import determinacy, outliers
 from errormotion.methods.multilateration.network.network import Network
 
 
