@@ -15,7 +15,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.simulators.device import DEFAULT_MACHINE
 from errormotion.instruments.simulators.virtual_world.world import let_time_pass
 from errormotion.instruments.transports import parse_address
-from errormotion.instruments.transports.serving import PtyServer, Server, make_server
+from errormotion.instruments.transports.loopback.serving import PtyServer, Server, make_server
 from errormotion.plugins import InstrumentSubject
 from errormotion.testing.kit import require
 from errormotion.testing.sessions import numbers

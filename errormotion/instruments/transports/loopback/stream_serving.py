@@ -7,7 +7,7 @@ import socket
 import threading
 from collections.abc import Callable
 
-from errormotion.instruments.transports.serving import TcpServer
+from errormotion.instruments.transports.loopback.serving import TcpServer
 
 MOST_CONNECTIONS = 16
 """Number of connections kept open; beyond it the oldest one is closed."""
