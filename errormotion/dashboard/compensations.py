@@ -24,7 +24,7 @@ from errormotion.campaign.files import BenchPlan, load_bench
 from errormotion.compensation.online.audit import AuditReader
 from errormotion.compensation.online.prediction import predictor
 from errormotion.dashboard.kept import Kept, stamp
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.errors import CompensationError, ErrormotionError
 
 SHOWN = 20

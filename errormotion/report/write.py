@@ -329,7 +329,7 @@ def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = 
 def belonging(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
     """Return the datasets beside a file of errors that state its hash (`errors_hash`), such as an evaluation of it."""
     from errormotion.datasets import hash_dataset, load
-    from errormotion.datasets.storage import reading
+    from errormotion.datasets.storage.disk import reading
 
     beside = {path: load(path) for path in sorted(file.parent.glob(f"{glob.escape(file.stem)}.*.nc"))}
     stated = {path: ds for path, ds in beside.items() if "errors_hash" in ds.attrs}

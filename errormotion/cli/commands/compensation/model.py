@@ -17,7 +17,7 @@ from errormotion.cli.settings import read_settings
 from errormotion.compensation.thermal_model import SCHEMA as MODEL_SCHEMA
 from errormotion.compensation.thermal_model import Check, Settings, ThermalModel, check, fit
 from errormotion.datasets.schemas import DOF, SCHEMA
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError, RunError
 

@@ -8,7 +8,7 @@ from errormotion import datasets, plugins
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError
 from errormotion.plugins import Calibration

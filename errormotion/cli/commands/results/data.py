@@ -19,7 +19,7 @@ from errormotion.cli.settings import read_settings
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.cli.tolerances import end_with, lines_of, remarks
 from errormotion.datasets.results.merit import figures_of
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError, ErrormotionError
 from errormotion.tolerances.conformity import judge

@@ -21,10 +21,10 @@ import xarray as xr
 from xarray.indexes import RangeIndex
 
 from errormotion.datasets.checks import storable_violations
-from errormotion.datasets.compression import as_stored, encoding
 from errormotion.datasets.files.containers import check_netcdf, check_zarr
 from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.schemas import SCHEMA
+from errormotion.datasets.storage.compression import as_stored, encoding
 from errormotion.errors import DatasetError, ErrormotionError
 
 _NETCDF = (".nc", ".nc4", ".h5")
@@ -98,7 +98,7 @@ def load(path: str | Path) -> xr.Dataset:
 def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write a dataset beside its place, bring it to the disk and rename it.
 
-    Large influences of an error dataset are rounded, see `errormotion.datasets.compression.as_stored`. A NetCDF file is
+    Large influences of an error dataset are rounded, see `errormotion.datasets.storage.compression.as_stored`. A NetCDF file is
     composed in memory, a Zarr folder one variable at a time (piece by piece if dask holds it).
     Evenly spaced times that the attributes ``sample_rate`` and ``time_start`` tell are left out.
 

@@ -15,7 +15,7 @@ import xarray as xr
 from xarray.backends import BackendEntrypoint
 
 from errormotion.datasets.results import accessor
-from errormotion.datasets.storage import load
+from errormotion.datasets.storage.disk import load
 from errormotion.errors import DatasetError
 
 _ = accessor  # registers ds.em
