@@ -98,9 +98,9 @@ def load(path: str | Path) -> xr.Dataset:
 def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write a dataset beside its place, bring it to the disk and rename it.
 
-    Large influences of an error dataset are rounded, see `errormotion.datasets.storage.compression.as_stored`. A NetCDF file is
-    composed in memory, a Zarr folder one variable at a time (piece by piece if dask holds it).
-    Evenly spaced times that the attributes ``sample_rate`` and ``time_start`` tell are left out.
+    Large influences of an error dataset are rounded, see `errormotion.datasets.storage.compression.as_stored`. A NetCDF
+    file is composed in memory, a Zarr folder one variable at a time (piece by piece if dask holds it).
+    Evenly spaced times that the attributes ``sample_rate`` and ``time_start`` state are left out.
 
     Parameters
     ----------
