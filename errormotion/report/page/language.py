@@ -36,8 +36,8 @@ _BEFORE_UNIT = re.compile(r"(?<![\w.])\d+\.\d+(?= (?:[uµ]?m|mm|[uµm]?rad|arcse
 _MICRO = re.compile(r"(?<!\w)u(?=(?:m|rad)(?!\w))")
 _LIST = re.compile(r"(, | und )")
 _UNITS = re.compile(r"\b(?:arcsec|min|m?rad|days)\b")
-_SVG_TEXT = re.compile(r"(?<=>)([^<>]*[^<>\s][^<>]*)(?=</text>)")
-_SVG_NAME = re.compile(r'(?<= data-(?:x-name)=")([^"]+)(?=")')
+_SVG_TEXT = re.compile(r"(?<=>)([^<>]*[^<>\s][^<>]*)(?=</(?:text|span|label)>)")
+_SVG_NAME = re.compile(r'(?:(?<= data-x-name=")|(?<= aria-label="))([^"]+)(?=")')
 _AnyBlock = TypeVar("_AnyBlock", bound=Block)
 
 
