@@ -234,11 +234,12 @@ def _put(content: Any, place: Sequence[Key], new: Any) -> None:
             if new is None and isinstance(content, dict) and each not in content:
                 return
             content = content.setdefault(each, {}) if isinstance(content, dict) else content[each]
+        last: Any = place[-1]
         if new is None and isinstance(content, list):
-            del content[place[-1]]
+            del content[last]
         elif new is None:
-            content.pop(place[-1], None)
+            content.pop(last, None)
         else:
-            content[place[-1]] = new
+            content[last] = new
     except (KeyError, IndexError, TypeError, AttributeError):
         raise DatasetError(f"{dotted(place)}: there is no such place in the text") from None
