@@ -19,7 +19,7 @@ from errormotion.cli.page import Page
 from errormotion.compensation.correction import Correction, correction
 from errormotion.compensation.program import LEFT, ByTool, Offsets, Outcome, Settings, compensate
 from errormotion.compensation.program.reading.offsets import read_parameters, read_tools
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import DatasetError, ProgramError
 

@@ -13,7 +13,7 @@ from errormotion.cli.commands.compensation.model import errors_of
 from errormotion.cli.output import show, show_json
 from errormotion.cli.settings import read_settings
 from errormotion.compensation.tables import axis_table, export, get
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import DatasetError
 

@@ -18,7 +18,7 @@ from errormotion.cli.results import load
 from errormotion.cli.summary import as_printed
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.results.tables import to_dataframe
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
 from errormotion.report.exports import xlsx
 from errormotion.report.exports.tables import Entry, Sheet
