@@ -106,6 +106,10 @@ class Door:
         """Return a spindle speed, 1/min; InstrumentError unless it is finite and within the limits."""
         return self._bounded(speed, "spindle speed", self.limits.spindle_speed, 1.0, "/min")
 
+    def duration(self, seconds: float) -> float:
+        """Return a time, s; InstrumentError unless it is finite."""
+        return self._bounded(seconds, "time", None, 1.0, "s")
+
     def _bounded(
         self, value: float, what: str, limit: float | None, scale: float, unit: str, positive: bool = False
     ) -> float:

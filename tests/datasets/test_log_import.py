@@ -9,6 +9,8 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.datasets.importing import import_log
+from errormotion.datasets.text import log_reader
+from errormotion.datasets.text.log_format import Format
 from errormotion.errors import DatasetError
 from errormotion.methods.beam_direction import BeamDirection, simulation
 from errormotion.twin import VirtualMachine
@@ -212,3 +214,11 @@ def test_a_plugin_reads_its_own_maps(run, tmp_path: Path, monkeypatch: pytest.Mo
     found = import_log(tmp_path / "log.csv", tmp_path / "own.toml", tmp_path / "own.nc")
     assert found.attrs["machine"] == "log.csv own.toml"
     assert (tmp_path / "own.nc").exists()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_a_line_without_end_is_refused_before_it_is_in_memory(tmp_path: Path, encoding: str) -> None:
+    log = tmp_path / "log.csv"
+    log.write_bytes(f"a,b\n1,2\n{'3' * (log_reader.LONGEST_LINE + 1)}".encode(encoding))
+    with pytest.raises(DatasetError, match=r"log\.csv, line 3: expected at most \d+ characters"):
+        list(log_reader.top_lines(log, Format(encoding=encoding, skip=3)))

@@ -146,6 +146,9 @@ def test_numbers_that_are_none_are_refused_without_limits_as_well(plugin_id: str
             continue  # a number: the machine refuses it by its travel
         with pytest.raises(InstrumentError, match="finite"):
             call(driver, name, **changed)
+    if value != 1e308:
+        with pytest.raises(InstrumentError, match="finite"):
+            driver.elapse(value)
 
 
 def test_a_probe_passes_the_limits_on_to_its_controller() -> None:

@@ -6,8 +6,9 @@ import csv
 from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import IO, AnyStr, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,8 @@ _FEWEST_INTERVALS = 4
 """Least number of intervals of which a usual one can be stated."""
 _SHARE_OF_USUAL = 0.7
 """Least share of intervals that are the usual one where a longer one is a hole."""
+LONGEST_LINE = 1 << 20
+"""Characters of a line, at most."""
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 
@@ -196,10 +199,10 @@ def _lines(log: Path, encoding: str) -> Iterator[tuple[int, str]]:
             binary.seek(0)
             if encoding.startswith(("utf-16", "utf-32")):
                 with log.open(encoding=encoding, newline="") as text:
-                    for number, line in enumerate(text, 1):
+                    for number, line in _bounded(text, log):
                         yield number, line
                 return
-            for number, raw in enumerate(binary, 1):
+            for number, raw in _bounded(binary, log):
                 yield number, raw.decode("utf-8-sig" if encoding == "utf-8" and number == 1 else encoding)
     except UnicodeDecodeError as error:
         byte = error.object[error.start]
@@ -211,6 +214,14 @@ def _lines(log: Path, encoding: str) -> Iterator[tuple[int, str]]:
         raise DatasetError(f"{log}, line {number + 1}: is not {encoding}: {error}") from error
     except OSError as error:
         raise DatasetError(f"{log}: cannot be read: {error.strerror}") from error
+
+
+def _bounded(file: IO[AnyStr], log: Path) -> Iterator[tuple[int, AnyStr]]:
+    """Yield the lines of a file with their numbers; DatasetError names one that is too long."""
+    for number, line in enumerate(iter(partial(file.readline, LONGEST_LINE + 1), file.read(0)), 1):
+        if len(line) > LONGEST_LINE:
+            raise DatasetError(f"{log}, line {number}: expected at most {LONGEST_LINE} characters; it is longer")
+        yield number, line
 
 
 def _rows(log: Path, form: Format) -> Iterator[tuple[int, list[str]]]:

@@ -196,7 +196,7 @@ class VirtualController(Driver):
 
     def elapse(self, seconds: float) -> None:
         """Let simulated time pass without samples."""
-        self._call("elapse", seconds=float(seconds))
+        self._call("elapse", seconds=self._door.duration(seconds))
 
     def run_steps(
         self,

@@ -222,7 +222,7 @@ class LinuxCNC(Driver):
 
     def elapse(self, seconds: float) -> None:
         """Let time pass; `stop` ends it with an InstrumentError. A simulation skips it, unless a program runs."""
-        self._order("elapse", seconds=float(seconds))
+        self._order("elapse", seconds=self._door.duration(seconds))
 
     def run_program(self, text: str) -> dict[str, Any]:
         """Run an NC program; return when it has started. ``state()["running"]`` states whether it runs, `finish` waits.
