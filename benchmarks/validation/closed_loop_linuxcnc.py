@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from errormotion import datasets
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import load_campaign
-from errormotion.cli.commands.run import work
+from errormotion.cli.commands.campaigns.run import work
 from errormotion.cli.demo import compensated_probing
 from errormotion.cli.demo.closed_loop import DISPLACEMENTS, with_warm_sensors
 from errormotion.compensation.online.prediction import predictor

@@ -17,10 +17,10 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
-from errormotion.campaign import head
-from errormotion.campaign.limits import NO_MOTIONS, Limits, extent, steps_of, violations
-from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
-from errormotion.campaign.timeline import Timeline, follower
+from errormotion.campaign.sections import head
+from errormotion.campaign.sections.limits import NO_MOTIONS, Limits, extent, steps_of, violations
+from errormotion.campaign.sections.machine import completed, contradictions, limits_within, read_machine
+from errormotion.campaign.sections.timeline import Timeline, follower
 from errormotion.compensation.online.settings import Limits as OffsetLimits
 from errormotion.datasets import certificates
 from errormotion.datasets.files import tomlfile

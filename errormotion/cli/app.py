@@ -130,7 +130,7 @@ def init(
     json_: Json = False,
 ) -> None:
     """Write a bench and a campaign for the instruments at hand; on a terminal, ask for what is not stated."""
-    from errormotion.cli.commands.init import command
+    from errormotion.cli.commands.campaigns.init import command
 
     command.init(
         folder, machine, chain, travel or [], instrument or [], test or [], set_ or [], force=force, as_json=json_
@@ -163,7 +163,7 @@ def run(
 ) -> None:
     """Run the tests of a campaign: acquire, identify, report."""
     if dry_run:
-        from errormotion.cli.commands import dry_run as dry
+        from errormotion.cli.commands.campaigns import dry_run as dry
 
         if campaign is None:
             typer.echo("--dry-run: expected a campaign file.", err=True)
@@ -173,7 +173,7 @@ def run(
     if out is not None:
         typer.echo("--out is allowed with --dry-run only.", err=True)
         raise typer.Exit(USAGE)
-    from errormotion.cli.commands import run as command
+    from errormotion.cli.commands.campaigns import run as command
 
     if detach:
         command.detach(campaign, resume=resume, runs=runs, as_json=json_)
@@ -221,11 +221,11 @@ def identify(
     json_: Json = False,
 ) -> None:
     """Identify the errors of one raw dataset, or of many."""
-    from errormotion.cli.commands import data
+    from errormotion.cli.commands.results import data
 
     trials = None
     if monte_carlo is not None:
-        from errormotion.cli.commands.monte_carlo import trials_of
+        from errormotion.cli.commands.results.monte_carlo import trials_of
 
         trials = data.Trials(trials_of(monte_carlo), digits, seed)
     data.identify(raw, method, out, set_ or [], settings, scheduler, workers, tolerances, json_, trials)
@@ -241,7 +241,7 @@ def calibrate(
     json_: Json = False,
 ) -> None:
     """Make a calibration from readings."""
-    from errormotion.cli.commands import calibrate as command
+    from errormotion.cli.commands.instruments import calibrate as command
 
     command.run(data, out, set_ or [], settings, json_)
 
@@ -255,7 +255,7 @@ def import_(
     json_: Json = False,
 ) -> None:
     """Convert a log with columns into a raw dataset."""
-    from errormotion.cli.commands import data
+    from errormotion.cli.commands.results import data
 
     data.import_log(log, map_, out, json_)
 
@@ -270,7 +270,7 @@ def monitor(
     json_: Annotated[bool, typer.Option("--json", help="Print one JSON document for each row.")] = False,
 ) -> None:
     """Show temperatures and working parameters live, and log them."""
-    from errormotion.cli.commands import monitor as command
+    from errormotion.cli.commands.instruments import monitor as command
 
     command.run(bench, runs, interval, duration, json_)
 
@@ -297,7 +297,7 @@ def compensate_run(
     json_: Annotated[bool, typer.Option("--json", help="Print one JSON document for each interval.")] = False,
 ) -> None:
     """Follow the temperatures of a machine with offsets; without --arm only compute and log them."""
-    from errormotion.cli.commands import follow as command
+    from errormotion.cli.commands.compensation import follow as command
 
     point = None if at is None else _millimetres("--at", at)
     code = command.run(
@@ -315,7 +315,7 @@ def compensate_status(
     json_: Json = False,
 ) -> None:
     """Show what compensations do now, whoever started them, and check their audit logs."""
-    from errormotion.cli.commands import following as command
+    from errormotion.cli.commands.compensation import following as command
 
     raise typer.Exit(command.status(folder, json_))
 
@@ -327,7 +327,7 @@ def compensate_stop(
     json_: Json = False,
 ) -> None:
     """Ask a compensation to ramp to zero and end, as Ctrl-C in its terminal does."""
-    from errormotion.cli.commands import following as command
+    from errormotion.cli.commands.compensation import following as command
 
     command.stop(folder, json_)
 
@@ -353,7 +353,7 @@ def simulate(
     json_: Json = False,
 ) -> None:
     """Start the simulated device of an instrument by itself, until Ctrl-C."""
-    from errormotion.cli.commands import simulate as command
+    from errormotion.cli.commands.instruments import simulate as command
 
     command.run(
         plugin,
@@ -377,7 +377,7 @@ def plan(
     json_: Json = False,
 ) -> None:
     """Report the uncertainty to expect of the tests of a campaign, and how to reduce it."""
-    from errormotion.cli.commands import plan as command
+    from errormotion.cli.commands.campaigns import plan as command
 
     command.expect(campaign, test, out, json_)
 
@@ -391,7 +391,7 @@ def program(
     json_: Json = False,
 ) -> None:
     """Write the NC programs of the tests of a campaign."""
-    from errormotion.cli.commands import program as command
+    from errormotion.cli.commands.campaigns import program as command
 
     command.write(campaign, test, out, json_)
 
@@ -409,7 +409,7 @@ def record(
     json_: Json = False,
 ) -> None:
     """Record a short session with one instrument: identity, readings, stream."""
-    from errormotion.cli.commands import record as command
+    from errormotion.cli.commands.instruments import record as command
 
     if not command.record(bench, instrument, for_, out, mask_serial, json_):
         raise typer.Exit(ERROR)
@@ -422,7 +422,7 @@ def replay(
     json_: Json = False,
 ) -> None:
     """Run the driver on a recorded session, and report whether it was reproduced."""
-    from errormotion.cli.commands import record as command
+    from errormotion.cli.commands.instruments import record as command
 
     if not command.replay(recording, json_):
         raise typer.Exit(INVALID)
@@ -446,7 +446,7 @@ def report(
     json_: Json = False,
 ) -> None:
     """Write the report of a run."""
-    from errormotion.cli.commands import data
+    from errormotion.cli.commands.results import data
 
     also = tuple(name for name, wanted in (("xlsx", xlsx), ("csv", csv), ("pdf", pdf)) if wanted)
     data.report(run, out, tolerances, json_, language=language or "", paper=paper or "", also=also)
@@ -459,7 +459,7 @@ def validate(
     json_: Json = False,
 ) -> None:
     """Check that a file follows its schema, and list every violation."""
-    from errormotion.cli.commands import data
+    from errormotion.cli.commands.results import data
 
     mistakes = data.validate(file)
     if json_:
@@ -478,7 +478,7 @@ def truth(
     out: Annotated[Path, typer.Option(help="File of the error dataset (.nc).")],
 ) -> None:
     """Write the true errors behind a run on a virtual machine, as an error dataset."""
-    from errormotion.cli.commands import truth as command
+    from errormotion.cli.commands.runs import truth as command
 
     command.truth(run, out)
 
@@ -530,7 +530,7 @@ def compare(
     json_: Json = False,
 ) -> None:
     """Compare results of one machine: whether they agree, and what explains it where they do not."""
-    from errormotion.cli.commands import compare as command
+    from errormotion.cli.commands.results import compare as command
 
     point = None if at is None else _millimetres("--at", at)
     origins = {}
@@ -559,7 +559,7 @@ def runs(
     json_: Json = False,
 ) -> None:
     """List the runs of folders, newest first, each with its figure of merit."""
-    from errormotion.cli.commands import runs as command
+    from errormotion.cli.commands.runs import listing as command
 
     command.runs(folders or [], machine, method, since, tolerances, json_)
 
@@ -632,7 +632,7 @@ OfRuns = Annotated[Path, typer.Argument(help="The folder of runs.")]
 @guarded
 def background_list(runs: OfRuns = Path("runs"), json_: Json = False) -> None:
     """List the processes of a folder of runs: where they are, and what they request."""
-    from errormotion.cli.commands import background as command
+    from errormotion.cli.commands.campaigns import background as command
 
     command.listed(runs, json_)
 
@@ -641,7 +641,7 @@ def background_list(runs: OfRuns = Path("runs"), json_: Json = False) -> None:
 @guarded
 def background_answer(runs: OfRuns = Path("runs"), process: Process = None) -> None:
     """State that the request to the operator is done."""
-    from errormotion.cli.commands import background as command
+    from errormotion.cli.commands.campaigns import background as command
 
     command.answer(runs, process)
 
@@ -650,7 +650,7 @@ def background_answer(runs: OfRuns = Path("runs"), process: Process = None) -> N
 @guarded
 def background_stop(runs: OfRuns = Path("runs"), process: Process = None) -> None:
     """Stop a campaign, as Ctrl-C does; it can be resumed."""
-    from errormotion.cli.commands import background as command
+    from errormotion.cli.commands.campaigns import background as command
 
     command.stop(runs, process)
 
@@ -668,7 +668,7 @@ def note(
     json_: Json = False,
 ) -> None:
     """Note an event of a machine, such as a collision or a repair."""
-    from errormotion.cli.commands import note as command
+    from errormotion.cli.commands.runs import note as command
 
     command.note(folder, text, machine, at, by, json_)
 
@@ -694,7 +694,7 @@ def history(
     json_: Json = False,
 ) -> None:
     """Show a figure of a machine over time: trend, steps, control limits, notes."""
-    from errormotion.cli.commands import history as command
+    from errormotion.cli.commands.runs import history as command
 
     point = None if at is None else _millimetres("--at", at)
     command.history(
@@ -721,7 +721,7 @@ def doctor(json_: Json = False) -> None:
 @guarded
 def plugins_list(json_: Json = False) -> None:
     """List all plugins, those that do not load included."""
-    from errormotion.cli.commands import plugins as command
+    from errormotion.cli.commands.plugins import listing as command
 
     command.list_plugins(json_)
 
@@ -730,7 +730,7 @@ def plugins_list(json_: Json = False) -> None:
 @guarded
 def plugins_show(plugin: Annotated[str, typer.Argument(help="Its id.")], json_: Json = False) -> None:
     """Show the description of a plugin and its settings."""
-    from errormotion.cli.commands import plugins as command
+    from errormotion.cli.commands.plugins import listing as command
 
     command.show_plugin(plugin, json_)
 
@@ -746,7 +746,7 @@ def plugins_check(
     json_: Json = False,
 ) -> None:
     """Run the conformance kit on a plugin."""
-    from errormotion.cli.commands import plugins as command
+    from errormotion.cli.commands.plugins import listing as command
 
     if not command.check_plugin(plugin, address, mutants, json_):
         raise typer.Exit(INVALID)
@@ -763,7 +763,7 @@ def plugins_new(
     json_: Json = False,
 ) -> None:
     """Write a new distribution with a plugin that passes the conformance kit."""
-    from errormotion.cli.commands import new as command
+    from errormotion.cli.commands.plugins import new as command
 
     command.new(what, name, out, json_)
 
@@ -798,7 +798,7 @@ def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], 
 @guarded
 def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: Json = False) -> None:
     """Open, identify and read every instrument once."""
-    from errormotion.cli.commands import bench as command
+    from errormotion.cli.commands.instruments import bench as command
 
     if not command.probe(file, json_):
         raise typer.Exit(ERROR)
@@ -814,7 +814,7 @@ def model_fit(
     json_: Json = False,
 ) -> None:
     """Fit a thermal model to the errors of warm-ups."""
-    from errormotion.cli.commands import model as command
+    from errormotion.cli.commands.compensation import model as command
 
     command.make(campaigns, out, set_ or [], settings, json_)
 
@@ -828,7 +828,7 @@ def model_predict(
     json_: Json = False,
 ) -> None:
     """Predict errors from temperatures and working parameters."""
-    from errormotion.cli.commands import model as command
+    from errormotion.cli.commands.compensation import model as command
 
     command.predict(model, data, out, json_)
 
@@ -847,7 +847,7 @@ def model_check(
     json_: Json = False,
 ) -> None:
     """Compare the prediction of a model with measured errors."""
-    from errormotion.cli.commands import model as command
+    from errormotion.cli.commands.compensation import model as command
 
     command.check_model(model, errors, page_of(report, pdf, paper, language), json_)
 
@@ -876,7 +876,7 @@ def compensate_effect(
     json_: Json = False,
 ) -> None:
     """Compare two results of one machine: what a compensation took off, and what is left."""
-    from errormotion.cli.commands import compensation_effect as command
+    from errormotion.cli.commands.compensation import effect as command
 
     point = None if at is None else _millimetres("--at", at)
     chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
@@ -917,7 +917,7 @@ def compensate_table(
     json_: Json = False,
 ) -> None:
     """Write a compensation table of one axis for a control."""
-    from errormotion.cli.commands import compensate as command
+    from errormotion.cli.commands.compensation import tables as command
 
     place = _millimetres("--at", at)
     tool = None if point is None else _millimetres("--functional-point", point)
@@ -969,7 +969,7 @@ def compensate_program(
     json_: Json = False,
 ) -> None:
     """Write an NC program whose cuts are where those of another were meant."""
-    from errormotion.cli.commands import compensate_program as command
+    from errormotion.cli.commands.compensation import program as command
 
     origins = []
     for text in offset or []:

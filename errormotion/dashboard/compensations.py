@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from errormotion import datasets
+from errormotion.campaign.compensation.following import AUDIT, STATUS, Status, compensations, is_working, read_status
 from errormotion.campaign.files import BenchPlan, load_bench
-from errormotion.campaign.following import AUDIT, STATUS, Status, compensations, is_working, read_status
 from errormotion.compensation.online.audit import AuditReader
 from errormotion.compensation.online.prediction import predictor
 from errormotion.dashboard.kept import Kept, stamp
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.errors import CompensationError, ErrormotionError
 
 SHOWN = 20

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.campaign.files import BenchPlan
-from errormotion.campaign.journal import cause_of
 from errormotion.campaign.monitor.sources import Source
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
+from errormotion.campaign.storage.journal import cause_of
 from errormotion.dashboard.course import thin
 
 SPAN = 8 * 3600.0

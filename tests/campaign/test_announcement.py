@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
-from errormotion.campaign.limits import Limits, announcement
+from errormotion.campaign.sections.limits import Limits, announcement
 from errormotion.cli.app import app
 from errormotion.plugins import Step
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from errormotion.campaign.files import load_campaign
-from errormotion.campaign.limits import Limits, extent, violations
+from errormotion.campaign.sections.limits import Limits, extent, violations
 from errormotion.errors import BenchError
 from errormotion.plugins import Step
 

@@ -14,8 +14,8 @@ from errormotion import datasets, plugins
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, list_runs
-from errormotion.campaign.journal import journal
-from errormotion.campaign.store import RawStore
+from errormotion.campaign.storage.journal import journal
+from errormotion.campaign.storage.store import RawStore
 from errormotion.errors import BenchError, RunError
 from errormotion.report import write_run_report
 

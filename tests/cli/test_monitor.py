@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from errormotion.campaign.monitor.watch import Snapshot
 from errormotion.cli.app import app
-from errormotion.cli.commands.monitor import LEAST_SPAN, Screen, clock
+from errormotion.cli.commands.instruments.monitor import LEAST_SPAN, Screen, clock
 from errormotion.cli.curves import bars
 
 BENCH = """\

@@ -12,9 +12,9 @@ from compensated_machine import MACHINE, SENSOR, Place, machine
 
 pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
 
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
+from errormotion.campaign.compensation.following import compensations, is_working, read_status, request_stop
 from errormotion.campaign.files import load_bench
-from errormotion.campaign.following import compensations, is_working, read_status, request_stop
 from errormotion.datasets import load
 
 FORM = "application/x-www-form-urlencoded"

@@ -15,8 +15,8 @@ from xarray.indexes import RangeIndex
 
 from errormotion import datasets
 from errormotion.datasets import load, save, validate
-from errormotion.datasets.compression import as_stored, round_significand
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.compression import as_stored, round_significand
+from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
 from errormotion.methods.spindle_drift import simulation
 from errormotion.twin import VirtualMachine

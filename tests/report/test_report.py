@@ -13,7 +13,7 @@ from errormotion.datasets import build_errors
 from errormotion.errors import DatasetError
 from errormotion.report import provenance, write_report
 from errormotion.report.document import Source
-from errormotion.report.series import commanded_speed
+from errormotion.report.drawings.series import commanded_speed
 
 pytestmark = pytest.mark.usefixtures("translated")
 

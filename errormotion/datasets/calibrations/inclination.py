@@ -32,8 +32,8 @@ from errormotion.datasets.checks import dims, magnitude_violations, storable_vio
 from errormotion.datasets.files.folders import folders_beside
 from errormotion.datasets.provenance import hash_dataset
 from errormotion.datasets.schemas import Row
-from errormotion.datasets.storage import load as load_dataset
-from errormotion.datasets.storage import reading, save
+from errormotion.datasets.storage.disk import load as load_dataset
+from errormotion.datasets.storage.disk import reading, save
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import inclination_rotation, tilt_vector
 

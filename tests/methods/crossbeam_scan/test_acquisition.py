@@ -12,7 +12,7 @@ import xarray as xr
 from armed import CONTROLLER
 
 from errormotion import datasets
-from errormotion.campaign.store import RawStore
+from errormotion.campaign.storage.store import RawStore
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, MethodError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX

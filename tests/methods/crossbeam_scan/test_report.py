@@ -430,7 +430,7 @@ def test_an_error_that_is_the_same_everywhere_is_drawn_without_a_warning(page, s
 def test_a_map_is_a_path_for_each_colour_and_keeps_its_holes():
     from matplotlib.figure import Figure
 
-    from errormotion.report.maps import DIVERGING, cells, scale_of
+    from errormotion.report.drawings.maps import DIVERGING, cells, scale_of
 
     rng = np.random.default_rng(0)
     values = rng.normal(0, 1, (40, 40))
@@ -447,7 +447,7 @@ def test_a_map_is_a_path_for_each_colour_and_keeps_its_holes():
 
 
 def test_zero_is_white_and_both_sides_have_the_same_depth():
-    from errormotion.report.maps import scale_of
+    from errormotion.report.drawings.maps import scale_of
 
     scale = scale_of(np.array([-1.0, 4.0]), 10)
     low, high = np.array(scale.to_rgba([-0.01, 0.01]))[:, :3]

@@ -13,8 +13,8 @@ from errormotion.methods.normal_vector import NormalVector, simulation
 from errormotion.methods.normal_vector.report.drawings import balls
 from errormotion.methods.normal_vector.report.view import MISSING, MOVED, WRONG, probing
 from errormotion.report import write_report
+from errormotion.report.drawings.timeline import clock
 from errormotion.report.text import fixed
-from errormotion.report.timeline import clock
 from errormotion.twin import Event, VirtualMachine
 
 pytestmark = pytest.mark.usefixtures("translated")

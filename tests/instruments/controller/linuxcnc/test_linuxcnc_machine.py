@@ -21,7 +21,7 @@ from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.controller import linuxcnc, linuxcnc_process
 from errormotion.instruments.touch_probe.controller_probe import ControllerProbe, ControllerProbeSettings
 from errormotion.plugins import MachineLimits, Touch
-from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
+from errormotion.testing.checks.instrument import INSTRUMENT_CHECKS
 from errormotion.testing.kit import run_check
 from errormotion.testing.run import subjects_of
 
