@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.errors import MethodError
 
 SOME = 150
@@ -236,7 +236,7 @@ def _from_plain_readings(
 
 def _scale(r: Array) -> float:
     """Return the robust scale of residuals about zero."""
-    return 1.4826 * float(np.median(np.abs(r)))
+    return NORMAL_MAD * float(np.median(np.abs(r)))
 
 
 def _what_is_wrong(j: int, d: Array, u: Array, extent: float, scale: float) -> str:
