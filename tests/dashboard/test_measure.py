@@ -88,6 +88,19 @@ def test_a_wrong_value_has_its_message_at_its_field_and_the_text_follows(reading
     assert "x" in _field(form, "test", 0, "method")["mistakes"][0]
 
 
+def test_tests_are_added_and_removed(reading: Any, folder: Path) -> None:
+    text = (folder / "drift.toml").read_text()
+    _, form = _post(reading, "/measure/form.json", file="drift.toml", text=text, add=True)
+    assert form["text"] == text + '\n[[test]]\nname = "test-2"\nmethod = ""\n'
+    assert [group["test"] for group in form["groups"]] == [None, 0, 1]
+    assert _field(form, "test", 1, "method")["mistakes"]
+    _, form = _post(reading, "/measure/form.json", file="drift.toml", text=form["text"], remove=1)
+    assert (form["text"].rstrip(), form["count"]) == (text.rstrip(), 0)
+    for wrong in (-1, "0", True, 7):
+        status, found = _post(reading, "/measure/form.json", file="drift.toml", text=text, remove=wrong)
+        assert (status, bool(found["error"])) == (400, True)
+
+
 def test_the_page_shows_names_as_text(reading: Any) -> None:
     status, _, text = reading.ask("/measure?file=drift.toml")
     assert status == 200

@@ -111,7 +111,7 @@ def draw(scene: Scene, key: str) -> Markup:
         label = f"<label for='{key}-v{k}'>{name}</label> " if name else ""
         title = name or f"rotated by {30 * k}°"
         checked = " checked" if k == 0 else ""
-        buttons.append(f"<input type='radio' name='{key}' id='{key}-v{k}' aria-label='{title}'{checked}>{label}")
+        buttons.append(f"<input type='radio' name='{key}' id='{key}-v{k}' aria-label=\"{title}\"{checked}>{label}")
         pictures.append(_picture(scene, camera(azimuth, elevation), centre, scale, f"{key}-p{k}"))
         rules.append(f"#{key}-v{k}:checked~#{key}-p{k}")
     style = (
@@ -121,7 +121,7 @@ def draw(scene: Scene, key: str) -> Markup:
     )
     points_of = escape(json.dumps(_plain(scene, centre, points), ensure_ascii=False, separators=(",", ":")))
     return Markup(
-        f"<div id='{key}-t' class='turn' data-scene=\"{points_of}\"><style>{style}</style><span>rotate: </span>"
+        f"<div id='{key}-t' class='turn' data-scene=\"{points_of}\"><style>{style}</style><span>rotate:</span> "
         f"{''.join(buttons)}{''.join(pictures)}</div>"
     )
 
