@@ -47,7 +47,7 @@ def timed(cycle: Callable[[int], object], cycles: int = CYCLES) -> str:
         cycle(k)
         times.append(time.perf_counter() - start)
     worst = statistics.quantiles(times, n=100)[98]
-    verdict = "within" if worst < WANTED else "BEYOND"
+    verdict = "within" if worst < WANTED else "outside"
     median, longest = statistics.median(times), max(times)
     return f"{1e3 * median:6.2f} {1e3 * worst:8.2f} {1e3 * longest:8.2f} ms   99 % {verdict} {1e3 * WANTED:g} ms"
 
