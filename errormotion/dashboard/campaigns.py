@@ -7,6 +7,7 @@ import io
 import os
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -153,10 +154,11 @@ class Campaigns:
         if self.control:
             return
         try:
-            known = set(_strings(parse_toml(self.read(name), "text")))
-            new = set(_strings(parse_toml(text, "text"))) - known
+            new = set(_strings(parse_toml(text, "text")))
         except ErrormotionError:
             return  # the form states what is wrong with it
+        with suppress(ErrormotionError):  # of a file that there is not, nothing is known
+            new -= set(_strings(parse_toml(self.read(name), "text")))
         for each in new:
             windows = PureWindowsPath(each)
             if PurePosixPath(each).is_absolute() or windows.drive or windows.root or ".." in windows.parts:

@@ -64,7 +64,7 @@ def test_json_has_files_and_figures(run, folder: Path) -> None:
         (("y.nc", "--for", "fagor", "--axis", "Y"), "No format of tables 'fagor'; there are: fanuc, generic"),
         (("y.nc", "--for", "siemen", "--axis", "Y"), "Did you mean 'siemens'"),
         (("y.nc", "--for", "generic", "--axis", "Q"), "axis: expected X, Y or Z; found 'Q'"),
-        (("y.nc", "--for", "generic", "--axis", "X"), "no positions of X"),
+        (("y.nc", "--for", "generic", "--axis", "X"), "y.nc: The errors have no positions of X"),
         (("y.nc", "--for", "generic", "--axis", "Y", "--step", "25"), "--step 25: expected a length with its unit"),
         (("y.nc", "--for", "generic", "--axis", "Y", "--step", "-5mm"), "a length above 0"),
         (("y.nc", "--for", "generic", "--axis", "Y", "--chain", "bed-X"), "expected a chain"),

@@ -90,7 +90,7 @@ def test_forged_and_wrong_requests_start_nothing(
         {"model": "bench.toml"},
     ):
         assert post(served, "/compensate/start", **{**START, **wrong}) == 400, wrong
-    for run in ("", "..", "../runs", "nowhere", "a/b"):
+    for run in ("", "..", "../runs", "nowhere", "a/b", 200 * "é"):
         assert post(served, "/compensate/stop", run=run) == 400
 
 

@@ -1,5 +1,6 @@
 """The page Measure over HTTP: fields, messages, plan, and what is refused without control."""
 
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -166,8 +167,9 @@ def test_a_file_is_saved_once_and_not_over_the_work_of_others(controlling: Any, 
 
 def test_without_control_no_other_files_are_looked_at(reading: Any, folder: Path) -> None:
     text = (folder / "drift.toml").read_text()
-    for path in ("/etc/hostname", "../bench.toml", "C:/x"):
-        status, found = _post(reading, "/measure/form.json", file="drift.toml", text=text.replace("bench.toml", path))
+    asked = itertools.product(("drift.toml", "", "none.toml", "../drift.toml"), ("/etc/hostname", "../b.toml", "C:/x"))
+    for name, path in asked:
+        status, found = _post(reading, "/measure/form.json", file=name, text=text.replace("bench.toml", path))
         assert (status, "looks at files of its folder only" in found["error"]) == (400, True)
 
 

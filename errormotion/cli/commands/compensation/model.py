@@ -143,7 +143,8 @@ def errors_of(path: Path) -> xr.Dataset:
 def source_of(path: Path) -> xr.Dataset | ThermalModel:
     """Return the thermal model of a file, or the error dataset of a file or a run folder."""
     ds = dataset_of(path)
-    return ThermalModel(ds) if ds.attrs.get("schema") == MODEL_SCHEMA else ds
+    with reading(path):
+        return ThermalModel(ds) if ds.attrs.get("schema") == MODEL_SCHEMA else ds
 
 
 def dataset_of(path: Path) -> xr.Dataset:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -18,6 +19,7 @@ from errormotion.cli.page import Page
 from errormotion.compensation.correction import Correction, correction
 from errormotion.compensation.program import LEFT, ByTool, Offsets, Outcome, Settings, compensate
 from errormotion.compensation.program.reading.offsets import read_parameters, read_tools
+from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import DatasetError, ProgramError
 
@@ -71,14 +73,17 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
     )
     given = [source_of(path) for path in sources]
     errors = [each if isinstance(each, xr.Dataset) else each.dataset for each in given]
-    found = _correction(given, choice)
+    with reading(sources[0]) if len(sources) == 1 else nullcontext():
+        found = _correction(given, choice)
     time = None
     if found.timed:
         time = _last(found) if choice.time is None else _quantity("--time", choice.time, Time)
     gauge = None if choice.gauge_point is None else np.array(choice.gauge_point)
     by_tool = ByTool(found, gauge, time)
     head = _head(part, sources, errors, settings, time)
-    outcome = compensate(part, target, by_tool, _offsets(choice), settings, head=head)
+    offsets = _offsets(choice)
+    with reading(part):
+        outcome = compensate(part, target, by_tool, offsets, settings, head=head)
     summary = outcome.summary
     expanded = np.empty((0, 3))
     if len(summary.places):

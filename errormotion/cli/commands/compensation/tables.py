@@ -13,6 +13,7 @@ from errormotion.cli.commands.compensation.model import errors_of
 from errormotion.cli.output import show, show_json
 from errormotion.cli.settings import read_settings
 from errormotion.compensation.tables import axis_table, export, get
+from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import DatasetError
 
@@ -42,17 +43,18 @@ def table(errors: Path, form: str, choice: Choice, out: Path, assignments: list[
     """
     chosen = get(form)
     settings = read_settings(chosen.Settings, None, assignments)
-    made = axis_table(
-        errors_of(errors),
-        choice.axis.upper(),
-        component=choice.component.upper(),
-        step=_quantity("--step", choice.step, Length),
-        at=choice.at,
-        time=_quantity("--time", choice.time, Time),
-        functional_point=choice.functional_point,
-        chain=choice.chain,
-        run=errors.resolve().name,
-    )
+    with reading(errors):
+        made = axis_table(
+            errors_of(errors),
+            choice.axis.upper(),
+            component=choice.component.upper(),
+            step=_quantity("--step", choice.step, Length),
+            at=choice.at,
+            time=_quantity("--time", choice.time, Time),
+            functional_point=choice.functional_point,
+            chain=choice.chain,
+            run=errors.resolve().name,
+        )
     exported = export(made, chosen, settings)
     paths = [str(path) for path in exported.save(out)]
     if as_json:
