@@ -22,15 +22,15 @@ from uuid import uuid4
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.campaign import head
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
 from errormotion.campaign.folder import FolderGoneError, RunFolder, list_runs, now
-from errormotion.campaign.journal import cause_of, journal
-from errormotion.campaign.limits import NO_MOTIONS, announcement, steps_of
-from errormotion.campaign.recorder import DiskFullError, Recorder
-from errormotion.campaign.store import committed_length
-from errormotion.campaign.timeline import follower
+from errormotion.campaign.sections import head
+from errormotion.campaign.sections.limits import NO_MOTIONS, announcement, steps_of
+from errormotion.campaign.sections.timeline import follower
+from errormotion.campaign.storage.journal import cause_of, journal
+from errormotion.campaign.storage.recorder import DiskFullError, Recorder
+from errormotion.campaign.storage.store import committed_length
 from errormotion.campaign.turns import claimed
 from errormotion.datasets import provenance
 from errormotion.datasets.certificates import ATTRIBUTE

@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from errormotion import datasets
+from errormotion.campaign.compensation.following import AUDIT, STATUS, Status, compensations, is_working, read_status
 from errormotion.campaign.files import BenchPlan, load_bench
-from errormotion.campaign.following import AUDIT, STATUS, Status, compensations, is_working, read_status
 from errormotion.compensation.online.audit import AuditReader
 from errormotion.compensation.online.prediction import predictor
 from errormotion.dashboard.kept import Kept, stamp
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.errors import CompensationError, ErrormotionError
 
 SHOWN = 20
@@ -39,6 +39,8 @@ MOST_FILES = 300
 """Files of a folder that are offered, at most."""
 LARGEST_MODEL = 64 << 20
 """Bytes of a file that is looked at whether it is a model."""
+LONGEST_NAME = 255
+"""Bytes of the name of a folder, at most."""
 LONGEST_OUTPUT = 4000
 """Bytes at the end of what a command printed."""
 
@@ -152,7 +154,8 @@ class Compensations:
         CompensationError
             There is none.
         """
-        if not key or len(key) > 255 or key != Path(key).name or not (self.runs / key / AUDIT).is_file():
+        fits = 0 < len(key.encode("utf-8", "surrogatepass")) <= LONGEST_NAME and key == Path(key).name
+        if not fits or not (self.runs / key / AUDIT).is_file():
             raise CompensationError(f"There is no compensation {key[:100]!r} in {self.runs}.")
         return self._following.get(key, lambda: Following(self.runs / key))
 

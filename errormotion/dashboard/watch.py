@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 from errormotion.campaign.background.recorded import Recorded, Value, recorded
 from errormotion.campaign.files import BenchPlan
-from errormotion.campaign.journal import cause_of
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.sources import Source
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
+from errormotion.campaign.storage.journal import cause_of
 from errormotion.campaign.turns import Claim, holder, watching
 from errormotion.dashboard.course import thin
 from errormotion.errors import ErrormotionError

@@ -16,9 +16,9 @@ import xarray as xr
 from simulated_clock import SimulatedClock
 
 from errormotion import datasets
-from errormotion.campaign.compensating import Compensation, Moment
+from errormotion.campaign.compensation.compensating import Compensation, Moment
+from errormotion.campaign.compensation.following import AUDIT
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, BenchPlan, parse_bench
-from errormotion.campaign.following import AUDIT
 from errormotion.compensation.online.audit import verify
 from errormotion.compensation.online.follower import State
 from errormotion.compensation.online.settings import Limits

@@ -9,7 +9,7 @@ from pathlib import Path
 from errormotion.campaign.background.processes import Background
 from errormotion.campaign.folder import RunFolder, is_locked
 from errormotion.campaign.runner import stored_plan
-from errormotion.campaign.store import committed_length
+from errormotion.campaign.storage.store import committed_length
 from errormotion.datasets.files.containers import LARGEST_METADATA
 from errormotion.datasets.files.reading import parse_json, read_bytes
 from errormotion.errors import ErrormotionError

@@ -11,10 +11,10 @@ import numpy as np
 import xarray as xr
 
 from errormotion import datasets
+from errormotion.campaign.compensation.following import STATUS, read_status
 from errormotion.campaign.folder import RunFolder
-from errormotion.campaign.following import STATUS, read_status
 from errormotion.campaign.runner import stored_plan
-from errormotion.campaign.store import committed_length
+from errormotion.campaign.storage.store import committed_length
 
 MOST_VALUES = 200
 """Values of one sample that are shown."""

@@ -72,17 +72,26 @@ class Measure(_OfCampaigns):
 
 
 class Fields(_OfCampaigns):
-    """The form of a text, as JSON; with a place and a value, after this field was changed."""
+    """The form of a text, as JSON, after a change that a request may state.
+
+    ``place`` and ``value``: of a field; ``add``: true, a test is added; ``remove``: number of the test to be removed.
+    """
 
     async def post(self) -> None:
         """Send text, fields and mistakes."""
         name, text = self.body("file", "text")
+        if self.found.get("add") is True:
+            return self.finish(_plain(await self.apart(self.campaigns().with_test, name, text)))
+        if (number := self.found.get("remove")) is not None:
+            if type(number) is not int or number < 0:
+                raise HTTPError(400, reason="remove: expected the number of a test")
+            return self.finish(_plain(await self.apart(self.campaigns().without_test, name, text, number)))
         place = self.found.get("place", [])
         if not isinstance(place, list) or not all(type(each) in (str, int) for each in place) or len(place) > 20:
             raise HTTPError(400, reason="place: expected keys")
         written = self.found.get("value", "")
         form = await self.apart(self.campaigns().form, name, text, tuple(place), str(written))
-        self.finish(_plain(form))
+        return self.finish(_plain(form))
 
 
 class Plan(_OfCampaigns):
