@@ -279,9 +279,13 @@ class Watch:
         row, others = dict.fromkeys(self.units, math.nan), []
         factors = {name: factor for name, _, factor in PARAMETERS}
         for each in values:
-            axis = each.label[-1:].upper() if each.variable == "position" and each.label in ("x", "y", "z") else ""
-            name = axis or (each.variable.replace("_", " ") if each.variable in _STATES else each.label)
-            if name in row and (name in self._places) == (each.unit == "degC"):
+            if each.unit == "degC":
+                name = each.label if each.label in self._places else ""
+            elif each.variable in _STATES:
+                name = each.variable.replace("_", " ")
+            else:
+                name = each.label.upper() if each.variable == "position" else ""
+            if name in row:
                 row[name] = factors.get(name, 1.0) * each.value
             elif each.variable not in _OF_A_LOG:
                 unit, factor = _FIELD.get(each.unit, (each.unit, 1.0))
@@ -379,8 +383,9 @@ class Watch:
                 self._record_time = now
             self._lent, self._record = claim, found
             self._revision += 1
-            row, _ = self._split(found.values if found is not None and new else ())
-            self._put(now, np.array(row))
+            if new or now - self._record_time > OLDEST_SAMPLE:  # between two samples is no gap
+                row, _ = self._split(found.values if found is not None and new else ())
+                self._put(now, np.array(row))
 
     def _put(self, time: float, row: Array) -> None:
         """Add a row to the history."""

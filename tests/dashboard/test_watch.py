@@ -144,13 +144,28 @@ def test_instruments_are_lent_to_who_measures_and_taken_again(make: Callable[...
     assert (np.diff(times) > 0).all()
 
 
+CONTROL = """\
+[instruments.control]
+driver = "virtual_controller"
+arm = true
+address = "sim://cframe/controller?seed=3"
+"""
+
+
 def test_a_record_of_a_run_is_shown_in_the_units_of_the_page(make: Callable[..., Watch]) -> None:
-    watch = make(start=False)
-    values = [Value("distance", "x1", 2e-4, "m"), Value("temperature", "column", 21.5, "degC")]
-    row, others = watch._split([*values, Value("temperature", "other", 22.0, "degC"), Value("gap", "m", 0.0, "1")])
-    assert row[1] == 21.5
-    assert math.isnan(row[0])
+    watch = make(MODULES + CONTROL, start=False)
+    values = [
+        Value("distance", "Z", 2e-4, "m"),
+        Value("position", "z", 0.3, "m"),
+        Value("spindle_speed", "", 1500.0, "1/min"),
+        Value("temperature", "column", 21.5, "degC"),
+        Value("temperature", "other", 22.0, "degC"),
+        Value("gap", "modules", 0.0, "1"),
+    ]
+    row, others = watch._split(values)
+    known = {name: value for name, value in zip(watch.units, row, strict=True) if math.isfinite(value)}
+    assert known == pytest.approx({"column": 21.5, "Z": 300.0, "spindle speed": 1500.0})
     assert [(each.name, each.value, each.unit) for each in others] == [
-        ("distance x1", pytest.approx(0.2), "mm"),
+        ("distance Z", pytest.approx(0.2), "mm"),
         ("temperature other", 22.0, "°C"),
     ]
