@@ -508,9 +508,9 @@ def _limit_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[s
         return [f"{where}: {error}"]
     if steps is None and hasattr(plugins.get("methods", method), "programs"):
         return [f"{where}: {NO_MOTIONS.format(method)}, and it writes NC programs"]
-    told = violations(extent(steps), bench.limits) if steps else []
+    broken = violations(extent(steps), bench.limits) if steps else []
     tables = "[limits]" if bench.description is None else "[limits] and [machine]"
-    return [f"{where}: {text} ({tables} of {bench.source})" for text in told]
+    return [f"{where}: {text} ({tables} of {bench.source})" for text in broken]
 
 
 def _name_mistakes(test: TestTable, place: tuple[str | int, ...], earlier: list[str]) -> list[str]:

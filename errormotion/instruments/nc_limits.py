@@ -1,4 +1,4 @@
-"""Limits of an NC program (ISO 6983), read line by line; what cannot be told to stay within them is refused.
+"""Limits of an NC program (ISO 6983), read line by line; a block that may leave them is refused.
 
 Understood are straight moves in absolute machine coordinates and mm: G0, G1, G31, G38.2 to G38.5 with X, Y, Z and F,
 G4 on a line of its own, G17, G21, G40, G49, G53, G80, G90, G94, M0 to M9, M30, S, T, comments, and the printing of

@@ -1,4 +1,4 @@
-"""The effect of a compensation: intervals that hold the true reduction, and what a reader is told."""
+"""The effect of a compensation: intervals that hold the true reduction, and what the page states."""
 
 from __future__ import annotations
 

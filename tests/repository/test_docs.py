@@ -1,6 +1,6 @@
 """Examples of the README, the tutorial, the explanations and the reference; and what is wrong in one is noticed.
 
-How examples are written and run is told in conftest.py.
+How examples are written and run: see conftest.py.
 """
 
 from collections.abc import Callable

@@ -247,9 +247,9 @@ def _writing(path: Path, part: Path) -> Iterator[None]:
 
 def _reason(error: Exception, missing: str) -> str:
     code = getattr(error, "errno", None)
-    told = re.search(r"errno = (\d+)", str(error))
-    if told is not None and code not in _REASONS:
-        code = int(told[1])
+    stated = re.search(r"errno = (\d+)", str(error))
+    if stated is not None and code not in _REASONS:
+        code = int(stated[1])
     if code == errno.ENOENT:
         return missing
     return _REASONS.get(code or 0, getattr(error, "strerror", None) or str(error))

@@ -181,11 +181,11 @@ def working(dataset: xr.Dataset, *, held: bool, commanded: Array | None = None) 
         ("spindle_speed", "spindle speed", "1/min", 1.0),
         ("feed", "feed", "m/min", 1 / 60),
     ):
-        told = commanded if name == "spindle_speed" else None
-        if told is None and (name not in dataset or dataset[name].dims != ("time",)):
+        stated = commanded if name == "spindle_speed" else None
+        if stated is None and (name not in dataset or dataset[name].dims != ("time",)):
             continue
-        title = f"Commanded {quantity}" if told is not None else f"Mean {quantity}" if held else quantity.capitalize()
-        values = told if told is not None else np.asarray(dataset[name].values, float) / size
+        title = f"Commanded {quantity}" if stated is not None else f"Mean {quantity}" if held else quantity.capitalize()
+        values = stated if stated is not None else np.asarray(dataset[name].values, float) / size
         if np.isfinite(values).any() and (name == "spindle_speed" or np.nanmax(np.abs(values)) > 0):
             panels.append(Panel(title, unit, [Line(title, values, None, "#bbbbbb")], 0.3, strip=True, held=held))
     return panels

@@ -578,7 +578,7 @@ def test_the_state_is_in_metres_whatever_the_ini_file_has(play: Callable[[Test],
     play(test)
 
 
-def test_of_a_linuxcnc_that_is_starting_nothing_is_told(play: Callable[[Test], None]) -> None:
+def test_of_a_linuxcnc_that_is_starting_nothing_is_reported(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.values.linear_units = 0.0
         assert "still starting" in await wire.ask("state")
@@ -689,7 +689,7 @@ def test_an_order_that_linuxcnc_never_takes_is_given_up(play: Callable[[Test], N
     play(test)
 
 
-def test_the_e_stop_that_stays_pressed_is_told(play: Callable[[Test], None]) -> None:
+def test_the_e_stop_that_stays_pressed_is_reported(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.state = lambda state: fake._took("ignored")  # type: ignore[method-assign]
         fake.values.task_state = fake.STATE_ESTOP

@@ -14,7 +14,7 @@ from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.identification.registration.kernels import FAST, compiled
 
 
-@compiled()
+@compiled(inner=True)
 def _weights(t: float) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
     """Return the four cubic B-splines at t in [0, 1) between the second and the third."""
     u, sixth = 1.0 - t, 1.0 / 6.0
@@ -23,7 +23,7 @@ def _weights(t: float) -> tuple[float, float, float, float]:  # pragma: no cover
     return first, second, 1.0 - first - second - last, last
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _row_sums(J: Array, w: Array, r: Array, weighted: Array, total: Array) -> None:  # pragma: no cover - compiled
     """Add up J^T W J, J^T W r and r^T W r of a row; ``w`` is 0 where a block does not count, ``weighted``: scratch."""
     n, m = J.shape
@@ -46,7 +46,7 @@ def _row_sums(J: Array, w: Array, r: Array, weighted: Array, total: Array) -> No
     total[n * n + n] = s
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _moved_row(
     height: Array, x: Array, y: float, pose: Array, grid: Array, points: Array
 ) -> None:  # pragma: no cover - compiled
@@ -63,7 +63,7 @@ def _moved_row(
         U[c], V[c] = (X[c] - ox) * fx, (Y[c] - oy) * fy
 
 
-@compiled()
+@compiled(inner=True)
 def _surface_row(
     points: Array, variance: Array, surface: Array, spread_of: Array, S: Array, cold: Array, between: Array
 ) -> None:  # pragma: no cover - compiled
@@ -97,7 +97,7 @@ def _surface_row(
         cold[c], between[c] = variance_there, t * (1.0 - t)
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _jacobian_row(
     points: Array, sx: Array, sy: Array, normal: Array, centre: Array, bases: Array, J: Array
 ) -> None:  # pragma: no cover - compiled

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.compiling import Compiler
 
 COLUMNS = 16
@@ -69,7 +69,7 @@ def threads() -> int:
     return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined, unused-ignore]
 
 
-@compiled()
+@compiled(inner=True)
 def _median(values: Array) -> float:  # pragma: no cover - compiled
     """Return the upper median of the values (n,), which are put in another order (Hoare's selection)."""
     k, low, high = len(values) // 2, 0, len(values) - 1
@@ -92,7 +92,7 @@ def _median(values: Array) -> float:  # pragma: no cover - compiled
     return float(values[k])
 
 
-@compiled()
+@compiled(inner=True)
 def _robust_plane(
     z: NDArray[np.float32], r0: int, c0: int, dx: Array, dy: Array, room: Array
 ) -> tuple[int, float, float, float, float]:  # pragma: no cover - compiled
@@ -137,10 +137,10 @@ def _robust_plane(
         if room[1, k] == room[1, k]:
             room[0, n] = abs(room[1, k] - height)
             n += 1
-    return n, height, sx, sy, 1.4826 * _median(room[0, :n])
+    return n, height, sx, sy, NORMAL_MAD * _median(room[0, :n])
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _trimmed_plane(
     z: NDArray[np.float32],
     r0: int,
@@ -211,7 +211,7 @@ def _trimmed_plane(
     return True
 
 
-@compiled()
+@compiled(inner=True)
 def _refit(
     z: NDArray[np.float32],
     r0: int,
@@ -246,7 +246,7 @@ def _refit(
     out[4] = 0.0
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _block_sums(
     z: NDArray[np.float32], r0: int, dx: NDArray[np.float32], dy: NDArray[np.float32], sums: NDArray[np.float32]
 ) -> None:  # pragma: no cover - compiled
@@ -272,7 +272,7 @@ def _block_sums(
         sums[0, column], sums[1, column], sums[2, column], sums[3, column] = S0, S1, S2, SS
 
 
-@compiled()
+@compiled(inner=True)
 def _row_scale(
     z: NDArray[np.float32],
     r0: int,

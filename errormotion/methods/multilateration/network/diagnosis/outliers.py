@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.methods.multilateration.network.loops import COMPILED_FROM, loops
 from errormotion.methods.multilateration.network.model import directions
 from errormotion.methods.multilateration.network.network import Network
@@ -74,7 +74,7 @@ def normalised(network: Network) -> Array:
 
 def gate(t: Array) -> float:
     """Return above which normalised residual (n, m) a reading is wrong."""
-    scale = max(1.0, 1.4826 * float(np.nanmedian(np.abs(t))))
+    scale = max(1.0, NORMAL_MAD * float(np.nanmedian(np.abs(t))))
     return scale * _least_gate(int(np.count_nonzero(np.isfinite(t))))
 
 
@@ -159,7 +159,7 @@ def _by_positions(network: Network, nominal: Array, targets: NDArray[np.intp]) -
     """Return the station without which each target lies where others do, -1 where none or several would do."""
     deviation = network.target - nominal
     usual = np.nanmedian(deviation, axis=0)
-    spread = 1.4826 * np.nanmedian(np.abs(deviation - usual), axis=0)
+    spread = NORMAL_MAD * np.nanmedian(np.abs(deviation - usual), axis=0)
     own, _, _ = network.blocks(targets)
     e = directions(network.target[targets], network.stations)
     w, r, share = network.weight[:, targets], network.residual[:, targets], network.redundancy[:, targets]

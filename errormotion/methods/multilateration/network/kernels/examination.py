@@ -16,7 +16,7 @@ from errormotion.methods.multilateration.network.kernels.four_examined import Fl
 from errormotion.methods.multilateration.network.kernels.general import sight
 
 
-@compiled()
+@compiled(inner=True)
 def _add_motions(F: Array, c: Array, out: Array) -> None:  # pragma: no cover - compiled
     """Add G^T F (6, q), G = [1, -(c x)], to ``out``."""
     for k in range(F.shape[1]):
@@ -29,7 +29,7 @@ def _add_motions(F: Array, c: Array, out: Array) -> None:  # pragma: no cover - 
         out[5, k] += c[0] * y - c[1] * x
 
 
-@compiled()
+@compiled(inner=True)
 def _add_response(
     e: Array, w: Array, D: Array, c: Array, extra: Array, i: int, v: Array, out: Array
 ) -> None:  # pragma: no cover - compiled
@@ -48,7 +48,7 @@ def _add_response(
                 out[a, 4 * n + p] -= v[a] * extra[p, j, i]
 
 
-@compiled()
+@compiled(inner=True)
 def _spread_motions(D: Array, c: Array, DG: Array) -> None:  # pragma: no cover - compiled
     """Fill D G (3, 6), G = [1, -(c x)]."""
     for k in range(3):
@@ -58,7 +58,7 @@ def _spread_motions(D: Array, c: Array, DG: Array) -> None:  # pragma: no cover 
         DG[k, 5] = D[k, 1] * c[0] - D[k, 0] * c[1]
 
 
-@compiled()
+@compiled(inner=True)
 def _datum_part(
     weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, part: int, sums: Array
 ) -> None:  # pragma: no cover - compiled
@@ -117,7 +117,7 @@ def datum_sums(
     return total[:, :6], total[:, 6:12], total[:, 12:]
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _covariance(
     D: Array, DG: Array, FW: Array, G: Array, H: Array, K: Array, room: Array, out: Array
 ) -> None:  # pragma: no cover - compiled
@@ -139,7 +139,7 @@ def _covariance(
             out[a, b] = s
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _examine_part(
     weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
     centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,

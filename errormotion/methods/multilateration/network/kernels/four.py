@@ -26,7 +26,7 @@ _SETTLED = 1e-14
 _LAST_STEPS = 30
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _add_products(v: Array, sums: Array) -> None:  # pragma: no cover - compiled
     """Add the upper triangle of v v^T (17, 17), v (17, LANES), to ``sums``: two rows by two at a time."""
     for i in range(0, 16, 2):
@@ -48,7 +48,7 @@ def _add_products(v: Array, sums: Array) -> None:  # pragma: no cover - compiled
         sums[i, 16] += a
 
 
-@compiled(forceinline=True)
+@compiled(inner=True, forceinline=True)
 def _load(
     reading: Array, weight: Array, dead_path: Array, place: Array, begin: int, count: int, R: Array, W: Array, U: Array
 ) -> None:  # pragma: no cover - compiled
@@ -70,7 +70,7 @@ def _load(
             U[k, t] = U[k, 0]
 
 
-@compiled(fastmath=EXACT, forceinline=True)
+@compiled(inner=True, fastmath=EXACT, forceinline=True)
 def _move(
     R: Array, W: Array, station: Array, U: Array, size: Array, spread: Array
 ) -> float:  # pragma: no cover - compiled
@@ -121,7 +121,7 @@ def _move(
     return far
 
 
-@compiled(fastmath=EXACT, forceinline=True)
+@compiled(inner=True, fastmath=EXACT, forceinline=True)
 def _equate(R: Array, W: Array, station: Array, U: Array, v: Array) -> None:  # pragma: no cover - compiled
     """Fill the equations v (17, LANES) that are left of targets: derivatives by (U, L) of each station, residual."""
     x0, y0, z0 = station[0, 0], station[0, 1], station[0, 2]
@@ -159,7 +159,7 @@ def _equate(R: Array, W: Array, station: Array, U: Array, v: Array) -> None:  # 
         v[16, t] = -(na * ra + nb * rb + nc * rc + nd * rd)
 
 
-@compiled(fastmath=EXACT)
+@compiled(inner=True, fastmath=EXACT)
 def reduce_four(
     reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, first: int, last: int, sums: Array
 ) -> float:  # pragma: no cover - compiled
@@ -182,7 +182,7 @@ def reduce_four(
     return furthest
 
 
-@compiled(fastmath=EXACT)
+@compiled(inner=True, fastmath=EXACT)
 def settle_four(
     reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, first: int, last: int,
     nominal: Array, centre: Array, openness: Array, sums: Array,
@@ -206,7 +206,7 @@ def settle_four(
     return furthest
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _add_moments(
     U: Array, nominal: Array, centre: Array, spread: Array, begin: int, count: int, sums: Array
 ) -> None:  # pragma: no cover - compiled
@@ -252,7 +252,7 @@ def _add_moments(
     sums[15] += cz
 
 
-@compiled(fastmath=EXACT)
+@compiled(inner=True, fastmath=EXACT)
 def screen_four(
     reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, first: int, last: int, factor: Array,
     weak: float, largest: Array,

@@ -18,7 +18,7 @@ Flags = NDArray[np.bool_]
 _NO_PLACE = 1e-12
 
 
-@compiled(fastmath=EXACT, forceinline=True)
+@compiled(inner=True, fastmath=EXACT, forceinline=True)
 def _sight(
     weight: Array, station: Array, target: Array, centre: Array, begin: int, count: int, W: Array, E: Array, C: Array,
     D: Array,
@@ -74,7 +74,7 @@ def _sight(
             C[k, t] -= centre[k]
 
 
-@compiled(fastmath=EXACT)
+@compiled(inner=True, fastmath=EXACT)
 def datum_four(
     weight: Array, station: Array, target: Array, carries: Flags, centre: Array, first: int, last: int, sums: Array
 ) -> None:  # pragma: no cover - compiled
@@ -127,7 +127,7 @@ def datum_four(
         _add_sums(own, C, E, v, P, sums)
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _add_sums(own: Array, C: Array, E: Array, v: Array, P: Array, sums: Array) -> None:  # pragma: no cover - compiled
     """Add sums over the lanes: G^T G, G^T D G and G^T F."""
     n, xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -172,7 +172,7 @@ def _add_sums(own: Array, C: Array, E: Array, v: Array, P: Array, sums: Array) -
             sums[a, 15 + 4 * j] += s
 
 
-@compiled(fastmath=EXACT, forceinline=True)
+@compiled(inner=True, fastmath=EXACT, forceinline=True)
 def _between(H: Array, C: Array, X: Array) -> None:  # pragma: no cover - compiled
     """Fill X (6, LANES): the upper triangle of G H G^T, G = [1, -(c x)], H symmetric."""
     for t in range(LANES):
@@ -195,7 +195,7 @@ def _between(H: Array, C: Array, X: Array) -> None:  # pragma: no cover - compil
         X[5, t] = r2 + b * r3 - a * r4
 
 
-@compiled(fastmath=EXACT)
+@compiled(inner=True, fastmath=EXACT)
 def examine_four(
     weight: Array, station: Array, target: Array, carries: Flags, centre: Array, factor: Array, shift: Array,
     H: Array, K: Array, first: int, last: int, covariance: Array, redundancy: Array,

@@ -33,7 +33,7 @@ _SETTLED = 1e-7
 _NO_PLACE = 1e-6
 
 
-@compiled()
+@compiled(inner=True)
 def _locate(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragma: no cover - compiled
     """Move a target ``u`` (3,) by one Gauss-Newton step on its distances ``reach`` (n,); return how far it went, m."""
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -72,7 +72,7 @@ def _locate(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragm
     return size
 
 
-@compiled()
+@compiled(inner=True)
 def _place(
     reach: Array, w: Array, station: Array, u: Array, steps: int, short: float
 ) -> float:  # pragma: no cover - compiled
@@ -87,7 +87,7 @@ def _place(
     return first
 
 
-@compiled()
+@compiled(inner=True)
 def reflect(
     reach: Array, w: Array, station: Array, u: Array, e: Array, r: Array, E: Array, Q: Array
 ) -> None:  # pragma: no cover - compiled
@@ -130,7 +130,7 @@ def reflect(
         E[c, c] = alpha
 
 
-@compiled(fastmath=FAST)
+@compiled(inner=True, fastmath=FAST)
 def _add_products(v: Array, count: int, sums: Array) -> None:  # pragma: no cover - compiled
     """Add v v^T over the first ``count`` columns to the upper triangle of ``sums``."""
     for i in range(len(sums)):
@@ -141,7 +141,7 @@ def _add_products(v: Array, count: int, sums: Array) -> None:  # pragma: no cove
             sums[i, j] += s
 
 
-@compiled()
+@compiled(inner=True)
 def reach_of(
     reading: Array, weight: Array, dead_path: Array, extra: Array, value: Array, i: int, reach: Array, w: Array
 ) -> None:  # pragma: no cover - compiled
@@ -154,7 +154,7 @@ def reach_of(
         reach[j] = d
 
 
-@compiled()
+@compiled(inner=True)
 def _reduce_chunk(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
     place: Array, first: int, last: int, sums: Array,
@@ -191,7 +191,7 @@ def _reduce_chunk(
     return furthest * furthest
 
 
-@compiled()
+@compiled(inner=True)
 def sight(
     w: Array, station: Array, u: Array, e: Array, distance: Array, D: Array
 ) -> bool:  # pragma: no cover - compiled
@@ -235,7 +235,7 @@ def sight(
     return True
 
 
-@compiled()
+@compiled(inner=True)
 def _settle_chunk(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
     place: Array, first: int, last: int, nominal: Array, centre: Array, openness: Array, sums: Array,
@@ -262,7 +262,7 @@ def _settle_chunk(
     return furthest * furthest
 
 
-@compiled()
+@compiled(inner=True)
 def reduce_part(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
     place: Array, part: int, sums: Array,
@@ -274,7 +274,7 @@ def reduce_part(
     return _reduce_chunk(reading, weight, station, dead_path, extra, value, place, first, last, sums)
 
 
-@compiled()
+@compiled(inner=True)
 def _settle_part(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
     place: Array, part: int, nominal: Array, centre: Array, openness: Array, sums: Array,
