@@ -20,6 +20,10 @@ from errormotion.report.canvas import COLOURS, DASHES
 
 HEIGHT = 300
 """Height of one panel, pixels."""
+SMALLEST_MARGIN = 0.05
+"""Above and below the values, in field units: rounding errors of a computer are not drawn as a course."""
+FEW = 20
+"""Values of a curve up to which each is a dot as well."""
 LONGEST = 40
 """Characters of a name at an axis."""
 FONT = "system-ui, 'Segoe UI', 'Liberation Sans', Arial, sans-serif"
@@ -134,7 +138,7 @@ def _reach(curves: Sequence[Curve]) -> Range1d:
     ends = [each.values + sign * np.nan_to_num(each.expanded) for each in curves for sign in (-1.0, 1.0)]
     known = np.concatenate(ends)[np.isfinite(np.concatenate(ends))]
     low, high = float(known.min()), float(known.max())
-    margin = 0.06 * (high - low) or 1.0
+    margin = max(0.06 * (high - low), SMALLEST_MARGIN)
     return Range1d(low - margin, high + margin)
 
 
@@ -208,4 +212,6 @@ def _draw(plot: figure, found: Course, curve: Curve, number: int) -> None:
         drawn = plot.line(
             "x", "y", source=source, color=colour, line_width=1.8, line_dash=list(dash), legend_label=curve.name
         )
+        if len(kept) <= FEW:  # one alone makes no line
+            plot.scatter("x", "y", source=source, size=6, color=colour)
     plot.add_tools(HoverTool(renderers=[drawn], tooltips=tips, mode="mouse" if found.names else "vline"))

@@ -10,6 +10,7 @@ from typing import Any
 from tornado.web import HTTPError
 
 from errormotion.campaign.background import processes
+from errormotion.campaign.background.elsewhere import measuring_elsewhere
 from errormotion.campaign.background.preliminary import preliminary, samples
 from errormotion.campaign.background.processes import Background
 from errormotion.campaign.folder import RunFolder
@@ -203,7 +204,10 @@ def _processes(runs: Path) -> list[dict[str, Any]]:
     found = processes.found(runs)
     shown = [each for each in found if each.alive] + [each for each in found if not each.alive][:SHOWN]
     busy = {name for each in found if each.alive for name in each.tests.values()}
-    return [_process(runs, each, busy) for each in shown]
+    others = measuring_elsewhere(runs, busy)
+    busy |= {each.name for each in others}
+    own = [_process(runs, each, busy) | {"elsewhere": False} for each in shown]
+    return [*(_process(runs, each, busy) | {"elsewhere": True} for each in others), *own]
 
 
 def _process(runs: Path, each: Background, busy: set[str]) -> dict[str, Any]:
