@@ -17,10 +17,6 @@ from errormotion.errors import DatasetError
 
 _ROWS = {row.name: row for row in ERROR_ROWS}
 
-Coordinate = (
-    ArrayLike | tuple[str | Sequence[str], ArrayLike] | tuple[str | Sequence[str], ArrayLike, Mapping[str, Any]]
-)
-
 
 def build_errors(
     values: ArrayLike,

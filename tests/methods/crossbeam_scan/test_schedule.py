@@ -3,13 +3,12 @@
 import json
 from itertools import pairwise
 
-import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition.programs import measuring_pass
-from errormotion.methods.crossbeam_scan.acquisition.schedule import PAUSE, scan_times, schedule
+from errormotion.methods.crossbeam_scan.acquisition.schedule import PAUSE, schedule
 from errormotion.methods.crossbeam_scan.settings import MINUTE, Settings
 
 TRAVEL = {"X": (0.0, 1.0), "Y": (0.0, 3.0), "Z": (0.0, 1.0)}
@@ -56,15 +55,6 @@ def test_predicted_durations_are_those_of_a_control_that_moves_with_constant_fee
         # places are written to a micrometre: 0.5 um a move at 60 mm/s
         assert path.duration == pytest.approx(item.seconds, abs=1e-3)
         place = float(path.places[-1][1])
-
-
-def test_predicted_scan_times_are_when_the_axis_is_over_the_artefacts(settings):
-    plan = schedule(settings)
-    item = plan.of_cycle(2)
-    low, _ = measuring_pass(settings).reach()
-    path = interpret(plan.programs[item.program].text(), (0.0, low, 0.0), TRAVEL, rapid=1.0)
-    times = np.array(scan_times(plan, settings)[2])
-    np.testing.assert_allclose(path.place(times - item.start)[:, 1], settings.positions, atol=1e-9)
 
 
 def test_warm_up_times_without_time_for_a_pass_between_them_are_refused(settings):

@@ -224,13 +224,6 @@ def worst_angle(covariance: Array) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
-def least_angle(limits: Limits) -> float:
-    """Return the lower bound of the worse angle's uncertainty over all planes, rad; see the module."""
-    return float(
-        np.sqrt(24.0 / limits.readings) * limits.noise / (limits.reach * np.tan(limits.max_inclination)),
-    )
-
-
 def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
     """Return the planes, strokes and readings that minimise the uncertainty of the worse of the beam's two angles.
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.acquisition.programs import (
-    DWELL,
     MINUTE,
     Program,
     measuring_pass,
@@ -135,13 +134,6 @@ def schedule(settings: Settings) -> Schedule:
     for program in programs.values():
         program.check(settings.travel)
     return Schedule(tuple(items), programs, (*[0.0] * cold, *settings.warm_up))
-
-
-def scan_times(plan: Schedule, settings: Settings) -> list[list[float]]:
-    """Return the planned times over the middle of each artefact, by pass, s since the start of the warm-up."""
-    low, _ = pass_ends(settings)
-    starts = [item.end - plan.programs[item.program].seconds(low) for item in plan.items if item.cycle >= 0]
-    return [[start + DWELL + (y - low) / settings.measuring_feed for y in settings.positions] for start in starts]
 
 
 def program_texts(settings: Settings) -> dict[str, str]:

@@ -73,8 +73,8 @@ class Lines:
     ----------
     slope, offset : ndarray (setting,)
         k, and the error at mid range, m; the offset is 0 where it was not free.
-    slope_variance, offset_variance, shared_variance : ndarray (setting,)
-        Of slope and offset and between them, from the noise.
+    slope_variance : ndarray (setting,)
+        From the noise.
     residual : ndarray (group,)
         m; of groups that were left out as well.
     left_out : ndarray of bool (group,)
@@ -86,8 +86,6 @@ class Lines:
     slope: Array
     offset: Array
     slope_variance: Array
-    offset_variance: Array
-    shared_variance: Array
     residual: Array
     left_out: NDArray[np.bool_]
     noise: float
@@ -187,13 +185,12 @@ def fit(readings: Readings, offsets: str = "auto") -> Lines:
     for _ in range(_ROUNDS):
         residual = readings.error - slope[readings.setting] * readings.depth - offset[readings.setting]
         before, kept = kept, _belonging(residual, kept, readings, free)
-        slope, offset, parts = _solve(readings, kept, free)
+        slope, offset, variance = _solve(readings, kept, free)
         if (before == kept).all():
             break
     residual = readings.error - slope[readings.setting] * readings.depth - offset[readings.setting]
     noise = _noise(residual[kept], int(kept.sum()) - len(count) * (2 if free else 1), readings.noise)
-    by_slope, by_offset, shared = (noise**2 * part for part in parts)
-    return Lines(slope, offset, by_slope, by_offset, shared, residual, ~kept, noise, free)
+    return Lines(slope, offset, noise**2 * variance, residual, ~kept, noise, free)
 
 
 def _start(readings: Readings, free: bool) -> tuple[Array, Array]:
@@ -226,8 +223,8 @@ def _belonging(residual: Array, kept: NDArray[np.bool_], readings: Readings, fre
     return np.asarray((np.abs(residual) <= _OUTLIER * scale) | few)
 
 
-def _solve(readings: Readings, kept: NDArray[np.bool_], free: bool) -> tuple[Array, Array, tuple[Array, Array, Array]]:
-    """Return slopes, offsets, and their variances and covariances for noise 1."""
+def _solve(readings: Readings, kept: NDArray[np.bool_], free: bool) -> tuple[Array, Array, Array]:
+    """Return slopes, offsets, and the variances of the slopes for noise 1."""
     n = int(readings.setting.max()) + 1
 
     def total(values: Array) -> Array:
@@ -237,11 +234,11 @@ def _solve(readings: Readings, kept: NDArray[np.bool_], free: bool) -> tuple[Arr
     E, DE = total(readings.error), total(readings.depth * readings.error)
     if not free:
         _require_depth(readings, DD > 0)
-        return DE / DD, np.zeros(n), (1 / DD, np.zeros(n), np.zeros(n))
+        return DE / DD, np.zeros(n), 1 / DD
     det = N * DD - D**2
     _require_depth(readings, det > 1e-9 * np.maximum(N * DD, 1e-30))
     slope, offset = (N * DE - D * E) / det, (DD * E - D * DE) / det
-    return slope, offset, (N / det, DD / det, -D / det)
+    return slope, offset, N / det
 
 
 def _require_depth(readings: Readings, enough: NDArray[np.bool_]) -> None:
