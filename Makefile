@@ -1,7 +1,7 @@
 # Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo compiled test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance following lowest lock
+.PHONY: help setup demo compiled test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance following programs lowest lock
 
 BIN := .venv/bin
 ARGS ?=
@@ -62,6 +62,9 @@ endurance: .venv/.dev  ## watch a machine for 24 simulated hours with a fault a 
 
 following: .venv/.dev  ## compensate the real LinuxCNC with a fault every 30 s, 72 minutes, and write docs/reliability.md
 	$(BIN)/python tools/following.py $(ARGS)
+
+programs: .venv/.dev  ## read 1e6 random NC programs by LinuxCNC's interpreter (ARGS="--programs 2e4"), and write docs/reliability.md
+	$(BIN)/python tools/programs.py $(ARGS)
 
 lowest: .venv/.dev  ## run tests with the lowest versions of packages that pyproject.toml allows, in .venv-lowest
 	$(BIN)/python tools/lowest.py $(ARGS)

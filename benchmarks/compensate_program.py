@@ -1,32 +1,20 @@
-"""NC programs: time and memory of a correction beside LinuxCNC's own reading, and random programs against LinuxCNC.
-
-``python benchmarks/compensate_program.py [PROGRAMS [SEED]]``: so many random programs of 60 steps (default 300).
-"""
+"""NC programs: time and memory of a correction beside LinuxCNC's own reading."""
 
 import math
 import os
 import resource
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
-from random import Random
 
 import numpy as np
 
 from errormotion.compensation.correction import correction
 from errormotion.compensation.program import ByTool, Offsets, Reader, Rewriting, Settings, compensate
-from errormotion.compensation.program.interpreter.agreement import check
 from errormotion.compensation.program.interpreter.canonical import interpreter
-from errormotion.errors import ProgramError
 from errormotion.twin import VirtualMachine
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-
-from nc_paths import ORIGINS
-from nc_programs import Programs
 
 BLOCKS = 200_000
 
@@ -74,36 +62,12 @@ def speed(folder: Path) -> None:
         print(f"  LinuxCNC's interpreter reads it in {time.perf_counter() - start:.1f} s, {own:.1f} s of CPU")
 
 
-def agreement(programs: int, seed: int) -> None:
-    """Compare the paths of random programs, many in one run of the interpreter."""
-    if interpreter() is None:
-        print("LinuxCNC's interpreter is not installed: random programs are not compared")
-        return
-    done = moves = differ = 0
-    start = time.perf_counter()
-    while done < programs:
-        count = min(50, programs - done)
-        lines: list[str] = []
-        for k in range(count):
-            made = Programs(Random(seed + done + k)).lines(60)
-            lines += [*(f"G10 L2 P{n} X{n} Y{-n} Z0 R0" for n in range(1, 10)), *made[:-1], "G80"]
-        try:
-            moves += check([*lines, "M2"], ORIGINS, Reader(ORIGINS))
-        except ProgramError as error:
-            differ += 1
-            print(f"  seeds {seed + done} to {seed + done + count - 1}: {error}")
-        done += count
-    took = time.perf_counter() - start
-    print(f"{done} random programs, {moves} moves: {differ} groups differ from LinuxCNC's path; {took:.0f} s")
-
-
 def main() -> None:
     folder = Path(tempfile.mkdtemp(prefix="errormotion-"))
     try:
         speed(folder)
     finally:
         shutil.rmtree(folder)
-    agreement(*(int(text) for text in (sys.argv[1:2] or ["300"]) + (sys.argv[2:3] or ["1000000"])))
 
 
 if __name__ == "__main__":

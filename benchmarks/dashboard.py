@@ -188,7 +188,7 @@ def measured(arguments: list[str], seconds: float) -> Taken:
 
 def verdict(within: bool) -> str:
     """Return a word."""
-    return "within" if within else "BEYOND"
+    return "within" if within else "outside"
 
 
 def main(seconds: float) -> None:

@@ -37,8 +37,8 @@ def one(seed: int, true: float, returns: int, settings: Settings) -> tuple[float
     truth = simulation.true_errors(machine, q)
     left = np.stack([found[name].values - truth[name].values for name in COORDINATES], axis=-1)
     u = np.sqrt(np.einsum("tii->ti", found["covariance"].values[:, :3, :3]))
-    told = [float(found[name]) if name in found else float("nan") for name in ("repeatability", "repeatability_u")]
-    return float(np.mean(np.abs(left) < 1.96 * u)), told[0], told[1]
+    reported = [float(found[name]) if name in found else float("nan") for name in ("repeatability", "repeatability_u")]
+    return float(np.mean(np.abs(left) < 1.96 * u)), reported[0], reported[1]
 
 
 def main() -> None:

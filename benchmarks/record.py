@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from errormotion.datasets.files import events
-from errormotion.record.listing import list_runs
+from errormotion.record.runs.listing import list_runs
 from errormotion.record.series import YEAR, Series
 from errormotion.record.steps import model_of
 

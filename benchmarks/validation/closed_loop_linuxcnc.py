@@ -1,4 +1,4 @@
-"""The closed loop with the real LinuxCNC: it probes a warm-up and, with offsets in its servo thread, another one.
+"""The closed loop with the real LinuxCNC: it probes a warm-up and, with offsets in its servo thread, two others.
 
 ``python benchmarks/validate.py closed_loop_linuxcnc --cache FOLDER``; of a single machine (several at a time need a
 network and IPC namespace each): ``PYTHONPATH=benchmarks python -m validation.closed_loop_linuxcnc SEED FOLDER``.
@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from errormotion import datasets
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import load_campaign
-from errormotion.cli.commands.run import work
+from errormotion.cli.commands.campaigns.run import work
 from errormotion.cli.demo import compensated_probing
 from errormotion.cli.demo.closed_loop import DISPLACEMENTS, with_warm_sensors
 from errormotion.compensation.online.prediction import predictor
@@ -38,6 +38,8 @@ FIRST = 100
 INTERVAL = 600.0
 """From one cycle to the next, simulated s."""
 CYCLES = {"training": 16, "compensated": 13}
+WARM_UPS = (2, 3)
+"""Those that are compensated."""
 MODEL = Settings(variant="lagged", lags=(), most_sensors=2)
 """Present temperatures alone: simulated minutes pass at once, and the compensation would take them for seconds."""
 BALLS = (0, 2, 3)
@@ -59,18 +61,18 @@ def section(seeds: int, cache: Path | None = None) -> Iterator[str]:
         "simulated joints. Each touch is a motion of LinuxCNC in real time; between two cycles "
         f"{INTERVAL / 60:g} simulated minutes pass at once, and the slew limit is therefore 20 um/s. A first warm-up "
         f"of {CYCLES['training']} cycles at 15000, then 5000 /min is probed (3 balls, 4 touches each) and a model "
-        "fitted to it: present temperatures, of at most 2 sensors. In the second warm-up, from the cold state, with "
-        f"random speeds and {CYCLES['compensated']} cycles, the code of `errormotion compensate run` reads the "
-        "thermometers in Modbus and writes to LinuxCNC: in the feedback path, or as external offsets. `without`: root "
-        "mean square of the true displacement (EX, EY, EZ together) of the second warm-up, without compensation, at "
-        "the times of the cycles after the cold one; `with`: the same as LinuxCNC probed it with the compensation, the "
-        "scatter of the probe (0.4 um a touch) included. `following`: share of the decisions that move the offset; it "
-        "is held while the machine probes, and here probing takes most of the real time."
+        "fitted to it: present temperatures, of at most 2 sensors. In the second and the third warm-up, each from "
+        f"the cold state, with random speeds and {CYCLES['compensated']} cycles, the code of `errormotion compensate "
+        "run` reads the thermometers in Modbus and writes to LinuxCNC: in the feedback path, or as external offsets. "
+        "`without`: root mean square of the true displacement (EX, EY, EZ together) of that warm-up, without "
+        "compensation, at the times of the cycles after the cold one; `with`: the same as LinuxCNC probed it with the "
+        "compensation, the scatter of the probe (0.4 um a touch) included. `following`: share of the decisions that "
+        "move the offset; it is held while the machine probes, and here probing takes most of the real time."
     )
-    yield from ("", "| machine | route | sensors | without/um | with/um | remaining | following |")
-    yield "|---|---|---|---|---|---|---|"
-    found: list[dict[str, Any]] = []
-    kept = sorted(int(file.stem) for file in folder.glob("[0-9]*.json"))
+    yield from ("", "| machine | route | sensors | warm-up | without/um | with/um | remaining | following |")
+    yield "|---|---|---|---|---|---|---|---|"
+    remaining: list[float] = []
+    kept = sorted(int(file.stem) for file in folder.glob("*.json") if file.stem.isdigit())
     new = (seed for seed in count(FIRST) if seed not in kept)
     for seed in islice(chain(kept, new), seeds):
         file = folder / f"{seed}.json"
@@ -79,12 +81,12 @@ def section(seeds: int, cache: Path | None = None) -> Iterator[str]:
                 [sys.executable, "-m", "validation.closed_loop_linuxcnc", str(seed), str(folder)], check=True
             )
         each = json.loads(file.read_text())
-        found.append(each)
-        yield (
-            f"| {seed} | {each['route']} | {', '.join(each['sensors'])} | {each['without']:.2f} | {each['with']:.2f} "
-            f"| {each['with'] / each['without']:.1%} | {each['following']:.0%} |"
-        )
-    remaining = [each["with"] / each["without"] for each in found]
+        for number, found in each["warm_ups"].items():
+            remaining.append(found["with"] / found["without"])
+            yield (
+                f"| {seed} | {each['route']} | {', '.join(each['sensors'])} | {number} | {found['without']:.2f} "
+                f"| {found['with']:.2f} | {remaining[-1]:.1%} | {found['following']:.0%} |"
+            )
     yield (
         f"\nMean of `remaining`: {np.mean(remaining):.1%}, largest {np.max(remaining):.1%}; larger than without: "
         f"{sum(each > 1 for each in remaining)} of {len(remaining)}."
@@ -98,10 +100,7 @@ def closed(seed: int, folder: Path) -> dict[str, Any]:
     here = world("cframe", seed)
     here.attach(Keeper())
     here.machine.state = individual("cframe", seed, np.random.default_rng([seed, 15])).state
-    at, further = 0.0, []
-    while at < INTERVAL * CYCLES["compensated"]:
-        further.append((at, float(np.round(rng.uniform(3000, here.machine.top_speed), -2))))
-        at += rng.uniform(600, 1500)
+    further = {number: _speeds(rng, here.machine.top_speed) for number in WARM_UPS}
     half = INTERVAL * CYCLES["training"] / 2
 
     def measured(name: str, schedule: list[tuple[float, float]]) -> tuple[Any, np.ndarray]:
@@ -119,20 +118,34 @@ def closed(seed: int, folder: Path) -> dict[str, Any]:
         datasets.save(measured("training", [(0.0, 15000.0), (half, 5000.0)])[0], kept)
     with datasets.load(kept) as training:
         model = fit([with_warm_sensors(training.load())], MODEL)
-    bench = load_campaign(_written(folder, "compensated", seed, route, further)).bench
-    here.start([])  # cold: the first readings are the reference
-    compensation = Compensation(bench, model.dataset, folder, arm=bench.machine)
-    states: Counter[str] = Counter()
-    with compensated_probing.following(compensation, states):
-        after, without = measured("compensated", further)
-    return {
-        "seed": seed,
-        "route": route,
-        "sensors": list(predictor(model.dataset).temperatures),
-        "without": 1e6 * _size(without),
-        "with": 1e6 * _size(_displacement(after)),
-        "following": states["following"] / states.total(),
-    }
+    warm_ups = {}
+    for number, speeds in further.items():
+        done = folder / f"{seed}-{number}.json"
+        if not done.exists():
+            bench = load_campaign(_written(folder, "compensated", seed, route, speeds)).bench
+            here.start([])  # cold: the first readings are the reference
+            compensation = Compensation(bench, model.dataset, folder, arm=bench.machine)
+            states: Counter[str] = Counter()
+            with compensated_probing.following(compensation, states):
+                after, without = measured("compensated", speeds)
+            figures = {
+                "without": 1e6 * _size(without),
+                "with": 1e6 * _size(_displacement(after)),
+                "following": states["following"] / states.total(),
+            }
+            _keep(done, figures)
+        warm_ups[str(number)] = json.loads(done.read_text())
+    sensors = list(predictor(model.dataset).temperatures)
+    return {"seed": seed, "route": route, "sensors": sensors, "warm_ups": warm_ups}
+
+
+def _speeds(rng: np.random.Generator, top_speed: float) -> list[tuple[float, float]]:
+    """Return random speeds of a compensated warm-up."""
+    at, found = 0.0, []
+    while at < INTERVAL * CYCLES["compensated"]:
+        found.append((at, float(np.round(rng.uniform(3000, top_speed), -2))))
+        at += rng.uniform(600, 1500)
+    return found
 
 
 def _displacement(errors: Any) -> np.ndarray:
@@ -185,11 +198,14 @@ def main() -> None:
     """Run one machine, and write its figures."""
     seed, folder = int(sys.argv[1]), Path(sys.argv[2]).resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(closed(seed, folder))
-    partial = folder / f"{seed}.part"
-    partial.write_text(text)
-    partial.rename(folder / f"{seed}.json")
-    print(text)
+    _keep(folder / f"{seed}.json", closed(seed, folder))
+
+
+def _keep(file: Path, values: dict[str, Any]) -> None:
+    partial = file.with_suffix(".part")
+    partial.write_text(json.dumps(values))
+    partial.rename(file)
+    print(values)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import load_bench
 from errormotion.compensation.thermal_model import Settings, fit
 from errormotion.dashboard.server import Options, serve

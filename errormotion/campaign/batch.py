@@ -23,11 +23,11 @@ from typing import NamedTuple
 
 from errormotion import __version__, datasets, plugins
 from errormotion.campaign.folder import RunFolder
-from errormotion.campaign.raw_paths import is_runs_folder, raw_of
 from errormotion.campaign.runner import Progress, Quiet, settings_hash
+from errormotion.campaign.storage.raw_paths import is_runs_folder, raw_of
 from errormotion.datasets import provenance
 from errormotion.datasets.files.hashing import has_hash
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError, ErrormotionError, RunError
 from errormotion.parallel import CPU_COUNT, SCHEDULERS, Workers, checked_scheduler, one_thread_at_a_time

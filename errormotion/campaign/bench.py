@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from errormotion.campaign.files import BenchInstrument, BenchPlan
-from errormotion.campaign.journal import cause_of
+from errormotion.campaign.storage.journal import cause_of
 from errormotion.errors import BenchError
 from errormotion.instruments.simulators.virtual_world.described import describe
 from errormotion.plugins import Identity

@@ -17,10 +17,10 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
-from errormotion.campaign import head
-from errormotion.campaign.limits import NO_MOTIONS, Limits, extent, steps_of, violations
-from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
-from errormotion.campaign.timeline import Timeline, follower
+from errormotion.campaign.sections import head
+from errormotion.campaign.sections.limits import NO_MOTIONS, Limits, extent, steps_of, violations
+from errormotion.campaign.sections.machine import completed, contradictions, limits_within, read_machine
+from errormotion.campaign.sections.timeline import Timeline, follower
 from errormotion.compensation.online.settings import Limits as OffsetLimits
 from errormotion.datasets import certificates
 from errormotion.datasets.files import tomlfile
@@ -508,9 +508,9 @@ def _limit_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[s
         return [f"{where}: {error}"]
     if steps is None and hasattr(plugins.get("methods", method), "programs"):
         return [f"{where}: {NO_MOTIONS.format(method)}, and it writes NC programs"]
-    told = violations(extent(steps), bench.limits) if steps else []
+    broken = violations(extent(steps), bench.limits) if steps else []
     tables = "[limits]" if bench.description is None else "[limits] and [machine]"
-    return [f"{where}: {text} ({tables} of {bench.source})" for text in told]
+    return [f"{where}: {text} ({tables} of {bench.source})" for text in broken]
 
 
 def _name_mistakes(test: TestTable, place: tuple[str | int, ...], earlier: list[str]) -> list[str]:

@@ -11,7 +11,7 @@ from errormotion import datasets, plugins
 from errormotion.campaign.files import parse_bench
 from errormotion.campaign.folder import RunFolder
 from errormotion.datasets.timing import between, later
-from errormotion.errors import DatasetError, RunError
+from errormotion.errors import BenchError, DatasetError, RunError
 from errormotion.instruments.simulators.virtual_world.described import NAME
 from errormotion.instruments.transports.address import parse_address
 
@@ -77,5 +77,8 @@ def machine_of(folder: RunFolder) -> VirtualMachine:
         raise RunError(f"{folder.path}: expected one virtual machine on the bench; found {names}")
     ((name, seed),) = found
     machine = VirtualMachine(plan.description if name == NAME and plan.description else name, seed=seed)
-    machine.start([Event(**event) for event in clock["schedule"]])
+    try:
+        machine.start([Event(**event) for event in clock["schedule"]])
+    except BenchError as error:
+        raise RunError(f"{folder.path / 'run.json'}: clock.schedule: {error}") from error
     return machine

@@ -9,8 +9,8 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
-from errormotion.campaign.raw_paths import is_runs_folder
-from errormotion.datasets.storage import reading
+from errormotion.campaign.storage.raw_paths import is_runs_folder
+from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError, RunError
 
 

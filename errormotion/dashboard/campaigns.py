@@ -7,6 +7,7 @@ import io
 import os
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -14,7 +15,7 @@ from typing import Any
 
 from errormotion.campaign.files import CampaignPlan, TestPlan
 from errormotion.campaign.folder import replace_text
-from errormotion.campaign.form.fields import Form, form_of, with_field
+from errormotion.campaign.form.fields import Form, form_of, with_field, with_test, without_test
 from errormotion.campaign.planning.expected import expected, planned
 from errormotion.campaign.planning.motions import beside_limits, headline, motions, picture
 from errormotion.dashboard.lab import NotFoundError
@@ -77,6 +78,14 @@ class Campaigns:
         except (OSError, UnicodeDecodeError) as error:
             raise BenchError(f"{self.folder / name}: cannot be read: {error}") from error
 
+    def with_test(self, name: str, text: str) -> Form:
+        """Return the form of a text to which a test was added."""
+        return self.form(name, with_test(self._short(text)))
+
+    def without_test(self, name: str, text: str, number: int) -> Form:
+        """Return the form of a text from which a test was removed."""
+        return self.form(name, without_test(self._short(text), number))
+
     def form(self, name: str, text: str, place: tuple[Key, ...] = (), written: str = "") -> Form:
         """Return the form of a text, after a field was changed where ``place`` is not empty.
 
@@ -87,8 +96,7 @@ class Campaigns:
         BenchError
             It names files that this page may not look at.
         """
-        if len(text) > LONGEST_TEXT:
-            raise BenchError(f"expected a campaign of at most {LONGEST_TEXT} characters; found {len(text)}")
+        text = self._short(text)
         if place:
             text = with_field(text, place, written)
         self._inside(name, text)
@@ -133,6 +141,12 @@ class Campaigns:
             raise BenchError(f"{path}: cannot be written: {error.strerror}") from error
         return path
 
+    @staticmethod
+    def _short(text: str) -> str:
+        if len(text) > LONGEST_TEXT:
+            raise BenchError(f"expected a campaign of at most {LONGEST_TEXT} characters; found {len(text)}")
+        return text
+
     def _path(self, name: str) -> Path:
         return self.folder / (name if NAME.fullmatch(name) else "new.toml")
 
@@ -140,10 +154,11 @@ class Campaigns:
         if self.control:
             return
         try:
-            known = set(_strings(parse_toml(self.read(name), "text")))
-            new = set(_strings(parse_toml(text, "text"))) - known
+            new = set(_strings(parse_toml(text, "text")))
         except ErrormotionError:
             return  # the form states what is wrong with it
+        with suppress(ErrormotionError):  # of a file that there is not, nothing is known
+            new -= set(_strings(parse_toml(self.read(name), "text")))
         for each in new:
             windows = PureWindowsPath(each)
             if PurePosixPath(each).is_absolute() or windows.drive or windows.root or ".." in windows.parts:

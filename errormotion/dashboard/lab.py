@@ -11,8 +11,8 @@ from pathlib import Path
 from errormotion.datasets.files.runfile import FILE
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
-from errormotion.record.entry import Entry, read_entry
-from errormotion.record.listing import DEEPEST, list_runs
+from errormotion.record.runs.entry import Entry, read_entry
+from errormotion.record.runs.listing import DEEPEST, list_runs
 from errormotion.record.text import FIELD, LONG
 from errormotion.report.text import DASH, rounded
 

@@ -10,7 +10,7 @@ import xarray as xr
 from markupsafe import Markup, escape
 
 from errormotion.errors import DatasetError
-from errormotion.report.turntable import Dots, Lines, Scene, draw, enlargement
+from errormotion.report.drawings.turntable import Dots, Lines, Scene, draw, enlargement
 
 LINEAR = ("EX", "EY", "EZ")
 PLACES = ("x", "y", "z")

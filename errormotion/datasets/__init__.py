@@ -7,7 +7,7 @@ from errormotion.datasets.provenance import hash_dataset
 from errormotion.datasets.results.accessor import Combination, ErrorMotion
 from errormotion.datasets.results.build import build_deviations, build_errors
 from errormotion.datasets.schemas import DOF, SCHEMA
-from errormotion.datasets.storage import load, save
+from errormotion.datasets.storage.disk import load, save
 from errormotion.datasets.validation import validate, violations
 
 __all__ = [

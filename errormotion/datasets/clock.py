@@ -1,4 +1,4 @@
-"""Time across interruptions: how long a record has run, on clocks that nobody sets.
+"""Time across interruptions: how long a record has run, on monotonic clocks.
 
 The wall clock of a computer may be set, by a person or by a time server, while a record runs and while it is
 interrupted. The time since the computer started (suspension included) is not set by anybody, but ends with a restart.

@@ -10,7 +10,7 @@ import xarray as xr
 from errormotion import plugins
 from errormotion.datasets.files.tomlfile import nearest, read_toml
 from errormotion.datasets.schemas import raw_schemas, variants
-from errormotion.datasets.storage import save
+from errormotion.datasets.storage.disk import save
 from errormotion.datasets.text.log_import import read_log
 from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError

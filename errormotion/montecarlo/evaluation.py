@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from errormotion import __version__, datasets, plugins
 from errormotion.arrays import Array
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.errors import MethodError, RunError
 from errormotion.montecarlo.adaptive import block_size, propagate, summarise
 from errormotion.montecarlo.intervals import fewest

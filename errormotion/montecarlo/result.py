@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets import hash_dataset
-from errormotion.datasets.compression import as_stored
 from errormotion.datasets.schemas import DOF, ERROR_ROWS
+from errormotion.datasets.storage.compression import as_stored
 from errormotion.errors import DatasetError
 from errormotion.montecarlo.adaptive import Summary
 from errormotion.montecarlo.validation import NOT_VALIDATED, UNDECIDED, VALIDATED, WORDS, Validation

@@ -1,7 +1,7 @@
 """A machine's record: every run of one or more folders with its figures of merit.
 
-``entry`` reads what a run folder states, ``index`` keeps it for the next call, ``listing`` selects, ``history``
-follows one figure over time.
+``runs`` reads what run folders state, keeps it for the next call, and selects; ``history`` follows one figure over
+time.
 """
 
 from errormotion.record.tree import open_run

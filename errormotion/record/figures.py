@@ -19,7 +19,7 @@ import numpy as np
 
 from errormotion.errors import DatasetError, ErrormotionError, RunError
 from errormotion.plugins import FigureOfMerit
-from errormotion.record.entry import Entry
+from errormotion.record.runs.entry import Entry
 from errormotion.record.series import Series
 from errormotion.tolerances.conformity import matches
 

@@ -17,8 +17,8 @@ from errormotion.datasets.files.events import instant
 from errormotion.errors import DatasetError, RunError
 from errormotion.record.control import chart
 from errormotion.record.figures import follow
-from errormotion.record.listing import Listing, Note
 from errormotion.record.regression import COVERAGE
+from errormotion.record.runs.listing import Listing, Note
 from errormotion.record.series import Series
 from errormotion.record.steps import FALSE_DEPARTURES, FALSE_STEPS, Model, Step, model_of
 

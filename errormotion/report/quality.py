@@ -11,8 +11,8 @@ import numpy as np
 import xarray as xr
 
 from errormotion.report.document import Block, Cell, Table, Text
+from errormotion.report.drawings.series import minutes_of
 from errormotion.report.fields import remarks
-from errormotion.report.series import minutes_of
 from errormotion.report.text import DASH, finite, fixed, integer, listed, minutes, percent
 
 

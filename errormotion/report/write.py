@@ -14,7 +14,7 @@ import xarray as xr
 from errormotion import plugins
 from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError, RunError
-from errormotion.report import generic, provenance
+from errormotion.report import provenance
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Part, Section, Source, Table
 from errormotion.report.exports import pdf, xlsx
@@ -24,7 +24,7 @@ from errormotion.report.page.assemble import Page, page
 from errormotion.report.page.head import Head, head_of, moment
 from errormotion.report.page.language import Catalogue
 from errormotion.report.page.verdict import verdict
-from errormotion.report.parts import beams
+from errormotion.report.parts import beams, generic
 from errormotion.report.text import DASH, written_in
 from errormotion.tolerances.conformity import Conformity, judge
 from errormotion.tolerances.table import Tolerances, from_run
@@ -329,7 +329,7 @@ def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = 
 def belonging(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
     """Return the datasets beside a file of errors that state its hash (`errors_hash`), such as an evaluation of it."""
     from errormotion.datasets import hash_dataset, load
-    from errormotion.datasets.storage import reading
+    from errormotion.datasets.storage.disk import reading
 
     beside = {path: load(path) for path in sorted(file.parent.glob(f"{glob.escape(file.stem)}.*.nc"))}
     stated = {path: ds for path, ds in beside.items() if "errors_hash" in ds.attrs}

@@ -62,14 +62,14 @@ def run_checks(subject: Subject) -> list[CheckResult]:
 def checks_for(subject: Subject) -> Sequence[Check[Any]]:
     """Return the checks for a subject of this kind, in the order in which they run."""
     if isinstance(subject, InstrumentSubject):
-        from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
+        from errormotion.testing.checks.instrument import INSTRUMENT_CHECKS
 
         return INSTRUMENT_CHECKS
     if isinstance(subject, CompensatorSubject):
-        from errormotion.testing.compensator_checks import COMPENSATOR_CHECKS
+        from errormotion.testing.checks.compensator import COMPENSATOR_CHECKS
 
         return COMPENSATOR_CHECKS
-    from errormotion.testing.method_checks import METHOD_CHECKS
+    from errormotion.testing.checks.method import METHOD_CHECKS
 
     return METHOD_CHECKS
 

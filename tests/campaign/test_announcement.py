@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
-from errormotion.campaign.limits import Limits, announcement
+from errormotion.campaign.sections.limits import Limits, announcement
 from errormotion.cli.app import app
 from errormotion.plugins import Step
 
@@ -40,15 +40,15 @@ class Record(runner.Quiet):
     """Keeps what is reported, in order; stops before the bench is opened."""
 
     def __init__(self) -> None:
-        self.told: list[str] = []
+        self.reported: list[str] = []
 
     def announce(self, text: str) -> None:
         """Keep."""
-        self.told.append(text)
+        self.reported.append(text)
 
     def stage(self, name: str, total: float | None = None) -> None:
         """Stop."""
-        self.told.append(name)
+        self.reported.append(name)
         raise KeyboardInterrupt
 
 
@@ -57,7 +57,7 @@ def test_every_test_is_announced_before_the_bench_is_opened(plan: Callable[..., 
     with pytest.raises(KeyboardInterrupt):
         runner.run(plan('name = "a"', 'name = "b"'), progress=record)
     stated = "states no motions; no order to the machine is allowed."
-    assert record.told == [f"a: {stated}", f"b: {stated}", "opening the bench"]
+    assert record.reported == [f"a: {stated}", f"b: {stated}", "opening the bench"]
 
 
 def test_a_resumed_campaign_announces_what_is_left(
@@ -70,7 +70,7 @@ def test_a_resumed_campaign_announces_what_is_left(
     record = Record()
     with pytest.raises(KeyboardInterrupt):
         runner.resume(campaign, progress=record)
-    assert [text.partition(":")[0] for text in record.told] == ["b", "opening the bench"]
+    assert [text.partition(":")[0] for text in record.reported] == ["b", "opening the bench"]
 
 
 def test_the_command_prints_it_where_no_terminal_is(lab: None, write: Callable[..., Path]) -> None:
@@ -84,7 +84,7 @@ def test_the_probing_example_announces_its_path() -> None:
     record = Record()
     with pytest.raises(KeyboardInterrupt):
         runner.run(campaign, progress=record)
-    (line, _) = record.told
+    (line, _) = record.reported
     assert "\n" not in line
     assert all(axis in line for axis in (" X ", " Y ", " Z "))
     assert "spindle up to" in line

@@ -44,7 +44,7 @@ def raws(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture
 def identify(raws: list[Path], tmp_path: Path) -> Identify:
-    """Identify the records, one after another unless told otherwise."""
+    """Identify the records, one after another unless stated otherwise."""
 
     def call(chosen: list[Path] | None = None, **keywords: object) -> list[Outcome]:
         options: dict[str, object] = {"scheduler": "sync"} | keywords
@@ -131,13 +131,13 @@ def test_worker_that_came_later_with_another_version_refuses_its_task(
     assert all("expected errormotion in version 99.0" in outcome.reason for outcome in outcomes)
 
 
-def test_cluster_that_is_not_there_is_told(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cluster_that_is_not_there_is_reported(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallel, "CLUSTER_TIMEOUT", 0.3)
     with pytest.raises(RunError, match="none answers"):
         identify(scheduler="tcp://127.0.0.1:9")
 
 
-def test_cluster_without_workers_is_told(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cluster_without_workers_is_reported(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallel, "CLUSTER_TIMEOUT", 2.0)
     with (
         local_cluster(0) as empty,
@@ -205,7 +205,7 @@ def test_plugin_that_breaks_on_one_run_harms_no_other(
     assert "Traceback" in outcomes[1].traceback
 
 
-def test_process_that_dies_is_told(raws: list[Path], identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_process_that_dies_is_reported(raws: list[Path], identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch, "_identify", lambda *_: os._exit(1))
     (outcome,) = identify(raws[:1], scheduler="processes", workers=1)
     assert "the process ended unexpectedly" in outcome.reason
@@ -244,7 +244,7 @@ def test_folder_of_runs_means_those_of_the_method(plan: Callable[..., CampaignPl
         identify_runs([runs], "spindle_drift", settings(), tmp_path / "none", scheduler="sync")
 
 
-def test_mistakes_are_told_before_anything_is_done(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
+def test_mistakes_are_reported_before_anything_is_done(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="found 'thread'"):
         identify(scheduler="thread")
     with pytest.raises(RunError, match="--workers: expected 1 or more"):

@@ -35,7 +35,7 @@ def test_offers_its_instruments_by_kind_and_closes_them(bench: Callable[..., Ben
     assert record["settings"]["block"] == 100
 
 
-def test_failed_connections_are_told_as_a_tree_and_nothing_stays_open(bench: Callable[..., BenchPlan]) -> None:
+def test_failed_connections_are_reported_as_a_tree_and_nothing_stays_open(bench: Callable[..., BenchPlan]) -> None:
     with pytest.raises(BenchError) as caught, OpenBench(bench(SECOND + "refuses = true")):
         pass
     assert str(caught.value).splitlines() == [

@@ -1,5 +1,6 @@
 """Damaged bench and campaign files: every mutant is read, or refused with an error of the project, in bounded time."""
 
+import json
 from pathlib import Path
 
 import mutants
@@ -37,4 +38,14 @@ def test_damaged_campaigns(tmp_path: Path, name: str) -> None:
 def test_a_run_json_that_is_nested_too_deep_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text('{"schema": "errormotion.run/1", "a": ' + "[" * 5000)
     with pytest.raises(RunError, match=r"run\.json: is not valid JSON"):
+        RunFolder.open(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "event", [{"time": [1]}, {"time": "1"}, {"time": -1}, {}, {"time": 1, "speed": 1}, {"time": 1, "spindle_speed": []}]
+)
+def test_a_schedule_that_is_none_is_named(tmp_path: Path, event: dict[str, object]) -> None:
+    content = {"schema": "errormotion.run/1", "clock": {"start": "", "time": 0, "schedule": [event]}}
+    (tmp_path / "run.json").write_text(json.dumps(content))
+    with pytest.raises(RunError, match=r"run\.json: [\s\S]*clock\.schedule"):
         RunFolder.open(tmp_path)

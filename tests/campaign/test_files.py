@@ -1,4 +1,4 @@
-"""Every mistake in a bench or campaign file is told at once: file, key, expected, found, nearest."""
+"""Every mistake in a bench or campaign file is reported at once: file, key, expected, found, nearest."""
 
 import shutil
 from collections.abc import Callable
@@ -34,7 +34,7 @@ def test_good_files_carry_settings_in_si_and_defaults(write: Callable[..., Path]
     assert plan.bench.instruments[0].settings.rate == 20000.0
 
 
-def test_all_mistakes_of_a_bench_file_are_told_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_of_a_bench_file_are_reported_at_once(tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     path.write_text(
         'schema = "errormotion.bench/2"\nname = "Table"\n'
@@ -52,7 +52,7 @@ def test_all_mistakes_of_a_bench_file_are_told_at_once(tmp_path: Path) -> None:
     assert block.startswith("instruments.b.blok: unknown key; did you mean 'block'?")
 
 
-def test_all_mistakes_of_a_campaign_file_are_told_at_once(write: Callable[..., Path]) -> None:
+def test_all_mistakes_of_a_campaign_file_are_reported_at_once(write: Callable[..., Path]) -> None:
     path = write('name = "a"\nsettings = {level = 25, cuont = 3}', 'name = "a"\ninputs = {zero = "first"}')
     level, unknown, twice, earlier = complaints(path, load_campaign)
     assert level == "test[0].settings.level: expected a length with its unit, such as '5 mm'; found 25"
@@ -139,13 +139,13 @@ def test_missing_file_is_named(tmp_path: Path) -> None:
         load_bench(tmp_path / "nowhere.toml")
 
 
-def test_broken_toml_is_told_with_its_line(write: Callable[..., Path]) -> None:
+def test_broken_toml_is_reported_with_its_line(write: Callable[..., Path]) -> None:
     path = write('name = "a')
     with pytest.raises(BenchError, match=r"campaign\.toml, line 7, column 10: not TOML"):
         load_campaign(path)
 
 
-def test_a_calibration_that_is_not_there_is_told_when_the_campaign_is_read(tmp_path: Path) -> None:
+def test_a_calibration_that_is_not_there_is_reported_when_the_campaign_is_read(tmp_path: Path) -> None:
     source = Path(__file__).parents[2] / "examples" / "virtual_beam"
     shutil.copy(source / "bench.toml", tmp_path)
     shutil.copy(source / "campaign.toml", tmp_path)

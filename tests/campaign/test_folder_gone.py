@@ -12,8 +12,8 @@ import xarray as xr
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, parse_bench
 from errormotion.campaign.monitor.watch import Monitor
-from errormotion.campaign.recorder import Recorder
-from errormotion.campaign.store import RawStore
+from errormotion.campaign.storage.recorder import Recorder
+from errormotion.campaign.storage.store import RawStore
 from errormotion.errors import RunError
 
 GONE = "is gone: it was moved or deleted while data were written to it"

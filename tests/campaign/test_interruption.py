@@ -14,7 +14,7 @@ import pytest
 from errormotion import datasets
 from errormotion.campaign import runner
 from errormotion.campaign.folder import RunFolder, list_runs
-from errormotion.campaign.store import committed_length
+from errormotion.campaign.storage.store import committed_length
 from errormotion.datasets.clock import joins
 from errormotion.datasets.provenance import of
 

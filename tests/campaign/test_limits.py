@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from errormotion.campaign.files import load_campaign
-from errormotion.campaign.limits import Limits, extent, violations
+from errormotion.campaign.sections.limits import Limits, extent, violations
 from errormotion.errors import BenchError
 from errormotion.plugins import Step
 
@@ -56,7 +56,7 @@ def test_a_test_within_the_limits_is_accepted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("limits", "told"),
+    ("limits", "message"),
     [
         ('X = ["0 m", "3 m"]', r"test\[0\]: X would go from .* mm to 36.* mm; its limits are 0 mm and 3000 mm"),
         ('Z = ["200 mm", "1 m"]', r"Z would go from 120 mm to .* mm; its limits are 200 mm and 1000 mm"),
@@ -64,21 +64,21 @@ def test_a_test_within_the_limits_is_accepted(tmp_path: Path) -> None:
         ('spindle_speed = "8000 /min"', r"the spindle would turn at 9000 /min; its limit is 8000 /min"),
     ],
 )
-def test_a_test_that_would_leave_them_is_refused_when_it_is_read(tmp_path: Path, limits: str, told: str) -> None:
-    with pytest.raises(BenchError, match=told):
+def test_a_test_that_would_leave_them_is_refused_when_it_is_read(tmp_path: Path, limits: str, message: str) -> None:
+    with pytest.raises(BenchError, match=message):
         load_campaign(campaign(tmp_path, limits))
 
 
 @pytest.mark.parametrize(
-    ("limits", "told"),
+    ("limits", "message"),
     [
         ('X = ["4 m", "0 m"]', "X: expected the lowest position, then the highest"),
         ("X = [0, 4]", r"limits\.X\[0\]: expected a length with its unit, such as '5 mm'; found 0"),
         ('W = ["0 m", "4 m"]', r"limits\.W: unknown key"),
     ],
 )
-def test_limits_without_sense_are_told(tmp_path: Path, limits: str, told: str) -> None:
-    with pytest.raises(BenchError, match=told):
+def test_limits_without_sense_are_reported(tmp_path: Path, limits: str, message: str) -> None:
+    with pytest.raises(BenchError, match=message):
         load_campaign(campaign(tmp_path, limits))
 
 
@@ -98,7 +98,7 @@ def test_the_extent_is_what_the_steps_say() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "message"),
     [
         (
             '    { centre = ["3500 mm", "700 mm", "200 mm"] },\n',
@@ -119,10 +119,10 @@ def test_the_extent_is_what_the_steps_say() -> None:
     ids=["two balls", "no cycle", "no time to warm up"],
 )
 def test_a_campaign_that_cannot_be_made_is_refused_when_it_is_read(
-    tmp_path: Path, old: str, new: str, told: str
+    tmp_path: Path, old: str, new: str, message: str
 ) -> None:
     path = campaign(tmp_path, "")
     assert old in CAMPAIGN
     path.write_text(CAMPAIGN.replace(old, new))
-    with pytest.raises(BenchError, match=told):
+    with pytest.raises(BenchError, match=message):
         load_campaign(path)

@@ -15,8 +15,8 @@ from errormotion.cli.app import app
 from errormotion.cli.demo import probing
 from errormotion.errors import BenchError, InstrumentError, RunError
 from errormotion.plugins import kind_registry
+from errormotion.testing.checks.method import METHOD_CHECKS
 from errormotion.testing.kit import run_check
-from errormotion.testing.method_checks import METHOD_CHECKS
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted(

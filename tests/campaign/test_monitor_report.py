@@ -102,7 +102,7 @@ def test_gaps_are_counted_drawn_and_listed(html):
     assert "No answer: control" not in html
 
 
-def test_why_a_temperature_is_unknown_is_told(html):
+def test_why_a_temperature_is_unknown_is_reported(html):
     found = {row[0]: row for row in rows(html, "Temperatures in °C")}
     assert found["motor"][7].startswith("21.50 %")
     assert found["ambient"][7].startswith("100 %")

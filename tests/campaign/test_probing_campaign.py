@@ -16,7 +16,7 @@ from errormotion.campaign import runner
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, list_runs
-from errormotion.campaign.store import committed_length
+from errormotion.campaign.storage.store import committed_length
 from errormotion.errors import InstrumentTimeoutError, RunError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import reset, world

@@ -14,8 +14,8 @@ from errormotion import datasets, plugins
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, list_runs
-from errormotion.campaign.journal import journal
-from errormotion.campaign.store import RawStore
+from errormotion.campaign.storage.journal import journal
+from errormotion.campaign.storage.store import RawStore
 from errormotion.errors import BenchError, RunError
 from errormotion.report import write_run_report
 
@@ -253,7 +253,9 @@ def test_method_without_data_is_a_failure(plan: Plan) -> None:
         runner.run(plan('name = "a"\nsettings = {count = 0}'))
 
 
-def test_broken_run_json_is_told_and_harms_no_other_run(plan: Plan, tmp_path: Path, write: Callable[..., Path]) -> None:
+def test_broken_run_json_is_reported_and_affects_no_other_run(
+    plan: Plan, tmp_path: Path, write: Callable[..., Path]
+) -> None:
     first, _ = runner.run(plan('name = "a"', 'name = "b"'))
     (first.path / "run.json").write_text("{")
     with pytest.raises(RunError, match=r"run\.json: is not valid JSON"):

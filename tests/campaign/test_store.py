@@ -9,8 +9,8 @@ import pytest
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.campaign import store as store_module
-from errormotion.campaign.store import RawStore, committed_length
+from errormotion.campaign.storage import store as store_module
+from errormotion.campaign.storage.store import RawStore, committed_length
 from errormotion.errors import RunError
 
 RATE = 1000.0

@@ -126,7 +126,7 @@ def test_a_beam_that_breaks_costs_nothing_but_time(lab):
     assert np.abs(miss(run)[0]).max() < 4
 
 
-def test_a_tracker_that_nobody_moves_is_told_and_not_measured(lab):
+def test_a_tracker_that_nobody_moves_is_reported_and_not_measured(lab):
     plan, runs = lab()
     operator = Operator()
 

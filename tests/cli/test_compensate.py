@@ -45,11 +45,11 @@ def test_a_table_is_written_and_its_errors_are_printed(run, folder: Path) -> Non
 
 
 def test_json_has_files_and_figures(run, folder: Path) -> None:
-    told = run(
+    reported = run(
         folder / "volume.nc", "--for", "linuxcnc", "--axis", "y", "--step", "0.1 m", "--at", "-100,0,300",
         "--functional-point", "0,0,-150", "-o", "tables", "--json",
     )  # fmt: skip
-    answer = json.loads(told.stdout)
+    answer = json.loads(reported.stdout)
     assert answer["ok"] is True
     assert answer["files"] == ["tables/C-frame-610-Y.comp"]
     assert Path(answer["files"][0]).exists()
@@ -64,7 +64,7 @@ def test_json_has_files_and_figures(run, folder: Path) -> None:
         (("y.nc", "--for", "fagor", "--axis", "Y"), "No format of tables 'fagor'; there are: fanuc, generic"),
         (("y.nc", "--for", "siemen", "--axis", "Y"), "Did you mean 'siemens'"),
         (("y.nc", "--for", "generic", "--axis", "Q"), "axis: expected X, Y or Z; found 'Q'"),
-        (("y.nc", "--for", "generic", "--axis", "X"), "no positions of X"),
+        (("y.nc", "--for", "generic", "--axis", "X"), "y.nc: The errors have no positions of X"),
         (("y.nc", "--for", "generic", "--axis", "Y", "--step", "25"), "--step 25: expected a length with its unit"),
         (("y.nc", "--for", "generic", "--axis", "Y", "--step", "-5mm"), "a length above 0"),
         (("y.nc", "--for", "generic", "--axis", "Y", "--chain", "bed-X"), "expected a chain"),
@@ -78,21 +78,21 @@ def test_json_has_files_and_figures(run, folder: Path) -> None:
 def test_what_makes_no_table_is_refused_and_nothing_is_written(
     run, folder: Path, tmp_path: Path, arguments: tuple[str, ...], message: str
 ) -> None:
-    told = run(folder / arguments[0], *arguments[1:], "--out", "tables")
-    assert told.exit_code == 1, told.output
-    assert message in told.stderr
+    reported = run(folder / arguments[0], *arguments[1:], "--out", "tables")
+    assert reported.exit_code == 1, reported.output
+    assert message in reported.stderr
     assert not Path("tables").exists()
 
 
 def test_places_that_are_none_are_a_mistake_of_use(run, folder: Path) -> None:
-    told = run(folder / "y.nc", "--for", "generic", "--axis", "Y", "--at", "1,2")
-    assert told.exit_code == 2
-    assert "--at 1,2: expected three numbers in mm" in told.stderr
+    reported = run(folder / "y.nc", "--for", "generic", "--axis", "Y", "--at", "1,2")
+    assert reported.exit_code == 2
+    assert "--at 1,2: expected three numbers in mm" in reported.stderr
 
 
 def test_a_file_that_exists_is_kept(run, folder: Path) -> None:
     arguments = (folder / "y.nc", "--for", "generic", "--axis", "Y")
     assert run(*arguments).exit_code == 0
-    told = run(*arguments)
-    assert told.exit_code == 1
-    assert "C-frame-610-Y.csv exists already" in told.stderr
+    reported = run(*arguments)
+    assert reported.exit_code == 1
+    assert "C-frame-610-Y.csv exists already" in reported.stderr

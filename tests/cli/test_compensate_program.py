@@ -74,6 +74,7 @@ def test_says_what_was_done(part: Path, volume: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
+        ((), "part.ngc: "),
         ((), "G54 is not known"),
         (("--offset", "G60=0,0,0"), "G60"),
         (("--offset", "G54=0,0,0", "--tolerance", "1"), "--tolerance"),

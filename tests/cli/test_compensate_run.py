@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import load_bench
 from errormotion.cli.app import app
 from errormotion.compensation.online.follower import State

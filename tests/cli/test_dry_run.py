@@ -21,7 +21,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_path_duration_and_limits_are_told_and_drawn(folder: Path) -> None:
+def test_path_duration_and_limits_are_reported_and_drawn(folder: Path) -> None:
     result = CliRunner().invoke(app, ["run", "virtual_probing/monday.toml", "--dry-run", "--out", "pictures"])
     assert result.exit_code == 0, result.output
     assert result.stdout.startswith("monday: 3 h 0")

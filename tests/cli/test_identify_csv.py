@@ -48,25 +48,25 @@ def test_text_gives_the_errors_that_the_same_numbers_give_as_netcdf(
     assert b.attrs["method"] == "spindle_drift"
 
 
-def test_mistake_in_the_text_is_told_with_its_place(run: Run, tmp_path: Path) -> None:
+def test_mistake_in_the_text_is_reported_with_its_place(run: Run, tmp_path: Path) -> None:
     text = "# schema = errormotion.raw.inclination/1\nreading [mm],reference [mm],inclination,rotation [deg]\n1,1,0,0\n"
     (tmp_path / "readings.csv").write_text(text)
-    told = run("identify", "readings.csv", "--method", "spindle_drift", "--out", "errors.nc", code=1).stderr
-    assert "line 2: column 3 'inclination': expected its unit in brackets, such as 'inclination [rad]'" in told
+    reported = run("identify", "readings.csv", "--method", "spindle_drift", "--out", "errors.nc", code=1).stderr
+    assert "line 2: column 3 'inclination': expected its unit in brackets, such as 'inclination [rad]'" in reported
     assert not (tmp_path / "errors.nc").exists()
 
 
 def test_errors_name_no_method_to_identify_them(run: Run, raw: Path) -> None:
     run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc")
-    told = run("identify", "errors.nc", "--out", "again.nc", code=1).stderr
-    assert "expected a raw dataset of a method; found schema errormotion.errors/1" in told
+    reported = run("identify", "errors.nc", "--out", "again.nc", code=1).stderr
+    assert "expected a raw dataset of a method; found schema errormotion.errors/1" in reported
 
 
 def test_method_of_a_folder_of_runs_has_to_be_named(run: Run, tmp_path: Path) -> None:
     (tmp_path / "runs" / "one").mkdir(parents=True)
     (tmp_path / "runs" / "one" / "run.json").write_text("{}")
-    told = run("identify", "runs", "--out", "errors", code=1).stderr
-    assert "is a folder of runs; name the method with --method" in told
+    reported = run("identify", "runs", "--out", "errors", code=1).stderr
+    assert "is a folder of runs; name the method with --method" in reported
 
 
 @pytest.mark.parametrize(
@@ -76,12 +76,12 @@ def test_method_of_a_folder_of_runs_has_to_be_named(run: Run, tmp_path: Path) ->
 def test_check_bar_alone_is_fitted_and_tells_no_beam(run: Run, name: str, radius: float, left_out: int) -> None:
     published = Path(__file__).parents[2] / "examples" / "check_bar" / f"{name}.csv"
     run("validate", published)
-    told = run("identify", published, "--out", "errors.nc").stdout
-    line = next(line for line in told.splitlines() if line.startswith("radius of the check bar"))
+    reported = run("identify", published, "--out", "errors.nc").stdout
+    line = next(line for line in reported.splitlines() if line.startswith("radius of the check bar"))
     value, unit = line.split()[-3], line.split()[-1]
     digits = len(value.partition(".")[2])
     assert (float(value), unit) == (pytest.approx(radius, abs=0.51 * 10 ** -min(digits, 4)), "mm")
-    assert "the beam is taken as stated, without uncertainty, and its errors are unknown" in told
+    assert "the beam is taken as stated, without uncertainty, and its errors are unknown" in reported
     errors = datasets.load("errors.nc")
     assert datasets.violations(errors) == []
     assert np.isnan(errors.em.twist()).all()

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import Result
 
 from errormotion.campaign.files import load_bench, load_campaign
-from errormotion.cli.commands.init import command
+from errormotion.cli.commands.campaigns.init import command
 from errormotion.datasets.files.tomlfile import parse_toml
 from errormotion.datasets.files.tomltext import key, value
 

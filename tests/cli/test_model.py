@@ -41,8 +41,8 @@ def test_a_model_is_made_used_and_checked(run, folder: Path) -> None:
     predicted = run("predict", "m.nc", folder / "2.nc", "-o", "p.nc")
     assert predicted.stdout.startswith("p.nc: errors of spindle at 25 times by thermal_model")
     assert datasets.load("p.nc").attrs["method"] == "thermal_model"
-    told = run("check", "m.nc", folder / "2.nc", "--json")
-    answer = json.loads(told.stdout)
+    reported = run("check", "m.nc", folder / "2.nc", "--json")
+    answer = json.loads(reported.stdout)
     assert answer["removed"]["EZ"] > 0.9
     assert "removed/%" in run("check", "m.nc", folder / "2.nc").stdout
 
@@ -57,7 +57,7 @@ def test_a_model_is_made_used_and_checked(run, folder: Path) -> None:
         (("check", "{0}/0.nc", "{0}/1.nc"), "expected schema errormotion.model.thermal/1"),
     ],
 )
-def test_what_cannot_be_done_is_told(run, folder: Path, arguments: tuple[str, ...], message: str) -> None:
+def test_what_cannot_be_done_is_reported(run, folder: Path, arguments: tuple[str, ...], message: str) -> None:
     result = run(*(text.format(folder) for text in arguments))
     assert result.exit_code == 1
     assert message in result.stderr

@@ -36,9 +36,9 @@ def run(*arguments: str):
 
 
 def test_a_check_writes_its_page_and_says_where(folder: Path) -> None:
-    told = run("model", "check", "m.nc", "third.nc", "--report", "page.html")
-    assert told.exit_code == 0, told.output
-    assert told.stdout.splitlines()[-1] == "page.html"
+    reported = run("model", "check", "m.nc", "third.nc", "--report", "page.html")
+    assert reported.exit_code == 0, reported.output
+    assert reported.stdout.splitlines()[-1] == "page.html"
     assert "Thermal model compared with measurement" in (folder / "page.html").read_text(encoding="utf-8")
     answer = json.loads(run("model", "check", "m.nc", "third.nc", "--report", "page.html", "--json").stdout)
     assert answer["report"] == "page.html"
@@ -46,9 +46,9 @@ def test_a_check_writes_its_page_and_says_where(folder: Path) -> None:
 
 
 def test_a_page_is_not_written_over_something_else(folder: Path) -> None:
-    told = run("model", "check", "m.nc", "third.nc", "--report", "third.nc")
-    assert told.exit_code == 1
-    assert "third.nc: expected a name that ends in .html" in told.output
+    reported = run("model", "check", "m.nc", "third.nc", "--report", "third.nc")
+    assert reported.exit_code == 1
+    assert "third.nc: expected a name that ends in .html" in reported.output
 
 
 def test_without_the_option_there_is_no_page(folder: Path) -> None:
@@ -72,8 +72,8 @@ places = {{ spindle = ["0 mm", "0 mm", "400 mm"] }}
     watched = run("monitor", "bench.toml", "--interval", "500 ms", "--duration", "2 s", "--json")
     assert watched.exit_code == 0, watched.output
     log = next((folder / "runs").glob("*monitor*"))
-    told = run("report", str(log), "--out", "log.html")
-    assert told.exit_code == 0, told.output
+    reported = run("report", str(log), "--out", "log.html")
+    assert reported.exit_code == 0, reported.output
     text = (folder / "log.html").read_text(encoding="utf-8")
     assert "Log of a monitor" in text
     assert "SIMULATED DATA" in text

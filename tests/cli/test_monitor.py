@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from errormotion.campaign.monitor.watch import Snapshot
 from errormotion.cli.app import app
-from errormotion.cli.commands.monitor import LEAST_SPAN, Screen, clock
+from errormotion.cli.commands.instruments.monitor import LEAST_SPAN, Screen, clock
 from errormotion.cli.curves import bars
 
 BENCH = """\
@@ -58,7 +58,7 @@ def test_the_end_says_where_the_log_is(bench: Path) -> None:
         (["--duration", "0 s"], "--duration: expected more than 0 s; found '0 s'"),
     ],
 )
-def test_a_time_without_sense_is_told(bench: Path, arguments: list[str], message: str) -> None:
+def test_a_time_without_sense_is_reported(bench: Path, arguments: list[str], message: str) -> None:
     result = CliRunner().invoke(app, ["monitor", str(bench), *arguments])
     assert result.exit_code == 1
     assert message in result.stderr
@@ -95,8 +95,8 @@ def test_the_page_shows_temperatures_parameters_alarms_and_who_is_silent() -> No
     assert spindle[:6] == ["spindle", "26.00", "+6.00", "+12.00", "20.00", "26.00"]
     assert next(line for line in lines if line.startswith("column")).split()[:2] == ["column", "open"]
     text = "\n".join(lines)
-    for told in ("X 100.000  Y 0.000  Z -50.000 mm", "12000 /min", "1500 mm/min", "warm.ngc", "spindle hot"):
-        assert told in text
+    for reported in ("X 100.000  Y 0.000  Z -50.000 mm", "12000 /min", "1500 mm/min", "warm.ngc", "spindle hot"):
+        assert reported in text
     assert "far is silent: no answer" in text
     assert "rows without an answer: far 7" in text
 

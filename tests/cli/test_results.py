@@ -87,6 +87,15 @@ def test_export_writes_a_table_in_field_units(run: Run, tmp_path: Path) -> None:
     xr.testing.assert_identical(datasets.load(tmp_path / "out.nc"), errors())
 
 
+def test_what_holds_no_errors_is_named_and_nothing_is_written(run: Run, tmp_path: Path) -> None:
+    comparison = datasets.load(Path(__file__).parents[1] / "data" / "datasets" / "comparison.nc")
+    datasets.save(comparison, tmp_path / "other.nc")
+    for out in ("out.csv", "out.nc"):
+        told = run("export", "other.nc", "-o", out, code=1)
+        assert "other.nc: '.em" in told.stderr
+        assert not (tmp_path / out).exists()
+
+
 def test_texts_of_strangers_are_no_formulas(run: Run, tmp_path: Path) -> None:
     datasets.save(errors(("=1+1", "<b>&")), tmp_path / "errors.nc")
     run("export", "errors.nc", "-o", "out.csv")

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from errormotion import plugins
 from errormotion.campaign.files import parse_bench
 from errormotion.cli.app import app
-from errormotion.cli.commands import simulate
-from errormotion.cli.commands.plugins import group_of
+from errormotion.cli.commands.instruments import simulate
+from errormotion.cli.commands.plugins.listing import group_of
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.line_profiler.keyence_ljx.driver import KeyenceLJX
 from errormotion.instruments.thermometer.dcon import DconSettings, DconTemperature

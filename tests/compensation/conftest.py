@@ -46,8 +46,8 @@ def warm_up() -> Callable[..., xr.Dataset]:
         for k, name in enumerate(DOF):
             ds[name] = ds[name] + np.where(ds["time"] > 0, NOISE[k] * rng.normal(size=ds.sizes["time"]), 0.0)
         ds["covariance"] = (ds["covariance"].dims, covariance)
-        told = json.loads(ds.attrs["provenance"]) | {"instruments": [{"address": f"twin://{kind}?seed={seed}"}]}
-        return ds.assign_attrs(provenance=json.dumps(told))
+        reported = json.loads(ds.attrs["provenance"]) | {"instruments": [{"address": f"twin://{kind}?seed={seed}"}]}
+        return ds.assign_attrs(provenance=json.dumps(reported))
 
     return measured
 

@@ -1,4 +1,4 @@
-"""The effect of a compensation: intervals that hold the true reduction, and what a reader is told."""
+"""The effect of a compensation: intervals that hold the true reduction, and what the page states."""
 
 from __future__ import annotations
 
@@ -130,6 +130,13 @@ def test_a_source_that_both_share_is_one_draw() -> None:
     shared = effect(warm_up(30, expansion="bar 7"), warm_up(15, start=LATER, expansion="bar 7")).part("EZ").reduction
     assert shared.value == pytest.approx(0.5, abs=0.01) == pytest.approx(alone.value, abs=0.01)
     assert shared.high - shared.low < 0.8 * (alone.high - alone.low)
+
+
+def test_a_result_may_state_references_without_identities() -> None:
+    after = warm_up(15, start=LATER)
+    states = {"source_reference": ("source", np.ones(after.sizes["source"], np.int8))}
+    after = after.drop_vars("source_id", errors="ignore").assign_coords(states)
+    assert effect(warm_up(30), after).part("EZ").reference > 0
 
 
 def test_results_of_different_days_have_one_time_0() -> None:

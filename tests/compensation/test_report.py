@@ -64,12 +64,12 @@ def checked(model, warm_ups, tmp_path_factory):
 
 def test_figures_of_the_check_stand_on_the_page(checked):
     found, html = checked
-    told = {row[0]: row[1:] for row in rows(html, "Root mean square of the measured errors")}
+    reported = {row[0]: row[1:] for row in rows(html, "Root mean square of the measured errors")}
     for i, name in enumerate(DOF):
-        assert number(told[name][1]) == pytest.approx(found.rms[i] / SIZE[i], abs=0.006)
-        assert number(told[name][2]) == pytest.approx(found.remaining[i] / SIZE[i], abs=0.006)
-        assert told[name][3] == fixed(100 * found.removed[i], 0)
-        assert told[name][4] == fixed(100 * found.held[i], 0)
+        assert number(reported[name][1]) == pytest.approx(found.rms[i] / SIZE[i], abs=0.006)
+        assert number(reported[name][2]) == pytest.approx(found.remaining[i] / SIZE[i], abs=0.006)
+        assert reported[name][3] == fixed(100 * found.removed[i], 0)
+        assert reported[name][4] == fixed(100 * found.held[i], 0)
     least = DOF[int(np.argmin(found.removed))]
     assert f"(lowest: {least})" in words(html)
 
@@ -77,21 +77,21 @@ def test_figures_of_the_check_stand_on_the_page(checked):
 def test_candidates_and_their_scores_are_those_of_the_provenance(checked, model):
     steps = json.loads(model.dataset.attrs["provenance"])["steps"]
     tried = next(step["tried"] for step in steps if "tried" in step)
-    told = rows(checked[1], "Candidates: the best of each variant")[1:]
-    assert len(told) == len(tried) == 2
-    for row, each in zip(told, tried, strict=True):
+    reported = rows(checked[1], "Candidates: the best of each variant")[1:]
+    assert len(reported) == len(tried) == 2
+    for row, each in zip(reported, tried, strict=True):
         assert row[0] == each["variant"]
         assert number(row[3]) == pytest.approx(each["score"], rel=0.005)
-    assert [row[4] for row in told] == ["selected", ""]
-    assert "spindle_front and column" in told[0][2]
+    assert [row[4] for row in reported] == ["selected", ""]
+    assert "spindle_front and column" in reported[0][2]
 
 
 def test_coefficients_and_their_units_are_those_of_the_model(checked, model):
     ds = model.dataset
     for caption, first in (("Coefficients of the displacements", 0), ("Coefficients of the rotations", 3)):
-        told = rows(checked[1], caption)[1:]
-        assert [row[0] for row in told] == [feature.name for feature in model.features]
-        for k, row in enumerate(told):
+        reported = rows(checked[1], caption)[1:]
+        assert [row[0] for row in reported] == [feature.name for feature in model.features]
+        for k, row in enumerate(reported):
             assert row[1] == ("K" if not model.features[k].parameter else row[1])
             for column in range(3):
                 i = first + column
@@ -141,13 +141,13 @@ def test_prediction_shows_its_numbers_and_that_nothing_was_measured(model, warm_
     html = write_report(predicted, tmp_path / "r.html").read_text(encoding="utf-8")
     assert "<h1>Errors predicted by a thermal model</h1>" in html
     assert "instants; not measured." in words(html)
-    told = {row[0]: row for row in rows(html, "The six errors as predicted")}
+    reported = {row[0]: row for row in rows(html, "The six errors as predicted")}
     for i, name in enumerate(DOF):
         expanded = 2 * float(np.sqrt(predicted["covariance"][-1, i, i])) / SIZE[i]
-        assert number(told[name][6]) == pytest.approx(float(predicted[name][-1]) / SIZE[i], abs=0.06 * expanded)
+        assert number(reported[name][6]) == pytest.approx(float(predicted[name][-1]) / SIZE[i], abs=0.06 * expanded)
 
 
-def test_prediction_beyond_training_is_told_and_shaded(model, warm_ups, tmp_path):
+def test_prediction_beyond_training_is_reported_and_shaded(model, warm_ups, tmp_path):
     predicted = model.predict(warm_ups[3])
     out = predicted["outside"].values
     assert 0 < out.sum() < out.size
@@ -155,12 +155,12 @@ def test_prediction_beyond_training_is_told_and_shaded(model, warm_ups, tmp_path
     text = words(html)
     assert f"{out.sum()} of {out.size} instants lie outside the training range" in text
     assert "Coloured background: outside" in text
-    told = rows(html, "Inputs outside the training range")[1:]
+    reported = rows(html, "Inputs outside the training range")[1:]
     by_input = predicted["outside_feature"].sum("time")
     expected = {
         str(name): str(int(n)) for name, n in zip(predicted["feature"].values, by_input.values, strict=True) if n
     }
-    assert {row[0]: row[1] for row in told} == expected
+    assert {row[0]: row[1] for row in reported} == expected
     json_notes = json.loads(predicted.attrs["notes"])
     assert all(note in text for note in json_notes)
 

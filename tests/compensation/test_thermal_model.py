@@ -65,8 +65,8 @@ def test_what_was_simulated_does_not_pass_for_measured(model: ThermalModel, pair
     for ds in (model.dataset, model.predict(pair[0])):
         assert json.loads(ds.attrs["provenance"])["instruments"] == behind
     log = pair[0].drop_vars(["EX"]).assign_attrs(provenance="{}", instruments=json.dumps([{"address": "sim://x"}]))
-    told = json.loads(model.predict(log).attrs["provenance"])["instruments"]
-    assert told == [{"address": "sim://x"}, *behind]
+    reported = json.loads(model.predict(log).attrs["provenance"])["instruments"]
+    assert reported == [{"address": "sim://x"}, *behind]
 
 
 def test_times_beyond_the_training_are_flagged(model: ThermalModel, pair: list[xr.Dataset]) -> None:
@@ -134,7 +134,7 @@ def test_sensors_are_chosen_where_the_heat_is(pair: list[xr.Dataset]) -> None:
     assert "dice" not in fit(noisy, LAGGED).sensors
 
 
-def test_one_campaign_alone_is_told(pair: list[xr.Dataset]) -> None:
+def test_one_campaign_alone_is_reported(pair: list[xr.Dataset]) -> None:
     assert fit(pair[:1], LAGGED).dataset.attrs["validated"] == "blocks in time of one campaign"
 
 
@@ -215,8 +215,8 @@ def test_a_file_that_is_no_model_is_refused(tmp_path: Path, pair: list[xr.Datase
 def test_the_page_of_schemas_has_the_table_of_the_model() -> None:
     page = (Path(__file__).parents[2] / "docs" / "reference" / "schemas.md").read_text()
     section = page.partition("\n## Thermal model")[2].partition("\n## ")[0]
-    told = [line for line in section.splitlines() if line.startswith("| `")]
-    assert [line.split("|")[1].strip(" `") for line in told] == [row.name for row in ROWS]
-    for line, row in zip(told, ROWS, strict=True):
+    reported = [line for line in section.splitlines() if line.startswith("| `")]
+    assert [line.split("|")[1].strip(" `") for line in reported] == [row.name for row in ROWS]
+    for line, row in zip(reported, ROWS, strict=True):
         assert row.meaning in line
         assert ", ".join(row.dims) in line

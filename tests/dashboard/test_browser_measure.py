@@ -107,6 +107,12 @@ def test_a_campaign_is_corrected_planned_run_stopped_resumed_and_outlives_the_da
         }"""
     )
     expect(page.locator("#text")).to_have_value(re.compile('operator = "A"(.|\n)*average = "4 s"'))
+    page.click("#add")
+    expect(page.locator("""[data-place='["test",1,"name"]']""")).to_have_value("test-2")
+    expect(page.locator("#text")).to_have_value(re.compile('name = "test-2"'))
+    accessible()
+    page.click("text=Remove test 2")
+    expect(page.locator("#text")).not_to_have_value(re.compile("test-2"))
     page.fill("#text", page.input_value("#text").replace('"2"', '"40 s"'))
     expect(duration).to_have_value("40 s")
     expect(page.locator("#count")).to_have_text("The campaign has no mistakes.")

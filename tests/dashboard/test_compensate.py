@@ -12,9 +12,9 @@ from compensated_machine import MACHINE, SENSOR, Place, machine
 
 pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
 
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
+from errormotion.campaign.compensation.following import compensations, is_working, read_status, request_stop
 from errormotion.campaign.files import load_bench
-from errormotion.campaign.following import compensations, is_working, read_status, request_stop
 from errormotion.datasets import load
 
 FORM = "application/x-www-form-urlencoded"
@@ -90,7 +90,7 @@ def test_forged_and_wrong_requests_start_nothing(
         {"model": "bench.toml"},
     ):
         assert post(served, "/compensate/start", **{**START, **wrong}) == 400, wrong
-    for run in ("", "..", "../runs", "nowhere", "a/b"):
+    for run in ("", "..", "../runs", "nowhere", "a/b", 200 * "é"):
         assert post(served, "/compensate/stop", run=run) == 400
 
 

@@ -1,5 +1,6 @@
 """The page Measure over HTTP: fields, messages, plan, and what is refused without control."""
 
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -88,6 +89,19 @@ def test_a_wrong_value_has_its_message_at_its_field_and_the_text_follows(reading
     assert "x" in _field(form, "test", 0, "method")["mistakes"][0]
 
 
+def test_tests_are_added_and_removed(reading: Any, folder: Path) -> None:
+    text = (folder / "drift.toml").read_text()
+    _, form = _post(reading, "/measure/form.json", file="drift.toml", text=text, add=True)
+    assert form["text"] == text + '\n[[test]]\nname = "test-2"\nmethod = ""\n'
+    assert [group["test"] for group in form["groups"]] == [None, 0, 1]
+    assert _field(form, "test", 1, "method")["mistakes"]
+    _, form = _post(reading, "/measure/form.json", file="drift.toml", text=form["text"], remove=1)
+    assert (form["text"].rstrip(), form["count"]) == (text.rstrip(), 0)
+    for wrong in (-1, "0", True, 7):
+        status, found = _post(reading, "/measure/form.json", file="drift.toml", text=text, remove=wrong)
+        assert (status, bool(found["error"])) == (400, True)
+
+
 def test_the_page_shows_names_as_text(reading: Any) -> None:
     status, _, text = reading.ask("/measure?file=drift.toml")
     assert status == 200
@@ -153,8 +167,9 @@ def test_a_file_is_saved_once_and_not_over_the_work_of_others(controlling: Any, 
 
 def test_without_control_no_other_files_are_looked_at(reading: Any, folder: Path) -> None:
     text = (folder / "drift.toml").read_text()
-    for path in ("/etc/hostname", "../bench.toml", "C:/x"):
-        status, found = _post(reading, "/measure/form.json", file="drift.toml", text=text.replace("bench.toml", path))
+    asked = itertools.product(("drift.toml", "", "none.toml", "../drift.toml"), ("/etc/hostname", "../b.toml", "C:/x"))
+    for name, path in asked:
+        status, found = _post(reading, "/measure/form.json", file=name, text=text.replace("bench.toml", path))
         assert (status, "looks at files of its folder only" in found["error"]) == (400, True)
 
 

@@ -126,7 +126,7 @@ def test_a_place_with_weight_zero_does_not_matter_even_when_unknown(errors) -> N
     assert np.isnan(ds.em.covariance_between(0, 1)).all()
 
 
-def test_drawing_the_sources_gives_the_covariance_that_is_told(errors) -> None:
+def test_drawing_the_sources_gives_the_covariance_that_is_reported(errors) -> None:
     ds = errors(n=3, seed=5)
     F = ds["influence"].values
     rest = ds["covariance"].values - np.einsum("spi,spj->pij", F, F)
@@ -134,10 +134,10 @@ def test_drawing_the_sources_gives_the_covariance_that_is_told(errors) -> None:
     draws = np.einsum("ds,spi->dpi", rng.normal(size=(20_000, 3)), F)
     draws += np.einsum("pij,dpj->dpi", np.linalg.cholesky(rest), rng.normal(size=(20_000, 3, 6)))
     combined = draws[:, 2] - 0.5 * draws[:, 0]
-    told = ds.em.combine([-0.5, 0, 1], "time").covariance.values
-    scale = np.sqrt(np.outer(np.diag(told), np.diag(told)))
+    reported = ds.em.combine([-0.5, 0, 1], "time").covariance.values
+    scale = np.sqrt(np.outer(np.diag(reported), np.diag(reported)))
     # standard error of a covariance from 20 000 draws: at most sqrt(2 / 20 000) = 1 % of the scale; five of them
-    np.testing.assert_allclose(np.cov(combined.T) / scale, told / scale, atol=0.05)
+    np.testing.assert_allclose(np.cov(combined.T) / scale, reported / scale, atol=0.05)
 
 
 def test_the_budget_adds_up_to_the_total(errors) -> None:

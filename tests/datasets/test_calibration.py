@@ -111,9 +111,9 @@ def test_between_settings_is_supported(good: InclinationCalibration) -> None:
 def test_beyond_the_steepest_setting_is_refused_by_name(good: InclinationCalibration) -> None:
     with pytest.raises(
         MethodError, match=r"inclination 50\.0 deg at rotation 30\.0 deg lies beyond the steepest"
-    ) as told:
+    ) as reported:
         good.compensate(1e-3, tilt_vector(np.radians(50.0), np.radians(30.0)))
-    assert "nearest calibrated: inclination 40.0 deg at rotation 30.0 deg" in str(told.value)
+    assert "nearest calibrated: inclination 40.0 deg at rotation 30.0 deg" in str(reported.value)
 
 
 def test_a_hole_is_refused_where_it_is_used(holed: InclinationCalibration) -> None:
@@ -218,9 +218,9 @@ def test_a_calibration_that_is_not_there_says_where_it_was_looked_for(
     good: InclinationCalibration, folders: Path
 ) -> None:
     good.save(folders / "bench" / "calibrations" / "left.nc")
-    with pytest.raises(DatasetError, match="not found") as told:
+    with pytest.raises(DatasetError, match="not found") as reported:
         InclinationCalibration.find("right", folders / "bench")
-    message = str(told.value)
+    message = str(reported.value)
     assert str(folders / "bench" / "calibrations" / "right.nc") in message
     assert str(folders / "here" / "calibrations" / "right.nc") in message
     assert "Calibrations there: left." in message
@@ -233,7 +233,7 @@ def test_readings_are_no_calibration(tmp_path: Path) -> None:
         InclinationCalibration.load(tmp_path / "data.nc")
 
 
-def test_every_breach_of_the_schema_is_told(good: InclinationCalibration, tmp_path: Path) -> None:
+def test_every_breach_of_the_schema_is_reported(good: InclinationCalibration, tmp_path: Path) -> None:
     broken = good.dataset.drop_vars("noise").assign(
         mid_range=5.0, coefficient_covariance=(("term", "term_"), -np.eye(4)), tilt_scale=np.nan
     )
@@ -243,6 +243,6 @@ def test_every_breach_of_the_schema_is_told(good: InclinationCalibration, tmp_pa
     found = violations(good.dataset.assign(coefficient_covariance=(("term", "term_"), -np.eye(4))))
     assert found == ["coefficient_covariance: expected a symmetric matrix without negative variances; found another"]
     datasets.save(broken, tmp_path / "broken.nc")
-    with pytest.raises(DatasetError, match=rf"breaks its schema \({SCHEMA}\)") as told:
+    with pytest.raises(DatasetError, match=rf"breaks its schema \({SCHEMA}\)") as reported:
         InclinationCalibration.load(tmp_path / "broken.nc")
-    assert len(told.value.violations) == 3
+    assert len(reported.value.violations) == 3

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from errormotion.datasets import storage
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.datasets.calibrations.pretravel import PretravelMap
+from errormotion.datasets.storage import disk as storage
 from errormotion.datasets.validation import validate
 from errormotion.errors import ErrormotionError
 

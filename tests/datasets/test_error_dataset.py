@@ -55,23 +55,23 @@ def test_extra_results_ride_along_but_may_not_take_a_name(errors) -> None:
         errors(extras={"EX": xr.DataArray(0.0)})
 
 
-def test_all_violations_of_a_result_are_told_at_once(errors) -> None:
+def test_all_violations_of_a_result_are_reported_at_once(errors) -> None:
     values = np.zeros((7, 6))
     values[0, 0] = 0.3
     values[1, 3] = 0.5
     with pytest.raises(DatasetError) as caught:
         errors(values=values, component="saddle", reference=" ", functional_point=(0, 0, 500))
-    told = "\n".join(caught.value.violations)
+    message = "\n".join(caught.value.violations)
     assert len(caught.value.violations) == 5
-    assert "EX = 0.3 m: expected -0.1..0.1 m; is it in mm?" in told
-    assert "EA = 0.5 rad: expected -0.2..0.2 rad" in told
-    assert "component" in told
-    assert "reference" in told
-    assert "500 m: expected within 50 m; is it in mm?" in told
+    assert "EX = 0.3 m: expected -0.1..0.1 m; is it in mm?" in message
+    assert "EA = 0.5 rad: expected -0.2..0.2 rad" in message
+    assert "component" in message
+    assert "reference" in message
+    assert "500 m: expected within 50 m; is it in mm?" in message
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"values": np.zeros((7, 5))}, r"values: expected shape \(time, 6\); found \(7, 5\)"),
         ({"covariance": np.zeros((7, 6))}, r"covariance: expected shape \(7, 6, 6\); found \(7, 6\)"),
@@ -85,20 +85,20 @@ def test_all_violations_of_a_result_are_told_at_once(errors) -> None:
         ({"coords": {}}, "time: missing"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(errors, changes, told) -> None:
-    with pytest.raises(DatasetError, match=told):
+def test_arrays_that_do_not_fit_are_refused(errors, changes, message) -> None:
+    with pytest.raises(DatasetError, match=message):
         errors(**changes)
 
 
 @pytest.mark.parametrize(
-    ("time", "told"),
+    ("time", "message"),
     [
         ([0, 1, 2, 2, 3, 4, 5.0], "increasing seconds; found 2 s after 2 s"),
         ([0, 1, 2, np.nan, 3, 4, 5.0], "finite seconds; found nan"),
     ],
 )
-def test_times_increase(errors, time, told) -> None:
-    with pytest.raises(DatasetError, match=told):
+def test_times_increase(errors, time, message) -> None:
+    with pytest.raises(DatasetError, match=message):
         errors(coords={"time": np.array(time)})
 
 
@@ -133,8 +133,8 @@ def test_influence_is_not_larger_than_the_covariance(errors) -> None:
 def test_the_rest_beside_the_influences_is_a_covariance(errors) -> None:
     F = np.zeros((1, 7, 6))
     F[0, :, 0] = F[0, :, 1] = 0.9e-6
-    told = "expected the covariance less the influences to be a covariance"
-    with pytest.raises(DatasetError, match=told):
+    message = "expected the covariance less the influences to be a covariance"
+    with pytest.raises(DatasetError, match=message):
         # each variance holds its influence, but the two freedoms are not correlated as the common source makes them
         errors(covariance=np.tile(np.eye(6) * 1e-12, (7, 1, 1)), influence=F, sources=["a"], source_groups=["a"])
 
@@ -142,9 +142,9 @@ def test_the_rest_beside_the_influences_is_a_covariance(errors) -> None:
 def test_nan_of_value_and_covariance_go_together(errors) -> None:
     ds = errors()
     ds["EY"][2] = np.nan
-    told = violations(ds)
-    assert "covariance: expected NaN exactly where the value is NaN" in told
-    assert "EY" in told
+    message = violations(ds)
+    assert "covariance: expected NaN exactly where the value is NaN" in message
+    assert "EY" in message
 
 
 def test_missing_freedoms_and_attributes_are_named(errors) -> None:
@@ -152,11 +152,11 @@ def test_missing_freedoms_and_attributes_are_named(errors) -> None:
     del ds.attrs["frame"]
     ds.attrs["provenance"] = "none"
     ds.attrs["operator"] = None
-    told = violations(ds)
-    assert "EB EC: missing" in told
-    assert "attribute 'frame': missing" in told
-    assert "provenance': expected a JSON object" in told
-    assert "attribute 'operator': expected text, a number or a flat array of them; found None" in told
+    message = violations(ds)
+    assert "EB EC: missing" in message
+    assert "attribute 'frame': missing" in message
+    assert "provenance': expected a JSON object" in message
+    assert "attribute 'operator': expected text, a number or a flat array of them; found None" in message
 
 
 def test_a_unit_other_than_si_is_refused(errors) -> None:

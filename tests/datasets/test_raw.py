@@ -7,7 +7,7 @@ from errormotion import datasets
 from errormotion.datasets.files.sampling import SAMPLE, sample
 
 
-def told(ds: xr.Dataset) -> str:
+def reported(ds: xr.Dataset) -> str:
     return "\n".join(datasets.violations(ds))
 
 
@@ -54,11 +54,11 @@ def test_a_missing_channel_is_named(drift, beams) -> None:
     expected = "channel: expected X1 X2 Y1 Y2 Z; found X1 X2 Y1 Z: missing Y2"
     for ds in (drift(), beams()):
         assert datasets.violations(ds.sel(channel=["X1", "X2", "Y1", "Z"])) == [expected]
-    assert "missing Y2, unknown Y3" in told(drift().assign_coords(channel=["X1", "X2", "Y1", "Y3", "Z"]))
-    assert "expected a coordinate with the labels X1 X2 Y1 Y2 Z; found none" in told(drift().drop_vars("channel"))
+    assert "missing Y2, unknown Y3" in reported(drift().assign_coords(channel=["X1", "X2", "Y1", "Y3", "Z"]))
+    assert "expected a coordinate with the labels X1 X2 Y1 Y2 Z; found none" in reported(drift().drop_vars("channel"))
 
 
-def test_a_bar_radius_in_mm_is_told(drift) -> None:
+def test_a_bar_radius_in_mm_is_reported(drift) -> None:
     assert datasets.violations(drift(bar_radius=5.0)) == ["bar_radius = 5 m: expected 0.0005..0.1 m; is it in mm?"]
 
 
@@ -92,12 +92,12 @@ def test_a_bar_radius_in_mm_is_told(drift) -> None:
         ),
     ],
 )
-def test_what_cannot_be_is_told_with_what_was_expected(drift, changes, sentence) -> None:
+def test_what_cannot_be_is_reported_with_what_was_expected(drift, changes, sentence) -> None:
     (found,) = datasets.violations(drift(**changes))
     assert found.startswith(sentence)
 
 
-def test_all_violations_are_told_at_once(drift) -> None:
+def test_all_violations_are_reported_at_once(drift) -> None:
     ds = drift(bar_radius=5.0).drop_vars(["distance_noise", "level"]).sel(channel=["X1", "X2", "Y1", "Y2"])
     ds["distance"].attrs["units"] = "mm"
     with pytest.raises(datasets.validation.DatasetError) as caught:
@@ -118,17 +118,17 @@ def test_a_unit_that_means_the_same_is_welcome(drift, unit) -> None:
 def test_a_unit_that_means_something_else_is_refused(drift, unit) -> None:
     ds = drift()
     ds["distance"].attrs["units"] = unit
-    assert f"distance: expected units 'm'; found '{unit}'" in told(ds)
+    assert f"distance: expected units 'm'; found '{unit}'" in reported(ds)
 
 
 def test_times_increase_or_follow_from_the_rate(drift) -> None:
     ds = drift()
     t = ds["time"].values.copy()
     t[20] = t[19]
-    assert "time: expected increasing seconds; found 9.5 s after 9.5 s" in told(ds.assign_coords(time=t))
-    assert "time(time): missing" in told(ds.drop_vars("time"))
+    assert "time: expected increasing seconds; found 9.5 s after 9.5 s" in reported(ds.assign_coords(time=t))
+    assert "time(time): missing" in reported(ds.drop_vars("time"))
     assert datasets.violations(ds.drop_vars("time").assign_attrs(sample_rate=20e3)) == []
-    assert "'sample_rate': expected a positive number" in told(ds.drop_vars("time").assign_attrs(sample_rate=0.0))
+    assert "'sample_rate': expected a positive number" in reported(ds.drop_vars("time").assign_attrs(sample_rate=0.0))
 
 
 def test_a_huge_record_is_looked_at_in_samples(drift) -> None:
@@ -140,7 +140,7 @@ def test_a_huge_record_is_looked_at_in_samples(drift) -> None:
     assert 0 < lazy.read <= SAMPLE
     assert not ds["time"].variable._in_memory
     lazy.value = 1.0
-    assert "distance = 1 m" in told(ds)
+    assert "distance = 1 m" in reported(ds)
 
 
 def test_samples_reach_from_the_first_to_the_last_value() -> None:
@@ -168,4 +168,4 @@ def test_every_schema_accepts_what_it_describes_and_misses_what_is_gone(raw) -> 
     assert datasets.violations(ds) == []
     for row in raw.rows:
         if row.required and row.name != raw.marker:
-            assert f"{row.name}({', '.join(row.dims)}): missing" in told(ds.drop_vars(row.name))
+            assert f"{row.name}({', '.join(row.dims)}): missing" in reported(ds.drop_vars(row.name))

@@ -49,9 +49,9 @@ def complaints(read, tmp_path: Path):
     def complaints(text: str | bytes) -> str:
         with pytest.raises(DatasetError) as caught:
             read(text)
-        told = str(caught.value)
-        assert str(tmp_path / "readings.csv") in told
-        return told
+        message = str(caught.value)
+        assert str(tmp_path / "readings.csv") in message
+        return message
 
     return complaints
 
@@ -133,7 +133,7 @@ def test_numbers_come_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "message"),
     [
         ("x [mm]", "q [mm]", "line 6: column 3 'q [mm]': unknown column; "),
         ("x [mm]", "stage_xx [mm]", "did you mean 'stage_x'?"),
@@ -188,12 +188,12 @@ def test_numbers_come_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFact
         ("# schema = errormotion.raw.beam_direction/1\n", "", "expected a line '# schema = ...'"),
     ],
 )
-def test_mistakes_are_told_with_their_place(complaints, old: str, new: str, told: str) -> None:
-    assert told in complaints((HEAD + TABLE).replace(old, new, 1))
+def test_mistakes_are_reported_with_their_place(complaints, old: str, new: str, message: str) -> None:
+    assert message in complaints((HEAD + TABLE).replace(old, new, 1))
 
 
 @pytest.mark.parametrize(
-    ("table", "told"),
+    ("table", "message"),
     [
         (
             "\nplane,nominal_normal_x [1],nominal_normal_y [1],nominal_normal_z [1]\n1,0,1,0\n7,0,0,1\n",
@@ -214,25 +214,25 @@ def test_mistakes_are_told_with_their_place(complaints, old: str, new: str, told
         ('\nbar_distance [mm]\n"0.1\n', "line 14: cannot be split into fields"),
     ],
 )
-def test_mistakes_of_further_tables(complaints, table: str, told: str) -> None:
-    assert told in complaints(HEAD + TABLE + table)
+def test_mistakes_of_further_tables(complaints, table: str, message: str) -> None:
+    assert message in complaints(HEAD + TABLE + table)
 
 
 def test_variables_of_two_kinds_do_not_share_a_table(complaints) -> None:
-    told = complaints(
+    message = complaints(
         INCLINATION.replace("reading [mm],", "reading_noise [um],", 1).replace("# reading_noise = 0.1 um\n", "")
     )
-    assert "expected variables of one kind in a table; found reading_noise (one value) and reference (group)" in told
+    assert "expected variables of one kind in a table; found reading_noise (one value) and reference (group)" in message
 
 
-def test_all_mistakes_are_told_at_once(complaints) -> None:
-    told = complaints((HEAD + TABLE).replace("-1.508", "a").replace("0.25", "b").replace("0.1 um", "0.1"))
-    assert "3 mistakes" in told
-    assert told.index("line 5") < told.index("line 8") < told.index("line 9")
+def test_all_mistakes_are_reported_at_once(complaints) -> None:
+    message = complaints((HEAD + TABLE).replace("-1.508", "a").replace("0.25", "b").replace("0.1 um", "0.1"))
+    assert "3 mistakes" in message
+    assert message.index("line 5") < message.index("line 8") < message.index("line 9")
 
 
 @pytest.mark.parametrize(
-    ("data", "told"),
+    ("data", "message"),
     [
         (b"", "expected a line of column names and lines of readings; found none"),
         (HEAD.encode(), "expected a line of column names"),
@@ -240,10 +240,10 @@ def test_all_mistakes_are_told_at_once(complaints) -> None:
         ((HEAD + "# 3 \xb5m\n" + TABLE).encode("latin-1"), "line 6: byte 0xb5 is not UTF-8"),
     ],
 )
-def test_other_files_are_told(complaints, data: bytes, told: str) -> None:
-    assert told in complaints(data)
+def test_other_files_are_reported(complaints, data: bytes, message: str) -> None:
+    assert message in complaints(data)
 
 
-def test_no_file_is_told(tmp_path: Path) -> None:
+def test_no_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"nothing\.csv: cannot be read: No such file"):
         datasets.load(tmp_path / "nothing.csv")

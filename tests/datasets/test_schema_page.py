@@ -68,10 +68,10 @@ def test_the_table_of_calibrations_is_the_schema() -> None:
 
 def test_the_reference_names_every_key_of_a_map() -> None:
     page = (DOCS / "reference" / "import-maps.md").read_text()
-    told = set(re.findall(r"[`.]([a-z_]+)`", page))
+    reported = set(re.findall(r"[`.]([a-z_]+)`", page))
     for table in (ImportMap, Format, TimeColumn, Channel, TemperatureColumn, SpeedColumn):
         keys = {field.alias or name for name, field in table.model_fields.items()}
-        assert keys - {"format", "time", "channels", "temperatures", "spindle_speed"} <= told
+        assert keys - {"format", "time", "channels", "temperatures", "spindle_speed"} <= reported
 
 
 def test_the_table_of_attributes_is_the_schema() -> None:

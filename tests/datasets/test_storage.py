@@ -15,8 +15,8 @@ from xarray.indexes import RangeIndex
 
 from errormotion import datasets
 from errormotion.datasets import load, save, validate
-from errormotion.datasets.compression import as_stored, round_significand
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.compression import as_stored, round_significand
+from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
 from errormotion.methods.spindle_drift import simulation
 from errormotion.twin import VirtualMachine
@@ -112,7 +112,7 @@ def test_what_was_loaded_can_be_saved_as_the_other_kind(drift, tmp_path, suffix)
 
 
 @both
-def test_evenly_spaced_times_are_told_by_rate_and_start(drift, tmp_path, suffix) -> None:
+def test_evenly_spaced_times_are_reported_by_rate_and_start(drift, tmp_path, suffix) -> None:
     ds = drift(n=40).drop_vars(["time", "temperature"]).assign_attrs(sample_rate=20e3, time_start=2.5)
     with load(save(ds, tmp_path / f"raw{suffix}")) as back:
         assert isinstance(back.xindexes["time"], RangeIndex)
@@ -152,7 +152,7 @@ def test_metadata_in_the_root_counts_before_that_of_the_arrays(tmp_path) -> None
     a = root.create_array("a", shape=(4,), chunks=(4,), dtype="f8", dimension_names=("time",))
     with pytest.warns(zarr.errors.ZarrUserWarning, match="not part in the Zarr format 3"):
         zarr.consolidate_metadata(tmp_path / "raw.zarr")
-    a.resize((9,))  # a writer that was cut off before it told the root
+    a.resize((9,))  # a writer that was cut off before it updated the root
     with load(tmp_path / "raw.zarr") as ds:
         assert ds.sizes == {"time": 4}
 
@@ -228,7 +228,7 @@ def test_a_folder_that_cannot_be_put_in_place_leaves_the_old_one(errors, tmp_pat
     xr.testing.assert_identical(load(path), errors(seed=1))
 
 
-def test_a_place_that_takes_no_file_is_told(errors, tmp_path) -> None:
+def test_a_place_that_takes_no_file_is_reported(errors, tmp_path) -> None:
     with pytest.raises(DatasetError, match="there is no such folder"):
         save(errors(), tmp_path / "none" / "errors.nc")
     with pytest.raises(DatasetError, match=r"ends in \.nc .* or \.zarr"):
@@ -246,7 +246,7 @@ def test_an_attribute_that_no_file_can_hold_is_named_before_writing(errors, tmp_
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.0002, 0.5, 0.999])
-def test_a_truncated_file_is_told(drift, tmp_path, kept) -> None:
+def test_a_truncated_file_is_reported(drift, tmp_path, kept) -> None:
     path = save(drift(), tmp_path / "raw.nc")
     whole = path.read_bytes()
     path.write_bytes(whole[: int(kept * len(whole))])
@@ -254,7 +254,7 @@ def test_a_truncated_file_is_told(drift, tmp_path, kept) -> None:
         load(path)
 
 
-def test_a_damaged_folder_is_told(errors, tmp_path) -> None:
+def test_a_damaged_folder_is_reported(errors, tmp_path) -> None:
     path = save(errors(), tmp_path / "errors.zarr")
     for broken in (path / "EX" / "zarr.json", path / "zarr.json"):
         broken.write_text(broken.read_text()[:20])
@@ -262,7 +262,7 @@ def test_a_damaged_folder_is_told(errors, tmp_path) -> None:
             load(path)
 
 
-def test_a_cut_off_chunk_is_told(errors, tmp_path) -> None:
+def test_a_cut_off_chunk_is_reported(errors, tmp_path) -> None:
     path = save(errors(), tmp_path / "errors.zarr")
     (chunk,) = [file for file in (path / "covariance").rglob("*") if file.is_file() and file.name != "zarr.json"]
     chunk.write_bytes(chunk.read_bytes()[:20])
@@ -270,7 +270,7 @@ def test_a_cut_off_chunk_is_told(errors, tmp_path) -> None:
         load(path)
 
 
-def test_what_is_no_dataset_is_told(tmp_path) -> None:
+def test_what_is_no_dataset_is_reported(tmp_path) -> None:
     (tmp_path / "log.csv").write_text("t;X1;X2\n")
     with pytest.raises(DatasetError, match="errormotion import"):
         load(tmp_path / "log.csv")
@@ -308,7 +308,7 @@ def test_a_folder_around_a_dataset_points_to_it(drift, tmp_path) -> None:
         load(tmp_path)
 
 
-def test_a_file_that_may_not_be_read_is_told(errors, tmp_path, monkeypatch) -> None:
+def test_a_file_that_may_not_be_read_is_reported(errors, tmp_path, monkeypatch) -> None:
     path = save(errors(), tmp_path / "errors.nc")
 
     def denied(*_: object, **__: object) -> io.BytesIO:

@@ -75,7 +75,7 @@ def test_a_good_file_becomes_a_model_in_si(write) -> None:
     assert (found.bar_radius, found.test[0].average) == (0.005, 120.0)
 
 
-def test_every_mistake_is_told_with_file_key_expected_and_found(write) -> None:
+def test_every_mistake_is_reported_with_file_key_expected_and_found(write) -> None:
     path = write("""
         schema = "errormotion.example/1"
         bar_radius = 5
@@ -126,7 +126,7 @@ def test_a_rule_about_a_whole_table_speaks_for_itself(write) -> None:
         ("a = 1\na = 2\n", "line 2, column 6"),
     ],
 )
-def test_what_is_no_toml_is_told_with_its_place(write, text: str | bytes, place: str) -> None:
+def test_what_is_no_toml_is_reported_with_its_place(write, text: str | bytes, place: str) -> None:
     path = write(text)
     assert complaints(path)[0].startswith(f"{path}, {place}: ")
 

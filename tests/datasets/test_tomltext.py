@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from errormotion.datasets.files.tomltext import with_value
+from errormotion.datasets.files.tomltext import with_table, with_value, without_table
 from errormotion.errors import DatasetError
 
 TEXT = """\
@@ -67,3 +67,33 @@ def test_an_array_over_several_lines_is_one_value() -> None:
 def test_what_cannot_be_changed_alone_is_refused(text: str, place: tuple[Any, ...]) -> None:
     with pytest.raises(DatasetError):
         with_value(text, place, 5)
+
+
+def test_a_table_is_added_at_the_end() -> None:
+    assert with_table(TEXT, "test", {"name": "d"}) == TEXT + '\n[[test]]\nname = "d"\n'
+    assert with_table("a = 1", "test", {"name": "d"}) == 'a = 1\n\n[[test]]\nname = "d"\n'
+    assert with_table("", "test", {"name": "d"}) == '[[test]]\nname = "d"\n'
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_table_is_removed_with_those_in_it_and_nothing_else(number: int) -> None:
+    changed = without_table(TEXT + "[report]\nlanguage = 'de' # r\n", "test", number)
+    kept = tomllib.loads(TEXT)
+    del kept["test"][number]
+    assert tomllib.loads(changed) == kept | {"report": {"language": "de"}}
+    assert [mark in changed for mark in ("# head", "# first", "# ISO # 230", "# tail", "# r")] == [
+        True, number != 0, number != 1, True, True,
+    ]  # fmt: skip
+
+
+def test_the_last_table_leaves_none() -> None:
+    assert without_table('a = 1\n\n[[test]]\nname = "d"\n', "test", 0) == "a = 1\n\n"
+
+
+@pytest.mark.parametrize("text", ["test = [{ a = 1 }]", "test = 1", "a = 1", "[[test]]\n", "a = "])
+def test_tables_in_another_form_are_refused(text: str) -> None:
+    with pytest.raises(DatasetError):
+        without_table(text, "test", 1)
+    if "[[" not in text and text != "a = 1":
+        with pytest.raises(DatasetError):
+            with_table(text, "test", {"a": 2})

@@ -144,7 +144,7 @@ def test_touches_beyond_the_map_are_refused_before_anything_moves(tmp_path: Path
         assert world("cframe", 3).time == 0.0
 
 
-def test_a_map_that_is_not_there_is_told_on_opening() -> None:
+def test_a_map_that_is_not_there_is_reported_on_opening() -> None:
     with pytest.raises(DatasetError, match=r"nowhere\.nc.*no such file"):
         ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, pretravel="nowhere.nc")).open()
 

@@ -26,7 +26,7 @@ from errormotion.instruments.touch_probe.dprnt.codec import (
     text_of,
 )
 from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, touch_of
-from errormotion.instruments.transports.serving import TcpServer
+from errormotion.instruments.transports.loopback.serving import TcpServer
 from errormotion.kinematics.fits import fit_sphere
 from errormotion.plugins import Contact, Touch
 

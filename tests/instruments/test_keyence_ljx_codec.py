@@ -120,11 +120,11 @@ def test_the_reply_that_announces_a_stream_has_its_facts_at_their_places() -> No
     struct.pack_into("<i", frame, 32, 4711)
     frame[40] = INTENSITY | 1
     struct.pack_into("<HHii", frame, 44, 3200, 80, -2_000_000, 1250)
-    told = codec.parse_layout(codec.parse_reply(bytes(frame)))
-    assert (told.start_code, told.kind, told.points) == (4711, 0x41, 3200)
-    assert (told.z_unit, told.x_start, told.x_pitch) == pytest.approx((0.8e-6, -0.02, 12.5e-6), rel=1e-12)
-    assert told.x[[0, 1, -1]] == pytest.approx([-0.02, -0.02 + 12.5e-6, 0.02 - 12.5e-6], rel=1e-12)
-    assert codec.layout_data(told) == bytes(frame[28:])
+    reported = codec.parse_layout(codec.parse_reply(bytes(frame)))
+    assert (reported.start_code, reported.kind, reported.points) == (4711, 0x41, 3200)
+    assert (reported.z_unit, reported.x_start, reported.x_pitch) == pytest.approx((0.8e-6, -0.02, 12.5e-6), rel=1e-12)
+    assert reported.x[[0, 1, -1]] == pytest.approx([-0.02, -0.02 + 12.5e-6, 0.02 - 12.5e-6], rel=1e-12)
+    assert codec.layout_data(reported) == bytes(frame[28:])
 
 
 @pytest.mark.parametrize(("points", "unit"), [(0, 10), (3201, 10), (3200, 0)])

@@ -9,7 +9,7 @@ import pytest
 
 from errormotion.errors import InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX, LJXSettings
-from errormotion.instruments.transports.serving import TcpServer
+from errormotion.instruments.transports.loopback.serving import TcpServer
 
 TIMEOUT = 0.3  # s
 

@@ -20,7 +20,7 @@ from errormotion.instruments.simulators.faults import parse_fault
 from errormotion.instruments.simulators.line_profiler.keyence_ljx import SimulatedLJX, packed
 from errormotion.instruments.simulators.line_profiler.profile_sources import Lines, SweptSurface
 from errormotion.instruments.transports import parse_address
-from errormotion.instruments.transports.serving import TcpServer
+from errormotion.instruments.transports.loopback.serving import TcpServer
 from errormotion.plugins.readings import Profiles
 
 SMALL = "sim://cframe/profiler?seed=3&points=80"

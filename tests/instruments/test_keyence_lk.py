@@ -116,7 +116,7 @@ def test_on_the_machine_it_reads_its_depth_to_a_plane() -> None:
             assert sensor.no_value == ""
 
 
-def test_on_the_machine_beyond_the_range_is_told_from_before_it() -> None:
+def test_on_the_machine_beyond_the_range_is_reported_from_before_it() -> None:
     with KeyenceLK("sim://cframe/lk?seed=3", PATIENT) as sensor:
         here = world("cframe", 3)
         here.set_target("plane", INCLINED, 0.0)

@@ -229,7 +229,7 @@ def test_a_tracker_that_stays_busy_is_named_so() -> None:
 @pytest.mark.parametrize(
     ("code", "words"), [(10015, "does not answer its controller"), (3007, "an error of the tracker processor")]
 )
-def test_refusals_and_errors_are_told_in_words(fault: str, code: int, words: str) -> None:
+def test_refusals_and_errors_are_reported_in_words(fault: str, code: int, words: str) -> None:
     with (
         LeicaEmScon(ADDRESS + f"&fault={fault}&fault_at=8&code={code}", QUICK) as tracker,
         pytest.raises(InstrumentError, match=f"status {code}.*{words}"),

@@ -156,7 +156,7 @@ def test_a_refusal_has_no_values_behind_its_status() -> None:
     assert (packet.status, dict(packet.values)) == (statuses.BUSY, {})
 
 
-def test_a_command_that_is_not_known_here_is_told_by_its_number() -> None:
+def test_a_command_that_is_not_known_here_is_reported_by_its_number() -> None:
     assert codec.decode_command(struct.pack("<iII", 12, 0, 9999)) == (9999, {})
     assert decoded(codec.encode_answer(9999, statuses.NOT_IMPLEMENTED)).command == 9999
 

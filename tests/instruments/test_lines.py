@@ -8,7 +8,7 @@ import pytest
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
 from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.lines import ManyLines, open_lines
-from errormotion.instruments.transports.serving import TcpServer
+from errormotion.instruments.transports.loopback.serving import TcpServer
 
 
 class Twofold:

@@ -265,7 +265,7 @@ def test_each_fault_is_a_state_of_its_own(wire: str, fault: str, error: type[Ins
 
 
 @pytest.mark.parametrize("wire", ["framing=rtu", "wire=pty"])
-def test_a_wrong_checksum_is_told_from_silence(wire: str) -> None:
+def test_a_wrong_checksum_is_reported_from_silence(wire: str) -> None:
     with (
         ModbusTemperature(f"{LOGGER}&{wire}&fault=checksum&fault_at=1", QUICK) as thermometer,
         pytest.raises(ProtocolError, match=r"has the checksum .* expected"),

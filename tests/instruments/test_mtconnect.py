@@ -27,19 +27,19 @@ def test_a_state_is_what_the_machine_does() -> None:
         assert agent.identify().simulated
         control.spindle(6000.0)
         control.move_to((0.1, 0.05, 0.2), 0.05)
-        told, true = agent.state(), control.state()
-    assert told["time"] == pytest.approx(true["time"], abs=1e-5)  # the agent reports microseconds
-    assert told["position_time"] == told["time"]
+        reported, true = agent.state(), control.state()
+    assert reported["time"] == pytest.approx(true["time"], abs=1e-5)  # the agent reports microseconds
+    assert reported["position_time"] == reported["time"]
     for key in ("position", "commanded_position"):
-        assert told[key] == pytest.approx(true[key], abs=0.6e-7)  # half the last digit, 0.1 um
-    assert told["spindle_speed"] == pytest.approx(true["spindle_speed"], abs=0.06)
-    assert told["spindle_load"] == pytest.approx(true["spindle_load"], abs=1e-4)
-    assert told["mode"] == "mdi"
-    assert told["enabled"]
-    assert not told["running"]
-    assert told["homed"] is None
-    assert told["alarms"] == []
-    assert told["unavailable"] == ["program"]
+        assert reported[key] == pytest.approx(true[key], abs=0.6e-7)  # half the last digit, 0.1 um
+    assert reported["spindle_speed"] == pytest.approx(true["spindle_speed"], abs=0.06)
+    assert reported["spindle_load"] == pytest.approx(true["spindle_load"], abs=1e-4)
+    assert reported["mode"] == "mdi"
+    assert reported["enabled"]
+    assert not reported["running"]
+    assert reported["homed"] is None
+    assert reported["alarms"] == []
+    assert reported["unavailable"] == ["program"]
 
 
 def test_a_program_and_its_feed_show_while_it_runs() -> None:
@@ -55,7 +55,7 @@ def test_a_program_and_its_feed_show_while_it_runs() -> None:
     assert 0 < state["position"][0] < 0.1
 
 
-def test_alarms_and_emergency_stop_are_told() -> None:
+def test_alarms_and_emergency_stop_are_reported() -> None:
     with MTConnect(ADDRESS) as agent, VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
         control.press_estop()
         state = agent.state()

@@ -189,7 +189,7 @@ TEXT = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=3
 
 @given(st.data(), st.lists(st.integers(643, 64876), min_size=1, max_size=20), st.lists(TEXT, max_size=4))
 @compiled
-def test_answers_between_the_data_are_told_apart_and_harm_nothing(
+def test_answers_between_the_data_are_reported_apart_and_harm_nothing(
     data: st.DataObject, raws: list[int], answers: list[bytes]
 ) -> None:
     samples = [wire([raw], number) for number, raw in enumerate(raws)]

@@ -7,8 +7,8 @@ import pytest
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
 from errormotion.instruments.transports import Transport, open_transport
+from errormotion.instruments.transports.loopback.serving import make_server
 from errormotion.instruments.transports.recording import Recorder, read_index, read_recording, write_index
-from errormotion.instruments.transports.serving import make_server
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ class Tap(Transport):
         self.flow_control = flow_control
         self.waiting: list[bytes] = []
         self.change = threading.Condition()
-        self.told: list[int] = []
+        self.reported: list[int] = []
 
     def put(self, data: bytes) -> None:
         with self.change:
@@ -35,7 +35,7 @@ class Tap(Transport):
             assert self.change.wait_for(lambda: not self.waiting, 5.0)
 
     def report_delivered(self, samples: int) -> None:
-        self.told.append(samples)
+        self.reported.append(samples)
 
     def _send(self, data: bytes) -> None:
         self.put(b"OK>")
@@ -86,7 +86,7 @@ def test_samples_come_in_order_whatever_the_pieces(tap: Tap, reader: Reader) -> 
         tap.put(piece)
     assert fill(reader, 2)[0] == [1, 2]
     assert fill(reader, 4)[0] == [3, 4, 5, 6]
-    assert tap.told == [2, 6]
+    assert tap.reported == [2, 6]
 
 
 def test_a_full_queue_holds_the_device_back(tap: Tap, reader: Reader) -> None:
@@ -162,7 +162,7 @@ def test_samples_may_have_any_shape(tap: Tap) -> None:
     reader.fill(values, reasons, 1.0)
     reader.abandon()
     assert values.tolist() == [[1, 2], [3, 4], [5, 6]]
-    assert tap.told == [3]
+    assert tap.reported == [3]
 
 
 def test_a_stream_that_ends_by_itself_gives_its_last_samples_first(tap: Tap, reader: Reader) -> None:

@@ -150,7 +150,7 @@ def test_wrong_titles_are_named(tmp_path: Path, head: str, words: str) -> None:
     assert words in refusal(write(tmp_path, "S1,1,1500", head=head))
 
 
-def test_all_mistakes_are_told_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
     message = refusal(write(tmp_path, "S1,1,x,20,1013,40", "S1,2,1500,200,1013,40", "S1,2,1500,20,1013"))
     assert "3 mistakes" in message
     assert all(f"line {number}:" in message for number in (2, 3, 4))

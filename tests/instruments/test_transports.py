@@ -7,7 +7,7 @@ import pytest
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.transports import Transport, open_transport, parse_address
-from errormotion.instruments.transports.serving import Server, TcpServer, make_server
+from errormotion.instruments.transports.loopback.serving import Server, TcpServer, make_server
 
 
 class Echo:

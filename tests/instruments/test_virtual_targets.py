@@ -109,7 +109,7 @@ def test_both_kinds_of_sensor_read_the_same_surface(kind: str) -> None:
             assert from_start == pytest.approx(true + 10e-3, abs=1e-9)
 
 
-def test_before_and_behind_the_range_are_told_apart_and_a_miss_from_both() -> None:
+def test_before_and_behind_the_range_are_reported_apart_and_a_miss_from_both() -> None:
     with (
         VirtualController(f"sim://cframe/c?{SEED}", CONTROLLER) as controller,
         OptoNCDT(f"sim://cframe/a?{SEED}", SLOW) as opto,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from errormotion import plugins
-from errormotion.campaign.machine import completed, contradictions
+from errormotion.campaign.sections.machine import completed, contradictions
 from errormotion.kinematics.description import MachineDescription
 from errormotion.methods.multilateration import simulation
 from errormotion.twin import VirtualMachine

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from errormotion.cli.app import app
-from errormotion.cli.commands.new import id_of
+from errormotion.cli.commands.plugins.new import id_of
 from errormotion.errors import PluginError
 
 

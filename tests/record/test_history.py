@@ -22,7 +22,7 @@ from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 from errormotion.record.figures import follow
 from errormotion.record.history import history
-from errormotion.record.listing import list_runs
+from errormotion.record.runs.listing import list_runs
 from errormotion.report import write_run_report
 
 pytestmark = pytest.mark.usefixtures("translated")

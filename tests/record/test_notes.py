@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from errormotion.cli.app import app
 from errormotion.datasets.files import events
 from errormotion.errors import RunError
-from errormotion.record import listing
+from errormotion.record.runs import listing
 
 
 def make(path: Path, created: str = "2026-03-01T08:00:00+00:00", machine: str = "VM1") -> Path:

@@ -17,7 +17,7 @@ from errormotion.campaign import folder as run_folder
 from errormotion.cli.app import app
 from errormotion.datasets import provenance
 from errormotion.errors import RunError
-from errormotion.record import entry, index, listing
+from errormotion.record.runs import entry, index, listing
 
 LONG_AGO = 1_700_000_000_000_000_000
 """Time of change of files that have settled, ns."""

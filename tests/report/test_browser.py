@@ -10,7 +10,7 @@ import pytest
 
 from errormotion.report import canvas, write_page
 from errormotion.report.document import Figure, Part, Section, Source
-from errormotion.report.turntable import Dots, Scene, draw
+from errormotion.report.drawings.turntable import Dots, Scene, draw
 
 BROWSER = shutil.which("chromium")
 NAME = "<script>alert(1)</script>"
@@ -40,7 +40,7 @@ ACTIONS = """addEventListener("load", () => {
   found.push(tip.innerText);
   const space = document.querySelector(".turn canvas");
   const drawn = space.getContext("2d").getImageData(0, 0, space.width, space.height).data;
-  found.push(drawn.some((each) => each > 0));
+  found.push(drawn.some((each) => each > 0), space.getAttribute("aria-label"));
   const log = document.createElement("pre");
   log.id = "log";
   log.append(found.join("|").replaceAll("\\n", ";"));
@@ -74,9 +74,9 @@ def test_values_zoom_and_space(drift, tmp_path: Path) -> None:
     )
     found = re.search(r'<pre id="log">(.*?)</pre>', done.stdout, re.DOTALL)
     assert found is not None
-    first, zoomed, changed, back, by_key, drawn = found[1].split("|")
+    first, zoomed, changed, back, by_key, drawn, label = found[1].split("|")
     name = NAME.replace("<", "&lt;").replace(">", "&gt;")
     assert first == f"time 50.0 min; {name}: 100.0 ± 0.25 µm"
     assert zoomed.startswith("time 25.5")  # the left edge is at 25 min now
     assert by_key.startswith("time 51.0 min;")
-    assert (changed, back, drawn) == ("true", "true", "true")
+    assert (changed, back, drawn, label) == ("true", "true", "true", "Points.")

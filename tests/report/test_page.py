@@ -160,8 +160,8 @@ def test_no_private_path_of_a_run_is_printed(beams, tmp_path):
 
 
 def test_bench_and_campaign_state_the_head(tmp_path):
-    from errormotion.campaign import head
     from errormotion.campaign.files import load_bench, load_campaign
+    from errormotion.campaign.sections import head
 
     bench = (
         'schema = "errormotion.bench/1"\nname = "b"\nmachine = "m"\n[laboratory]\nname = "Lab"\nlogo = "l.svg"\n'

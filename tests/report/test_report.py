@@ -13,7 +13,7 @@ from errormotion.datasets import build_errors
 from errormotion.errors import DatasetError
 from errormotion.report import provenance, write_report
 from errormotion.report.document import Source
-from errormotion.report.series import commanded_speed
+from errormotion.report.drawings.series import commanded_speed
 
 pytestmark = pytest.mark.usefixtures("translated")
 
@@ -143,7 +143,7 @@ def test_a_value_that_holds_a_compensation_step_says_so(page):
     assert "includes the step of a compensation that was switched in this interval" in page.text
 
 
-def test_a_switched_compensation_is_told_with_its_change(page):
+def test_a_switched_compensation_is_reported_with_its_change(page):
     found = re.search(r"Z compensation off at 101.0 min: .*? stepped by \+(\d+\.\d+) ±", page.text)
     # 29.3 um were put in; the warm-up adds less than 0.02 um between the two means.
     assert float(found[1]) == pytest.approx(29.3, abs=0.1)

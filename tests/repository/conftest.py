@@ -3,7 +3,8 @@
 ``python`` blocks are executed; with ``>>>`` their output is compared. ``console`` blocks: each line that starts with
 ``$`` is run, must succeed, and what follows it is compared with what it prints (``...`` stands for anything). A
 ``code-block`` with a ``:caption:`` is a file and is written. Other languages (``text``, ``sh``) are only shown.
-``% skip: next`` leaves out one block.
+``% skip: next`` leaves out one block. A page with ``% continues: OTHER.md`` runs after that page, with its files and
+names.
 
 ``make demo``, with which two pages begin, runs once: each gets what was printed, and a copy of the files.
 A call of ``errormotion`` runs in this process, which has its libraries loaded already: that takes seconds a command.
@@ -23,6 +24,7 @@ import traceback
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sybil import Document, Example
@@ -134,6 +136,18 @@ def parse(page: Path) -> Document:
     return Document.parse(str(page), *parsers, captioned_files, SkipParser())
 
 
+def continues(page: Path) -> Path | None:
+    """Return the page whose files and names the examples of a page use."""
+    found = re.search(r"^% continues: (\S+)$", page.read_text(), re.MULTILINE)
+    return (page.parent / found[1]).resolve(strict=True) if found else None
+
+
+def continuations(page: Path) -> list[Path]:
+    """Return the pages that continue a page, directly or not."""
+    others = [other for other in sorted(page.parent.glob("*.md")) if continues(other) == page]
+    return [found for other in others for found in (other, *continuations(other))]
+
+
 def home(page: Path) -> str:
     """Return the file of tests that runs a page: each takes one worker about as long as the others."""
     if page.parent.name != "how-to":
@@ -147,7 +161,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
     file = Path(metafunc.module.__file__).stem
     mine = [page for page in pages if page.exists() and home(page) == file and list(parse(page))]
-    names = {str(page.relative_to(ROOT)): page for page in mine}
+    names = {str(page.relative_to(ROOT)): page for page in mine if continues(page) is None}
     marks = {name: [pytest.mark.slow] if name in SLOW else [] for name in names}
     metafunc.parametrize("documented", [pytest.param(names[name], id=name, marks=marks[name]) for name in names])
 
@@ -160,14 +174,18 @@ def examples() -> Callable[[Path], Document]:
 
 @pytest.fixture
 def run_examples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
-    """Return what runs the examples of a page in order, in an empty folder."""
+    """Return what runs the examples of a page in order, and of those that continue it, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.setenv("COLUMNS", "120")
 
     def run(page: Path) -> None:
-        for example in parse(page):
-            example.evaluate()
+        names: dict[str, Any] = {}
+        for one in (page, *continuations(page)):
+            document = parse(one)
+            document.namespace = names
+            for example in document:
+                example.evaluate()
 
     return run

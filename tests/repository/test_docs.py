@@ -1,6 +1,6 @@
 """Examples of the README, the tutorial, the explanations and the reference; and what is wrong in one is noticed.
 
-How examples are written and run is told in conftest.py.
+How examples are written and run: see conftest.py.
 """
 
 from collections.abc import Callable
@@ -49,3 +49,16 @@ def test_examples_of_a_page_build_on_one_another(
     )
     assert len(list(examples(page))) == 6
     run_examples(page)
+
+
+def test_a_page_that_continues_another_has_its_files_and_names(
+    page: Path, run_examples: Run, examples: Callable[[Path], Document]
+) -> None:
+    page.write_text("```{code-block} toml\n:caption: b.toml\nx = 1\n```\n\n```python\nnumber = 2\n```\n")
+    second, third = page.with_name("second.md"), page.with_name("third.md")
+    second.write_text("% continues: page.md\n\n```console\n$ cat b.toml\nx = 1\n```\n\n```python\nnumber += 1\n```\n")
+    third.write_text("% continues: second.md\n\n```python\n>>> number\n3\n```\n")
+    run_examples(page)
+    third.write_text("% continues: second.md\n\n```python\n>>> number\n2\n```\n")
+    with pytest.raises(AssertionError):
+        run_examples(page)

@@ -1,6 +1,6 @@
 """Examples of the how-to pages that neither measure nor calibrate.
 
-How examples are written and run is told in conftest.py.
+How examples are written and run: see conftest.py.
 """
 
 from collections.abc import Callable

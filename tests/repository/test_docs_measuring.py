@@ -1,6 +1,6 @@
 """Examples of the pages that measure something and calibrate a sensor.
 
-How examples are written and run is told in conftest.py.
+How examples are written and run: see conftest.py.
 """
 
 from collections.abc import Callable

@@ -26,7 +26,7 @@ OTHER_MEANINGS = {
     ("beam_direction", "errormotion/methods/spindle_drift/"),
     ("beam_direction", "errormotion/instruments/"),
     ("beam_direction", "errormotion/report/parts/beams.py"),
-    ("thermal_model", "errormotion/cli/commands/model.py"),
+    ("thermal_model", "errormotion/cli/commands/compensation/model.py"),
     ("thermal_model", "errormotion/compensation/"),
     ("linuxcnc", "errormotion/compensation/tables/formats/linuxcnc.py"),
     ("linuxcnc", "errormotion/instruments/compensator/linuxcnc.py"),

@@ -10,6 +10,7 @@ import pytest
 import errormotion
 
 ROOT = Path(__file__).parents[2]
+MOST_MODULES = 12
 TARGETS = {"setup", "demo", "test", "lint", "docs", "bench", "validate"}
 
 
@@ -70,6 +71,15 @@ def test_every_package_has_tests() -> None:
     packages = {path.parent.name for path in (ROOT / "errormotion").glob("*/__init__.py")}
     tested = {path.parent.relative_to(ROOT / "tests").parts[0] for path in (ROOT / "tests").glob("*/**/test_*.py")}
     assert packages <= tested
+
+
+def test_no_folder_holds_more_modules_than_a_reader_surveys() -> None:
+    full = {
+        str(folder.relative_to(ROOT)): count
+        for folder in sorted({path.parent for path in (ROOT / "errormotion").rglob("*.py")})
+        if (count := sum(path.name != "__init__.py" for path in folder.glob("*.py"))) > MOST_MODULES
+    }
+    assert not full, "Modules in one folder: divide them into rooms, each a package with one purpose"
 
 
 def test_links_between_pages_lead_somewhere() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from simulated_clock import SimulatedClock
 
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, parse_bench
 from errormotion.compensation.online.follower import LONGEST_STEP, State
 from errormotion.compensation.online.settings import Limits

@@ -17,7 +17,7 @@ import fault_trials as trials
 import numpy as np
 from fault_processes import Forked
 
-from errormotion.campaign.compensating import AUDIT
+from errormotion.campaign.compensation.compensating import AUDIT
 from errormotion.campaign.files import load_bench
 from errormotion.campaign.folder import list_runs
 from errormotion.campaign.monitor.watch import Monitor

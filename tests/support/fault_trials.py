@@ -22,7 +22,7 @@ import numpy as np
 
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder, list_runs
-from errormotion.campaign.store import committed_length
+from errormotion.campaign.storage.store import committed_length
 
 if TYPE_CHECKING:
     pass
@@ -205,7 +205,7 @@ def differences(runs: Path, undisturbed: Path) -> list[str]:
 
 def command(journal: str, limit: int, arguments: list[str]) -> None:
     """Run the command line; note what is delivered to the recorder, before it is."""
-    from errormotion.campaign.recorder import Recorder
+    from errormotion.campaign.storage.recorder import Recorder
     from errormotion.cli import main
 
     if limit:

@@ -21,7 +21,7 @@ from errormotion import datasets
 from errormotion.campaign.files import load_bench, load_campaign
 from errormotion.campaign.folder import SCHEMA as RUN_SCHEMA
 from errormotion.campaign.folder import RunFolder
-from errormotion.campaign.store import committed_length
+from errormotion.campaign.storage.store import committed_length
 from errormotion.datasets.certificates import ATTRIBUTE, certificates_of
 from errormotion.datasets.clock import CLOCK, JOINS, age, notes
 from errormotion.datasets.files import events
@@ -39,8 +39,8 @@ from errormotion.instruments.nc_limits import check_program
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret, title
 from errormotion.instruments.transports.address import parse_address
 from errormotion.plugins import MachineLimits
-from errormotion.record import index
-from errormotion.record.entry import read_entry
+from errormotion.record.runs import index
+from errormotion.record.runs.entry import read_entry
 from errormotion.tolerances.table import load_tolerances
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from linuxcnc_watch import DRIVERS
 
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, parse_bench
 from errormotion.compensation.online.settings import Limits
 from errormotion.compensation.thermal_model import ThermalModel

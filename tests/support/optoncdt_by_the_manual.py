@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from errormotion.instruments.transports.serving import TcpServer
+from errormotion.instruments.transports.loopback.serving import TcpServer
 
 TICK = 0.002
 """Time between two groups of measurements, s; the tests do not depend on it."""

@@ -8,7 +8,7 @@ import threading
 import numpy as np
 
 from errormotion.instruments.point_lds.capancdt.blocks import HEADER
-from errormotion.instruments.transports.serving import TcpServer
+from errormotion.instruments.transports.loopback.serving import TcpServer
 
 WELCOME = b"Welcome to capaNCDT 6200\r\nDevice:DT6230\r\nS/N:1234\r\n"
 CHANNEL = "ANO2303018,NAMDL6230,SNO0815,OFS0,RNG2000,UNTµm"

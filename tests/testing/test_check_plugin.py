@@ -52,7 +52,7 @@ def test_a_plugin_names_its_own_subjects(registered, tmp_path, monkeypatch):
         subjects_of("methods", "mine")
 
 
-def test_a_method_that_names_none_is_told_how_to(registered):
+def test_a_method_that_names_none_is_reported_how_to(registered):
     registered(info=MethodInfo("mine", "", "simulated_only"))
     with pytest.raises(PluginError, match="conformance = 'module:name'"):
         subjects_of("methods", "mine")

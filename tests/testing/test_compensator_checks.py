@@ -14,7 +14,7 @@ from errormotion.instruments.compensator.modbus_registers import ModbusRegisters
 from errormotion.instruments.compensator.offset_file import OffsetFile
 from errormotion.plugins import Applied, CompensatorSubject
 from errormotion.testing import CompensatorConformance
-from errormotion.testing.compensator_checks import COMPENSATOR_CHECKS
+from errormotion.testing.checks.compensator import COMPENSATOR_CHECKS
 from errormotion.testing.kit import CheckResult, run_check
 
 

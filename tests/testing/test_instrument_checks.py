@@ -19,7 +19,7 @@ from pydantic import ConfigDict
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
 from errormotion.plugins import Identity, InstrumentInfo, PluginSettings, Samples
 from errormotion.testing import InstrumentConformance, InstrumentSubject, run_checks
-from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
+from errormotion.testing.checks.instrument import INSTRUMENT_CHECKS
 from errormotion.testing.kit import run_check
 
 BLOCK = 8

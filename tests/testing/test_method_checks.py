@@ -13,8 +13,8 @@ from errormotion.kinematics.twists import cross_matrix
 from errormotion.plugins import MethodInfo, Needs, PluginSettings, Redraw, Redrawing
 from errormotion.report.document import Part
 from errormotion.testing import MethodConformance, MethodSubject, run_checks
+from errormotion.testing.checks.method import METHOD_CHECKS
 from errormotion.testing.kit import run_check
-from errormotion.testing.method_checks import METHOD_CHECKS
 
 SCHEMA = "errormotion.raw.body/1"
 NOISE = 1e-7  # m, of one reading

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from errormotion.testing.compensator_checks import COMPENSATOR_CHECKS
-from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
-from errormotion.testing.method_checks import METHOD_CHECKS
+from errormotion.testing.checks.compensator import COMPENSATOR_CHECKS
+from errormotion.testing.checks.instrument import INSTRUMENT_CHECKS
+from errormotion.testing.checks.method import METHOD_CHECKS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "check-a-plugin.md").read_text()
 

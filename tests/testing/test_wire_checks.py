@@ -21,7 +21,9 @@ from errormotion.instruments.transports import Address, Transport, open_transpor
 from errormotion.instruments.transports.modbus.client import ModbusLine
 from errormotion.instruments.transports.serial_line import SerialTransport
 from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
-from errormotion.testing import InstrumentConformance, InstrumentSubject, fuzz_checks, run_checks, wire_checks
+from errormotion.testing import InstrumentConformance, InstrumentSubject, run_checks
+from errormotion.testing.checks import fuzz as fuzz_checks
+from errormotion.testing.checks import wire as wire_checks
 from errormotion.testing.kit import CheckFailedError
 
 ADDRESS = "sim://cframe/dial?seed=3"

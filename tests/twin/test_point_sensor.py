@@ -142,9 +142,9 @@ def test_out_of_range_there_is_no_reading_and_which_side_can_be_told(sensor: Poi
     depths = 1e-3 * np.array([-10.1, -9.9, 0.0, 9.9, 10.1])
     stage = -sensor.true_origin - depths[:, None] * sensor.true_direction
     np.testing.assert_array_equal(np.isnan(sensor.still(face, stage)), [True, False, False, False, True])
-    told = sensor.still(face, stage, beyond=True)
-    assert told[0] == -np.inf
-    assert told[-1] == np.inf
+    reported = sensor.still(face, stage, beyond=True)
+    assert reported[0] == -np.inf
+    assert reported[-1] == np.inf
 
 
 def test_a_sensor_that_counts_from_the_start_of_its_range_sees_the_same_surface(

@@ -10,7 +10,7 @@ from errormotion import datasets
 from errormotion.campaign.files import TestPlan
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.runner import stored_plan
-from errormotion.campaign.store import committed_length
+from errormotion.campaign.storage.store import committed_length
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.errors import DatasetError, RunError
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -18,7 +19,7 @@ from errormotion import plugins
 from errormotion.campaign.files import CampaignPlan, CampaignTable, MistakesError, TestTable, campaign_of
 from errormotion.campaign.form.written import default_of, quantity_of
 from errormotion.datasets.files.tomlfile import Key, dotted, options_of, parse_toml
-from errormotion.datasets.files.tomltext import value, value_of, with_value
+from errormotion.datasets.files.tomltext import value, value_of, with_table, with_value, without_table
 from errormotion.errors import BenchError, DatasetError, PluginError
 
 DEEPEST = 3
@@ -63,11 +64,12 @@ class Field:
 
 @dataclass(frozen=True)
 class Group:
-    """Fields of one table, and the mistakes that belong to none of them."""
+    """Fields of one table, the mistakes that belong to none of them, and the number of its test from 0."""
 
     title: str
     fields: tuple[Field, ...]
     mistakes: tuple[str, ...] = ()
+    test: int | None = None
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ def form_of(text: str, source: Path) -> Form:
             own.append(Field(**{**each.__dict__, "mistakes": tuple(here)}))
         if place:
             rest, mistakes = _split(mistakes, place, whole=True)
-        groups.append(Group(title, tuple(own), tuple(rest)))
+        groups.append(Group(title, tuple(own), tuple(rest), test=int(place[1]) if place else None))
     return Form(text, tuple(groups), (*general, *mistakes), plan)
 
 
@@ -121,6 +123,31 @@ def with_field(text: str, place: Sequence[Key], written: str) -> str:
     if written.strip() == "" and not (found.required and found.plain):
         return with_value(text, place, None)
     return with_value(text, place, written if found.plain else value_of(written.strip()))
+
+
+def with_test(text: str) -> str:
+    """Return the text of a campaign with one more test, whose method is still to be chosen.
+
+    Raises
+    ------
+    DatasetError
+        The text states its tests in a form to which none can be added.
+    """
+    tests = parse_toml(text, "text").get("test")
+    names = {test.get("name") for test in tests if isinstance(test, dict)} if isinstance(tests, list) else set()
+    name = next(each for number in count(len(names) + 1) if (each := f"test-{number}") not in names)
+    return with_table(text, "test", {"name": name, "method": ""})
+
+
+def without_test(text: str, number: int) -> str:
+    """Return the text of a campaign without one of its tests, counted from 0.
+
+    Raises
+    ------
+    DatasetError
+        There is no such test, or the text states it in a form that cannot be removed alone.
+    """
+    return without_table(text, "test", number)
 
 
 def _checked(text: str, source: Path) -> tuple[CampaignPlan | None, list[str], list[str]]:

@@ -9,7 +9,7 @@ from errormotion.datasets.clock import steady
 
 
 class Clock:
-    """The clock of the computer, which nobody sets; a subclass may run at another rate, as for simulated days."""
+    """The clock of the computer, which is monotonic; a subclass may run at another rate, as for simulated days."""
 
     def now(self) -> float:
         """Return the time, s; it is never set back."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from errormotion.campaign.monitor.log import AXES, BINS, NUMBERS, Channel, Gap, Log, read_log
-from errormotion.report import provenance, timeline
+from errormotion.report import provenance
 from errormotion.report.canvas import COLOURS
 from errormotion.report.document import (
     Block,
@@ -22,6 +22,7 @@ from errormotion.report.document import (
     Text,
     or_dash,
 )
+from errormotion.report.drawings import timeline
 from errormotion.report.page.language import texts_of
 from errormotion.report.parts import sensors
 from errormotion.report.text import fixed, integer, listed, percent

@@ -11,8 +11,8 @@ from typing import Any
 
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchInstrument
-from errormotion.campaign.journal import cause_of
 from errormotion.campaign.monitor.clock import Clock
+from errormotion.campaign.storage.journal import cause_of
 
 FIRST_RETRY_INTERVAL, LONGEST_RETRY_INTERVAL = 1.0, 30.0
 """Time until an instrument is opened again after a failure, s; doubled after each failure up to the longest."""

@@ -25,12 +25,12 @@ import xarray as xr
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.folder import FolderGoneError, RunFolder, now
-from errormotion.campaign.journal import cause_of, journal
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.campaign.monitor.sources import Source
-from errormotion.campaign.recorder import Recorder
-from errormotion.campaign.store import RawStore
+from errormotion.campaign.storage.journal import cause_of, journal
+from errormotion.campaign.storage.recorder import Recorder
+from errormotion.campaign.storage.store import RawStore
 from errormotion.datasets import provenance
 from errormotion.errors import BenchError
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from errormotion.campaign.files import CampaignPlan, TestPlan
-from errormotion.campaign.limits import AXES, NO_MOTIONS, Extent, Limits, extent, steps_of
+from errormotion.campaign.sections.limits import AXES, NO_MOTIONS, Extent, Limits, extent, steps_of
 from errormotion.errors import BenchError
 from errormotion.plugins import Step
 

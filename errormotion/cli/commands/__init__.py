@@ -1,1 +1,1 @@
-"""The commands, one module each: what they do is in the packages below."""
+"""The commands, a folder for each group; `app` states their arguments. What they do is in the packages below."""

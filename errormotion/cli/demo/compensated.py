@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from errormotion import datasets
-from errormotion.cli.commands.compensation_effect import plain
+from errormotion.cli.commands.compensation.effect import plain
 from errormotion.cli.demo.closed_loop import Duty, Loop, Speeds, WarmUp, close
 from errormotion.cli.output import show, show_json, table
 from errormotion.compensation.effect.report import write

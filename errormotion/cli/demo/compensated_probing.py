@@ -16,11 +16,11 @@ from pathlib import Path
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.campaign.compensating import Compensation
+from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import load_campaign
 from errormotion.campaign.folder import RunFolder
-from errormotion.cli.commands.compensation_effect import plain
-from errormotion.cli.commands.run import describe, work
+from errormotion.cli.commands.campaigns.run import describe, work
+from errormotion.cli.commands.compensation.effect import plain
 from errormotion.cli.demo.closed_loop import with_warm_sensors
 from errormotion.cli.output import show, show_json, table
 from errormotion.compensation.effect import effect

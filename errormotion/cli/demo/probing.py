@@ -10,7 +10,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.campaign.files import load_campaign
-from errormotion.cli.commands.run import describe, work
+from errormotion.cli.commands.campaigns.run import describe, work
 from errormotion.cli.demo.spindle import ARCSEC, UM, Number
 from errormotion.cli.output import show, show_json, table
 from errormotion.datasets.schemas import DOF

@@ -15,8 +15,8 @@ from errormotion.arrays import Array
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.truth import machine_of, truth_of
-from errormotion.cli.commands.compare import as_plain, text
-from errormotion.cli.commands.run import describe, work
+from errormotion.cli.commands.campaigns.run import describe, work
+from errormotion.cli.commands.results.compare import as_plain, text
 from errormotion.cli.output import show, show_json, table
 from errormotion.compare import compare as compared
 from errormotion.kinematics.iso import DOF

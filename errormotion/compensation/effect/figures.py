@@ -120,7 +120,7 @@ def reduction_of(before: tuple[float, float], after: tuple[float, float], covari
     worst = math.copysign(ua * ub, -ratio) if covariance is None else covariance
     # (a - r b)^2 <= K^2 (ua^2 - 2 r c + r^2 ub^2): a quadratic in r
     A, B, C = b**2 - (K * ub) ** 2, -2 * (a * b - K**2 * worst), a**2 - (K * ua) ** 2
-    if A <= 0:  # the figure before is not told from 0
+    if A <= 0:  # the figure before cannot be distinguished from 0
         return Interval(1 - abs(ratio), -math.inf, 1.0)
     root = math.sqrt(max(B**2 - 4 * A * C, 0.0))
     low, high = (-B - root) / (2 * A), (-B + root) / (2 * A)

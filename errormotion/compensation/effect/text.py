@@ -21,7 +21,7 @@ def verdict(found: Effect) -> list[str]:
     lines = []
     whole = next((part for part in found.parts if part.name == DISPLACEMENT), found.parts[0])
     if not math.isfinite(whole.reduction.value):
-        lines.append("Nothing can be said: the errors before the compensation are not told from 0.")
+        lines.append("Nothing can be said: the errors before the compensation cannot be distinguished from 0.")
     else:
         gained = whole.reduction.value
         change = f"{percent(gained)} less" if gained >= 0 else f"{percent(-gained)} more"
@@ -36,7 +36,9 @@ def verdict(found: Effect) -> list[str]:
     lines += [f"{', '.join(of[WORSE])}: larger with the compensation."] if of[WORSE] else []
     lines += [f"{', '.join(of[OPEN])}: no change shown."] if of[OPEN] else []
     if none_left := [part.name for part in found.parts if part.correctable and part.after.low == 0]:
-        lines.append(f"{', '.join(none_left)}: what is left is not told from the uncertainty of the measurement.")
+        lines.append(
+            f"{', '.join(none_left)}: what is left cannot be distinguished from the uncertainty of the measurement."
+        )
     return lines + limits(found)
 
 

@@ -179,7 +179,7 @@ def _with_sensors(
 
     if settings.sensors is not None:
         return candidate(settings.sensors)
-    # One warm-up has one course of the speed: without a sensor it cannot be told from the heat.
+    # One warm-up has one course of the speed: without a sensor its effect cannot be separated from that of the heat.
     sensed = len(columns.records) == 1 and bool(common) and settings.most_sensors > 0
     best = None if sensed else candidate(())
     while len(best.sensors if best else ()) < settings.most_sensors:

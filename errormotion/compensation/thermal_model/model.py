@@ -18,8 +18,8 @@ from errormotion.compensation.thermal_model.record import instruments_of, read_i
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
 from errormotion.datasets.schemas import DOF, Row
-from errormotion.datasets.storage import load as load_dataset
-from errormotion.datasets.storage import reading, save
+from errormotion.datasets.storage.disk import load as load_dataset
+from errormotion.datasets.storage.disk import reading, save
 from errormotion.datasets.timing import start_of
 from errormotion.errors import DatasetError
 

@@ -25,8 +25,8 @@ from errormotion.dashboard.pages.results import REPORT_POLICY, loaded, millimetr
 from errormotion.errors import DatasetError, ErrormotionError
 from errormotion.kinematics.iso import DOF
 from errormotion.record.history import history
-from errormotion.record.listing import list_runs
 from errormotion.record.page import write as write_history
+from errormotion.record.runs.listing import list_runs
 
 MOST_COMPARED = 20
 """Results of one comparison."""

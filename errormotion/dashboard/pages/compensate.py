@@ -13,7 +13,7 @@ import numpy as np
 from tornado.web import HTTPError
 
 from errormotion.arrays import Array
-from errormotion.campaign.following import Status, is_working, read_status, request_stop
+from errormotion.campaign.compensation.following import Status, is_working, read_status, request_stop
 from errormotion.dashboard.compensations import Compensations, Start, rows
 from errormotion.dashboard.course import thin
 from errormotion.dashboard.figures import following_item

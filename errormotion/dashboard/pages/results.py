@@ -20,9 +20,9 @@ from errormotion.dashboard.lab import Choice, figure_text
 from errormotion.dashboard.pages.page import POLICY, Guarded
 from errormotion.dashboard.space import Drawing, drawing, has_volume
 from errormotion.datasets.results.merit import figures_of
-from errormotion.datasets.storage import reading
+from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
-from errormotion.record.entry import MOST_FIGURES
+from errormotion.record.runs.entry import MOST_FIGURES
 
 PAGE = 100
 """Runs on one page of the table."""

@@ -5,18 +5,7 @@ const INTERVAL = 1000, LIVE_INTERVAL = 3000; // ms
 const text = byId("text"), control = Boolean(byId("processes-card").dataset.control);
 let before = text.dataset.before, asked = 0, timer = 0, shown = "", planned = null;
 
-async function ask(path, body) {
-  const options = body === undefined ? {} : { method: "POST", body: JSON.stringify(body) };
-  let answer;
-  try {
-    answer = await fetch(path, { ...options, headers: { Accept: "application/json", "Content-Type": "application/json" } });
-  } catch {
-    throw new Error("The dashboard does not answer.");
-  }
-  const found = await answer.json();
-  if (!answer.ok) throw new Error(found.error);
-  return found;
-}
+const ask = (path, body) => answerOf(path, { body, limit: 0, stay: true });
 
 function button(label, work, className) {
   const made = element("button", label, className);
@@ -65,7 +54,7 @@ function fill(each) { // values and messages, in the fields that are there
 
 function show(form) {
   const fields = form.groups.flatMap((group) => group.fields);
-  const frame = JSON.stringify(fields.map((each) => [each.place, each.choices]));
+  const frame = JSON.stringify([form.groups.map((group) => group.test), fields.map((each) => [each.place, each.choices])]);
   if (frame !== shown && form.groups.length) {
     shown = frame;
     let number = 0;
@@ -80,8 +69,8 @@ function show(form) {
         more.append(element("summary", `${rest.length} further settings`), ...rest);
         card.append(more);
       }
-      const mistakes = element("ul", undefined, "mistakes");
-      card.append(mistakes);
+      if (group.test !== null) card.append(button(`Remove test ${group.test + 1}`, () => tests({ remove: group.test }), "remove"));
+      card.append(element("ul", undefined, "mistakes"));
       return card;
     }));
   }
@@ -129,6 +118,13 @@ let queue = Promise.resolve(); // fields change one after the other, each the te
 function changed(place, value) {
   queue = queue.then(() => check({ place, value }));
 }
+function tests(change) { // added or removed; the form is made anew, and the new test is shown
+  queue = queue.then(async () => {
+    await check(change);
+    if (change.add) byId("form").lastElementChild?.querySelector("input, select")?.focus();
+  });
+}
+byId("add").addEventListener("click", () => tests({ add: true }));
 text.addEventListener("input", () => {
   ready();
   clearTimeout(timer);
@@ -256,7 +252,8 @@ function process(each) { // made anew only when something but the progress has c
       link.href = `/run?${new URLSearchParams({ run: test.run })}`;
       links.append(link, " ");
     }
-    if (control && each.alive) links.append(button("Stop", (event) => command("/measure/stop", { process: each.name }, event.target), "stop"));
+    if (each.elsewhere) links.append(element("span", "It was started in a terminal or another program: Ctrl-C there stops it.", "note"));
+    else if (control && each.alive) links.append(button("Stop", (event) => command("/measure/stop", { process: each.name }, event.target), "stop"));
     if (control && each.resume) links.append(button("Resume", (event) => command("/measure/resume", { run: each.resume }, event.target)));
     if (links.childNodes.length) made.append(links);
     if (card) card.replaceWith(made);

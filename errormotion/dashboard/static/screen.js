@@ -10,11 +10,24 @@ function element(name, text, className) {
   return made;
 }
 
-async function answerOf(path) { // the token may have changed: the dashboard was started again
-  const answer = await fetch(path, { headers: { Accept: "application/json" }, signal: AbortSignal.timeout(10000) });
-  if (answer.status === 403) location.assign("/login");
-  if (!answer.ok) throw new Error((await answer.json()).error);
-  return answer.json();
+// Ask the server; with a body, post it. A 403 leads to the login, since the dashboard may have been started again with
+// another token; not with stay, where the page holds what a person has written.
+async function answerOf(path, { body, limit = 10000, stay = false } = {}) {
+  const options = { headers: { Accept: "application/json" }, signal: limit ? AbortSignal.timeout(limit) : undefined };
+  if (body !== undefined) {
+    Object.assign(options, { method: "POST", body: JSON.stringify(body) });
+    options.headers["Content-Type"] = "application/json";
+  }
+  let answer;
+  try {
+    answer = await fetch(path, options);
+  } catch {
+    throw new Error("The dashboard does not answer.");
+  }
+  if (answer.status === 403 && !stay) location.assign("/login");
+  const found = await answer.json();
+  if (!answer.ok) throw new Error(found.error);
+  return found;
 }
 
 const LARGE = matchMedia("(min-width: 2600px)").matches;

@@ -32,8 +32,8 @@ from errormotion.datasets.checks import dims, magnitude_violations, storable_vio
 from errormotion.datasets.files.folders import folders_beside
 from errormotion.datasets.provenance import hash_dataset
 from errormotion.datasets.schemas import Row
-from errormotion.datasets.storage import load as load_dataset
-from errormotion.datasets.storage import reading, save
+from errormotion.datasets.storage.disk import load as load_dataset
+from errormotion.datasets.storage.disk import reading, save
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import inclination_rotation, tilt_vector
 
@@ -44,8 +44,8 @@ FOLDER = "calibrations"
 VARIABLE = "ERRORMOTION_CALIBRATIONS"
 """Environment variable that names one more such folder."""
 
-BEYOND = 0.05
-"""Share of the calibrated range by which a reading may lie beyond it."""
+EXTRAPOLATION = 0.05
+"""Largest extrapolation beyond the calibrated range of readings, as a share of it."""
 
 _DEPTH = (-0.2, 0.2)  # m; ranges of point sensors, and mm show
 _SLOPE = (-0.5, 0.5)  # an error of half the depth is no inclination error
@@ -366,7 +366,7 @@ class InclinationCalibration:
 
     def _require_depth(self, depth: Array) -> None:
         low, high = (float(self.dataset[name]) - self.mid_range for name in ("reading_low", "reading_high"))
-        spare = BEYOND * (high - low)
+        spare = EXTRAPOLATION * (high - low)
         wrong = depth[(depth < low - spare) | (depth > high + spare)]
         if wrong.size:
             worst = wrong.flat[np.argmax(np.abs(wrong))]

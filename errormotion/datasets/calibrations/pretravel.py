@@ -23,8 +23,8 @@ from errormotion.arrays import Array
 from errormotion.datasets.calibrations import owner
 from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
 from errormotion.datasets.schemas import Row
-from errormotion.datasets.storage import load as load_dataset
-from errormotion.datasets.storage import reading, save
+from errormotion.datasets.storage.disk import load as load_dataset
+from errormotion.datasets.storage.disk import reading, save
 from errormotion.errors import DatasetError
 
 SCHEMA = "errormotion.calibration.pretravel/1"

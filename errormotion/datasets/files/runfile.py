@@ -41,10 +41,17 @@ class _Method(_Table):
     id: str = ""
 
 
+class _Event(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    time: float = Field(ge=0.0, le=1e10)
+    spindle_speed: float | None = Field(default=None, ge=0.0)
+    compensation: dict[str, bool] | None = None
+
+
 class _Clock(_Table):
     start: str = ""
     time: float = Field(default=0.0, ge=0.0, le=1e10)
-    schedule: list[dict[str, Any]] = []
+    schedule: list[_Event] = []
 
 
 class _Step(_Table):

@@ -67,14 +67,60 @@ def with_value(text: str, place: Sequence[Key], content: Any) -> str:
     DatasetError
         The text is not TOML, is too long, or states the value in a form that cannot be changed alone.
     """
-    if len(text) > LONGEST_TEXT:
-        raise DatasetError(f"expected at most {LONGEST_TEXT} characters; found {len(text)}")
-    before = parse_toml(text, "text")
+    before = _read(text)
     expected = copy.deepcopy(before)
     _put(expected, place, content)
-    if expected == before:
-        return text
-    changed = _changed(text, tuple(place), content, expected)
+    return text if expected == before else _same(_changed(text, tuple(place), content, expected), expected, place)
+
+
+def with_table(text: str, name: str, content: Mapping[str, Any]) -> str:
+    """Return a text with one more table at the end of an array of tables, which may not be there yet.
+
+    Raises
+    ------
+    DatasetError
+        The text is not TOML, is too long, or states the array in another form than by headers ``[[name]]``.
+    """
+    before = _read(text)
+    expected = copy.deepcopy(before)
+    expected[name] = [*before.get(name, []), dict(content)] if isinstance(before.get(name, []), list) else None
+    lead = "" if not text else "\n" if text.endswith("\n") else "\n\n"
+    lines = "".join(f"{key(each)} = {value(found)}\n" for each, found in content.items())
+    return _same(f"{text}{lead}[[{key(name)}]]\n{lines}", expected, (name,))
+
+
+def without_table(text: str, name: str, number: int) -> str:
+    """Return a text without one table of an array of tables, and without the tables in it; comments around it remain.
+
+    Raises
+    ------
+    DatasetError
+        The text is not TOML, is too long, has no such table, or states it in another form than by headers ``[[name]]``.
+    """
+    expected = _read(text)
+    if not isinstance(expected.get(name), list):
+        raise DatasetError(f"{name}: there are no such tables in the text")
+    _put(expected, (name, number), None)
+    if not expected[name]:
+        del expected[name]
+    own: list[_Statement] = []
+    for each in [*reversed(list(_statements(text))), None]:
+        if each is not None and each.table[:2] == (name, number):
+            own.append(each)
+        elif own:  # these stand together, in reverse order
+            head, rest = text[: own[-1].start], text[own[0].end :]
+            text = head + (rest.removeprefix("\n") if head.endswith("\n\n") or not head else rest)
+            own = []
+    return _same(text, expected, (name, number))
+
+
+def _read(text: str) -> dict[str, Any]:
+    if len(text) > LONGEST_TEXT:
+        raise DatasetError(f"expected at most {LONGEST_TEXT} characters; found {len(text)}")
+    return parse_toml(text, "text")
+
+
+def _same(changed: str, expected: Any, place: Sequence[Key]) -> str:
     with suppress(DatasetError):
         if parse_toml(changed, "text") == expected:
             return changed
@@ -188,9 +234,12 @@ def _put(content: Any, place: Sequence[Key], new: Any) -> None:
             if new is None and isinstance(content, dict) and each not in content:
                 return
             content = content.setdefault(each, {}) if isinstance(content, dict) else content[each]
-        if new is None:
-            content.pop(place[-1], None)
+        last: Any = place[-1]
+        if new is None and isinstance(content, list):
+            del content[last]
+        elif new is None:
+            content.pop(last, None)
         else:
-            content[place[-1]] = new
+            content[last] = new
     except (KeyError, IndexError, TypeError, AttributeError):
         raise DatasetError(f"{dotted(place)}: there is no such place in the text") from None

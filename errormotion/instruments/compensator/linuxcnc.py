@@ -19,6 +19,7 @@ from errormotion.instruments.controller.linuxcnc import codec
 from errormotion.instruments.controller.linuxcnc.driver import NAME, read_token
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.recording import RecordingTransport, ReplayTransport
 from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo, PluginSettings
 
 SIMULATOR = "errormotion.instruments.simulators.controller.linuxcnc:SimulatedLinuxCNC"
@@ -45,6 +46,8 @@ class LinuxCNCOffset(Driver):
     address : str
         As that of the driver ``linuxcnc``: ``unix://~/.errormotion/linuxcnc.sock``, ``sim://cframe/linuxcnc?seed=3``.
     settings : LinuxCNCCompensatorSettings, optional
+    record : Path, optional
+        File to which every frame of the session is recorded.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -57,17 +60,19 @@ class LinuxCNCOffset(Driver):
     Settings: ClassVar[type[PluginSettings]] = LinuxCNCCompensatorSettings
     route: ClassVar[str] = "external"
 
-    def __init__(self, address: str, settings: Any = None) -> None:
-        super().__init__(address, settings)
+    def __init__(self, address: str, settings: Any = None, *, record: Path | None = None) -> None:
+        super().__init__(address, settings, record=record)
         self._door = OffsetDoor(f"{self.info.id} at {address}")
         self._number = 0
         self._may_write = False
 
     @classmethod
     def conformance(cls) -> CompensatorSubject:
-        """Return what the conformance kit examines: the machine that runs here, without writing to it."""
+        """Return what the conformance kit examines: a LinuxCNC of its own, with simulated joints."""
         return CompensatorSubject(
-            cls, address="unix://~/.errormotion/linuxcnc.sock", dead_address="unix:///nonexistent/linuxcnc.sock"
+            cls,
+            address=f"sim://cframe/linuxcnc?seed=3&route={cls.route}&slew=20&linger=60",
+            dead_address="unix:///nonexistent/linuxcnc.sock",
         )
 
     def close(self) -> None:
@@ -77,18 +82,8 @@ class LinuxCNCOffset(Driver):
 
     def identify(self) -> Identity:
         """Return the machine."""
-        facts = self._ask("identify")
-        try:
-            return Identity(
-                manufacturer=str(facts["manufacturer"]),
-                model=str(facts["model"]),
-                serial_number=str(facts["serial_number"]),
-                firmware=str(facts["firmware"]),
-                simulated=self.transport.simulated,
-                details={"address": self.address, "route": self.route},
-            )
-        except (KeyError, TypeError):
-            raise ProtocolError(f"Expected the identity of a LinuxCNC; found {str(facts)[:200]}") from None
+        details = {"address": self.address, "route": self.route}
+        return codec.decode_identity(self._ask("identify"), self.transport.simulated, details)
 
     def arm(self, limit: float) -> None:
         """Let offsets be written up to a limit of each axis, m; ask the bridge for the right to set them.
@@ -163,7 +158,9 @@ class LinuxCNCOffset(Driver):
 
     def _hello(self, line: Transport, *, compensate: bool) -> Any:
         token = "" if line.simulated else read_token(self.settings.token_file, self.address)
-        return self._ask("hello", token=token, control=False, client=f"{NAME} {id(self):x}", compensate=compensate)
+        recorded = isinstance(line, RecordingTransport | ReplayTransport)
+        client = NAME if recorded else f"{NAME} {id(self):x}"  # a session is replayed by another object
+        return self._ask("hello", token=token, control=False, client=client, compensate=compensate)
 
     def _ask(self, op: str, **arguments: Any) -> Any:
         """Return the result of a request; after a failure without an answer the connection is closed."""

@@ -8,7 +8,7 @@ from errormotion.instruments.simulators.faults import Fault, parse_fault, stray_
 from errormotion.instruments.simulators.late import LateAnswer
 from errormotion.instruments.simulators.virtual_world.world import world
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.serving import make_server
+from errormotion.instruments.transports.loopback.serving import make_server
 
 DEFAULT_MACHINE = "cframe"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 
-from errormotion.instruments.transports.serving import Server
+from errormotion.instruments.transports.loopback.serving import Server
 
 
 class LateAnswer:

@@ -77,7 +77,7 @@ def open_transport(
         case "replay":
             transport = ReplayTransport(Path(address.path), timeout=timeout)
         case "sim":
-            from errormotion.instruments.transports.simulated import SimulatedTransport
+            from errormotion.instruments.transports.loopback.simulated import SimulatedTransport
 
             transport = SimulatedTransport(address, load_simulator(simulator, url), timeout=timeout, baudrate=baudrate)
         case _:
@@ -105,7 +105,7 @@ def load_simulator(name: str | None, url: str) -> Callable[[Address], Any]:
         raise InstrumentError(f"The simulator '{name}' behind '{url}' does not load: {error}") from error
 
     def start(address: Address) -> Any:
-        from errormotion.instruments.transports.serving import placed
+        from errormotion.instruments.transports.loopback.serving import placed
 
         with placed(address):
             return simulator(address)

@@ -14,6 +14,7 @@ from errormotion.errors import InstrumentError, ReplayError
 from errormotion.instruments.transports import load_simulator
 from errormotion.instruments.transports.address import Address, parse_address
 from errormotion.instruments.transports.base import Transport
+from errormotion.instruments.transports.loopback.simulated import SimulatedTransport
 from errormotion.instruments.transports.recording import (
     Recorder,
     RecordingTransport,
@@ -21,7 +22,6 @@ from errormotion.instruments.transports.recording import (
     read_index,
     write_index,
 )
-from errormotion.instruments.transports.simulated import SimulatedTransport
 from errormotion.instruments.transports.tcp import TcpTransport
 
 COMMAND = "command"

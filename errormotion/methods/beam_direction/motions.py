@@ -20,7 +20,7 @@ from errormotion.plugins import Step
 if TYPE_CHECKING:
     from errormotion.methods.beam_direction.settings import Settings
 
-BEYOND = 0.6
+SEARCH_MARGIN = 0.6
 """Distance beyond the search in which a face may be, as a share of the range: half of it, and a move for its sign."""
 
 
@@ -44,7 +44,7 @@ def steps(settings: Settings, instruments: Mapping[str, Any] | None = None) -> l
     found: list[Step] = []
     for normal in normals:
         path = stage_path(settings, normal, length)
-        for position in _face(start, forth, reach, reach + BEYOND * length, path):
+        for position in _face(start, forth, reach, reach + SEARCH_MARGIN * length, path):
             x, y, z = (float(each) for each in position)
             found.append(Step("move", (x, y, z), math.nan, math.nan))
     return found

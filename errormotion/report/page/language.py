@@ -1,5 +1,7 @@
 """The language of a report: every text of a page is looked up in a catalogue, English to the other language.
 
+In every language, micrometres and microradians have the sign µ, also where a text of the terminal states ``um``.
+
 A catalogue is a TOML file ``LANGUAGE.toml`` of one table: English text = its translation. ``{}`` stands for what
 differs, such as a value or a name, in the order of the English text; ``{2}`` is the second one. A text of several
 sentences may be listed by sentence. What no catalogue lists stays English. Plugins bring a catalogue of their own as
@@ -36,8 +38,8 @@ _BEFORE_UNIT = re.compile(r"(?<![\w.])\d+\.\d+(?= (?:[uµ]?m|mm|[uµm]?rad|arcse
 _MICRO = re.compile(r"(?<!\w)u(?=(?:m|rad)(?!\w))")
 _LIST = re.compile(r"(, | und )")
 _UNITS = re.compile(r"\b(?:arcsec|min|m?rad|days)\b")
-_SVG_TEXT = re.compile(r"(?<=>)([^<>]*[^<>\s][^<>]*)(?=</text>)")
-_SVG_NAME = re.compile(r'(?<= data-(?:x-name)=")([^"]+)(?=")')
+_SVG_TEXT = re.compile(r"(?<=>)([^<>]*[^<>\s][^<>]*)(?=</(?:text|span|label)>)")
+_SVG_NAME = re.compile(r'(?:(?<= data-x-name=")|(?<= aria-label="))([^"]+)(?=")')
 _AnyBlock = TypeVar("_AnyBlock", bound=Block)
 
 
@@ -80,8 +82,10 @@ class Catalogue:
 
     def __call__(self, text: Any) -> Any:
         """Return a text in the language; sentences one by one if it is not listed as a whole."""
-        if self.language == "en" or not isinstance(text, str) or isinstance(text, Markup) or not text.strip():
+        if not isinstance(text, str) or isinstance(text, Markup) or not text.strip():
             return text
+        if self.language == "en":
+            return _MICRO.sub("µ", text)
         sentences = _SENTENCES.split(text)
         if len(sentences) > 1 and text not in self._exact:
             return " ".join(str(self(each)) for each in sentences)
@@ -92,8 +96,10 @@ class Catalogue:
 
     def word(self, text: Any) -> Any:
         """Return a name or a number in the language; what is not listed is a name of the data and stays."""
-        if self.language == "en" or not isinstance(text, str) or isinstance(text, Markup):
+        if not isinstance(text, str) or isinstance(text, Markup):
             return text
+        if self.language == "en":
+            return _MICRO.sub("µ", text)
         found = self._found(text)
         if found is not None:
             return found
@@ -132,8 +138,6 @@ class Catalogue:
 
     def svg(self, drawing: Markup) -> Markup:
         """Return a drawing with its texts in the language."""
-        if self.language == "en":
-            return drawing
         text = _SVG_TEXT.sub(lambda found: escape(str(self._label(unescape(found[1]))), quote=False), str(drawing))
         return Markup(_SVG_NAME.sub(lambda found: escape(str(self.word(unescape(found[1])))), text))
 
@@ -149,8 +153,6 @@ class Catalogue:
 
     def block(self, block: _AnyBlock, *, rows: bool = True) -> _AnyBlock:
         """Return a block in the language; without ``rows``, the rows of a table stay as they are."""
-        if self.language == "en":
-            return block
         made: Block
         if isinstance(block, Text):
             made = replace(block, text=self(block.text))

@@ -1,1 +1,1 @@
-"""Parts that several chapters share: beams, budget, temperature sensors."""
+"""Chapters and parts of chapters that do not belong to one method: any error dataset, beams, sensors."""

@@ -22,7 +22,7 @@ from errormotion.report.document import (
     estimate,
     or_dash,
 )
-from errormotion.report.series import LOOK
+from errormotion.report.drawings.series import LOOK
 from errormotion.report.text import ARCSEC, DASH, finite, fixed, integer, listed, rounded, significant
 
 _UNKNOWN = "the beam was not determined"

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.report import canvas
 from errormotion.report.document import Block, Cell, Figure, Source, Table, Text, or_dash
+from errormotion.report.drawings.timeline import UNKNOWN, sensor_names
+from errormotion.report.drawings.turntable import TURN, Dots, Ellipsoids, Lines, Scene, draw
 from errormotion.report.text import DASH, finite, fixed, integer, listed, percent
-from errormotion.report.timeline import UNKNOWN, sensor_names
-from errormotion.report.turntable import TURN, Dots, Ellipsoids, Lines, Scene, draw
 
 _FAINT, _STILL, _COOLER = "#c3c8d0", "#6f7680", canvas.BLUE
 _WARMER = ("#6f7680", "#B07800", "#D55E00", "#96280a")

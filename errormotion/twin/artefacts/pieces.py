@@ -17,7 +17,7 @@ Surface = Callable[[Array, Array], ArrayLike]
 
 #: distance of the knots of a free form, m, and their number beyond the outline: effects of the end fall by 0.27 a knot
 KNOTS = 0.1e-3
-BEYOND = 20
+MARGIN = 20
 
 _NO_TABLE = np.zeros((4, 4))
 
@@ -76,7 +76,7 @@ def freeform(z: Surface, half_size: tuple[float, float] = (22e-3, 30e-3), *, nam
     BenchError
         ``z`` returns another shape or values that are not finite.
     """
-    x, y = (KNOTS * np.arange(-(n := round(half / KNOTS) + BEYOND), n + 1) for half in half_size)
+    x, y = (KNOTS * np.arange(-(n := round(half / KNOTS) + MARGIN), n + 1) for half in half_size)
     grid = np.meshgrid(x, y, indexing="ij")
     values = np.asarray(z(*grid), dtype=float)
     if values.shape != grid[0].shape or not np.isfinite(values).all():

@@ -262,8 +262,9 @@ def test_the_machine_is_switched_on_again_during_the_ramp(machine: Machine, comp
         ("M64 P0\nG4 P1.5\nM65 P0\n", "the program holds the offset"),
         ("G38.3 Z-2 F80\nG53 G0 Z0\n", "the machine probes"),
         ("M3 S600\nG4 P0.3\nG33 Z-8 K0.5\nM5\nG53 G0 Z0\n", "a thread is cut"),
+        ("M3 S600\nG4 P0.3\nG33.1 Z-8 K0.5\nM5\nG53 G0 Z0\n", "a thread is cut"),
     ],
-    ids=["hold", "probe", "thread"],
+    ids=["hold", "probe", "thread", "tap"],
 )
 def test_nothing_changes_while_the_machine_must_not_be_disturbed(
     machine: Machine, compensator: LinuxCNCOffset, program: str, busy: str

@@ -25,7 +25,7 @@ LAYOUT = {
 
 
 class Stage:
-    """Goes where it is told, to the micrometre, and says where it is."""
+    """Goes to the commanded place, to the micrometre, and says where it is."""
 
     def __init__(self):
         self.place, self.moves = np.zeros(3), 0
@@ -174,7 +174,7 @@ def test_readings_that_grow_while_the_sensor_comes_nearer_are_refused():
         list(measure_planes(Bench(sign=-1.0), settings(), {}, None))
 
 
-def test_a_face_that_is_not_there_is_told_with_where_it_was_looked_for():
+def test_a_face_that_is_not_there_is_reported_with_where_it_was_looked_for():
     with pytest.raises(MethodError, match=r"no reading from -5 to 5 mm along the beam"):
         list(measure_planes(Bench(), settings(start=(0.05, 0.05, 0.3), search=5e-3), {}, None))
 

@@ -121,10 +121,10 @@ def test_noise_larger_than_stated_is_said_and_widens_the_uncertainty() -> None:
 
 def test_without_stated_noise_the_residuals_tell_it() -> None:
     bar = fit_bar(bar_points(1e-6, 4), ALONG_Z)
-    told = fit_bar(bar_points(1e-6, 4), ALONG_Z, noise=1e-6)
+    reported = fit_bar(bar_points(1e-6, 4), ALONG_Z, noise=1e-6)
     assert np.isnan(bar.explained)
     assert not bar.exceeds_noise
-    assert bar.radius_u == pytest.approx(told.radius_u, rel=0.5)
+    assert bar.radius_u == pytest.approx(reported.radius_u, rel=0.5)
 
 
 def test_order_of_the_points_does_not_matter_on_a_circle() -> None:
@@ -213,7 +213,7 @@ def test_too_few_points_and_points_of_no_bar_are_refused() -> None:
         ({"noise": -1.0}, "expected a standard deviation"),
     ],
 )
-def test_wrong_options_are_told(options: dict, message: str) -> None:
+def test_wrong_options_are_reported(options: dict, message: str) -> None:
     with pytest.raises(MethodError, match=message):
         fit_bar(bar_points(1e-6), ALONG_Z, **options)
 

@@ -126,13 +126,13 @@ def test_planes_stand_as_the_gauge_was_set(machine, calibration):
 def test_the_calibration_that_was_used_is_in_the_provenance(machine, calibration):
     raw = simulation.raw(machine, FOUR, seed=3)
     known = InclinationCalibration.load(calibration)
-    told = provenance.of(identify(raw, compensation=calibration))["calibration"]
-    assert told == known.reference()
-    assert told["name"] == "sensor"
+    reported = provenance.of(identify(raw, compensation=calibration))["calibration"]
+    assert reported == known.reference()
+    assert reported["name"] == "sensor"
     changed = InclinationCalibration(known.dataset.assign(mid_range=1e-3))
     renamed = InclinationCalibration(known.dataset.assign_attrs(name="other"))
-    assert changed.reference()["hash"] != told["hash"]
-    assert renamed.reference()["hash"] == told["hash"]
+    assert changed.reference()["hash"] != reported["hash"]
+    assert renamed.reference()["hash"] == reported["hash"]
     assert "calibration" not in provenance.of(identify(raw))
 
 
@@ -188,13 +188,13 @@ def test_an_unsure_scale_turns_the_beam_and_moves_its_start(machine):
 
 
 def test_without_compensation_it_is_said_and_planes_contradict_one_another(machine):
-    told = notes(identify(simulation.raw(machine, FOUR, seed=0)))
-    assert "No inclination compensation" in told
-    assert "The planes contradict one another: chi-square" in told
-    assert "The uncertainties are raised" in told
-    assert "worst is plane" in told
-    told = notes(identify(simulation.raw(machine, FOUR[:3], seed=0)))
-    assert "three planes do not show which of them is wrong" in told
+    reported = notes(identify(simulation.raw(machine, FOUR, seed=0)))
+    assert "No inclination compensation" in reported
+    assert "The planes contradict one another: chi-square" in reported
+    assert "The uncertainties are raised" in reported
+    assert "worst is plane" in reported
+    reported = notes(identify(simulation.raw(machine, FOUR[:3], seed=0)))
+    assert "three planes do not show which of them is wrong" in reported
 
 
 def test_two_planes_state_the_other_direction_and_the_missing_zero_point(machine):
@@ -273,9 +273,9 @@ def test_sound_data_raise_no_alarm(machine):
 
 def test_known_points_without_an_uncertainty_are_said_to_be_taken_as_exact(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
-    told = "the known points of the planes are assumed to be exact"
-    assert told in notes(identify(raw.drop_vars("plane_point_uncertainty")))
-    assert told in notes(identify(raw.assign(plane_point_uncertainty=((), np.nan, {"units": "m"}))))
+    reported = "the known points of the planes are assumed to be exact"
+    assert reported in notes(identify(raw.drop_vars("plane_point_uncertainty")))
+    assert reported in notes(identify(raw.assign(plane_point_uncertainty=((), np.nan, {"units": "m"}))))
 
 
 def test_missing_and_out_of_range_readings_are_counted(machine):

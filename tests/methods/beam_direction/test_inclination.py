@@ -126,8 +126,8 @@ def test_a_setting_at_the_wrong_angle_is_left_out_and_named() -> None:
     wrong = np.isclose(raw["inclination"], np.radians(20)) & np.isclose(raw["rotation"], np.radians(60))
     raw["reading"] = raw["reading"] + xr.where(wrong, 3e-4 * raw["reference"], 0.0)
     found = calibrate(raw)
-    told = "1 setting contradicts all others and was left out: inclination 20 deg at rotation 60 deg."
-    assert told in found.dataset.attrs["notes"]
+    reported = "1 setting contradicts all others and was left out: inclination 20 deg at rotation 60 deg."
+    assert reported in found.dataset.attrs["notes"]
     assert int(found.dataset["setting_left_out"].sum()) == 1
     q = tilt_vector(np.radians(20.0), np.radians(60.0))
     assert abs(found.slope(q)[0] - plane_slope(q)) < 4 * found.slope(q)[1]
@@ -222,11 +222,13 @@ def test_intervals_hold_the_truth_wherever_tilts_are_supported(inclinations) -> 
 
 def test_a_hole_along_the_inclination_is_named() -> None:
     rings = np.radians([0.0, 5, 10, 15, 20, 35, 40, 45])
-    told = calibrate(readings(alphas=rings)).dataset.attrs["notes"]
-    assert "usual step is 5 deg of inclination; tilts in them are refused: inclination 20 to 35 deg at every" in told
-    assert "spoils" not in told
-    told = calibrate(readings(alphas=rings[[0, 1, 2, 3, 6, 7]])).dataset.attrs["notes"]
-    assert "A hole of 25 deg at every rotation also affects its surroundings" in told
+    reported = calibrate(readings(alphas=rings)).dataset.attrs["notes"]
+    assert (
+        "usual step is 5 deg of inclination; tilts in them are refused: inclination 20 to 35 deg at every" in reported
+    )
+    assert "spoils" not in reported
+    reported = calibrate(readings(alphas=rings[[0, 1, 2, 3, 6, 7]])).dataset.attrs["notes"]
+    assert "A hole of 25 deg at every rotation also affects its surroundings" in reported
 
 
 def test_intervals_hold_the_truth_in_holes() -> None:

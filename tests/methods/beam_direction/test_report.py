@@ -225,9 +225,9 @@ def test_the_chapter_has_its_sections(html):
 
 def test_every_figure_is_drawn_and_told_in_words(html):
     assert len(drawings(html)) == 6
-    told = re.findall(r'<figure role="img" aria-label="([^"]+)"', html)
-    assert len(told) == 6
-    assert all(len(words) > 60 for words in told)
+    reported = re.findall(r'<figure role="img" aria-label="([^"]+)"', html)
+    assert len(reported) == 6
+    assert all(len(words) > 60 for words in reported)
 
 
 def test_the_file_stays_small_and_leads_nowhere(html):
@@ -297,20 +297,20 @@ def test_a_tilt_that_the_calibration_does_not_support_is_said(page):
     supported, bare = (
         page(result(planes)) for planes in (((20, 0), (20, 90), (25, 180)), ((20, 0), (30, 45), (25, 180)))
     )
-    told = [re.search(r'aria-label="(Maps of the inclination error[^"]+)"', html)[1] for html in (supported, bare)]
-    assert "not supported" not in told[0]
-    assert re.search(r"plane 2 \S+ \(not supported\)", told[1])
+    reported = [re.search(r'aria-label="(Maps of the inclination error[^"]+)"', html)[1] for html in (supported, bare)]
+    assert "not supported" not in reported[0]
+    assert re.search(r"plane 2 \S+ \(not supported\)", reported[1])
     assert "extrapolated" not in supported
     assert "plane 2 lies outside the settings of the calibration" in words_of(bare)
 
 
-def test_the_calibration_is_told_with_its_remaining_error(html):
+def test_the_calibration_is_reported_with_its_remaining_error(html):
     found = re.search(r"at 78 tilts, 1 of them left out, fitted by a polynomial of order (\d+)", words_of(html))
     assert int(found[1]) == calibration().order
-    told = re.search(r"were left out of the fit: (\S+) µm per mm \(95 %: (\S+) to (\S+)\)", words_of(html))
+    reported = re.search(r"were left out of the fit: (\S+) µm per mm \(95 %: (\S+) to (\S+)\)", words_of(html))
     ds = calibration().dataset
     expected = 1e3 * np.array([ds["remaining_error"].item(), *ds["remaining_error_interval"].values])
-    np.testing.assert_allclose([float(number) for number in told.groups()], expected, rtol=0.06)  # two digits
+    np.testing.assert_allclose([float(number) for number in reported.groups()], expected, rtol=0.06)  # two digits
 
 
 def test_a_calibration_that_is_not_there_is_a_sentence(tmp_path, monkeypatch):
@@ -378,7 +378,7 @@ def test_extras_of_nothing_but_nan_are_no_values(page):
     assert "nan" not in words_of(html).lower().split()
 
 
-def test_strokes_are_told_by_the_raw_dataset_too(page):
+def test_strokes_are_reported_by_the_raw_dataset_too(page):
     errors = result()
     raw = xr.Dataset({"stage": errors["stage"]})
     (row,) = table(page(errors.drop_vars("stage"), raw=raw), "Readings that were left out")
@@ -414,7 +414,7 @@ def test_remarks_of_the_method_are_warnings(page):
     assert '<p class="warning">The compensation went round 4 times.</p>' in page(errors)
 
 
-def test_many_planes_are_told_and_some_are_drawn(page):
+def test_many_planes_are_reported_and_some_are_drawn(page):
     html = page(result(tuple((20, angle) for angle in range(0, 360, 24))))
     assert len(table(html, "The planes.")) == 15
     assert "12 of 15 planes are shown." in words_of(html)
@@ -431,7 +431,7 @@ def measured():
     return raw
 
 
-def test_a_result_of_the_method_is_told_whole(page, measured):
+def test_a_result_of_the_method_is_reported_whole(page, measured):
     errors = BeamDirection().identify(measured, Settings(compensation="lk-h050", extrapolate=True, ordered=False))
     html = page(errors, raw=measured)
     text = words_of(html)
@@ -451,7 +451,7 @@ def test_a_result_of_the_method_is_told_whole(page, measured):
     ]
 
 
-def test_a_result_without_compensation_is_told_with_its_contradiction(page, measured):
+def test_a_result_without_compensation_is_reported_with_its_contradiction(page, measured):
     html = page(BeamDirection().identify(measured, Settings(ordered=False)), raw=measured)
     assert "The readings were not compensated for the tilt of the planes" in words_of(html)
     assert "The planes contradict one another" in words_of(html)

@@ -209,7 +209,7 @@ def test_uncertainty_of_the_calibration_is_shared(scan: Callable[..., Points], b
         ({"normals": np.tile(ACROSS, (3, 1))}, "parallel to the surface"),
     ],
 )
-def test_wrong_input_is_told(change: dict, message: str) -> None:
+def test_wrong_input_is_reported(change: dict, message: str) -> None:
     given = {"reading": READING, "stage": STAGE, "origin": ORIGIN, "direction": U} | change
     with pytest.raises(MethodError, match=message):
         points(**given)

@@ -53,7 +53,7 @@ def test_the_same_cut_with_places_counted_from_its_own_start_is_refused(pair, sh
         solved(cold, (z[100:], x, y[:300] + shift))
 
 
-def test_places_in_millimetres_are_told(pair):
+def test_places_in_millimetres_are_reported(pair):
     (z, x, y), _ = pair
     with pytest.raises(MethodError, match=r"millimetres.*divide by 1000"):
         prepare(z * 1e3, x * 1e3, y * 1e3)

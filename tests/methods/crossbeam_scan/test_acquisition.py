@@ -12,7 +12,7 @@ import xarray as xr
 from armed import CONTROLLER
 
 from errormotion import datasets
-from errormotion.campaign.store import RawStore
+from errormotion.campaign.storage.store import RawStore
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, MethodError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX
@@ -253,7 +253,7 @@ def test_broken_passes_that_are_not_in_a_row_do_not_end_it(tmp_path):
 
 
 @pytest.mark.parametrize("pitch", [1e-3, 1e-9, -1e-6])
-def test_a_wrong_encoder_pitch_is_told_at_the_first_pass(tmp_path, pitch):
+def test_a_wrong_encoder_pitch_is_reported_at_the_first_pass(tmp_path, pitch):
     with pytest.raises(
         MethodError, match=r"none of them in a scan; the scans are at 0\.3, 0\.45 m\. Check encoder_pitch"
     ):
@@ -396,7 +396,7 @@ def test_a_record_that_does_not_say_when_it_began_is_not_gone_on_with(tmp_path, 
         record_scans(bench_of(day(Machine(real=True))), SETTINGS, None, done)
 
 
-def test_the_operator_is_told_which_program_and_what_it_does(tmp_path, day):
+def test_the_operator_is_reported_which_program_and_what_it_does(tmp_path, day):
     machine = day(Machine(real=True))
     texts = {program.name: program.text() for program in schedule(SETTINGS).programs.values()}
 

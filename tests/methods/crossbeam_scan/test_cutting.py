@@ -179,12 +179,12 @@ def test_the_overflow_of_a_count_is_mended_and_noted(whole):
     ("pitch", "found"),
     [(1e-3, r"none of \d+ lines there, but at 267"), (1e-9, "none of"), (-1e-6, r"at -0\.48")],
 )
-def test_a_wrong_encoder_pitch_is_told(whole, pitch, found):
+def test_a_wrong_encoder_pitch_is_reported(whole, pitch, found):
     with pytest.raises(MethodError, match=rf"Expected lines at the artefacts .*{found}.*Check\s+encoder_pitch"):
         Scans(whole.assign(encoder_pitch=((), pitch)))
 
 
-def test_a_pitch_that_puts_all_lines_into_one_scan_is_told(whole):
+def test_a_pitch_that_puts_all_lines_into_one_scan_is_reported(whole):
     near = whole.assign(encoder_pitch=((), 1e-9), encoder_zero=((), 0.3))
     with pytest.raises(MethodError, match=r"found 0\.07 um from line to line"):
         Scans(near)

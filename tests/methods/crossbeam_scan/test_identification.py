@@ -267,7 +267,7 @@ def test_strain_is_what_the_axis_does_along_a_scan(found, machines):
     H, places = RigidTransform.from_matrix(crossbeam.pose), np.array(PLACES)
     slope = (crossbeam.twist(7200.0, places + 1e-3) - crossbeam.twist(7200.0, places - 1e-3)) / 2e-3
     known = H.rotation.inv().apply(slope[:, :3] + np.cross(slope[:, 3:], crossbeam.lever + H.translation))
-    # a scale of the feed is told by the curvature along it alone, ten times worse than the others
+    # a scale of the feed is determined by the curvature along it alone, ten times worse than the others
     assert ds["strain"].values[2][:, [0, 2]] == pytest.approx(known[:, [0, 2]], abs=10e-6)
     assert ds["strain"].values[2][:, 1] == pytest.approx(known[:, 1], abs=150e-6)
     assert not found["rigid"][0]["strain"].sel(direction="x").values[0].any()
@@ -280,7 +280,7 @@ def test_raw_stays_as_it_was_and_is_named(campaigns, found):
     assert hashed in str(found["free"][0].attrs["provenance"])
 
 
-def test_unknown_uncertainties_are_told(campaigns):
+def test_unknown_uncertainties_are_reported(campaigns):
     bare = campaigns[0].drop_vars(["pose_covariance", "lever_uncertainty"]).isel(cycle=[0, 2])
     ds = identify(bare)
     assert any("pose of the profiler is assumed exact" in note for note in ds.attrs["notes"])

@@ -76,7 +76,7 @@ def test_it_never_waits_and_its_thread_ends(scans, monkeypatch):
     assert live._thread is None
 
 
-def test_a_scan_that_cannot_be_registered_is_told_and_nothing_ends(scans):
+def test_a_scan_that_cannot_be_registered_is_reported_and_nothing_ends(scans):
     live = LiveScans(SETTINGS)
     for chunk in chunks(scans):
         flat = xr.zeros_like(chunk["record"])

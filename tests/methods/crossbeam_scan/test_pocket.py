@@ -104,7 +104,7 @@ def test_lost_lines_stay_open():
     assert raw.attrs["dropped"] > 0
 
 
-def test_lines_that_lie_further_apart_than_stated_are_told():
+def test_lines_that_lie_further_apart_than_stated_are_reported():
     control, profiler = gantry(26)
     with control, profiler, pytest.raises(MethodError, match=r"Expected 700 lines 40 um apart .* found 4\d\d"):
         list(record_pocket(

@@ -19,7 +19,7 @@ def test_bending_of_a_block_is_that_of_its_parabola():
 
 
 @pytest.mark.parametrize(("pitch", "notes"), [(25e-6, 0), (50e-6, 1)])
-def test_points_too_far_apart_for_the_relief_are_told(gantry, pitch, notes):
+def test_points_too_far_apart_for_the_relief_are_reported(gantry, pitch, notes):
     profiler = Profiler(400, pitch)
     raw = simulation.raw_scans(gantry, [0, 3600], [0.1], seed=1, profiler=profiler, profiles=200, feed=70e-6)
     found = register_all(Scans(raw), [0], 0.5e-6, Settings())

@@ -227,9 +227,9 @@ def test_the_file_stays_small_and_leads_nowhere(html):
 
 def test_every_figure_is_drawn_and_told_in_words(html):
     assert len(drawings(html)) == 5
-    told = re.findall(r'<figure role="img" aria-label="([^"]+)"', html)
-    assert len(told) == 5
-    assert all(len(words) > 60 for words in told)
+    message = re.findall(r'<figure role="img" aria-label="([^"]+)"', html)
+    assert len(message) == 5
+    assert all(len(words) > 60 for words in message)
 
 
 def test_key_figures_are_the_largest_warm_errors_with_place_and_time(html, whole):
@@ -320,11 +320,11 @@ def test_remarks_of_the_method_are_warnings(html):
 
 
 @pytest.mark.parametrize(
-    ("notes", "told"),
+    ("notes", "message"),
     [(["One.", "", "Two."], ["One.", "Two."]), ('["One."]', ["One."]), ("One.", ["One."]), ("", []), ([""], [])],
 )
-def test_remarks_may_be_a_list_or_its_json(notes, told):
-    assert remarks(xr.Dataset(attrs={"notes": notes})) == told
+def test_remarks_may_be_a_list_or_its_json(notes, message):
+    assert remarks(xr.Dataset(attrs={"notes": notes})) == message
 
 
 def test_the_cold_repeat_is_judged_by_its_uncertainty(page, small):
@@ -334,7 +334,7 @@ def test_the_cold_repeat_is_judged_by_its_uncertainty(page, small):
     assert "the largest is EYY at y = −300 mm with 5 times its own" in words_of(found[1])
 
 
-def test_the_pose_is_told_in_angles_and_shifts(html):
+def test_the_pose_is_reported_in_angles_and_shifts(html):
     rows = {row[0]: row[1:] for row in table(html, "Pose of the profiler in the tool frame")}
     # H[0, 2] = sin b; 2 sigma of b are 0.02 mrad.
     pose = VirtualMachine("gantry", seed=3).crossbeam.pose
@@ -430,7 +430,7 @@ def test_an_error_that_is_the_same_everywhere_is_drawn_without_a_warning(page, s
 def test_a_map_is_a_path_for_each_colour_and_keeps_its_holes():
     from matplotlib.figure import Figure
 
-    from errormotion.report.maps import DIVERGING, cells, scale_of
+    from errormotion.report.drawings.maps import DIVERGING, cells, scale_of
 
     rng = np.random.default_rng(0)
     values = rng.normal(0, 1, (40, 40))
@@ -447,7 +447,7 @@ def test_a_map_is_a_path_for_each_colour_and_keeps_its_holes():
 
 
 def test_zero_is_white_and_both_sides_have_the_same_depth():
-    from errormotion.report.maps import scale_of
+    from errormotion.report.drawings.maps import scale_of
 
     scale = scale_of(np.array([-1.0, 4.0]), 10)
     low, high = np.array(scale.to_rgba([-0.01, 0.01]))[:, :3]

@@ -306,6 +306,6 @@ def test_a_pass_that_broke_says_where_and_why(record, record_errors):
 
 
 @pytest.mark.parametrize("pitch", [1e-3, 1e-9])
-def test_a_wrong_encoder_pitch_is_told(record, pitch):
+def test_a_wrong_encoder_pitch_is_reported(record, pitch):
     with pytest.raises(MethodError, match="Check encoder_pitch"):
         identify(record.assign(encoder_pitch=((), pitch)))

@@ -31,7 +31,7 @@ def true_place(position):
 
 
 class Machine:
-    """Goes where it is told, with a clock of its own."""
+    """Goes to the commanded place, with a clock of its own."""
 
     def __init__(self):
         self.place, self.time, self.path = np.zeros(3), 0.0, []

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.determinacy import swapped_stations
-from errormotion.methods.multilateration.network.notes import notes_of
+from errormotion.methods.multilateration.network.diagnosis.determinacy import swapped_stations
+from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.methods.multilateration.planning.bound import bound
 

@@ -254,11 +254,11 @@ def test_repeatability_of_the_machine_is_noise_where_set_ups_follow_one_another(
     assert float(share) == pytest.approx(4 / 4.25)  # 2 um beside the tracker's 0.5 um
 
 
-def _returning(machine, seed, true, returns=6, **told):
+def _returning(machine, seed, true, returns=6, **reported):
     q = simulation.target_grid(machine, (4, 4, 3))
     q = np.concatenate([q, q[:: 48 // returns][:returns]])
     raw = simulation.raw(machine, q, seed=seed, repeatability=true)
-    left = Multilateration().identify(raw, Settings(parametric=False, **told))
+    left = Multilateration().identify(raw, Settings(parametric=False, **reported))
     return left, vectors(left) - vectors(simulation.true_errors(machine, q))
 
 
@@ -349,7 +349,7 @@ def test_a_station_far_from_its_rough_place_is_remarked_upon(raw, errors):
     np.testing.assert_allclose(vectors(found), vectors(errors), atol=1e-10)
 
 
-def test_millimetres_for_metres_are_told(raw):
+def test_millimetres_for_metres_are_reported(raw):
     small = raw.assign(displacement=raw["displacement"] * 1e3)
     with pytest.raises((MethodError, DatasetError), match=r"millimetres|in mm\?"):
         Multilateration().identify(small)
@@ -392,7 +392,7 @@ def test_swapped_readings_are_named_like_swapped_places(raw, errors):
     np.testing.assert_allclose(vectors(found), vectors(errors), atol=1e-10)
 
 
-def test_one_reading_in_millimetres_is_left_out_and_a_station_in_millimetres_is_told(raw):
+def test_one_reading_in_millimetres_is_left_out_and_a_station_in_millimetres_is_reported(raw):
     one = raw.copy(deep=True)
     one["displacement"][1, 41] *= 1e3
     found = Multilateration().identify(one)
@@ -458,7 +458,7 @@ def test_rows_of_nan_are_left_out_or_told(raw, name, row, message):
     assert np.isfinite(np.sqrt(np.einsum("tii->ti", found["covariance"].values[:, :3, :3]))[~lost]).all()
 
 
-def test_air_that_is_not_known_at_all_is_told(raw):
+def test_air_that_is_not_known_at_all_is_reported(raw):
     without = _with_air(raw).drop_vars("refractive_index")
     without["relative_humidity"][:] = np.nan
     with pytest.raises(MethodError, match="relative_humidity: expected numbers; found NaN only"):

@@ -9,7 +9,8 @@ import pytest
 
 from errormotion import datasets
 from errormotion.methods.multilateration import simulation
-from errormotion.methods.multilateration.network import loops, outliers
+from errormotion.methods.multilateration.network import loops
+from errormotion.methods.multilateration.network.diagnosis import outliers
 from errormotion.methods.multilateration.network.model import Stations, readings
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.twin import VirtualMachine

@@ -13,7 +13,7 @@ from errormotion.datasets import build_errors, provenance
 from errormotion.methods.multilateration import Multilateration, simulation
 from errormotion.methods.multilateration.report.view import network, thinned
 from errormotion.report import write_report
-from errormotion.report.turntable import Ellipsoids, Lines, Scene, camera, draw, enlargement
+from errormotion.report.drawings.turntable import Ellipsoids, Lines, Scene, camera, draw, enlargement
 from errormotion.twin import VirtualMachine
 
 pytestmark = pytest.mark.usefixtures("translated")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from errormotion.methods.multilateration.network.notes import notes_of
+from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
 from errormotion.methods.multilateration.network.solver import solve
 
 STATION = np.array(

@@ -6,8 +6,8 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2, norm
 
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
 from errormotion.methods.multilateration.network.model import Stations, jacobian, motions, readings
-from errormotion.methods.multilateration.network.notes import notes_of
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.methods.multilateration.planning.bound import bound, relative_bound
 

@@ -274,7 +274,7 @@ def test_who_takes_no_more_cycles_leaves_a_machine_that_stands() -> None:
     assert control.log[-1] == ("stop", True)
 
 
-def test_a_machine_that_cannot_be_stopped_is_told() -> None:
+def test_a_machine_that_cannot_be_stopped_is_reported() -> None:
     control = Control()
 
     def gone(seconds):
@@ -437,7 +437,7 @@ def test_three_balls_are_the_least() -> None:
         next(acquire(Bench(), settings(balls=BALLS[:2])))
 
 
-def test_a_ball_that_was_not_found_cold_is_told_at_once() -> None:
+def test_a_ball_that_was_not_found_cold_is_reported_at_once() -> None:
     class Blind(Probe):
         def measure(self, touches):
             for contact, touch in zip(super().measure(touches), touches, strict=True):
@@ -451,7 +451,7 @@ def test_a_ball_that_was_not_found_cold_is_told_at_once() -> None:
 # ---------------------------------------------------------------------- for the person at the machine
 
 
-def test_each_cycle_is_told_in_a_line() -> None:
+def test_each_cycle_is_reported_in_a_line() -> None:
     machine = VirtualMachine("gantry", seed=5)
     machine.start([])
     raw = simulation.raw(machine, [0.0, 600.0], seed=1, touches=5)

@@ -135,7 +135,7 @@ def test_noise_that_nobody_stated_comes_from_the_residuals(probed):
     assert "from the residuals" in found.attrs["notes"][0]
 
 
-def test_noise_above_the_stated_one_is_told_and_counted(probed):
+def test_noise_above_the_stated_one_is_reported_and_counted(probed):
     _, raw = probed(noise=0.8e-6)
     raw["touch_noise"] = raw["touch_noise"] * 0 + 0.25e-6
     raised, kept = (

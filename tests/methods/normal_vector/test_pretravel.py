@@ -198,7 +198,7 @@ def test_a_broken_map_is_refused(name: str, factor: float, message: str) -> None
 def test_the_reference_page_says_what_is_checked() -> None:
     page = (Path(__file__).parents[3] / "docs" / "reference" / "schemas.md").read_text()
     section = page.partition("\n## Pre-travel map")[2].partition("\n## ")[0]
-    told = [line for line in section.splitlines() if line.startswith("| `")]
-    for row, line in zip(ROWS, told, strict=True):
+    reported = [line for line in section.splitlines() if line.startswith("| `")]
+    for row, line in zip(ROWS, reported, strict=True):
         limits = "" if math.isinf(row.low) else f"{row.low:g} to {row.high:g}"
         assert line == f"| `{row.name}` | {', '.join(row.dims)} | {row.unit} | yes | {limits} | {row.meaning} |"

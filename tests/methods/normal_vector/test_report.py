@@ -13,8 +13,8 @@ from errormotion.methods.normal_vector import NormalVector, simulation
 from errormotion.methods.normal_vector.report.drawings import balls
 from errormotion.methods.normal_vector.report.view import MISSING, MOVED, WRONG, probing
 from errormotion.report import write_report
+from errormotion.report.drawings.timeline import clock
 from errormotion.report.text import fixed
-from errormotion.report.timeline import clock
 from errormotion.twin import Event, VirtualMachine
 
 pytestmark = pytest.mark.usefixtures("translated")
@@ -112,7 +112,7 @@ def test_errors_in_the_table_are_those_of_the_dataset(folder):
         decimals = len(expanded.split(".")[1])
         assert value.strip() == fixed(float(errors[name][-1]) / size, decimals, signed=True)
         sigma = float(np.sqrt(errors["covariance"][-1, i, i]))
-        # The expanded uncertainty is told with two digits.
+        # The expanded uncertainty is stated with two digits.
         assert number(expanded) == pytest.approx(2 * sigma / size, rel=0.06)
         assert number(found[name][3]) == pytest.approx(float(errors[name].max()) / size, abs=0.006)
         assert found[name][7] == "10 of 10"
@@ -129,7 +129,7 @@ def test_displacements_of_the_balls_are_those_of_the_dataset(folder):
         assert row[8] == "no"
 
 
-def test_enlargement_that_is_told_is_the_one_that_is_drawn():
+def test_enlargement_that_is_reported_is_the_one_that_is_drawn():
     seen = probing(*clean())
     figure = balls(seen, "k")
     factor = int(re.search(r"magnified (\d[\d\u202f]*) times", figure.caption)[1].replace("\u202f", ""))
@@ -172,7 +172,7 @@ def test_ball_that_moved_is_named_and_marked(folder):
     assert "Red, dashed: B2" in html
 
 
-def test_remarks_of_the_method_and_flags_of_the_probe_are_told(folder):
+def test_remarks_of_the_method_and_flags_of_the_probe_are_reported(folder):
     errors, raw = troubled()
     html = words(page(troubled, folder))
     for note in errors.attrs["notes"]:
@@ -268,7 +268,7 @@ def test_result_without_any_of_its_extras_still_has_a_page(tmp_path):
     assert "No temperatures were recorded." in text
 
 
-def test_cycles_that_are_all_unknown_are_told(tmp_path):
+def test_cycles_that_are_all_unknown_are_reported(tmp_path):
     errors, raw = clean()
     gone = errors.copy(deep=True)
     for name in ("EX", "EY", "EZ", "EA", "EB", "EC"):

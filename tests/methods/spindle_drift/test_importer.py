@@ -139,7 +139,7 @@ def test_empty_cells_are_nan_and_counted(run) -> None:
     assert int(np.isnan(raw["distance"]).sum()) == 3
 
 
-def test_every_mistake_is_told_with_its_line(complaints) -> None:
+def test_every_mistake_is_reported_with_its_line(complaints) -> None:
     log = (
         GOOD
         + "0.5,1,1,1,1,1,20\n# a comment\n\n1,1,1,1,one,1,20\n"
@@ -157,7 +157,7 @@ def test_every_mistake_is_told_with_its_line(complaints) -> None:
     ]
 
 
-def test_missing_and_doubled_columns_are_told_with_the_nearest(complaints) -> None:
+def test_missing_and_doubled_columns_are_reported_with_the_nearest(complaints) -> None:
     assert complaints("# c\nt,X1,X2,Y1,Y-2,Z,Z\n0,1,1,1,1,1,1\n") == [
         "line 2: channels.Y2: no column 'Y2'; did you mean 'Y-2'? Known here: X1, X2, Y-2, Y1, Z, t",
         "line 2: channels.Z: column 'Z' occurs 2 times; give its number instead",
@@ -174,7 +174,7 @@ def test_a_decimal_comma_is_recognised(complaints) -> None:
 
 
 @pytest.mark.parametrize(
-    ("log", "told"),
+    ("log", "message"),
     [
         (b"t,X1,X2,Y1,Y2,Z,T\n0,1,1,1,1,1,20\n1,1,1,1,1,1,20 \xb0C\n", "log.csv, line 3: byte 0xb0 is not utf-8"),
         (GOOD.encode("utf-16"), "log.csv, line 1: starts with the byte order mark of UTF-16"),
@@ -184,18 +184,18 @@ def test_a_decimal_comma_is_recognised(complaints) -> None:
         ("t,X1,X2,Y1,Y2,Z,T\n", "log.csv: expected lines of numbers below the header; found none"),
     ],
 )
-def test_a_text_that_is_no_table_is_told(complaints, log, told) -> None:
-    assert complaints(log)[0].startswith(told)
+def test_a_text_that_is_no_table_is_reported(complaints, log, message) -> None:
+    assert complaints(log)[0].startswith(message)
 
 
-def test_many_mistakes_are_counted_and_the_first_are_told(complaints) -> None:
+def test_many_mistakes_are_counted_and_the_first_are_reported(complaints) -> None:
     (found,) = complaints(GOOD + "".join(f"{k},a,1,1,1,1,20\n" for k in range(1, 101)))
     assert found == "lines 4, 5, 6, 7, 8 and 95 more: channels.X1, field 2: expected a number; found 'a'"
     found = complaints(GOOD + "".join(f"{k},1,1,1,1,1,20{',1' * k}\n" for k in range(1, 101)), map_text(HEAD))
     assert found == ["lines 4, 5, 6, 7, 8 and 95 more: expected 7 fields; found 8 in line 4"]
 
 
-def test_dates_that_are_none_are_told(complaints) -> None:
+def test_dates_that_are_none_are_reported(complaints) -> None:
     head = HEAD.replace('unit = "min"', 'unit = "iso8601"')
     (found,) = complaints("t,X1,X2,Y1,Y2,Z,T\n14:05,1,1,1,1,1,20\n", map_text(head))
     assert found.startswith(
@@ -203,7 +203,7 @@ def test_dates_that_are_none_are_told(complaints) -> None:
     )
 
 
-def test_mistakes_of_the_map_are_told_by_key(complaints) -> None:
+def test_mistakes_of_the_map_are_reported_by_key(complaints) -> None:
     mapping = map_text(HEAD.replace('"5 mm"', "5").replace('"min"', '"mm"')).replace("[channels.Y2]", "[channels.y2]")
     mapping = mapping.replace("[0, 0, 1]", "[0, 0, 2]")
     (found,) = complaints(GOOD, mapping)
@@ -219,14 +219,14 @@ def test_mistakes_of_the_map_are_told_by_key(complaints) -> None:
 
 
 @pytest.mark.parametrize(
-    ("extra", "told"),
+    ("extra", "message"),
     [
         ('[format]\ndelimiter = ","\ndecimal = ","\n', "format: decimal sign and delimiter are both ','"),
         ('[format]\nencoding = "utf8-ish"\n', "format.encoding: expected an encoding such as 'utf-8'"),
     ],
 )
-def test_a_format_that_cannot_be_is_told(complaints, extra, told) -> None:
-    assert told in complaints(GOOD, map_text(HEAD + extra))[0]
+def test_a_format_that_cannot_be_is_reported(complaints, extra, message) -> None:
+    assert message in complaints(GOOD, map_text(HEAD + extra))[0]
 
 
 def test_beam_uncertainties_are_given_for_all_or_none(complaints) -> None:
@@ -235,7 +235,7 @@ def test_beam_uncertainties_are_given_for_all_or_none(complaints) -> None:
     assert "together, or neither" in complaints(GOOD, map_text() + 'origin_uncertainty = "10 um"\n')[0]
 
 
-def test_a_missing_log_is_told(tmp_path) -> None:
+def test_a_missing_log_is_reported(tmp_path) -> None:
     (tmp_path / "map.toml").write_text(map_text())
     with pytest.raises(DatasetError, match=r"none\.csv: cannot be read: No such file"):
         import_log(tmp_path / "none.csv", tmp_path / "map.toml", tmp_path / "raw.nc")

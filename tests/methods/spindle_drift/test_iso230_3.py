@@ -42,7 +42,7 @@ def value(found, quantity, measure, table="value"):
     return getattr(found, table)[QUANTITIES.index(quantity), MEASURES.index(measure)]
 
 
-def test_ranges_and_differences_are_told_apart():
+def test_ranges_and_differences_are_reported_apart():
     t = np.arange(0, 7200.5, 0.5)
     found = results(t)
     assert value(found, "X1", "range_total") == pytest.approx(

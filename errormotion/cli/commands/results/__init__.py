@@ -1,1 +1,1 @@
-"""Commands that hand a result on: to the browser, to a spreadsheet."""
+"""Results: identify, validate, compare, show, and hand on to a spreadsheet."""

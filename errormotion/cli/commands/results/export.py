@@ -18,6 +18,7 @@ from errormotion.cli.results import load
 from errormotion.cli.summary import as_printed
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.results.tables import to_dataframe
+from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
 from errormotion.report.exports import xlsx
 from errormotion.report.exports.tables import Entry, Sheet
@@ -52,13 +53,14 @@ def export(
         names = ", ".join(found) or "none"
         raise DatasetError(f"{result}: expected one result, a run folder or a NetCDF file; found {names}")
     (errors,) = found.values()
-    if at is not None:
-        errors = errors.em.at(at)
+    with reading(result):
+        rows = int(np.prod([errors.sizes[dim] for dim in errors.em.dims]))
+        if at is not None:
+            errors = errors.em.at(at)
     if out.suffix.lower() in (".nc", ".zarr"):
         if freedoms is not None:
             raise DatasetError(f"{out}: a dataset holds all freedoms; --freedoms is for .csv and .xlsx")
         datasets.save(errors, out)
-        rows = int(np.prod([errors.sizes[dim] for dim in errors.em.dims]))
         sheets = []
     else:
         sheets = [_errors(errors, freedoms, k), _figures(errors), _about(errors, k)]

@@ -55,7 +55,7 @@ def _page(place: Path) -> Path:
         if page is None:
             raise RunError(f"{place}: has no {PAGE}. Write it with 'errormotion report {place}'")
         return page
-    from errormotion.record.listing import list_runs
+    from errormotion.record.runs.listing import list_runs
 
     for path, _ in list_runs([place]).runs:
         page = _inside(path)

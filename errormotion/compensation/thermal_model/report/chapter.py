@@ -7,11 +7,12 @@ import math
 import numpy as np
 import xarray as xr
 
-from errormotion.report import budget, provenance, quality, timeline
+from errormotion.report import budget, provenance, quality
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
-from errormotion.report.generic import unit_at
+from errormotion.report.drawings import timeline
 from errormotion.report.parts import sensors
+from errormotion.report.parts.generic import unit_at
 from errormotion.report.text import fixed, integer, listed, percent
 
 _PREDICTED = (

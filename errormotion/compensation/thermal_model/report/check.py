@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.compensation.thermal_model.report import chapter as thermal_model
-from errormotion.report import canvas, provenance, timeline
+from errormotion.report import canvas, provenance
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import (
     Block,
@@ -27,9 +27,10 @@ from errormotion.report.document import (
     estimate,
     or_dash,
 )
+from errormotion.report.drawings import timeline
 from errormotion.report.fields import remarks
-from errormotion.report.generic import unit_at
 from errormotion.report.parts import sensors
+from errormotion.report.parts.generic import unit_at
 from errormotion.report.text import DASH, fixed, integer, listed, significant
 
 COVERAGE_FACTOR = 1.96

@@ -14,7 +14,7 @@ from errormotion.datasets.units import convert, format_quantity
 DIVERGING = LinearSegmentedColormap.from_list(
     "errors", ["#00305A", "#0072B2", "#9CCBE8", "#FFFFFF", "#F5BE98", "#D55E00", "#6B2A00"]
 )
-"""Blue below zero, white at zero, vermillion above: told apart with every colour vision."""
+"""Blue below zero, white at zero, vermillion above: distinguishable with every colour vision."""
 
 _UNKNOWN = "#D9D9D9"
 

@@ -21,7 +21,7 @@ UNITS = {
 """Inside unit and field unit of each estimate."""
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#B5558A", "#3291C8", "#B07800", "#222222", "#8C6D00")
-"""After Okabe and Ito: told apart with every colour vision."""
+"""After Okabe and Ito: distinguishable with every colour vision."""
 
 MARKERS = "os^Dv<>P"
 

@@ -2,7 +2,8 @@
 """Connects LinuxCNC with other programs: JSON lines on a Unix socket, or on a port of this computer.
 
 LinuxCNC's Python module works only in the Python of the system, beside LinuxCNC. This file therefore runs there, as the
-``DISPLAY`` of an INI file or as an ``APP`` beside another display, and needs only that Python. A request is
+``DISPLAY`` of an INI file or as an ``APP`` beside another display, and needs only that Python. It is copied to the
+machine as one file and imports nothing of this package: it is therefore not divided into modules. A request is
 ``{"id": 1, "op": "move_to", "position": [0.1, 0, 0]}``, its answer ``{"id": 1, "ok": true, "result": ...}`` or
 ``{"id": 1, "ok": false, "error": "..."}``. While an order runs, ``{"id": 1, "beat": 7, "time": 3.2}`` is sent five
 times a second. Lengths are in m, speeds in m/s, those of spindles in 1/min, times in s since the bridge started;
@@ -53,6 +54,7 @@ HELLO_TIMEOUT = 5.0  # s from a connection to its first request
 POSITION_TOLERANCE = 1e-6  # m between goal and final position
 MAX_CLIENTS = 64
 MAX_STRANGERS = 16  # connections without a valid first request
+STRANGER_TIME = 0.2  # s that each of them has at least, however many wait
 MAX_REQUEST_BYTES = 1 << 16  # of one line
 MAX_PROGRAM_BYTES = 1 << 24  # of all parts
 MAX_UNREAD_BYTES = 1 << 18  # of answers to one client
@@ -110,7 +112,9 @@ class Client(asyncio.Protocol):
         self.transport: Any = None
         self.greeted = self.control = self.compensate = self.gone = False
         self.name = ""
+        self.since = time.monotonic()
         self.program: list[str] = []  # parts of a program that are here already
+        self.program_size = 0
         self.tasks: set[asyncio.Task[None]] = set()
         self._buffer = bytearray()
         self._reading = False  # whether further lines are taken in a moment
@@ -177,6 +181,11 @@ class Client(asyncio.Protocol):
                 self.transport.pause_reading()
             if self._serving is None:
                 self._serving = asyncio.ensure_future(self._serve())
+
+    def discard_program(self) -> None:
+        """Forget the parts of a program."""
+        self.program.clear()
+        self.program_size = 0
 
     def welcome(self) -> None:
         """Accept the client."""
@@ -519,10 +528,18 @@ class Bridge:
 
     def arrived(self, client: Client) -> None:
         """Register a connection. Of too many strangers the oldest is disconnected."""
-        strangers = [each for each in self.clients if not each.greeted]
+        strangers = self._strangers()
         if len(strangers) >= MAX_STRANGERS:
             strangers[0].end()
         self.clients[client] = None
+
+    def crowded(self) -> bool:
+        """Whether so many strangers have just arrived that the next one has to wait until their time is over."""
+        strangers = self._strangers()
+        return len(strangers) >= MAX_STRANGERS and time.monotonic() - strangers[0].since < STRANGER_TIME
+
+    def _strangers(self) -> list[Client]:
+        return [each for each in self.clients if not each.greeted]
 
     def left(self, client: Client) -> None:
         """Forget a connection, and end its motions."""
@@ -890,10 +907,11 @@ class Bridge:
         if not isinstance(text, str):
             raise RefusedError("expected the text of a part of a program")
         if not text:
-            client.program.clear()
+            client.discard_program()
         client.program.append(text)
-        if sum(map(len, client.program)) > MAX_PROGRAM_BYTES:
-            client.program.clear()
+        client.program_size += len(text)
+        if client.program_size > MAX_PROGRAM_BYTES:
+            client.discard_program()
             raise RefusedError(f"expected a program of at most {MAX_PROGRAM_BYTES} bytes")
 
     async def run_program(self, client: Client, text: Any, machine_coordinates: Any = False) -> dict[str, Any]:
@@ -902,7 +920,7 @@ class Bridge:
         With ``machine_coordinates`` it is refused while an offset of work or tool, or a rotation, is in force.
         """
         parts = client.program.copy()
-        client.program.clear()
+        client.discard_program()
         await self._demand()
         if not isinstance(text, str):
             raise RefusedError("expected the text of a program")
@@ -1024,7 +1042,10 @@ class Bridge:
         speed, most = _number(feed, "a feed in m/s"), self._fastest()
         if not 0 < speed <= most * (1 + 1e-6):
             raise RefusedError(f"expected a feed above 0 and at most {most:g} m/s; found {feed!r}")
-        return f"F{speed * 6e4:.6f}"
+        word = f"F{speed * 6e4:.6f}"
+        if not float(word[1:]) > 0:
+            raise RefusedError(f"expected a feed of at least 1e-6 mm/min; found {feed!r} m/s")
+        return word
 
     def _fastest(self) -> float:
         """Return the highest feed of the INI file, m/s."""
@@ -1237,6 +1258,19 @@ def unix_socket(path: Path) -> socket.socket:
     return line
 
 
+async def admit(bridge: Bridge, line: socket.socket) -> None:
+    """Accept connections one by one: a flood of them delays neither the clients nor who comes after it for long."""
+    loop = asyncio.get_running_loop()
+    while True:
+        while bridge.crowded():
+            await asyncio.sleep(POLL_INTERVAL)
+        try:
+            connection, _ = await loop.sock_accept(line)
+            await loop.connect_accepted_socket(lambda: Client(bridge), connection)
+        except OSError:  # lost already, or too many open files
+            await asyncio.sleep(POLL_INTERVAL)
+
+
 async def run(make: Callable[[], Bridge], line: socket.socket, announce: Path | None, idle: float) -> None:
     """Serve until this process is ended, or no client has been connected for ``idle`` s."""
     bridge, ended = make(), asyncio.Event()
@@ -1247,7 +1281,9 @@ async def run(make: Callable[[], Bridge], line: socket.socket, announce: Path | 
         loop.add_signal_handler(number, ended.set)
     await bridge.await_linuxcnc()
     watch = asyncio.ensure_future(bridge.watch_threads()) if bridge.compensates else None
-    server = await loop.create_server(lambda: Client(bridge), sock=line, backlog=MAX_CLIENTS)
+    line.setblocking(False)
+    line.listen(MAX_CLIENTS)
+    door = asyncio.ensure_future(admit(bridge, line))
     name = line.getsockname()
     where = {"socket": name} if isinstance(name, str) else {"port": name[1]}
     print(f"errormotion's bridge listens on {name if isinstance(name, str) else f'127.0.0.1:{name[1]}'}", flush=True)
@@ -1263,7 +1299,8 @@ async def run(make: Callable[[], Bridge], line: socket.socket, announce: Path | 
             last_client = time.monotonic()
     if watch is not None:
         watch.cancel()
-    server.close()
+    door.cancel()
+    line.close()
 
 
 def _component(hal: Any) -> Any:

@@ -113,7 +113,7 @@ def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Arra
     import xarray as xr
 
     from errormotion.datasets.files.containers import check_netcdf
-    from errormotion.datasets.storage import reading
+    from errormotion.datasets.storage.disk import reading
 
     try:
         with reading(path):

@@ -17,7 +17,7 @@ from errormotion.instruments.simulators.controller.opcua.serving import ServingT
 from errormotion.instruments.simulators.controller.opcua.space import Ids, Space, number
 from errormotion.instruments.simulators.faults import parse_fault
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.serving import listening_at, not_listening, reachable_at
+from errormotion.instruments.transports.loopback.serving import listening_at, not_listening, reachable_at
 
 AXES = "XYZ"
 MM = 1e-3

@@ -31,6 +31,7 @@ from errormotion.instruments.simulators.controller.linuxcnc_config import (
     pin_values,
 )
 from errormotion.instruments.simulators.controller.linuxcnc_process import LinuxCNCProcess
+from errormotion.instruments.simulators.controller.linuxcnc_servo import ServoThreadPart
 from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.instruments.transports import Address, Transport, open_transport
@@ -205,6 +206,10 @@ class SimulatedLinuxCNC(SimulatedDevice):
         except BaseException:
             super().close()
             raise
+        unit, found = 25.4e-3 if self._control.inch else 1e-3, _compensated(address)
+        self.machine = ServoThreadPart(
+            unit, found.slew, found.watchdog, lambda: self._forward({"id": OWN, "op": "estop"})
+        )
         try:
             self._bridge: Transport = open_transport(f"unix://{self._control.process.socket}", timeout=ANSWER_TIMEOUT)
             try:
@@ -228,10 +233,16 @@ class SimulatedLinuxCNC(SimulatedDevice):
         if self._closed:
             return
         self._closed = True
+        self.machine.busy = ""
         self._pump.join()
         self._bridge.close()
         self._control.leave(self._linger)
         super().close()
+
+    @property
+    def driver_settings(self) -> dict[str, str]:
+        """Settings with which a driver or a compensator connects at `url`."""
+        return {"token_file": str(self._control.process.folder / "token")}
 
     # ------------------------------------------------------------------ to the bridge
 
@@ -361,8 +372,8 @@ class SimulatedLinuxCNC(SimulatedDevice):
             return
         if self._own_error:
             message = {"id": number, "ok": False, "error": f"error of the simulated probe: {self._own_error}"}
-        if not beating:
-            self._requests.pop(number, None)
+        if not beating and self._requests.pop(number, None) == "set_offset" and message["ok"]:
+            self.machine.orders += 1
         if isinstance(result, dict):
             if "time" in result:
                 result["time"] = self.world.time

@@ -47,7 +47,7 @@ from errormotion.instruments.simulators.faults import parse_fault, stray_bytes
 from errormotion.instruments.simulators.late import LateAnswer
 from errormotion.instruments.simulators.virtual_world.world import world
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.serving import TcpServer
+from errormotion.instruments.transports.loopback.serving import TcpServer
 
 HEARTBEAT = 10000
 """What is stated in ``* PONG``, ms."""

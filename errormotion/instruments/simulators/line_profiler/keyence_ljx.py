@@ -23,7 +23,7 @@ from errormotion.instruments.simulators.line_profiler.profile_sources import (
     make_source,
 )
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.stream_serving import NewestConnectionServer
+from errormotion.instruments.transports.loopback.stream_serving import NewestConnectionServer
 
 __all__ = ["SimulatedLJX", "packed"]
 

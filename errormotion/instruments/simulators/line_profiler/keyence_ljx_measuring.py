@@ -15,7 +15,7 @@ from errormotion.instruments.simulators.line_profiler import keyence_ljx_wire as
 from errormotion.instruments.simulators.line_profiler.keyence_ljx_memory import Memory
 from errormotion.instruments.simulators.line_profiler.keyence_ljx_wire import ProfileLayout
 from errormotion.instruments.simulators.line_profiler.profile_sources import Feed, Lines
-from errormotion.instruments.transports.stream_serving import NewestConnectionServer
+from errormotion.instruments.transports.loopback.stream_serving import NewestConnectionServer
 
 POLL_INTERVAL = 0.01  # s between checks whether a profile is due
 GRAB_TIMEOUT = 2.0  # s

@@ -10,7 +10,7 @@ import numpy as np
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.serving import TcpServer
+from errormotion.instruments.transports.loopback.serving import TcpServer
 
 Array = np.ndarray[Any, Any]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.serving import Server, TcpServer
+from errormotion.instruments.transports.loopback.serving import Server, TcpServer
 from errormotion.twin import VirtualMachine
 
 DEFAULT_SENSORS = "frame,ambient,spindle_front,spindle_rear,column"

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from errormotion.instruments.transports.serving import listening_at, not_listening, reachable_at
+from errormotion.instruments.transports.loopback.serving import listening_at, not_listening, reachable_at
 
 _MAX_LINE_BYTES = 8192
 _MAX_HEADERS = 100

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ def _least_deviations(design: Array, distance: Array) -> Array:
 
 def _far_off(residual: Array, used: Mask, total: float) -> Mask:
     """Return the outliers with respect to the stated noise and to the observed scatter."""
-    scatter = 1.4826 * np.median(np.abs(residual[used] - np.median(residual[used])))
+    scatter = NORMAL_MAD * np.median(np.abs(residual[used] - np.median(residual[used])))
     return np.asarray(np.abs(residual) > OUTLIER * max(float(scatter), total))
 
 

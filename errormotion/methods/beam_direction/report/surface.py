@@ -18,8 +18,8 @@ from errormotion.errors import DatasetError
 from errormotion.kinematics.beams import tilt_vector
 from errormotion.methods.beam_direction.report.view import Found, Planes
 from errormotion.report import canvas
-from errormotion.report import maps as crossbeam_maps
 from errormotion.report.document import Block, Figure, Source, Text
+from errormotion.report.drawings import maps as crossbeam_maps
 from errormotion.report.text import finite, fixed, integer, listed, significant
 
 _HATCH = "#9a9a9a"

@@ -145,7 +145,7 @@ class Operated:
         self._deadline = 0.0
 
     def now(self) -> float:
-        """Return a time that nobody sets, s."""
+        """Return the time of the monotonic clock, s."""
         return steady()
 
     def start(self, program: Program, *, listening: bool = False) -> float:

@@ -16,9 +16,9 @@ from matplotlib.ticker import MaxNLocator
 from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.report.view import Campaign, after, millimetres
 from errormotion.report import canvas
-from errormotion.report import maps as crossbeam_maps
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Figure
+from errormotion.report.drawings import maps as crossbeam_maps
 from errormotion.report.fields import field, unit_of
 from errormotion.report.text import finite, fixed
 

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure as Canvas
 from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.report.view import Campaign, after, at_y
 from errormotion.report import canvas
-from errormotion.report import maps as crossbeam_maps
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Figure, Text
+from errormotion.report.drawings import maps as crossbeam_maps
 from errormotion.report.fields import field
 from errormotion.report.text import finite, fixed, integer, significant
 

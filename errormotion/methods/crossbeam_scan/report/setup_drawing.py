@@ -19,7 +19,7 @@ from errormotion.report.canvas import BLUE, GREEN, PURPLE, VERMILLION
 from errormotion.report.document import Block, Cell, Figure, Text
 from errormotion.report.text import fixed
 
-_BEYOND = 0.25  # of the beam drawn beyond the first and the last artefact, m
+_OVERHANG = 0.25  # of the beam drawn beyond the first and the last artefact, m
 _SHORTEST = 1.2  # drawn beam, m
 _BEAM = 0.14  # side of the drawn beam, m
 _CARRIAGE = 0.2  # width of the drawn carriage, m
@@ -135,7 +135,7 @@ def _moved(seen: Campaign) -> NDArray[np.bool_]:
 def _beam(seen: Campaign) -> tuple[float, float]:
     """Return the ends of the drawn beam, m: its true ones are not known."""
     low, high = float(seen.position.min()), float(seen.position.max())
-    more = max(_BEYOND, (_SHORTEST - (high - low)) / 2)
+    more = max(_OVERHANG, (_SHORTEST - (high - low)) / 2)
     return low - more, high + more
 
 

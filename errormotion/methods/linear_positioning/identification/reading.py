@@ -16,7 +16,7 @@ from errormotion.methods.linear_positioning.schema import APPROACHES
 from errormotion.methods.linear_positioning.settings import Settings
 
 FEWEST_TARGETS = 3
-"""Positions by which a drift that grows with the position is told from the scatter of the readings."""
+"""Positions by which a drift that grows with the position is distinguished from the scatter of the readings."""
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import xarray as xr
 
-from errormotion.report import generic
 from errormotion.report.document import Cell, Part, Section, Source, Table, estimate
+from errormotion.report.parts import generic
 from errormotion.report.text import SECOND_OF_ARC, UM, fixed
 
 MEASURES = {

@@ -27,7 +27,7 @@ from errormotion.methods.multilateration.identification.judging import judge, re
 from errormotion.methods.multilateration.identification.result import result
 from errormotion.methods.multilateration.identification.state import State, read, short
 from errormotion.methods.multilateration.network import solver
-from errormotion.methods.multilateration.network.weakness import weak_targets
+from errormotion.methods.multilateration.network.diagnosis.weakness import weak_targets
 
 if TYPE_CHECKING:
     from errormotion.methods.multilateration.identification.drift import Drift

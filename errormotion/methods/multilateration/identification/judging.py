@@ -11,7 +11,7 @@ from errormotion.methods.multilateration.identification import repeatability
 from errormotion.methods.multilateration.identification.drift import positions
 from errormotion.methods.multilateration.identification.moving import find_move
 from errormotion.methods.multilateration.identification.state import State
-from errormotion.methods.multilateration.network.determinacy import swapped_stations
+from errormotion.methods.multilateration.network.diagnosis.determinacy import swapped_stations
 
 FALSE_ALARM = 1e-3
 """Probability of a note on readings that scatter as stated."""

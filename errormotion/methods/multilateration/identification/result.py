@@ -21,7 +21,7 @@ from errormotion.methods.multilateration.identification.parameters import fit_ma
 from errormotion.methods.multilateration.identification.state import State
 from errormotion.methods.multilateration.identification.volume import parametric_extras
 from errormotion.methods.multilateration.network.alternating import alternate
-from errormotion.methods.multilateration.network.notes import notes_of
+from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network import determinacy, outliers
 from errormotion.methods.multilateration.network.descent import State, descend
+from errormotion.methods.multilateration.network.diagnosis import determinacy, outliers
+from errormotion.methods.multilateration.network.diagnosis.weakness import carriers
 from errormotion.methods.multilateration.network.loops import loops
 from errormotion.methods.multilateration.network.model import Stations
 from errormotion.methods.multilateration.network.network import Network
 from errormotion.methods.multilateration.network.problem import Problem, state_problem
 from errormotion.methods.multilateration.network.start import initial_stations
 from errormotion.methods.multilateration.network.turning import Motion
-from errormotion.methods.multilateration.network.weakness import carriers
 
 TOLERANCE = 1e-12
 """What a further step may still move a target, m."""

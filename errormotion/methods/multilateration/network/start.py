@@ -16,11 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.errors import MethodError
 
-SOME = 150
-"""Readings of a station that are used: enough for a start value."""
+MOST_READINGS = 150
+"""Most readings of a station that are used for its start value."""
 FLAT = 1e-3
 """Targets thinner than this share of their extent lie in a plane, or on a line."""
 FITS = 0.01
@@ -53,7 +53,7 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
         raise MethodError(
             f"expected approximate positions ({n}, 3) of the stations, found {station.shape}; give one per row"
         )
-    centre, extent, products = _shape(target, _some(len(target), 4 * SOME).step)
+    centre, extent, products = _shape(target, _spread(len(target), 4 * MOST_READINGS).step)
     values, axes = np.linalg.eigh(products)
     spread = np.sqrt(np.maximum(values[::-1], 0.0) / values[-1])
     if spread[1] < FLAT:
@@ -66,7 +66,7 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
     if normal is None and _from_plain_readings(reading, weight, target, centre, _ENOUGH * extent, places, dead_paths):
         return Start(places, dead_paths)
     for j in range(n):
-        d, u = _taken(reading[j], weight[j], target, centre, SOME)
+        d, u = _selected(reading[j], weight[j], target, centre, MOST_READINGS)
         rough = None if station is None or not np.isfinite(station[j]).all() else station[j] - centre
         if len(d) < 5:
             if rough is None:
@@ -85,7 +85,7 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
     return Start(places, dead_paths)
 
 
-def _some(count: int, most: int) -> slice:
+def _spread(count: int, most: int) -> slice:
     """Return which of so many values to take: at most so many, evenly spread."""
     return slice(None, None, max(1, -(-count // most)))
 
@@ -97,7 +97,7 @@ def _shape(target: Array, every: int) -> tuple[Array, float, Array]:
     return centre, float(np.linalg.norm(np.ptp(some, axis=0))), (some - centre).T @ (some - centre)
 
 
-def _taken(reading: Array, weight: Array, target: Array, centre: Array, most: int) -> tuple[Array, Array]:
+def _selected(reading: Array, weight: Array, target: Array, centre: Array, most: int) -> tuple[Array, Array]:
     """Return some of a station's readings (k,) and their targets (k, 3) about ``centre``, evenly spread."""
     known = np.flatnonzero(weight > 0.0)
     taken = known[:: max(1, -(-len(known) // most))]
@@ -220,7 +220,7 @@ def _from_plain_readings(
 ) -> bool:
     """Fill positions (n, 3) and dead paths (n,) of stations from plain readings; return whether all were found."""
     for j in range(len(reading)):
-        d, u = _taken(reading[j], weight[j], target, centre, SOME)
+        d, u = _selected(reading[j], weight[j], target, centre, MOST_READINGS)
         if len(d) < 5:
             return False
         x = _linear(d, u)
@@ -236,7 +236,7 @@ def _from_plain_readings(
 
 def _scale(r: Array) -> float:
     """Return the robust scale of residuals about zero."""
-    return 1.4826 * float(np.median(np.abs(r)))
+    return NORMAL_MAD * float(np.median(np.abs(r)))
 
 
 def _what_is_wrong(j: int, d: Array, u: Array, extent: float, scale: float) -> str:

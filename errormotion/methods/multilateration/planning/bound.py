@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network import determinacy, vectorised
+from errormotion.methods.multilateration.network import vectorised
 from errormotion.methods.multilateration.network.descent import State
+from errormotion.methods.multilateration.network.diagnosis import determinacy
+from errormotion.methods.multilateration.network.diagnosis.weakness import carriers
 from errormotion.methods.multilateration.network.model import Stations, motions, readings
 from errormotion.methods.multilateration.network.network import Network
 from errormotion.methods.multilateration.network.problem import state_problem
 from errormotion.methods.multilateration.network.solver import conclude
-from errormotion.methods.multilateration.network.weakness import carriers
 
 _EXACT = 1e-3
 """Noise of the first target's readings, in units of their own, that counts as none."""

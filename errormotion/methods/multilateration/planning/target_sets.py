@@ -84,11 +84,11 @@ def _size(term: Term, displacement: float, rotation: float) -> float:
 
 @dataclass(frozen=True)
 class Volume:
-    """Candidates, what measuring each tells, and what is wanted at each.
+    """Candidates, the rows of their readings in the design matrix, and what is required at each.
 
     Attributes
     ----------
-    told : ndarray (k, n, P)
+    rows : ndarray (k, n, P)
         B of every candidate.
     known : ndarray (P, P)
         M_0.
@@ -102,7 +102,7 @@ class Volume:
         B of further targets, which may be measured and are not to be chosen.
     """
 
-    told: Array
+    rows: Array
     known: Array
     wanted: Array
     own: Array
@@ -113,7 +113,7 @@ class Volume:
     def of(
         cls, station: Array, place: Array, sees: NDArray[np.bool_], noise: float, expected: Expected | None, count: int
     ) -> Volume:
-        """Return what targets tell.
+        """Return the candidates and their rows.
 
         Parameters
         ----------
@@ -151,20 +151,20 @@ class Volume:
             basis = _without_motions(stations.motions(centre))
             Q = Q @ basis
             F = -D @ np.einsum("kja,kjp->kap", E, Q)
-            told = np.where(fine[:, None, None], Q + E @ F, 0.0)
+            rows = np.where(fine[:, None, None], Q + E @ F, 0.0)
             wanted = _in_datum(F[:count], G, fine[:count])
             own, known = np.trace(D[:count], axis1=1, axis2=2), np.eye(basis.shape[1]) / _LOOSE**2
-            return cls(told[:count], known, wanted, own, fine[:count], told[count:])
-        told = np.concatenate([E @ expected.columns, Q], axis=2)
+            return cls(rows[:count], known, wanted, own, fine[:count], rows[count:])
+        rows = np.concatenate([E @ expected.columns, Q], axis=2)
         known = np.diag(np.concatenate([expected.size**-2.0, np.full(4 * n, _LOOSE**-2.0)]))
         shown = _in_datum(expected.columns[:count], G, np.ones(count, bool))
         wanted = np.concatenate([shown, np.zeros((count, 3, 4 * n))], axis=2)
-        return cls(told[:count], known, wanted, np.zeros(count), fine[:count], told[count:])
+        return cls(rows[:count], known, wanted, np.zeros(count), fine[:count], rows[count:])
 
     def covariance(self, chosen: Sequence[int] | NDArray[np.intp] | None = None) -> Array:
         """Return that of the unknowns, (P, P), when the chosen ones are measured, or without them the further ones."""
-        told = self.further if chosen is None else self.told[np.asarray(chosen, dtype=np.intp)]
-        B = told.reshape(-1, self.known.shape[0])
+        rows = self.further if chosen is None else self.rows[np.asarray(chosen, dtype=np.intp)]
+        B = rows.reshape(-1, self.known.shape[0])
         return _inverse(self.known + B.T @ B)
 
     def worth(self, chosen: Sequence[int] | NDArray[np.intp] | None = None) -> Array:
@@ -225,14 +225,14 @@ class Volume:
 
     def _gains(self, C: Array, V: Array) -> Array:
         """Return the decrease of the trace of V C by each candidate, (k,); -inf for candidates that are not seen."""
-        BC = self.told @ C
-        inner = np.eye(self.told.shape[1]) + BC @ self.told.transpose(0, 2, 1)
+        BC = self.rows @ C
+        inner = np.eye(self.rows.shape[1]) + BC @ self.rows.transpose(0, 2, 1)
         gain = np.trace(np.linalg.solve(inner, BC @ V @ BC.transpose(0, 2, 1)), axis1=1, axis2=2)
         return np.where(self.fine, gain, -np.inf)
 
     def _losses(self, C: Array, V: Array, chosen: list[int]) -> Array:
         """Return by how much the trace of V C rises without each of the chosen ones."""
-        B = self.told[chosen]
+        B = self.rows[chosen]
         BC = B @ C
         inner = np.eye(B.shape[1]) * (1 + 1e-9) - BC @ B.transpose(0, 2, 1)
         return np.asarray(np.trace(np.linalg.solve(inner, BC @ V @ BC.transpose(0, 2, 1)), axis1=1, axis2=2))

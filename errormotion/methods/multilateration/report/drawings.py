@@ -10,8 +10,8 @@ from errormotion.arrays import Array
 from errormotion.methods.multilateration.report.view import AXES, Network, thinned
 from errormotion.report import canvas
 from errormotion.report.document import Block, Figure, Text
+from errormotion.report.drawings.turntable import TURN, Dots, Ellipsoids, Lines, Scene, draw, enlargement
 from errormotion.report.text import finite, fixed, integer, listed, rounded, significant
-from errormotion.report.turntable import TURN, Dots, Ellipsoids, Lines, Scene, draw, enlargement
 
 _VECTORS, _SIGHTS, _ELLIPSOIDS = 400, 60, 150
 _ARROW = 0.12  # longest arrow, share of the diagonal of the volume

@@ -8,8 +8,9 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.arrays import Array
-from errormotion.report import canvas, maps
+from errormotion.report import canvas
 from errormotion.report.document import Block, Cell, Figure, Table, Text, or_dash
+from errormotion.report.drawings import maps
 from errormotion.report.text import finite, fixed, integer
 
 _LEVELS = 3

@@ -19,7 +19,7 @@ from errormotion.methods.normal_vector.report.view import (
     is_normal_vector,
     probing,
 )
-from errormotion.report import budget, provenance, quality, timeline
+from errormotion.report import budget, provenance, quality
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import (
     Block,
@@ -34,9 +34,10 @@ from errormotion.report.document import (
     estimate,
     or_dash,
 )
-from errormotion.report.generic import unit_at
+from errormotion.report.drawings import timeline
+from errormotion.report.drawings.series import commanded_speed, events
 from errormotion.report.parts import sensors
-from errormotion.report.series import commanded_speed, events
+from errormotion.report.parts.generic import unit_at
 from errormotion.report.text import finite, fixed, integer, listed, significant
 
 __all__ = ["is_normal_vector", "part"]

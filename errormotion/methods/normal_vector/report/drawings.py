@@ -7,11 +7,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.methods.normal_vector.report.view import MISSING, MOVED, UNDETERMINED, WRONG, Probing
-from errormotion.report import canvas, timeline
+from errormotion.report import canvas
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Figure, Text
+from errormotion.report.drawings import timeline
+from errormotion.report.drawings.turntable import TURN, Dots, Ellipsoids, Lines, Scene, draw, enlargement
 from errormotion.report.text import SECOND_OF_ARC, UM, finite, fixed, integer, listed
-from errormotion.report.turntable import TURN, Dots, Ellipsoids, Lines, Scene, draw, enlargement
 
 _LONGEST = 0.22  # drawn length of the longest displacement, relative to the diagonal of the balls
 _FAINT, _SOFT = "#c3c8d0", "#6f7680"

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across, turned
 
@@ -113,7 +113,7 @@ def likelihood_fit(
     while True:
         origin, direction, jacobian = _gauss_newton(distance, centre, radius, origin, direction, used, name)
         residual = distance - sphere_reading(origin, direction, centre, radius)[0]
-        spread = 1.4826 * np.median(np.abs(residual[used] - np.median(residual[used])))
+        spread = NORMAL_MAD * np.median(np.abs(residual[used] - np.median(residual[used])))
         outlier = used & ~(np.abs(residual) <= max(_OUTLIER * spread, 1e-12))
         if not outlier.any():
             break

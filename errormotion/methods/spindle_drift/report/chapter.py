@@ -13,7 +13,7 @@ from errormotion.methods.spindle_drift.report import drawings as spindle_figures
 from errormotion.methods.spindle_drift.report import iso230_3, setup_drawing
 from errormotion.report import budget, provenance, quality
 from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
-from errormotion.report.series import (
+from errormotion.report.drawings.series import (
     QUANTITIES,
     WHAT,
     Curve,

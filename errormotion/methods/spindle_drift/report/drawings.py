@@ -13,9 +13,9 @@ from matplotlib.figure import Figure as Canvas
 from errormotion.report import canvas
 from errormotion.report.canvas import BLUE, DASHES
 from errormotion.report.document import Figure
-from errormotion.report.series import LOOK, Curve, Event, curves, last_known, minutes_of, running
+from errormotion.report.drawings.series import LOOK, Curve, Event, curves, last_known, minutes_of, running
+from errormotion.report.drawings.timeline import events_in_words, mark
 from errormotion.report.text import UM, fixed
-from errormotion.report.timeline import events_in_words, mark
 
 Limits = Mapping[str, tuple[float, float]]
 """Lower and upper limits of errors by name, SI."""

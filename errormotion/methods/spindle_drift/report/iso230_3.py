@@ -11,7 +11,7 @@ import xarray as xr
 from markupsafe import Markup
 
 from errormotion.report.document import Cell, Table, estimate
-from errormotion.report.series import QUANTITIES, Event, curves, end_of_running, minutes_of, unit_of
+from errormotion.report.drawings.series import QUANTITIES, Event, curves, end_of_running, minutes_of, unit_of
 from errormotion.report.text import fixed
 
 #: Factor from a measure to its field unit, beyond the field unit of the quantity, and that unit's suffix.

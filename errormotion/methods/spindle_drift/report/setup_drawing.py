@@ -12,7 +12,7 @@ from matplotlib.figure import Figure as Canvas
 
 from errormotion.report import canvas
 from errormotion.report.document import Cell, Figure, Table
-from errormotion.report.series import LOOK, curves, end_of_running, last_known
+from errormotion.report.drawings.series import LOOK, curves, end_of_running, last_known
 from errormotion.report.text import fixed, integer, listed
 
 _NEEDED = ("beam_origin", "beam_direction", "bar_axis_point", "bar_axis_direction", "bar_radius")

@@ -289,7 +289,7 @@
       this.canvas = document.createElement("canvas");
       this.canvas.tabIndex = 0;
       this.canvas.setAttribute("role", "img");
-      this.canvas.setAttribute("aria-label", holder.dataset.label);
+      this.canvas.setAttribute("aria-label", holder.closest("figure").getAttribute("aria-label"));
       const still = document.createElement("div");
       still.className = "still";
       still.append(...holder.childNodes);

@@ -65,18 +65,18 @@ def start(tmp_path: Path) -> Iterator[Start]:
     started: list[subprocess.Popen[bytes]] = []
 
     def begin(*words: str) -> dict[str, Any]:
-        told = tmp_path / "announced.json"
+        reported = tmp_path / "announced.json"
         path = os.pathsep.join([str(tmp_path), *sys.path])
         environment = {**os.environ, "HOME": str(tmp_path), "PYTHONPATH": path, "COMMANDS": str(tmp_path / "commands")}
         started.append(
-            subprocess.Popen([sys.executable, str(BRIDGE), "--announce", str(told), *words], env=environment)
+            subprocess.Popen([sys.executable, str(BRIDGE), "--announce", str(reported), *words], env=environment)
         )
         until = time.monotonic() + 20
-        while not told.exists():
+        while not reported.exists():
             assert started[-1].poll() is None
             assert time.monotonic() < until
             time.sleep(0.02)
-        return dict(json.loads(told.read_text()))
+        return dict(json.loads(reported.read_text()))
 
     yield begin
     for process in started:
@@ -101,14 +101,14 @@ def closed_without_answer(line: socket.socket) -> bool:
 
 
 def test_by_default_it_listens_on_a_socket_of_its_user(start: Start, tmp_path: Path) -> None:
-    told = start()
+    reported = start()
     path = tmp_path / ".errormotion" / "linuxcnc.sock"
-    assert told["socket"] == str(path)
+    assert reported["socket"] == str(path)
     assert path.stat().st_mode & 0o777 == 0o600
-    listening = [line.split() for line in Path(f"/proc/{told['pid']}/net/tcp").read_text().splitlines()[1:]]
+    listening = [line.split() for line in Path(f"/proc/{reported['pid']}/net/tcp").read_text().splitlines()[1:]]
     inodes = {
         link.removeprefix("socket:[").removesuffix("]")
-        for each in Path(f"/proc/{told['pid']}/fd").iterdir()
+        for each in Path(f"/proc/{reported['pid']}/fd").iterdir()
         if (link := os.readlink(each)).startswith("socket:")
     }
     assert not [row for row in listening if row[9] in inodes]  # no TCP unless it is asked for

@@ -4,6 +4,7 @@ import asyncio
 import json
 import os
 import signal
+import socket
 import warnings
 from collections.abc import Callable, Coroutine
 from pathlib import Path
@@ -376,6 +377,28 @@ def test_the_65th_client_is_refused_and_strangers_take_no_place(play: Callable[[
     play(test)
 
 
+def test_a_burst_of_strangers_leaves_time_for_the_first_request(
+    play: Callable[[Test], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "STRANGER_TIME", 60.0)
+
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        with socket.create_server(("127.0.0.1", 0), backlog=64) as line:
+            line.setblocking(False)
+            door = asyncio.ensure_future(module.admit(bridge, line))
+            reader, writer = await asyncio.open_connection(*line.getsockname())
+            burst = [await asyncio.open_connection(*line.getsockname()) for _ in range(2 * module.MAX_STRANGERS)]
+            while not bridge.crowded():
+                await asyncio.sleep(0.01)
+            writer.write(json.dumps(HELLO).encode() + b"\n")
+            assert json.loads(await asyncio.wait_for(reader.readline(), 30))["ok"]
+            door.cancel()
+            for _, each in [(reader, writer), *burst]:
+                each.close()
+
+    play(test)
+
+
 # ---------------------------------------------------------------------- control
 
 
@@ -516,6 +539,7 @@ def test_a_flood_of_stops_is_one_stop(play: Callable[[Test], None]) -> None:
         ("move_to", {"position": [0, 0, 0], "feed": 10**400}, "expected a feed"),
         ("move_to", {"position": [0, 0, 10**400]}, "expected a coordinate"),
         ("move_to", {"position": [0, 0, 0], "feed_limit": 0}, "feed above 0"),
+        ("move_to", {"position": [0, 0, 0], "feed": 1e-13}, "at least 1e-6 mm/min"),
         ("probe", {"target": [0, 0, 0.01], "feed": 1e305}, "at most 10 m/s"),
         ("spindle", {"speed": 1e308}, "at most 1e+06"),
         ("spindle", {"speed": 10**400}, "expected spindle speed"),
@@ -554,7 +578,7 @@ def test_the_state_is_in_metres_whatever_the_ini_file_has(play: Callable[[Test],
     play(test)
 
 
-def test_of_a_linuxcnc_that_is_starting_nothing_is_told(play: Callable[[Test], None]) -> None:
+def test_of_a_linuxcnc_that_is_starting_nothing_is_reported(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.values.linear_units = 0.0
         assert "still starting" in await wire.ask("state")
@@ -665,7 +689,7 @@ def test_an_order_that_linuxcnc_never_takes_is_given_up(play: Callable[[Test], N
     play(test)
 
 
-def test_the_e_stop_that_stays_pressed_is_told(play: Callable[[Test], None]) -> None:
+def test_the_e_stop_that_stays_pressed_is_reported(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.state = lambda state: fake._took("ignored")  # type: ignore[method-assign]
         fake.values.task_state = fake.STATE_ESTOP

@@ -21,7 +21,7 @@ from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.controller import linuxcnc, linuxcnc_process
 from errormotion.instruments.touch_probe.controller_probe import ControllerProbe, ControllerProbeSettings
 from errormotion.plugins import MachineLimits, Touch
-from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
+from errormotion.testing.checks.instrument import INSTRUMENT_CHECKS
 from errormotion.testing.kit import run_check
 from errormotion.testing.run import subjects_of
 
@@ -81,19 +81,19 @@ def test_says_who_it_is_and_how_it_stands(machine: LinuxCNC) -> None:
 
 def test_moves_to_a_place_and_is_there_when_the_call_returns(machine: LinuxCNC) -> None:
     machine.move_to([-0.23, -0.2, 0.12])
-    told = machine.move_to([-0.22, -0.18, 0.12], 0.05)
+    reported = machine.move_to([-0.22, -0.18, 0.12], 0.05)
     state = machine.state()
     np.testing.assert_allclose(state["position"], [-0.22, -0.18, 0.12], atol=1e-9)
     np.testing.assert_allclose(state["commanded_position"], [-0.22, -0.18, 0.12], atol=1e-9)
-    assert told["duration"] > math.hypot(0.01, 0.02) / 0.05
+    assert reported["duration"] > math.hypot(0.01, 0.02) / 0.05
     assert (state["feed"], state["running"], state["mode"]) == (0.0, False, "mdi")
 
 
 def test_the_clock_of_the_world_goes_on_with_motion_and_jumps_by_waiting(machine: LinuxCNC) -> None:
     began = machine.state()["time"]
-    told = machine.move_to(HERE)
+    reported = machine.move_to(HERE)
     moved = machine.state()["time"] - began
-    assert moved == pytest.approx(told["duration"], abs=0.2)  # beats come five times a second
+    assert moved == pytest.approx(reported["duration"], abs=0.2)  # beats come five times a second
     machine.elapse(3600.0)
     assert machine.state()["time"] == pytest.approx(began + moved + 3600.0, abs=0.2)
 
@@ -385,9 +385,9 @@ def test_homes_a_machine_that_was_just_switched_on(machine: LinuxCNC) -> None:
 
 def test_a_program_runs_while_its_state_is_followed(machine: LinuxCNC) -> None:
     machine.move_to(HERE)
-    told = machine.run_program("G21 G90 G94\nG1 X-230 F2000\nG4 P0.3\nG1 X-220\nM2\n")
+    reported = machine.run_program("G21 G90 G94\nG1 X-230 F2000\nG4 P0.3\nG1 X-220\nM2\n")
     state = machine.state()
-    assert (state["running"], state["mode"], state["program"]) == (True, "automatic", told["program"])
+    assert (state["running"], state["mode"], state["program"]) == (True, "automatic", reported["program"])
     with pytest.raises(InstrumentError, match="busy: program"):
         machine.move_to([0.0, 0.0, 0.0])
     done = machine.finish()

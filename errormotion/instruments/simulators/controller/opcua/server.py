@@ -23,7 +23,7 @@ from errormotion.instruments.simulators.device import DEFAULT_MACHINE
 from errormotion.instruments.simulators.faults import parse_fault
 from errormotion.instruments.simulators.virtual_world.world import world
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.serving import listening_at, not_listening, reachable_at
+from errormotion.instruments.transports.loopback.serving import listening_at, not_listening, reachable_at
 
 STYLES = ("cnc", "sinumerik")
 UNITS = ("model", "ua")

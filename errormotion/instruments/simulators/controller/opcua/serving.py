@@ -12,7 +12,7 @@ from asyncua import ua
 
 from errormotion.instruments.simulators.controller.opcua.listening import FaultyServer, Outgoing
 from errormotion.instruments.simulators.controller.opcua.space import SmallServer
-from errormotion.instruments.transports.serving import reachable_at
+from errormotion.instruments.transports.loopback.serving import reachable_at
 
 Result = TypeVar("Result")
 

@@ -1,6 +1,6 @@
 """An optoNCDT laser sensor on RS422, from the maker's manuals: its commands, what it refuses, and its data stream.
 
-Two models, told apart throughout: ILD2300 and ILD1420. Facts and where they come from (operating instructions of
+Two models, distinguished throughout: ILD2300 and ILD1420. Facts and where they come from (operating instructions of
 Micro-Epsilon: "2300" is optoNCDT 2300, "1420" optoNCDT 1420, "1320" its sister, "24x1" confocalDT 24x1 of the same
 family of controllers):
 

@@ -20,7 +20,7 @@ from errormotion.instruments.simulators.point_lds.optoncdt.values import (
     mastered,
     raw_distances,
 )
-from errormotion.instruments.transports.serving import Server
+from errormotion.instruments.transports.loopback.serving import Server
 
 Array = np.ndarray[Any, Any]
 

@@ -1,4 +1,4 @@
-"""Normals of scanned surfaces, told from the points themselves."""
+"""Normals of scanned surfaces, computed from the points themselves."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.datasets import provenance, validate
 from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.inclination import InclinationCalibration, build, half_tilt, hole_texts, terms
@@ -156,7 +156,7 @@ def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.boo
             mirror=settings.mirror,
         )
         z = np.abs(surface.prediction.z)
-        z = z / max(1.4826 * float(np.median(z)), 1e-3)
+        z = z / max(NORMAL_MAD * float(np.median(z)), 1e-3)
         # The worst one first, because it also affects its neighbours.
         wrong = z > max(_CONTRADICTS, 0.5 * z.max())
         if not wrong.any() or (~kept).sum() + wrong.sum() > _MOST_CONTRADICTING * len(q):

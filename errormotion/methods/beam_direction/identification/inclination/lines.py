@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.errors import MethodError
 
 Indices = NDArray[np.int64]
@@ -28,7 +28,6 @@ _OUTLIER = 5.0
 _LEAST_NOISE = 1e-10
 """m; rounding of readings without noise."""
 _ROUNDS = 20
-_GAUSS = 1.4826  # standard deviation of normal numbers over their median absolute deviation
 
 
 @dataclass(frozen=True)
@@ -222,7 +221,7 @@ def _belonging(residual: Array, kept: NDArray[np.bool_], readings: Readings, fre
     count = np.bincount(readings.setting)
     # The residuals of a fitted line are smaller than the errors, by the degrees of freedom of the line.
     share = min(len(count) * (2 if free else 1) / kept.sum(), 0.75)
-    scale = max(_GAUSS * float(np.median(np.abs(residual[kept]))) / np.sqrt(1 - share), _LEAST_NOISE)
+    scale = max(NORMAL_MAD * float(np.median(np.abs(residual[kept]))) / np.sqrt(1 - share), _LEAST_NOISE)
     few = count[readings.setting] < (_ENOUGH if free else 2)
     return np.asarray((np.abs(residual) <= _OUTLIER * scale) | few)
 
@@ -300,7 +299,7 @@ def mid_range(readings: Readings, lines: Lines) -> MidRange:
     for _ in range(3):  # a zero that was set wrongly does not count
         (_, shift), *_ = np.linalg.lstsq(A[good], lines.offset[good])
         rest = lines.offset - A @ np.array([np.median(lines.offset + lines.slope * shift), shift])
-        good = np.abs(rest) <= _OUTLIER * max(_GAUSS * float(np.median(np.abs(rest))), _LEAST_NOISE)
+        good = np.abs(rest) <= _OUTLIER * max(NORMAL_MAD * float(np.median(np.abs(rest))), _LEAST_NOISE)
     scatter = float(np.sqrt((rest[good] ** 2).sum() / max(int(good.sum()) - 2, 1)))
     C = np.linalg.inv(A[good].T @ A[good]) * scatter**2
     return MidRange(readings.mid_range + float(shift), float(np.sqrt(C[1, 1])), scatter)

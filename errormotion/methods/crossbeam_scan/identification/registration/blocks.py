@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.registration import kernels
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Moments
@@ -235,7 +235,7 @@ def _slope_noise(slope: Array, height: Array, pitch: float, axis: int) -> float:
     step = max(1, slope.size // _FEW)
     slope, height = slope[::step], height[::step]
     inner = np.abs(slope[:, 1:-1] - (height[:, 2:] - height[:, :-2]) / (2 * pitch))
-    return 1.4826 * sampled_median(inner)
+    return NORMAL_MAD * sampled_median(inner)
 
 
 def sampled_median(values: Array) -> float:
@@ -272,7 +272,7 @@ def _block_scales(z: NDArray[np.float32], dx: Array, dy: Array, step: int) -> Ar
     sy = _medians((block[:, half_r:] - block[:, :half_r]) / run, kernels.FEWEST // 4)
     rest = block - sx[:, None, None] * dx - sy[:, None, None] * y[:, :, None]
     height = _medians(rest, kernels.FEWEST)
-    scales = 1.4826 * _medians(np.abs(rest - height[:, None, None]), kernels.FEWEST)
+    scales = NORMAL_MAD * _medians(np.abs(rest - height[:, None, None]), kernels.FEWEST)
     return np.asarray(scales[np.isfinite(scales)])
 
 

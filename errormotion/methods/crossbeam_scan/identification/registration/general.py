@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.kinematics.twists import cross_matrix
 from errormotion.methods.crossbeam_scan.identification.registration import clouds
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import freedoms, refuse, scales
@@ -58,7 +58,7 @@ def register_clouds(cold: ArrayLike, warm: ArrayLike, *, point: ArrayLike | None
     normals, tilt = clouds.normals(old)
     normal = normals[nearest]
     residual = np.sum(normal * (moved - old[nearest]), axis=1)
-    scale = 1.4826 * float(np.median(np.abs(residual)))
+    scale = NORMAL_MAD * float(np.median(np.abs(residual)))
     used = np.abs(residual) <= GATE * scale
     J = np.hstack([normal, np.cross(moved - middle, normal)])[used]
     H = J.T @ J

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.compiling import Compiler
 
 COLUMNS = 16
@@ -137,7 +137,7 @@ def _robust_plane(
         if room[1, k] == room[1, k]:
             room[0, n] = abs(room[1, k] - height)
             n += 1
-    return n, height, sx, sy, 1.4826 * _median(room[0, :n])
+    return n, height, sx, sy, NORMAL_MAD * _median(room[0, :n])
 
 
 @compiled(inner=True, fastmath=FAST)

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.methods.crossbeam_scan.identification.registration.blocks import BlockMap, some_of, upper_median
 from errormotion.methods.crossbeam_scan.identification.registration.comparison import (
     accumulate,
@@ -178,7 +178,7 @@ class Sums:
 
     def scale(self) -> float:
         """Return the robust standard deviation of the residuals about zero, m; infinite where there are none."""
-        found = 1.4826 * upper_median(np.abs(some_of(self.residual, _FEW)))
+        found = NORMAL_MAD * upper_median(np.abs(some_of(self.residual, _FEW)))
         return found if found == found else np.inf
 
 

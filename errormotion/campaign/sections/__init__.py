@@ -1,0 +1,1 @@
+"""Sections of bench and campaign files: head, machine, limits, timeline."""

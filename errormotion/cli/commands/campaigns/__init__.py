@@ -1,0 +1,1 @@
+"""Campaigns: files, uncertainty to expect, programs, and runs in this process or in the background."""

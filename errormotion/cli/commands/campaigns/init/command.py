@@ -1,0 +1,153 @@
+"""``errormotion init``: answers from options and questions, checked, and written as two files."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from errormotion import plugins
+from errormotion.campaign.files import parse_bench, parse_campaign
+from errormotion.cli.commands.campaigns.init import asking
+from errormotion.cli.commands.campaigns.init.writing import Answers, Instrument, Test, bench_text, campaign_text
+from errormotion.cli.guard import USAGE
+from errormotion.cli.output import show, show_json
+from errormotion.datasets.files.tomltext import value_of
+from errormotion.errors import BenchError, ErrormotionError
+
+BENCH, CAMPAIGN = "bench.toml", "campaign.toml"
+
+
+def init(
+    folder: Path,
+    machine: str,
+    chain: str,
+    travel: Sequence[str],
+    instruments: Sequence[str],
+    tests: Sequence[str],
+    assignments: Sequence[str],
+    *,
+    force: bool,
+    as_json: bool,
+    ask: asking.Ask | None = None,
+) -> None:
+    """Write a bench and a campaign.
+
+    Parameters
+    ----------
+    travel : sequence of str
+        ``AXIS=LOW,HIGH``, with units.
+    instruments : sequence of str
+        ``NAME=ID@ADDRESS``.
+    tests : sequence of str
+        ``NAME=ID``.
+    assignments : sequence of str
+        ``NAME.KEY=VALUE``: one setting of an instrument or a test.
+    ask : callable, optional
+        Asks a person for what is not stated; default: on a terminal.
+
+    Raises
+    ------
+    BenchError
+        Mistakes, as those of the files; an existing file without ``force``. Nothing is written then.
+    """
+    answers = _stated(machine, chain, travel, instruments, tests, assignments)
+    targets = [folder / BENCH, folder / CAMPAIGN]
+    if not force and (there := [str(path) for path in targets if path.exists()]):
+        raise BenchError(f"{' and '.join(there)}: exists already. Give another folder, or --force to replace it")
+    if ask is None and sys.stdin.isatty() and sys.stderr.isatty() and not as_json:
+        ask = _prompt
+    if ask is not None:
+        asking.complete(answers, ask)
+    elif not answers.machine or not answers.instruments:
+        typer.echo("Expected --machine and at least one --instrument: there is no terminal to ask at.", err=True)
+        raise typer.Exit(USAGE)
+    try:
+        texts = _checked(answers, folder)
+    except ErrormotionError as error:
+        raise BenchError(f"{error}\nNothing was written.") from error
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, text in texts.items():
+        _write(path, text, force)
+    files = [str(path) for path in texts]
+    if as_json:
+        show_json({"ok": True, "files": files})
+        return
+    for file in files:
+        show(file)
+    steps = [f"errormotion bench probe {files[0]}"]
+    steps += [f"errormotion plan {files[1]}", f"errormotion run {files[1]}"] if len(files) > 1 else []
+    show("\nNext:\n  " + "\n  ".join(steps))
+    if len(files) == 1:
+        show(f"No test was chosen, so there is no {CAMPAIGN}; 'errormotion plugins list' shows the methods.")
+
+
+def _stated(
+    machine: str,
+    chain: str,
+    travel: Sequence[str],
+    instruments: Sequence[str],
+    tests: Sequence[str],
+    assignments: Sequence[str],
+) -> Answers:
+    answers = Answers(machine.strip(), chain.strip())
+    for text in travel:
+        axis, _, span = text.partition("=")
+        answers.travel[axis.strip()] = asking.span_of(span)
+    for text in instruments:
+        name, _, rest = text.partition("=")
+        driver, _, address = rest.partition("@")
+        if not name.strip() or not driver.strip():
+            raise BenchError(f"--instrument {text}: expected NAME=ID@ADDRESS, ID of an instrument plugin")
+        plugins.get("instruments", driver.strip())
+        answers.instruments[name.strip()] = Instrument(driver.strip(), address.strip())
+    for text in tests:
+        name, _, method = text.partition("=")
+        if not name.strip() or not method.strip():
+            raise BenchError(f"--test {text}: expected NAME=ID, ID of a method plugin")
+        plugins.get("methods", method.strip())
+        answers.tests[name.strip()] = Test(method.strip())
+    owners: dict[str, Any] = {**answers.instruments, **answers.tests}
+    for text in assignments:
+        place, sign, content = text.partition("=")
+        owner, _, key = place.strip().partition(".")
+        if not sign or owner not in owners or not key:
+            known = ", ".join(owners) or "none"
+            raise BenchError(
+                f"--set {text}: expected NAME.KEY=VALUE with the name of an instrument or a test ({known})"
+            )
+        owners[owner].settings[key] = value_of(content.strip())
+    return answers
+
+
+def _checked(answers: Answers, folder: Path) -> dict[Path, str]:
+    """Return the texts of the files by their paths, as their reader accepts them."""
+    drivers = {name: plugins.get("instruments", each.driver).Settings for name, each in answers.instruments.items()}
+    methods = {name: plugins.get("methods", each.method).Settings for name, each in answers.tests.items()}
+    texts = {folder / BENCH: bench_text(answers, drivers)}
+    bench = parse_bench(texts[folder / BENCH], folder / BENCH)
+    if answers.tests:
+        texts[folder / CAMPAIGN] = campaign_text(answers, BENCH, methods)
+        parse_campaign(texts[folder / CAMPAIGN], folder / CAMPAIGN, bench)
+    return texts
+
+
+def _write(path: Path, text: str, force: bool) -> None:
+    if not force:
+        with path.open("x", encoding="utf-8") as file:  # refuses a file that has come meanwhile
+            file.write(text)
+        return
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _prompt(question: str, default: str) -> str:
+    return str(typer.prompt(question, default=default, show_default=bool(default), err=True))

@@ -1,0 +1,76 @@
+"""``errormotion program``: the NC programs of a campaign's tests, as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from errormotion.campaign.files import load_campaign
+from errormotion.campaign.sections.limits import announcement, steps_of
+from errormotion.cli.output import show, show_json, table
+from errormotion.errors import BenchError
+
+
+def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
+    """Write the programs of one test, or of every test whose method has some; existing files are not replaced.
+
+    What the programs move is printed on one line a test, on stderr.
+
+    With several such tests, each has its own folder in ``out``.
+
+    Raises
+    ------
+    BenchError
+        No such test, a method without programs, or a file that exists. Nothing is written then.
+    """
+    plan = load_campaign(campaign)
+    chosen = [entry for entry in plan.tests if test is None or entry.name == test]
+    if not chosen:
+        raise BenchError(
+            f"{campaign}: expected one of the tests {', '.join(entry.name for entry in plan.tests)}; found '{test}'"
+        )
+    with_programs = [entry for entry in chosen if hasattr(entry.method, "programs")]
+    if not with_programs:
+        names = ", ".join(sorted({entry.method.info.id for entry in chosen}))
+        raise BenchError(f"{campaign}: {names} has no NC programs: nothing to write for {test or 'any of its tests'}.")
+    files: list[tuple[str, Path, str]] = []
+    announced: list[str] = []
+    for entry in with_programs:
+        folder = out / entry.name if len(with_programs) > 1 else out
+        instruments = plan.bench.chosen(entry.instruments).settings_by_kind
+        announced.append(
+            announcement(entry.name, steps_of(entry.method, entry.settings, instruments), plan.bench.limits)
+        )
+        texts = entry.method().programs(entry.settings, instruments)
+        files += [(entry.name, folder / name, text) for name, text in texts.items()]
+    if existing := [str(path) for _, path, _ in files if path.exists()]:
+        raise BenchError(
+            f"{existing[0]} exists already: choose another folder, or remove the file. Nothing was written."
+        )
+    for line in announced:
+        typer.echo(line, err=True)
+    for _, path, text in files:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="ascii", newline="\r\n") as file:
+            file.write(text)
+    _show(files, as_json)
+
+
+def _show(files: list[tuple[str, Path, str]], as_json: bool) -> None:
+    rows: list[dict[str, Any]] = [
+        {"test": name, "file": str(path), "lines": len(text.splitlines()), "comments": _comments(text)}
+        for name, path, text in files
+    ]
+    if as_json:
+        show_json({"ok": True, "programs": rows})
+        return
+    shown = [[row["test"], row["file"], str(row["lines"]), "; ".join(row["comments"])] for row in rows]
+    show(table(["test", "file", "lines", "comments"], shown))
+
+
+def _comments(text: str) -> list[str]:
+    """Return the comments that stand on lines of their own."""
+    lines = [line.strip() for line in text.splitlines()]
+    return [line[1:-1] for line in lines if line.startswith("(") and line.endswith(")")]

@@ -1,0 +1,1 @@
+"""Thermal models, and what makes corrections of errors: tables, programs, offsets that follow the temperatures."""

@@ -1,0 +1,1 @@
+"""Instruments: benches, sessions, calibrations, simulators, monitors."""

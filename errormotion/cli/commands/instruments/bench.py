@@ -1,0 +1,93 @@
+"""``errormotion bench probe``."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from errormotion.campaign.bench import OpenBench
+from errormotion.campaign.files import BenchPlan, load_bench
+from errormotion.campaign.turns import claimed
+from errormotion.cli.output import show, show_json, table
+
+MOST_NUMBERS = 12
+"""Readings with more numbers are printed as a summary."""
+
+log = logging.getLogger(__name__)
+
+
+def probe(file: Path, as_json: bool) -> bool:
+    """Open, identify and read every instrument of a bench; return whether all of them answered."""
+    plan = load_bench(file)
+    with claimed(plan.machine, "a check of the bench"):
+        return _probe(plan, as_json)
+
+
+def _probe(plan: BenchPlan, as_json: bool) -> bool:
+    bench = OpenBench(plan)
+    found: list[dict[str, Any]] = []
+    try:
+        bench.try_open()
+        for answer in bench.answers:
+            record = answer.record() | {"error": answer.error, "reading": None}
+            if answer.driver is not None:
+                try:
+                    record["reading"] = _plain(answer.driver.read())
+                except Exception as error:
+                    log.exception("instrument %s: the reading failed", answer.instrument.name)
+                    record["error"] = f"{type(error).__name__}: {error}"
+            found.append(record)
+    finally:
+        bench.close()
+    good = not any(record["error"] for record in found)
+    if as_json:
+        show_json({"ok": good, "bench": bench.plan.name, "machine": bench.plan.machine, "instruments": found})
+    else:
+        rows = [
+            [
+                r["name"],
+                r["driver"],
+                _who(r["identity"]),
+                f"FAILED: {r['error']}" if r["error"] else _short(r["reading"]),
+            ]
+            for r in found
+        ]
+        show(table(["instrument", "driver", "identity", "reading (SI)"], rows))
+    return good
+
+
+def _who(identity: dict[str, Any] | None) -> str:
+    if identity is None:
+        return "-"
+    simulated = " (simulated)" if identity["simulated"] else ""
+    return f"{identity['manufacturer']} {identity['model']} {identity['serial_number']}{simulated}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return value if isinstance(value, str | int | float | bool | None) else str(value)
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{k} {_short(v)}" for k, v in value.items())
+    if isinstance(value, list):
+        if len(value) > MOST_NUMBERS:
+            return _summary(value)
+        return ", ".join(_short(v) for v in value) or "none"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _summary(values: list[Any]) -> str:
+    numbers = np.array([v for v in values if isinstance(v, int | float)], dtype=float)
+    known = numbers[np.isfinite(numbers)]
+    between = f", {known.min():.6g} to {known.max():.6g}" if known.size else ""
+    return f"{len(values)} values, {known.size} known{between}"

@@ -1,0 +1,146 @@
+"""Arguments of the commands on benches and instruments. What a command needs is imported when it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from errormotion.cli.guard import ERROR, INVALID, guarded
+from errormotion.cli.output import show, show_json, table
+from errormotion.cli.root import Json, app, bench_app
+
+
+@bench_app.command("validate")
+@guarded
+def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: Json = False) -> None:
+    """Check a bench file; nothing is opened."""
+    from errormotion.campaign.files import load_bench
+    from errormotion.errors import BenchError
+
+    try:
+        plan = load_bench(file)
+    except BenchError as error:
+        if json_:
+            show_json({"ok": False, "file": str(file), "message": str(error)})
+        typer.echo(str(error), err=True)
+        raise typer.Exit(INVALID) from error
+    rows = [[i.name, i.driver.info.id, i.driver.info.kind, i.address] for i in plan.instruments]
+    if json_:
+        keys = ("name", "driver", "kind", "address")
+        instruments = [dict(zip(keys, row, strict=True)) for row in rows]
+        show_json(
+            {"ok": True, "file": str(file), "name": plan.name, "machine": plan.machine, "instruments": instruments}
+        )
+    else:
+        show(f"{file}: valid. Bench '{plan.name}', machine '{plan.machine}'.")
+        show(table(["instrument", "driver", "kind", "address"], rows))
+
+
+@bench_app.command("probe")
+@guarded
+def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: Json = False) -> None:
+    """Open, identify and read every instrument once."""
+    from errormotion.cli.commands.instruments import bench as command
+
+    if not command.probe(file, json_):
+        raise typer.Exit(ERROR)
+
+
+@app.command()
+@guarded
+def calibrate(
+    data: Annotated[Path, typer.Argument(help="Readings of a sensor against a reference: NetCDF or CSV.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The calibration to write, .nc; it must not exist.")],
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting.")] = None,
+    settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
+    json_: Json = False,
+) -> None:
+    """Make a calibration from readings."""
+    from errormotion.cli.commands.instruments import calibrate as command
+
+    command.run(data, out, set_ or [], settings, json_)
+
+
+@app.command()
+@guarded
+def monitor(
+    bench: Annotated[Path, typer.Argument(help="A bench file with thermometers, a controller, or both.")],
+    runs: Annotated[Path, typer.Option(help="Folder for the run folder of the log.")] = Path("runs"),
+    interval: Annotated[str, typer.Option(help="Interval between two rows of the log.")] = "1 s",
+    duration: Annotated[str | None, typer.Option(help="Duration of the log; default: until Ctrl-C.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print one JSON document for each row.")] = False,
+) -> None:
+    """Show temperatures and working parameters live, and log them."""
+    from errormotion.cli.commands.instruments import monitor as command
+
+    command.run(bench, runs, interval, duration, json_)
+
+
+@app.command()
+@guarded
+def simulate(
+    plugin: Annotated[str, typer.Argument(help="The id of an instrument or a compensator.")],
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Port of the device, the next one for its next line; default: a free one."),
+    ] = None,
+    host: Annotated[
+        str | None, typer.Option(help="Address at which it listens; default: 127.0.0.1, this computer only.")
+    ] = None,
+    fault: Annotated[str | None, typer.Option(help="A fault of the device, such as silence, split or late.")] = None,
+    bench: Annotated[Path | None, typer.Option(help="A bench file: its machine, and its device.")] = None,
+    machine: Annotated[str | None, typer.Option(help="The virtual machine: cframe (default) or gantry.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Which individual of the machine.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter of the simulated device.")
+    ] = None,
+    json_: Json = False,
+) -> None:
+    """Start the simulated device of an instrument by itself, until Ctrl-C."""
+    from errormotion.cli.commands.instruments import simulate as command
+
+    command.run(
+        plugin,
+        port=port,
+        host=host,
+        fault=fault,
+        bench=bench,
+        machine=machine,
+        seed=seed,
+        settings=set_ or [],
+        as_json=json_,
+    )
+
+
+@app.command()
+@guarded
+def record(
+    bench: Annotated[Path, typer.Argument(help="A bench file.")],
+    instrument: Annotated[str, typer.Argument(help="The name of one of its instruments.")],
+    for_: Annotated[str, typer.Option("--for", metavar="TIME", help="Duration of the session.")] = "10 s",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The recording to write; default: INSTRUMENT-TIME.rec.")
+    ] = None,
+    mask_serial: Annotated[bool, typer.Option("--mask-serial", help="Mask the serial number.")] = False,
+    json_: Json = False,
+) -> None:
+    """Record a short session with one instrument: identity, readings, stream."""
+    from errormotion.cli.commands.instruments import record as command
+
+    if not command.record(bench, instrument, for_, out, mask_serial, json_):
+        raise typer.Exit(ERROR)
+
+
+@app.command()
+@guarded
+def replay(
+    recording: Annotated[Path, typer.Argument(help="A recording that 'errormotion record' has made.")],
+    json_: Json = False,
+) -> None:
+    """Run the driver on a recorded session, and report whether it was reproduced."""
+    from errormotion.cli.commands.instruments import record as command
+
+    if not command.replay(recording, json_):
+        raise typer.Exit(INVALID)

@@ -1,0 +1,1 @@
+"""Plugins: those that are installed, and new ones."""

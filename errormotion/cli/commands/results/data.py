@@ -1,0 +1,366 @@
+"""``errormotion identify``, ``import``, ``report`` and ``validate``: commands on stored data."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import typer
+
+from errormotion import datasets, plugins
+from errormotion.campaign.storage.raw_paths import is_runs_folder, raw_of
+from errormotion.cli.guard import ERROR, INTERNAL, log_file
+from errormotion.cli.output import show, show_json, working
+from errormotion.cli.progress import Bars
+from errormotion.cli.settings import read_settings
+from errormotion.cli.summary import as_printed, figure_table, notes_of
+from errormotion.cli.tolerances import end_with, lines_of, remarks
+from errormotion.datasets.results.merit import figures_of
+from errormotion.datasets.storage.disk import reading
+from errormotion.datasets.validation import explained
+from errormotion.errors import DatasetError, ErrormotionError
+from errormotion.tolerances.conformity import judge
+from errormotion.tolerances.table import Tolerances, from_run, load_tolerances
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from errormotion.campaign.batch import Outcome
+
+
+class Trials(NamedTuple):
+    """What ``--monte-carlo`` asks for; ``number`` is None for the adaptive procedure."""
+
+    number: int | None
+    digits: int
+    seed: int
+
+
+def identify(
+    raws: list[Path],
+    method_id: str | None,
+    out: Path,
+    assignments: list[str],
+    settings_file: Path | None,
+    scheduler: str | None,
+    workers: int | None,
+    tolerances: Path | None,
+    as_json: bool,
+    trials: Trials | None = None,
+) -> None:
+    """Identify one raw dataset into a file, or several into a folder, and decide on tolerances."""
+    limits = load_tolerances(tolerances) if tolerances is not None else None
+    several = len(raws) > 1 or is_runs_folder(raws[0]) or (trials is None and (scheduler or workers))
+    if not several and out.exists():
+        raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
+    method_id = method_id or _method_of(raws[0])
+    settings = read_settings(plugins.get("methods", method_id).Settings, settings_file, assignments)
+    if not several:
+        _identify_one(raw_of(raws[0]), method_id, settings, out, limits, as_json, trials, scheduler, workers)
+        return
+    from errormotion.campaign import batch
+
+    scheduler, note = batch.choose_scheduler(scheduler)
+    if note:
+        typer.echo(note, err=True)
+    with Bars(as_json) as bars:
+        outcomes = batch.identify_runs(
+            raws, method_id, settings, out, scheduler=scheduler, workers=workers, progress=bars
+        )
+        evaluations = (
+            {} if trials is None else _evaluated(outcomes, method_id, settings, trials, scheduler, workers, bars)
+        )
+    _show_outcomes(outcomes, out, scheduler, limits, as_json, evaluations)
+
+
+def _evaluated(
+    outcomes: list[Outcome],
+    method_id: str,
+    settings: Any,
+    trials: Trials,
+    scheduler: str,
+    workers: int | None,
+    bars: Bars,
+) -> dict[Path, xr.Dataset | str]:
+    """Return the Monte Carlo evaluation of each result, or why there is none; what exists already is kept."""
+    from errormotion.montecarlo.beside import evaluate_beside, file_beside
+
+    found = dict[Path, Any]()
+    for outcome in outcomes:
+        if outcome.reason or outcome.errors is None:
+            continue
+        file = file_beside(outcome.errors)
+        try:
+            found[outcome.raw] = (
+                datasets.load(file)
+                if file.exists()
+                else evaluate_beside(
+                    raw_of(outcome.raw), method_id, settings, datasets.load(outcome.errors), outcome.errors,
+                    trials=trials.number, digits=trials.digits, seed=trials.seed, scheduler=scheduler, workers=workers,
+                    progress=bars,
+                )
+            )  # fmt: skip
+        except ErrormotionError as error:
+            found[outcome.raw] = str(error)
+    return found
+
+
+def _method_of(raw: Path) -> str:
+    """Return the id of the method that identifies a raw dataset."""
+    if is_runs_folder(raw):
+        raise DatasetError(f"{raw}: is a folder of runs; name the method with --method")
+    path = raw_of(raw)
+    with reading(path), datasets.load(path) as dataset:
+        schema = str(dataset.attrs.get("schema", "none"))
+    owner = plugins.owner_of_schema(schema)
+    if owner is None or not hasattr(owner, "identify"):
+        raise DatasetError(f"{path}: expected a raw dataset of a method; found schema {schema}")
+    if schema in getattr(owner, "calibrations", {}):
+        raise DatasetError(f"{path}: holds readings of a calibration; use 'errormotion calibrate'")
+    return str(owner.info.id)
+
+
+def _show_outcomes(
+    outcomes: list[Outcome],
+    out: Path,
+    scheduler: str,
+    limits: Tolerances | None,
+    as_json: bool,
+    evaluations: Mapping[Path, xr.Dataset | str],
+) -> None:
+    """Print the outcome of each run; the exit code is that of a failure if one failed, else of the tolerances."""
+    from errormotion.cli.commands.results import monte_carlo
+
+    refused = [each for each in evaluations.values() if isinstance(each, str)]
+    failed = [outcome for outcome in outcomes if outcome.reason]
+    found = {}
+    for outcome in outcomes:
+        if limits is not None and outcome.errors is not None and not outcome.reason:
+            found[outcome.raw] = judge(datasets.load(outcome.errors), limits)
+    decisions = [each.plain() for each in found.values()]
+    if as_json:
+        keys = ("raw", "errors", "reason", "seconds", "stepped_over")
+        runs: list[dict[str, Any]] = [{key: getattr(outcome, key) for key in keys} for outcome in outcomes]
+        for outcome, run in zip(outcomes, runs, strict=True):
+            run["conformity"] = found[outcome.raw].plain() if outcome.raw in found else None
+            if (evaluation := evaluations.get(outcome.raw)) is not None:
+                run["verdicts"] = evaluation if isinstance(evaluation, str) else monte_carlo.summary(evaluation)
+        show_json({"ok": not failed and not refused, "scheduler": scheduler, "runs": runs})
+    else:
+        stepped_over = sum(outcome.stepped_over for outcome in outcomes)
+        made = len(outcomes) - len(failed) - stepped_over
+        show(f"{out}: {made} identified, {stepped_over} existed already, {len(failed)} failed")
+        for outcome in failed:
+            name = "" if outcome.reason.startswith(str(outcome.raw)) else f"{outcome.raw}: "
+            show(f"  failed: {name}{outcome.reason}")
+        for raw, conformity in found.items():
+            for line in conformity.lines()[:1]:
+                show(f"  {raw}: {line}")
+        for line in remarks(decisions):
+            show(line)
+        for raw, made_of_it in evaluations.items():
+            if isinstance(made_of_it, str):
+                show(f"  failed: Monte Carlo evaluation of {raw}: {made_of_it}")
+            else:
+                monte_carlo.show_evaluation(made_of_it, raw)
+    broken = any(outcome.traceback for outcome in failed)
+    if broken:
+        typer.echo(f"The tracebacks are in {log_file()}.", err=True)
+    if failed or refused:
+        raise typer.Exit(INTERNAL if broken else ERROR)
+    end_with(decisions)
+
+
+def _identify_one(
+    raw: Path,
+    method_id: str,
+    settings: Any,
+    out: Path,
+    limits: Tolerances | None,
+    as_json: bool,
+    trials: Trials | None,
+    scheduler: str | None,
+    workers: int | None,
+) -> None:
+    method, evaluation, file = plugins.get("methods", method_id), None, out
+    if trials is not None:
+        from errormotion.cli.commands.results import monte_carlo
+        from errormotion.montecarlo.beside import evaluate_beside
+
+        file = monte_carlo.beside(out)
+    with Bars(as_json) as bars:
+        with reading(raw), datasets.load(raw) as dataset:
+            bars.stage("identifying")
+            with explained(raw, dataset):
+                errors = method().identify(dataset, settings)
+        datasets.validate(errors)
+        if trials is not None:
+            evaluation = evaluate_beside(
+                raw, method_id, settings, errors, out, trials=trials.number, digits=trials.digits, seed=trials.seed,
+                scheduler=scheduler or "threads", workers=workers, progress=bars,
+            )  # fmt: skip
+    datasets.save(errors, out)
+    results, notes = [as_printed(figure) for figure in figures_of(errors)], notes_of(errors)
+    found = judge(errors, limits) if limits is not None else None
+    if as_json:
+        answer = {"errors": str(out), "component": errors.attrs["component"], "results": results, "notes": notes}
+        if evaluation is not None:
+            answer |= {"monte_carlo": str(file), "verdicts": monte_carlo.summary(evaluation)}
+        show_json({"ok": True, **answer, "conformity": found.plain() if found is not None else None})
+    else:
+        show(f"{out}: errors of {errors.attrs['component']} by {method_id} {errors.attrs['method_version']}")
+        for line in lines_of(found) if found is not None else []:
+            show(line)
+        if results:
+            show(figure_table(results))
+        for note in notes:
+            show(f"  note: {note}")
+        if evaluation is not None:
+            monte_carlo.show_evaluation(evaluation, file)
+    if found is not None:
+        end_with([found.plain()])
+
+
+def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
+    """Turn a log with columns into a raw dataset."""
+    from errormotion.datasets.importing import import_log as read_log
+
+    with Bars(as_json) as bars:
+        bars.stage("importing")
+        raw = read_log(log, map_file, out)
+    sizes = {str(dim): size for dim, size in raw.sizes.items()}
+    missing, notes = json.loads(raw.attrs["missing_values"]), json.loads(raw.attrs.get("import_notes", "[]"))
+    if as_json:
+        answer = {"schema": raw.attrs["schema"], "sizes": sizes, "missing": missing, "notes": notes}
+        show_json({"ok": True, "raw": str(out), **answer})
+    else:
+        show(f"{out}: {raw.attrs['schema']}, " + ", ".join(f"{size} along {dim}" for dim, size in sizes.items()))
+        for column, count in missing.items():
+            show(f"  {column}: {count} empty cells, kept as NaN")
+        for note in notes:
+            show(f"  note: {note}")
+
+
+def report(
+    run: Path,
+    out: Path | None,
+    tolerances: Path | None,
+    as_json: bool,
+    *,
+    language: str = "",
+    paper: str = "",
+    also: tuple[str, ...] = (),
+) -> None:
+    """Write the report of a run folder or of one file of errors, and decide on its tolerances."""
+    from errormotion.campaign.folder import RunFolder
+    from errormotion.report import Form, write_report, write_run_report
+    from errormotion.report.write import belonging
+
+    limits = load_tolerances(tolerances) if tolerances is not None else None
+    found, form = None, Form(language, paper, also)
+    if run.is_dir():
+        folder = RunFolder.open(run)
+        stored = limits or from_run(folder.data)
+        if stored is not None and folder.errors is not None:
+            with reading(folder.errors), datasets.load(folder.errors) as errors:
+                datasets.validate(errors)
+                found = judge(errors, stored)
+            folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
+        with working("Writing the report"), reading(run):
+            path = write_run_report(run, out, form=form)
+        if out is None:
+            folder.data["report"] = path.relative_to(folder.path).as_posix()
+            folder.step("report", "done")
+            folder.save()
+    else:
+        with working("Writing the report"), reading(run), datasets.load(run) as errors, explained(run, errors):
+            state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
+            page = out or run.with_suffix(".html")
+            path = write_report([errors, *belonging(errors, run)], page, run=state, form=form)
+            found = judge(errors, limits) if limits is not None else None
+    if as_json:
+        files = [str(each) for each in form.beside(path)]
+        plain = found.plain() if found is not None else None
+        show_json({"ok": True, "report": str(path), "files": files, "conformity": plain})
+    else:
+        for line in lines_of(found) if found is not None else []:
+            show(line)
+        for each in (path, *form.beside(path)):
+            show(str(each))
+    if found is not None:
+        end_with([found.plain()])
+
+
+def validate(file: Path) -> list[str]:
+    """Return every violation of a dataset, a run folder, a bench or a campaign file."""
+    if file.suffix == ".toml":
+        return _of_toml(file)
+    if (file / "run.json").exists():
+        return _of_run(file)
+    try:
+        with reading(file), datasets.load(file) as dataset:
+            return list(datasets.violations(dataset))
+    except DatasetError as error:
+        return [str(error)]
+
+
+def alike(mistakes: list[str]) -> list[str]:
+    """Return violations for a person: those that are alike in one line."""
+    from errormotion.datasets.files.tomlfile import grouped
+
+    return grouped(mistakes)
+
+
+def _of_toml(file: Path) -> list[str]:
+    from errormotion.campaign.files import load_bench, load_campaign
+    from errormotion.datasets.files.tomlfile import read_toml
+
+    try:
+        schema = str(read_toml(file).get("schema", ""))
+        if schema.startswith("errormotion.campaign/"):
+            load_campaign(file)
+        elif schema.startswith("errormotion.tolerances/"):
+            load_tolerances(file)
+        else:
+            load_bench(file)
+    except ErrormotionError as error:
+        return _mistakes(str(error), file)
+    return []
+
+
+def _mistakes(message: str, file: Path) -> list[str]:
+    """Return the single mistakes of a message; those of another file, such as the bench of a campaign, name it."""
+    from errormotion.datasets.files.tomlfile import single
+
+    found, source = list[str](), str(file)
+    for line in message.splitlines():
+        if line.startswith("  - "):
+            text = line.removeprefix("  - ")
+            found += [each if source == str(file) else f"{source}: {each}" for each in single(text)]
+        elif re.fullmatch(r".*: \d+ mistakes?", line):
+            source = line.rpartition(": ")[0]
+        elif found and line.startswith(" "):
+            found[-1] += f"\n{line}"
+        else:
+            found.append(line.removeprefix(f"{file}: "))
+    return found
+
+
+def _of_run(path: Path) -> list[str]:
+    from errormotion.campaign.folder import RunFolder
+    from errormotion.datasets.files import events
+
+    try:
+        folder = RunFolder.open(path)
+    except ErrormotionError as error:
+        return [str(error)]
+    found = []
+    for part in ([folder.raw] if folder.raw.exists() else []) + sorted(path.glob("errors/*/errors.nc")):
+        found += [f"{part.relative_to(path)}: {violation}" for violation in validate(part)]
+    found += events.read(path)[1]
+    if folder.finished and folder.errors is None:
+        found.append(f"run.json: expected 'errors', because the run is finished; found {json.dumps(None)}")
+    return found

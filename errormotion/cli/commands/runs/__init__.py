@@ -1,0 +1,1 @@
+"""The record of a machine: runs, their truth, notes, and history."""

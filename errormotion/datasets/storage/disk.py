@@ -1,0 +1,349 @@
+"""Datasets on disk: NetCDF-4 files and Zarr v3 folders, written whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import math
+import os
+import re
+import shutil
+import traceback
+import uuid
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from xarray.indexes import RangeIndex
+
+from errormotion.datasets.checks import storable_violations
+from errormotion.datasets.files.containers import check_netcdf, check_zarr
+from errormotion.datasets.files.reading import require_regular
+from errormotion.datasets.schemas import SCHEMA
+from errormotion.datasets.storage.compression import as_stored, encoding
+from errormotion.errors import DatasetError, ErrormotionError
+
+_NETCDF = (".nc", ".nc4", ".h5")
+_NUMERICAL = ("/numpy/", "/scipy/")
+_READERS = ("/zarr/", "/numcodecs/", "/h5py/", "/h5netcdf/")
+_HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_CLASSIC_SIGNATURE = b"CDF"
+
+# Longer time coordinates are left on disk: an index would pull them into memory.
+_LONGEST_INDEX = 100_000
+
+_REASONS = {
+    errno.ENOENT: "there is no such folder",
+    errno.EACCES: "permission denied; choose a place where you may write, or have the permission given",
+    errno.EPERM: "permission denied; choose a place where you may write, or have the permission given",
+    errno.EROFS: "the file system is read-only; choose another place",
+    errno.ENOSPC: "the disk is full; free some space or choose another disk. Nothing was left behind there",
+    errno.EDQUOT: "your disk quota is used up; free some space or choose another disk. Nothing was left behind there",
+    errno.EFBIG: "the file would be larger than allowed. Nothing was left behind there",
+    errno.ENAMETOOLONG: "the name is too long",
+}
+
+
+def load(path: str | Path) -> xr.Dataset:
+    """Open a dataset.
+
+    An error dataset is read into memory. A raw dataset stays on disk and is read where it is used; a long ``time`` has
+    no index, and evenly spaced times are not stored at all: they follow from the attributes ``sample_rate`` (Hz) and
+    ``time_start`` (s, 0 if missing).
+
+    Parameters
+    ----------
+    path : str or Path
+        NetCDF-4 file or Zarr folder; or ``.csv``, as `errormotion.datasets.text.readings_csv` reads it.
+
+    Returns
+    -------
+    Dataset
+
+    Raises
+    ------
+    DatasetError
+        Nothing there, no permission, not a dataset, or truncated.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".csv":
+        from errormotion.datasets.text.readings_csv import read_csv
+
+        return read_csv(path)
+    engine = _engine_of(path)
+    with _reading(path):
+        if engine == "h5netcdf":
+            check_netcdf(path)
+        elif engine == "zarr":
+            check_zarr(path)
+        ds = xr.open_dataset(
+            path,
+            engine=engine,
+            backend_kwargs={"consolidated": _is_consolidated(path)} if engine == "zarr" else {},
+            decode_times=False,
+            decode_timedelta=False,
+            create_default_indexes=False,
+        )
+        ds = _tidy(ds)
+        if ds.attrs.get("schema") == SCHEMA:
+            with ds:
+                ds = ds.load()
+    return _with_indexes(ds)
+
+
+def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
+    """Write a dataset beside its place, bring it to the disk and rename it.
+
+    Large influences of an error dataset are rounded, see `errormotion.datasets.storage.compression.as_stored`. A NetCDF
+    file is composed in memory, a Zarr folder one variable at a time (piece by piece if dask holds it).
+    Evenly spaced times that the attributes ``sample_rate`` and ``time_start`` state are left out.
+
+    Parameters
+    ----------
+    ds : Dataset
+    path : str or Path
+        ``.nc`` makes a NetCDF-4 file, ``.zarr`` a Zarr v3 folder.
+    overwrite : bool
+        Replace what is there.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    DatasetError
+        The path exists already, the ending is unknown, an attribute cannot be stored, or the disk does not take it
+        (nothing is left behind then).
+    """
+    path = Path(path)
+    if path.suffix not in (*_NETCDF, ".zarr"):
+        raise DatasetError(f"{path}: expected a name that ends in .nc (NetCDF-4 file) or .zarr (Zarr folder)")
+    _refuse_existing(path, overwrite)
+    unstorable = storable_violations(ds)
+    if unstorable:
+        raise DatasetError(f"{path}: cannot be written:", unstorable)
+    part = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
+    with _writing(path, part):
+        if path.suffix == ".zarr":
+            # xarray's overloads do not know the type of a plain path together with zarr_format
+            storable(ds).to_zarr(part, mode="w-", zarr_format=3, consolidated=False)
+        else:
+            # Composed in memory: HDF5 crashes the process when the disk fills up under an open file.
+            ready = storable(ds)
+            composed = io.BytesIO()  # ours: Python 3.13 complains of one that is closed while its contents are in use
+            ready.to_netcdf(composed, engine="h5netcdf", encoding=encoding(ready))
+            part.write_bytes(composed.getvalue())
+        _sync(part)
+        _refuse_existing(path, overwrite)
+        _replace(part, path)
+        _sync_one(path.parent)
+    return path
+
+
+def storable(ds: xr.Dataset) -> xr.Dataset:
+    """Return a dataset as it goes to disk: texts of free length, no former encoding, no derivable times."""
+    index = ds.xindexes.get("time")
+    if isinstance(index, RangeIndex) and math.isclose(index.step * ds.attrs.get("sample_rate", 0.0), 1.0):
+        ds = ds.drop_vars("time").assign_attrs(time_start=float(index.start))
+    ds = as_stored(ds).drop_encoding()
+    # Zarr v3 has no type for texts of fixed width; objects become its texts of free length.
+    texts = {name: variable.astype(object) for name, variable in ds.variables.items() if variable.dtype.kind in "UT"}
+    return (
+        ds.drop_indexes([name for name in texts if name in ds.xindexes])
+        .assign(texts)
+        .set_coords([name for name in texts if name in ds.coords])
+    )
+
+
+def _engine_of(path: Path) -> str:
+    """Return the xarray engine for what is at a path; DatasetError says what is there instead of a dataset."""
+    if path.is_dir():
+        if (path / "zarr.json").exists() or (path / ".zgroup").exists():
+            return "zarr"
+        inside = sorted(item.name for item in path.iterdir() if item.suffix in (".zarr", ".nc"))
+        hint = f" Did you mean {path / inside[0]}?" if inside else ""
+        raise DatasetError(f"{path}: is a folder without zarr.json, so no dataset.{hint}")
+    try:
+        require_regular(path)
+        with path.open("rb") as file:
+            head = file.read(8)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {_reason(error, 'there is no such file')}") from error
+    if head == _HDF5_SIGNATURE:
+        return "h5netcdf"
+    if not head:
+        raise DatasetError(f"{path}: is empty; expected a NetCDF-4 file. Writing was interrupted: create it again")
+    if head.startswith(_CLASSIC_SIGNATURE):
+        return "scipy"
+    if _HDF5_SIGNATURE.startswith(head):
+        raise DatasetError(f"{path}: is truncated; create it again or copy it again")
+    raise DatasetError(
+        f"{path}: is not a dataset; expected a NetCDF file, a Zarr folder or a .csv file of readings. For a text log "
+        "use 'errormotion import'"
+    )
+
+
+def _is_consolidated(folder: Path) -> bool:
+    """Whether the root of a Zarr folder holds the metadata of its arrays, which then counts before their own."""
+    root = json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
+    return bool(root.get("consolidated_metadata"))
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except DatasetError:
+        raise
+    except PermissionError as error:
+        raise DatasetError(f"{path}: cannot be read: permission denied") from error
+    except MemoryError as error:
+        raise DatasetError(f"{path}: needs more memory than this computer has") from error
+    except Exception as error:
+        # What h5py, zarr and xarray raise on files that were cut off or are something else.
+        what = "is truncated" if "truncated" in str(error) else "is damaged, or not a dataset of errormotion"
+        raise DatasetError(f"{path}: {what}; create it again or copy it again. (Reader: {error})") from error
+
+
+@contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Name the file in errors of the project, and turn what a damaged one raises when its values are read into one."""
+    try:
+        yield
+    except ErrormotionError as error:
+        if str(path) not in str(error):
+            error.args = (f"{path}: {error}",)
+        raise
+    except MemoryError as error:
+        raise DatasetError(f"{path}: needs more memory than this computer has") from error
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise DatasetError(f"{path}: its values cannot be evaluated ({type(error).__name__}: {error})") from error
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        if isinstance(error, ValueError) and any(part in frames[-1].filename for part in _NUMERICAL):
+            raise DatasetError(f"{path}: its values cannot be evaluated ({error})") from error
+        if not any(part in frame.filename for frame in frames for part in _READERS):
+            raise
+        raise DatasetError(
+            f"{path}: is damaged or incomplete; copy it again, or measure again. (Reader: {error})"
+        ) from error
+
+
+@contextmanager
+def _writing(path: Path, part: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        # HDF5 closes a file on a full disk with a RuntimeError that carries the system's words.
+        raise DatasetError(f"{path}: cannot be written: {_reason(error, 'there is no such folder')}") from error
+    finally:
+        _remove(part)
+
+
+def _reason(error: Exception, missing: str) -> str:
+    code = getattr(error, "errno", None)
+    stated = re.search(r"errno = (\d+)", str(error))
+    if stated is not None and code not in _REASONS:
+        code = int(stated[1])
+    if code == errno.ENOENT:
+        return missing
+    return _REASONS.get(code or 0, getattr(error, "strerror", None) or str(error))
+
+
+def _refuse_existing(path: Path, overwrite: bool) -> None:
+    if not overwrite and (path.exists() or path.is_symlink()):
+        raise DatasetError(f"{path}: exists already; choose another name, or allow overwriting")
+
+
+def _replace(part: Path, path: Path) -> None:
+    """Put the finished part in its place; a folder cannot be replaced in one step, so the old one steps aside first."""
+    if not path.is_dir():
+        part.replace(path)
+        return
+    old = part.with_suffix(".old")
+    path.rename(old)
+    try:
+        part.rename(path)
+    except OSError:
+        old.rename(path)
+        raise
+    _remove(old)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    """Bring a file, or a folder with all that is in it, to the disk."""
+    for folder, _, names in os.walk(path):
+        for name in names:
+            _sync_one(Path(folder) / name)
+        _sync_one(Path(folder))
+    if path.is_file():
+        _sync_one(path)
+
+
+def _sync_one(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _tidy(ds: xr.Dataset) -> xr.Dataset:
+    """Return a dataset with the same types whatever file it came from: plain texts, numbers and arrays."""
+    texts = {name: variable for name, variable in ds.variables.items() if variable.dtype.kind in "OST"}
+    if texts:
+        coords = [name for name in texts if name in ds.coords]
+        ds = ds.assign({name: _text(variable) for name, variable in texts.items()}).set_coords(coords)
+        ds = ds.drop_indexes([name for name in coords if name in ds.xindexes])
+    ds.attrs = _tidy_attrs(ds.attrs)
+    if isinstance(notes := ds.attrs.get("notes"), str):  # a list of one sentence comes back as a text
+        ds.attrs["notes"] = [notes]
+    for variable in ds.variables.values():
+        variable.attrs = _tidy_attrs(variable.attrs)
+    return ds
+
+
+def _text(variable: xr.Variable) -> xr.Variable:
+    values = [item.decode() if isinstance(item, bytes) else str(item) for item in variable.values.ravel().tolist()]
+    array = np.array(values, dtype=str).reshape(variable.shape)
+    return xr.Variable(variable.dims, array, variable.attrs)
+
+
+def _tidy_attrs(attrs: Mapping[Any, Any]) -> dict[str, Any]:
+    return {str(name): _tidy_value(value) for name, value in attrs.items()}
+
+
+def _tidy_value(value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype.kind in "OSUT":
+        return [str(item) for item in value.tolist()]
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, list) and value and all(isinstance(item, (int, float)) for item in value):
+        return np.array(value)
+    return value
+
+
+def _with_indexes(ds: xr.Dataset) -> xr.Dataset:
+    for dim, size in ds.sizes.items():
+        if dim in ds.coords and ds.coords[dim].dims == (dim,) and (dim != "time" or size <= _LONGEST_INDEX):
+            ds = ds.set_xindex(str(dim))
+    rate = ds.attrs.get("sample_rate")
+    if "time" in ds.sizes and "time" not in ds.variables and isinstance(rate, (int, float)) and rate > 0:
+        start, size = float(ds.attrs.get("time_start", 0.0)), ds.sizes["time"]
+        # Half a step before the end: the number of times does not hang on rounding, and the step is 1 / rate exactly.
+        index = RangeIndex.arange(start, start + (size - 0.5) / rate, 1 / rate, dim="time")
+        ds = ds.assign_coords(xr.Coordinates.from_xindex(index))
+        ds["time"].attrs["units"] = "s"
+    return ds

@@ -1,0 +1,81 @@
+"""The machine's part of online compensation in a simulated LinuxCNC: what its servo thread does, read by ``halcmd``."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable
+
+from errormotion.errors import InstrumentError
+
+TIMEOUT = 10.0  # s
+HELD = "errormotion-hold-2.in1"
+"""Pin by which a program holds the offset."""
+
+
+class ServoThreadPart:
+    """The machine's part of a simulated LinuxCNC, as the conformance kit looks at it. Time passes by itself.
+
+    Parameters
+    ----------
+    unit : float
+        Unit of length of LinuxCNC, m.
+    slew, watchdog : float
+        m/s, s.
+    stop : callable
+        Stops the machine (e-stop).
+
+    Attributes
+    ----------
+    orders : int
+        Number of offsets that the bridge has accepted.
+    """
+
+    def __init__(self, unit: float, slew: float, watchdog: float, stop: Callable[[], None]) -> None:
+        self.slew, self.watchdog = slew, watchdog
+        self.orders = 0
+        self._unit, self._stop = unit, stop
+        self._busy = self._fault = self._signal = ""
+
+    @property
+    def offset(self) -> tuple[float, float, float]:
+        """Offset of X, Y, Z in effect now, m."""
+        x, y, z = (self._unit * float(self._hal(f"getp errormotion-limit-{axis}.out")) for axis in "xyz")
+        return x, y, z
+
+    def elapse(self, seconds: float) -> None:
+        """Let real time pass, s."""
+        time.sleep(seconds)
+
+    @property
+    def busy(self) -> str:
+        """Why the offset must not change; a text holds it, as a program does."""
+        return self._busy
+
+    @busy.setter
+    def busy(self, why: str) -> None:
+        if why and not self._busy:
+            self._signal = self._hal(f"show pin {HELD}").split()[-1]
+            self._hal(f"unlinkp {HELD}", f"setp {HELD} 1")
+        elif self._busy and not why:
+            self._hal(f"setp {HELD} 0", f"net {self._signal} {HELD}")
+        self._busy = why
+
+    @property
+    def fault(self) -> str:
+        """Why the machine takes no offsets; a text stops it, and the next device switches it on again."""
+        return self._fault
+
+    @fault.setter
+    def fault(self, why: str) -> None:
+        if why and not self._fault:
+            self._stop()
+        self._fault = why
+
+    def _hal(self, *lines: str) -> str:
+        done = subprocess.run(
+            ["halcmd", "-s", "-f"], input="\n".join(lines), capture_output=True, text=True, timeout=TIMEOUT, check=False
+        )
+        if done.returncode:
+            raise InstrumentError(f"halcmd {lines[0]!r} fails: {done.stderr.strip()[:300]}")
+        return done.stdout

@@ -1,0 +1,18 @@
+"""Notes on a network: readings that were excluded, targets without a position, a weak layout, swapped stations."""
+
+from __future__ import annotations
+
+from errormotion.methods.multilateration.network.diagnosis import determinacy, outliers
+from errormotion.methods.multilateration.network.network import Network
+
+
+def notes_of(network: Network) -> tuple[str, ...]:
+    """Return what the operator should know about a network."""
+    return (
+        *outliers.notes(network.left_out, network.undecided),
+        *determinacy.without_place(network.weight, network.undecided),
+        *determinacy.without_say(network.carries, network.target),
+        *determinacy.weak_layout(network.target_covariance, network.weight, network.station, network.target),
+        *determinacy.weak_targets(network.target, network.target_covariance, network.station),
+        *determinacy.swap_note(network.station, network.rough),
+    )

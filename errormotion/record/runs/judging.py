@@ -1,0 +1,45 @@
+"""Decisions on the tolerances of runs in the record, with other limits than those that the runs state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from errormotion.errors import ErrormotionError
+from errormotion.record.runs.entry import Entry
+from errormotion.tolerances.conformity import Conformity, judge, judge_figures
+from errormotion.tolerances.table import Tolerances
+
+MOST_READ = 1000
+"""Error datasets that one call opens, the newest first; limits of freedoms need them."""
+
+
+def judge_runs(runs: Sequence[tuple[Path, Entry]], tolerances: Tolerances) -> list[Conformity | None]:
+    """Return the decision on each run, newest first; None for a run without errors.
+
+    A run whose error dataset cannot be read, or is beyond MOST_READ, is not decided; ``failure`` states why.
+    """
+    found = list[Conformity | None]()
+    read = 0
+    for path, entry in runs:
+        if not entry.errors:
+            found.append(None)
+        elif not tolerances.freedoms and entry.figures is not None:
+            found.append(judge_figures(entry.figures, tolerances))
+        else:
+            read += 1
+            found.append(_of_dataset(path / entry.errors, entry, tolerances, read > MOST_READ))
+    return found
+
+
+def _of_dataset(file: Path, entry: Entry, tolerances: Tolerances, too_many: bool) -> Conformity:
+    from errormotion import datasets
+
+    stated = judge_figures(entry.figures or (), tolerances)
+    if too_many:
+        return replace(stated, unused=(), failure=f"only {MOST_READ} error datasets are read; select runs with --since")
+    try:
+        return judge(datasets.load(file), tolerances)
+    except ErrormotionError as error:
+        return replace(stated, unused=(), failure=str(error))

@@ -1,0 +1,1 @@
+"""Drawings of several kinds on the canvas: series over time, timelines, maps, spatial views."""

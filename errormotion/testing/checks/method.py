@@ -1,0 +1,401 @@
+"""What every method plugin has to show; the statistical claims are in ``coverage``."""
+# ruff: noqa: D401 - the docstring of a check is its claim
+
+from __future__ import annotations
+
+import ast
+import json
+import sys
+from collections.abc import Hashable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, get_args
+
+import numpy as np
+import xarray as xr
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from errormotion import datasets
+from errormotion.datasets.schemas import variants
+from errormotion.errors import ErrormotionError
+from errormotion.kinematics import twists
+from errormotion.kinematics.iso import DOF
+from errormotion.plugins import MethodInfo, MethodSubject, Needs, Status, kind_registry
+from errormotion.testing.checks.coverage import coverage, differences, recovers_truth
+from errormotion.testing.checks.instrument import check_settings
+from errormotion.testing.checks.redraw import sources_as_stated, sources_drawn, why_no_redrawing
+from errormotion.testing.checks.text import chapters_translated, why_no_texts
+from errormotion.testing.kit import Checks, require
+from errormotion.testing.results import covariance, functional_point, names, sigma, values
+
+METHOD_CHECKS: Checks[MethodSubject] = Checks()
+
+#: Two results are the same when they differ by less than this fraction of their standard uncertainty: room for the
+#: rounding of sums in another order and for the last step of an iteration, and nothing else.
+SAME = 1e-3
+#: The same for data stored with 24 bits: 6e-8 of a reading, next to a noise that is rarely below 1e-6 of it.
+SAME_SINGLE = 0.1
+
+
+@METHOD_CHECKS.add()
+def info_complete(subject: MethodSubject) -> str:
+    """``info`` tells id, summary, status, version and what the method cannot see; ``needs`` names a raw schema."""
+    info, needs = subject.plugin.info, subject.plugin.needs
+    require(isinstance(info, MethodInfo), f"info: expected a MethodInfo, found {type(info).__name__}")
+    require(info.id.isidentifier() and info.id == info.id.lower(), f"info.id: expected lower case, found {info.id!r}")
+    require(len(info.summary.strip()) >= 10, f"info.summary: expected a sentence, found {info.summary!r}")
+    require(info.status in get_args(Status), f"info.status: expected one of {get_args(Status)}, found {info.status!r}")
+    require(bool(info.version), "info.version is empty")
+    blind = isinstance(info.cannot_see, tuple) and all(isinstance(text, str) and text for text in info.cannot_see)
+    require(blind, f"info.cannot_see: expected a tuple of sentences, found {info.cannot_see!r}")
+    require(isinstance(needs, Needs), f"needs: expected a Needs, found {type(needs).__name__}")
+    named = needs.raw_schema.startswith("errormotion.raw.") and "/" in needs.raw_schema
+    require(named, f"needs.raw_schema: expected 'errormotion.raw.NAME/VERSION', found {needs.raw_schema!r}")
+    return f"{info.id} {info.version}, {info.status}"
+
+
+@METHOD_CHECKS.add()
+def settings_strict(subject: MethodSubject) -> str:
+    """Settings are a PluginSettings, refuse unknown keys, and are unchanged after a round trip through JSON."""
+    return check_settings(subject.plugin.Settings, subject.effective_settings())
+
+
+@METHOD_CHECKS.add()
+def motions_stated(subject: MethodSubject) -> str:
+    """A method that can move a machine states its motions: by programs, or where its package names such a kind."""
+    plugin = subject.plugin
+    if hasattr(plugin, "motions"):
+        return "motions are stated"
+    name = plugin.info.id
+    require(not hasattr(plugin, "programs"), f"'{name}' writes NC programs and does not state its motions ('motions')")
+    moving = {each for each in kind_registry.kinds() if kind_registry.kind_changes_machine(each)}
+    found = sorted(moving & (set(plugin.needs.instruments) | _texts_of(plugin)))
+    named = " and ".join(found)
+    require(not found, f"'{name}' uses a {named} and does not state its motions ('motions'); [] where nothing moves")
+    return "nothing that moves is used"
+
+
+def _texts_of(plugin: Any) -> set[str]:
+    """Return the texts in the source of a plugin's package, or of its module where it is in none."""
+    source = Path(str(sys.modules[plugin.__module__].__file__))
+    in_package = (source.parent / "__init__.py").exists()
+    found: set[str] = set()
+    for path in source.parent.rglob("*.py") if in_package else [source]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.add(node.value)
+    return found
+
+
+@METHOD_CHECKS.add()
+def schema(subject: MethodSubject) -> str:
+    """Raw data and result follow their schemas, and the result says which method made it, from which settings."""
+    raw, _ = subject.make(0)
+    tables = tuple(getattr(subject.plugin, "raw_schemas", ()))
+    if tables or variants(str(raw.attrs.get("schema"))):  # a method without tables validates its raw data itself
+        datasets.validate(raw, tables)
+    expected = subject.plugin.needs.raw_schema
+    require(raw.attrs["schema"] == expected, f"raw data: expected schema {expected}, found {raw.attrs.get('schema')}")
+    errors = subject.identify(raw)
+    datasets.validate(errors)
+    info = subject.plugin.info
+    for key, value in {"schema": datasets.SCHEMA, "method": info.id, "method_version": info.version}.items():
+        require(errors.attrs[key] == value, f"attribute {key}: expected '{value}', found '{errors.attrs[key]}'")
+    provenance = json.loads(errors.attrs["provenance"])
+    require(bool(provenance), "attribute provenance is empty")
+    known, spread = np.isfinite(values(errors)), np.isfinite(sigma(errors))
+    require(bool(known.any()), "no freedom has a value")
+    require(bool((known == spread).all()), "a value without an uncertainty, or an uncertainty without a value")
+    return f"{known.any(axis=0).sum()} freedoms at {len(known)} places"
+
+
+@METHOD_CHECKS.add()
+def joins_along_a_dimension(subject: MethodSubject) -> str:
+    """The pieces of an acquisition join along a dimension of the raw data, and their expected length is known."""
+    method, settings = subject.plugin(), subject.effective_settings()
+    dim, length = method.append_dim(settings), method.progress(settings)
+    raw, _ = subject.make(0)
+    # What is acquired may be another variant of the schema than what is handed to the kit.
+    known = {str(d) for d in raw.dims}
+    tables = getattr(method, "raw_schemas", ()) or variants(method.needs.raw_schema)
+    known |= {d for table in tables for row in table.rows for d in row.dims}
+    require(dim in known, f"append_dim: expected one of {', '.join(sorted(known))}; found '{dim}'")
+    require(0 < length < float("inf"), f"progress: expected a positive length, found {length}")
+    return f"{length:g} along {dim}"
+
+
+@METHOD_CHECKS.add()
+def deterministic(subject: MethodSubject) -> str:
+    """One seed gives one raw dataset and, bit for bit, one result; another seed gives another."""
+    (raw, _), (again, _), (other, _) = subject.make(0), subject.make(0), subject.make(1)
+    require(raw.identical(again), "the source of raw data gives two datasets for one seed")
+    require(not raw.identical(other), "the source of raw data ignores the seed")
+    np.random.seed(1)  # noqa: NPY002 - a method that leans on the global generator shows itself
+    first = subject.identify(raw)
+    np.random.seed(2)  # noqa: NPY002
+    second = subject.identify(raw)
+    differ = [str(name) for name in first.variables if not first[name].identical(second[name])]
+    require(not differ, f"two identifications of one raw dataset differ in {', '.join(differ)}")
+    return "two results alike"
+
+
+METHOD_CHECKS.add(limit=60.0)(recovers_truth)
+METHOD_CHECKS.add(limit=300.0)(coverage)
+METHOD_CHECKS.add(limit=300.0)(differences)
+METHOD_CHECKS.add(limit=60.0, why_not=why_no_redrawing)(sources_drawn)
+METHOD_CHECKS.add(limit=300.0, why_not=why_no_redrawing)(sources_as_stated)
+METHOD_CHECKS.add(why_not=why_no_texts)(chapters_translated)
+
+
+@METHOD_CHECKS.add()
+def frame_invariance(subject: MethodSubject) -> str:
+    """Raw data moved as a whole into another frame give the same errors and covariance, moved."""
+    rotation, shift = (np.array(part) for part in subject.motion)
+    pose = RigidTransform.from_components(shift, Rotation.from_rotvec(rotation))
+    raw, _ = subject.make(0)
+    here, there = (
+        subject.identify(raw),
+        _moved_subject(subject, pose).identify(moved_raw(raw, subject.raw_vectors, pose)),
+    )
+    if names(here) != DOF:
+        return _deviation_invariance(here, there, pose)
+    back = np.round(pose.apply(functional_point(here)) - functional_point(there), 12)  # else NaN times rounding is NaN
+    turned = twists.adjoint(rotation=pose.rotation)
+    expected, spread = twists.transform(values(here), turned), twists.transform_covariance(covariance(here), turned)
+    carried = twists.adjoint(shift=back)
+    _require_close(
+        expected,
+        spread,
+        twists.transform(values(there), carried),
+        twists.transform_covariance(covariance(there), carried),
+    )
+    return f"{np.isfinite(expected).sum()} values alike"
+
+
+def _deviation_invariance(here: xr.Dataset, there: xr.Dataset, pose: RigidTransform) -> str:
+    """Fail unless the deviations are the same numbers, and their sensitivity turned with the frame."""
+    expected = here.em.in_frame(pose, "moved").em.at(functional_point(there))["sensitivity"]
+    same = expected.sizes == there["sensitivity"].sizes and np.allclose(expected, there["sensitivity"], atol=1e-9)
+    require(bool(same), "the sensitivity did not turn with the frame")
+    _require_close(values(here), covariance(here), values(there), covariance(there))
+    return f"{np.isfinite(values(here)).sum()} values alike"
+
+
+def _moved_subject(subject: MethodSubject, pose: RigidTransform) -> MethodSubject:
+    moved = dict(subject.settings)
+    for name, kind in subject.setting_vectors.items():
+        vector = np.asarray(moved[name], dtype=float)
+        moved[name] = tuple(pose.apply(vector) if kind == "point" else pose.rotation.apply(vector))
+    return replace(subject, settings=moved)
+
+
+def moved_raw(raw: xr.Dataset, vectors: Any, pose: RigidTransform) -> xr.Dataset:
+    """Return a raw dataset whose vectors have been taken into another frame."""
+    Q, shift = pose.rotation.as_matrix(), pose.translation
+    moved = raw.copy(deep=True)
+    for name, kind in vectors.items():
+        array = moved[name]
+        if kind in ("point", "direction"):
+            vector = array.transpose(..., "direction")
+            data = vector.values @ Q.T + (shift if kind == "point" else 0.0)
+            moved[name] = vector.copy(data=data).transpose(*array.dims)
+        elif kind == "covariance":
+            both = np.kron(np.eye(2), Q)
+            moved[name] = array.copy(data=both @ array.values @ both.T)
+        elif kind == "pose":
+            data = np.eye(4)
+            data[:3, :3], data[:3, 3] = Q @ array.values[:3, :3], Q @ array.values[:3, 3]
+            moved[name] = array.copy(data=data)
+        else:
+            axis = "xyz".index(kind)
+            require(bool(np.allclose(Q[axis], np.eye(3)[axis])), f"the motion of the subject turns the axis {kind}")
+            moved[name] = array + shift[axis]
+        moved[name].attrs = dict(array.attrs)
+    return moved
+
+
+@METHOD_CHECKS.add()
+def number_format(subject: MethodSubject) -> str:
+    """Measured values stored as float32 give the same errors, within a tenth of their uncertainty."""
+    raw, _ = subject.make(0)
+    single = raw.copy()
+    for name in measured_variables(subject, raw):
+        single[name] = raw[name].astype(np.float32)
+        single[name].attrs = dict(raw[name].attrs)
+    one, other = subject.identify(raw), subject.identify(single)
+    _require_close(values(one), covariance(one), values(other), covariance(other), fraction=SAME_SINGLE)
+    return f"{', '.join(measured_variables(subject, raw))} in single precision"
+
+
+@METHOD_CHECKS.add()
+def units(subject: MethodSubject) -> str:
+    """Measured values in mm, marked as such, give the same errors or a typed error, never others."""
+    raw, _ = subject.make(0)
+    lengths = [name for name in measured_variables(subject, raw) if raw[name].attrs.get("units") == "m"]
+    require(bool(lengths), "no measured variable has the attribute units = 'm'")
+    straight, verdicts = subject.identify(raw), []
+    for name in lengths:
+        field = raw.copy()
+        field[name] = (raw[name] * 1e3).assign_attrs(units="mm")
+        verdicts.append(_same_or_refused(subject, straight, field, f"{name} in mm"))
+    return "; ".join(verdicts)
+
+
+@METHOD_CHECKS.add()
+def layout(subject: MethodSubject) -> str:
+    """The order of dimensions does not matter, nor that of labels along them, unless a typed error refuses it."""
+    raw, _ = subject.make(0)
+    straight = subject.identify(raw)
+    turned = raw.copy()
+    for name in map(str, raw.data_vars):
+        turned[name] = raw[name].transpose(*reversed(raw[name].dims))
+    verdicts = [_same_or_refused(subject, straight, turned, "turned dimensions")]
+    verdicts += [
+        _same_or_refused(subject, straight, raw.isel({dim: slice(None, None, -1)}), f"reversed {dim}")
+        for dim in _labelled(raw, raw.dims)
+    ]
+    return "; ".join(verdicts)
+
+
+def _same_or_refused(subject: MethodSubject, one: xr.Dataset, raw: xr.Dataset, what: str) -> str:
+    try:
+        other = subject.identify(raw)
+    except ErrormotionError:
+        return f"{what}: refused"
+    other = other.sel({dim: one[dim] for dim in _labelled(one, one["EX"].dims)})
+    _require_close(values(one), covariance(one), values(other), covariance(other), what=what)
+    return f"{what}: the same"
+
+
+@METHOD_CHECKS.add(limit=60.0)
+def refuses_missing_inputs(subject: MethodSubject) -> str:
+    """Without a variable that it needs, or with data of another schema, the method says so in a typed error."""
+    raw, _ = subject.make(0)
+    for name in map(str, raw.data_vars):
+        less = raw.drop_vars(name)
+        if name in subject.optional:
+            subject.identify(less)
+        else:
+            _require_typed_refusal(subject, less, f"without '{name}'", names=name)
+    foreign = raw.assign_attrs(schema="errormotion.raw.of_another_method/1")
+    _require_typed_refusal(subject, foreign, "with data of another schema", names="of_another_method")
+    return f"each of {len(raw.data_vars) - len(subject.optional)} variables missed"
+
+
+@METHOD_CHECKS.add()
+def nothing_measured(subject: MethodSubject) -> str:
+    """Where no sensor gave a value, the method raises a typed error or returns NaN, never a number."""
+    raw, _ = subject.make(0)
+    blank = raw.copy()
+    for name in measured_variables(subject, raw):
+        blank[name] = raw[name] * np.nan
+        blank[name].attrs = dict(raw[name].attrs)
+    try:
+        errors = subject.identify(blank)
+    except ErrormotionError as error:
+        return f"{type(error).__name__}: {str(error).splitlines()[0]}"
+    require(not np.isfinite(values(errors)).any(), "numbers came out of nothing")
+    return "NaN throughout"
+
+
+@METHOD_CHECKS.add()
+def leaves_inputs_alone(subject: MethodSubject) -> str:
+    """Identification changes nothing in the raw dataset, attributes included, and works on read-only arrays."""
+    raw, _ = subject.make(0)
+    for variable in raw.variables.values():
+        if isinstance(variable.data, np.ndarray):
+            variable.data.flags.writeable = False
+    before = raw.copy(deep=True)
+    attributes = {str(name): dict(raw[name].attrs) for name in raw.variables}
+    subject.identify(raw)
+    require(before.identical(raw), "the raw dataset was changed")
+    changed = [name for name, attrs in attributes.items() if dict(raw[name].attrs) != attrs]
+    require(
+        not changed and before.attrs == raw.attrs, f"attributes were changed: {', '.join(changed) or 'of the whole'}"
+    )
+    return "unchanged"
+
+
+@METHOD_CHECKS.add(limit=60.0)
+def round_trip(subject: MethodSubject) -> str:
+    """A result comes back from its file as it was; raw data from a file (NetCDF, Zarr) give the same result."""
+    raw, _ = subject.make(0)
+    errors = subject.identify(raw)
+    with TemporaryDirectory() as folder:
+        datasets.save(errors, Path(folder) / "errors.nc")
+        loaded = datasets.load(Path(folder) / "errors.nc")
+        differ = [str(name) for name in errors.variables if not errors[name].equals(loaded[name])]
+        require(not differ, f"came back from NetCDF changed: {', '.join(differ)}")
+        require(loaded.attrs.keys() == errors.attrs.keys(), "attributes were lost or added in NetCDF")
+        loaded.close()
+        for name in ("raw.nc", "raw.zarr"):
+            datasets.save(raw, Path(folder) / name)
+            stored = datasets.load(Path(folder) / name)
+            again = subject.identify(stored)
+            stored.close()
+            _require_close(values(errors), covariance(errors), values(again), covariance(again), what=f"from {name}")
+    return "result, raw.nc, raw.zarr"
+
+
+@METHOD_CHECKS.add()
+def plan(subject: MethodSubject) -> str:
+    """``plan`` returns zeros with the covariance to expect, of the same freedoms that identification sees."""
+    planned = subject.plugin().plan(subject.effective_settings())
+    datasets.validate(planned)
+    expected = np.isfinite(values(subject.outcome(0)[0])).any(axis=0)
+    found = np.isfinite(sigma(planned)).any(axis=0)
+    seen, planned_for = (", ".join(np.array(names(planned))[which]) for which in (expected, found))
+    require(bool((found == expected).all()), f"plan covers {planned_for or 'nothing'}, identification sees {seen}")
+    known = values(planned)
+    require(bool((known[np.isfinite(known)] == 0).all()), "planned values are not zero")
+    return f"{planned_for}"
+
+
+def measured_variables(subject: MethodSubject, raw: xr.Dataset) -> tuple[str, ...]:
+    """Return the names of what sensors read: as the subject says, else all arrays of float64 that are no vectors."""
+    if subject.measured:
+        return subject.measured
+    arrays = {str(name): array for name, array in raw.data_vars.items() if name not in subject.raw_vectors}
+    return tuple(name for name, array in arrays.items() if array.ndim > 0 and array.dtype == np.float64)
+
+
+def _require_typed_refusal(subject: MethodSubject, raw: xr.Dataset, what: str, *, names: str) -> None:
+    try:
+        subject.identify(raw)
+    except ErrormotionError as error:
+        require(names in str(error), f"{what}: the message does not name '{names}': {error}")
+        return
+    except Exception as error:  # noqa: BLE001 - named in the verdict
+        require(False, f"{what}: expected an error of errormotion.errors, found {type(error).__name__}: {error}")
+    require(False, f"{what}: expected an error, but a result came")
+
+
+def _labelled(dataset: xr.Dataset, dims: Iterable[Hashable]) -> list[str]:
+    return [str(dim) for dim in dims if dim in dataset.coords and dataset[dim].dtype.kind in "UOT"]
+
+
+def _require_close(
+    one: np.ndarray,
+    spread: np.ndarray,
+    other: np.ndarray,
+    other_spread: np.ndarray,
+    fraction: float = SAME,
+    what: str = "",
+) -> None:
+    """Fail unless two results, (place, n) with covariances, agree to a fraction of their standard uncertainty."""
+    require(one.shape == other.shape, f"{what} {one.shape[0]} places became {other.shape[0]}".strip())
+    known, known_other = np.isfinite(one), np.isfinite(other)
+    require(bool((known == known_other).all()), f"{what} freedoms became known or unknown".strip())
+    require(bool(known.any()), "nothing to compare: no freedom is known")
+    u = np.sqrt(np.einsum("pii->pi", spread))
+    u_other = np.sqrt(np.einsum("pii->pi", other_spread))
+    scale = np.max(np.nan_to_num(u), axis=0, keepdims=True)
+    for what_differs, difference in {"value": np.abs(one - other), "standard uncertainty": np.abs(u - u_other)}.items():
+        ratio = np.where(known, difference, 0.0) / np.where(u > 0, u, np.where(scale > 0, scale, 1.0))
+        place, freedom = np.unravel_index(np.argmax(ratio), ratio.shape)
+        require(
+            ratio.max() <= fraction,
+            f"{what} {what_differs} of {DOF[freedom]} at place {place} differs by "
+            f"{ratio.max():.2g} of its uncertainty, expected at most {fraction:g}".strip(),
+        )

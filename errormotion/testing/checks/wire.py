@@ -1,0 +1,231 @@
+"""What the kit asks of a driver at the wire: late answers, the time limit, the baud rate."""
+# ruff: noqa: D401 - the docstring of a check is its claim
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.instruments.simulators.device import DEFAULT_MACHINE
+from errormotion.instruments.simulators.virtual_world.world import let_time_pass
+from errormotion.instruments.transports import parse_address
+from errormotion.instruments.transports.loopback.serving import PtyServer, Server, make_server
+from errormotion.plugins import InstrumentSubject
+from errormotion.testing.kit import require
+from errormotion.testing.sessions import numbers
+
+LATE = "late"
+LATE_ANSWERS = (12, 20, 30, 45, 70, 110)
+"""Numbers of the answer that is late: the first one for which the instrument is open by then."""
+READINGS = 24
+READINGS_AFTER_ERROR = 4
+MOST_FAILURES = 12
+PAUSE = 0.1
+"""After a failed reading, s."""
+TIME_BETWEEN_READINGS = 120.0
+"""Simulated time, s."""
+QUICK, SLOW = 0.2, 1.3
+"""Time limits that are tried, s; the default of a transport lies between them."""
+SPEEDS = (19200, 57600, 115200, 230400, 2000000)
+TCP_FORMS = ("tcp://{}", "modbus+tcp://{}?unit=1", "http://{}/")
+SERIAL_FORMS = ("serial://{}", "modbus+rtu://{}?unit=1")
+
+
+def no_late_answers(subject: InstrumentSubject) -> str:
+    """Return why the check of late answers does not apply; empty where it does."""
+    return "" if LATE in subject.menu else f"the simulator has no fault '{LATE}'"
+
+
+def no_time_limit(subject: InstrumentSubject) -> str:
+    """Return why the check of the time limit does not apply; empty where it does."""
+    return _no_setting(subject, "timeout")
+
+
+def no_baudrate(subject: InstrumentSubject) -> str:
+    """Return why the check of the baud rate does not apply; empty where it does."""
+    return _no_setting(subject, "baudrate")
+
+
+def _no_setting(subject: InstrumentSubject, name: str) -> str:
+    if name not in subject.plugin.Settings.model_fields:
+        return f"the settings have no '{name}'"
+    if subject.make is not None or not subject.simulated:
+        return "it needs a single simulated device"
+    return ""
+
+
+def late_answers(subject: InstrumentSubject) -> str:
+    """After an answer that came too late, the next reading is right, or a typed error; never the late answer."""
+    if not _no_setting(subject, "timeout"):
+        subject = _with_settings(subject, timeout=1.5 * QUICK)
+        limit = 1.5 * QUICK
+    else:
+        limit = 1.0
+    sound = _readings(subject, "")
+    seen = [
+        _require_in_step(sound, _late_readings(subject, when), how, repeats=subject.repeats)
+        for when, how in ((f"&late_by={1.5 * limit:g}", "half a time limit late"), ("", "late until the next answer"))
+    ]
+    return "; ".join(seen)
+
+
+Reading = tuple[float, ...] | Exception
+
+
+def _late_readings(subject: InstrumentSubject, when: str) -> list[Reading]:
+    """Return readings of which one answer is late, after the instrument was opened."""
+    found: list[Reading] = []
+    for number in LATE_ANSWERS:
+        found = _readings(subject, f"{LATE}&fault_at={number}{when}")
+        if not isinstance(found[0], Exception):
+            break
+    return found
+
+
+def _readings(subject: InstrumentSubject, fault: str) -> list[Reading]:
+    """Return readings or their errors: some without an error, or some right ones after the first error."""
+    found: list[Reading] = []
+    instrument = subject.build(fault=fault)
+    try:
+        instrument.open()
+        right, failures = 0, 0
+        while failures <= MOST_FAILURES and right < (READINGS_AFTER_ERROR if failures else READINGS):
+            _vary(subject, len(found))
+            try:
+                found.append(tuple(numbers(instrument.read())))
+                right += 1
+            except Exception as error:  # noqa: BLE001 - judged below
+                found.append(error)
+                right, failures = 0, failures + 1
+                time.sleep(PAUSE)  # some drivers wait before they connect again
+    except Exception as error:  # noqa: BLE001 - the answer was late while it was opened
+        found.append(error)
+    finally:
+        with suppress(InstrumentError):
+            instrument.close()
+    return found
+
+
+def _vary(subject: InstrumentSubject, number: int) -> None:
+    """Make the next reading another one: an answer that is taken for another could not be seen in equal ones."""
+    if subject.vary is not None:
+        subject.vary(number)
+    elif subject.simulated:
+        address = parse_address(subject.address)
+        machine, seed = address.host or DEFAULT_MACHINE, int(address.number("seed", 0))
+        let_time_pass(machine, seed, TIME_BETWEEN_READINGS, warm=bool(address.number("warm", 1)))
+
+
+def _require_in_step(sound: list[Reading], late: list[Reading], how: str, *, repeats: bool) -> str:
+    errors = [reading for reading in late if isinstance(reading, Exception)]
+    for error in errors:
+        require(isinstance(error, InstrumentError), f"{how}: expected an InstrumentError, found {error!r}")
+    if not errors:
+        return f"{how}: no error"
+    first = late.index(errors[0])
+    after = [reading for reading in late[first:] if not isinstance(reading, Exception)]
+    seen = f"{how}: {type(errors[0]).__name__}, then {len(after)}"
+    if repeats:
+        return f"{seen} readings; the device gives a lost one again, so that their order is not seen"
+    if first >= len(sound) or sum(_same(sound[first], reading) for reading in sound) != 1:
+        return f"{seen} readings; equal ones, whose order is not seen: state 'vary' in the subject"
+    require(
+        not any(_same(reading, sound[first]) for reading in after),
+        f"{how}: an answer that came too late was taken for that to the next request; send requests within "
+        "'with self.exchange() as line:'",
+    )
+    return f"{seen} right readings"
+
+
+def _same(reading: Reading, other: Reading) -> bool:
+    if isinstance(reading, Exception) or isinstance(other, Exception):
+        return False
+    return len(reading) == len(other) and bool(np.array_equal(np.array(reading), np.array(other), equal_nan=True))
+
+
+def time_limit(subject: InstrumentSubject) -> str:
+    """A silent instrument is given up after the ``timeout`` of the settings: neither sooner nor much later."""
+    for wire, forms in (("tcp", TCP_FORMS), ("pty", SERIAL_FORMS)):
+        for form in forms:
+            if _seconds_to_timeout(subject, wire, form, QUICK) is None:
+                continue
+            slow = _seconds_to_timeout(subject, wire, form, SLOW)
+            require(
+                slow is None or slow >= 0.95 * SLOW,
+                f"timeout = {SLOW} s: given up after {slow or 0:.2f} s; pass the setting to the transport",
+            )
+            most = 1.0 + 5 * QUICK
+            quick = min(_seconds_to_timeout(subject, wire, form, QUICK) or 0.0 for _ in range(2))
+            require(quick <= most, f"timeout = {QUICK} s: given up after {quick:.2f} s, expected at most {most:g} s")
+            return f"{form.partition(':')[0]}: {quick:.2f} s for {QUICK} s, {slow or 0:.2f} s for {SLOW} s"
+    return "it opens without an answer of the device"
+
+
+def _seconds_to_timeout(subject: InstrumentSubject, wire: str, form: str, limit: float) -> float | None:
+    """Return the time until a silent device is given up, s; None where this is not what happens."""
+    with _silent(wire) as server:
+        subject = _with_settings(subject, timeout=limit)
+        instrument = subject.build(address=form.format(_place(server)))
+        start = time.monotonic()
+        try:
+            instrument.open()
+        except InstrumentTimeoutError:
+            return time.monotonic() - start
+        except InstrumentError:
+            return None
+        finally:
+            with suppress(InstrumentError):
+                instrument.close()
+    return None
+
+
+def baudrate(subject: InstrumentSubject) -> str:
+    """The ``baudrate`` of the settings is that of the serial line."""
+    default = subject.plugin.Settings.model_fields["baudrate"].default
+    limit = {} if _no_setting(subject, "timeout") else {"timeout": QUICK}
+    for form in SERIAL_FORMS:
+        for speed in SPEEDS:
+            if speed == default:
+                continue
+            with _silent("pty") as server:
+                try:
+                    instrument = _with_settings(subject, baudrate=speed, **limit).build(
+                        address=form.format(_place(server))
+                    )
+                except ValueError:  # the instrument has no such rate
+                    continue
+                with suppress(InstrumentError):
+                    instrument.open()
+                with suppress(InstrumentError):
+                    instrument.close()
+                found = server.baudrate if isinstance(server, PtyServer) else 0
+            if found:
+                require(found == speed, f"expected a line with {speed} baud as in the settings, found {found}")
+                return f"{speed} baud"
+    return "it has no serial line"
+
+
+@contextmanager
+def _silent(wire: str) -> Iterator[Server]:
+    """A device that accepts a connection and never answers."""
+    server = make_server(wire, "silent", lambda _: None)
+    server.start()
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def _place(server: Server) -> str:
+    return server.url.partition("://")[2]
+
+
+def _with_settings(subject: InstrumentSubject, **settings: Any) -> InstrumentSubject:
+    given: Mapping[str, Any] = {**subject.settings, **settings}
+    return replace(subject, settings=given)
