@@ -8,8 +8,8 @@ A module declares its functions with a `Compiler`:
     def add(x, y): ...
 
 Nothing is compiled and numba is not imported before the first call. Compiled functions may call one another; one that
-only they call is declared with ``@compiled(inner=True)``, which leaves out its entry from Python: that takes a fifth of
-the time. What is compiled is kept in numba's cache on disk, so that it is compiled once for each installation.
+only they call is declared with ``@compiled(inner=True)``, which leaves out its entry from Python: an eighth of the
+code. What is compiled is kept in numba's cache on disk, so that it is compiled once for each installation.
 """
 
 from __future__ import annotations

@@ -3,13 +3,17 @@
 import subprocess
 import sys
 
+import pytest
+
+from errormotion.compiling import Compiler
+
 MODULE = """
 from errormotion.compiling import Compiler
 
 compiled = Compiler("the loops of a test", seconds=3)
 
 
-@compiled()
+@compiled(inner=True)
 def doubled(x):
     return 2.0 * x
 
@@ -51,3 +55,12 @@ def test_the_terminal_shows_one_line_while_loops_are_compiled_and_none_once_they
 
 def test_a_log_file_shows_no_line(tmp_path):
     assert run(tmp_path, "log") == ("7.0\n9.0\n", "")
+
+
+def test_a_function_that_only_compiled_code_calls_refuses_a_call_from_python():
+    @Compiler("nothing", seconds=0)(inner=True)
+    def halved(x):
+        return 0.5 * x
+
+    with pytest.raises(TypeError, match=r"halved is declared with inner=True"):
+        halved(1.0)
