@@ -25,6 +25,8 @@ import wire_trials as trials  # noqa: E402
 from fuzz import PAGE, sections, write_section  # noqa: E402
 from wire_proxy import LATE  # noqa: E402
 
+from errormotion.errors import InstrumentError  # noqa: E402
+
 TITLE = "Disturbed wires"
 TABLE = (
     "| instrument, wire | sessions | right | values lost, NaN | refused | errors | wrong by changed bytes |",
@@ -48,7 +50,12 @@ def work(task: tuple[int, str, int, int]) -> tuple[int, Row]:
     """Try the sessions of one instrument with one kind of fault."""
     number, kind, count, seed = task
     case, row = trials.cases()[number], Row()
-    for fault in trials.faults(case, kind, count, seed):
+    try:
+        faults = trials.faults(case, kind, count, seed)
+    except InstrumentError as error:
+        row.faults.append(f"without a disturbance: {type(error).__name__}: {error}")
+        return number, row
+    for fault in faults:
         outcome = trials.trial(case, fault)
         row.ends[outcome.end] += 1
         if outcome.error:

@@ -45,11 +45,8 @@ def errors_item(found: Course, freedoms: Sequence[str] = ()) -> dict[str, Any]:
         for curve in own:
             _draw(plot, found, curve, looks[curve.freedom])
         _legend(plot)
-        if panels:
-            plot.x_range = panels[0].x_range
         panels.append(plot)
-    rows = [[panel] for panel in panels]
-    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+    return _stacked(panels)
 
 
 def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
@@ -73,11 +70,8 @@ def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
             beside = 0.0 if joined else 0.12 * (i - (len(names) - 1) / 2)
             _draw(plot, replace(found, places=found.places + beside), curve, i)
         _legend(plot)
-        if panels:
-            plot.x_range = panels[0].x_range
         panels.append(plot)
-    rows = [[panel] for panel in panels]
-    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+    return _stacked(panels)
 
 
 def live_item(units: Mapping[str, str]) -> dict[str, Any]:
@@ -98,11 +92,8 @@ def live_item(units: Mapping[str, str]) -> dict[str, Any]:
             tips = [("time", "@x{%H:%M:%S}"), (plain(name), f"@y{{0.000}} {unit}")]
             plot.add_tools(HoverTool(renderers=[line], tooltips=tips, formatters={"@x": "datetime"}, mode="mouse"))
         _legend(plot)
-        if panels:
-            plot.x_range = panels[0].x_range
         panels.append(plot)
-    rows = [[panel] for panel in panels]
-    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+    return _stacked(panels)
 
 
 def following_item() -> dict[str, Any]:
@@ -124,9 +115,14 @@ def following_item() -> dict[str, Any]:
             plot.add_tools(HoverTool(renderers=[line], tooltips=tips, formatters={"@x": "datetime"}, mode="mouse"))
         if axis == "X":
             _legend(plot)
-        if panels:
-            plot.x_range = panels[0].x_range
         panels.append(plot)
+    return _stacked(panels)
+
+
+def _stacked(panels: Sequence[figure]) -> dict[str, Any]:
+    """Return panels one above the other, with one range of the abscissa."""
+    for panel in panels[1:]:
+        panel.x_range = panels[0].x_range
     rows = [[panel] for panel in panels]
     return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
 

@@ -48,6 +48,8 @@ LONGEST = 20.0
 REACHED = 0.7
 """The number of pieces varies where a device sends without requests: a fault is in so much of it."""
 REPEATS = 2
+UNDISTURBED = 10
+"""Repetitions of a session that was not disturbed and missed a time limit."""
 PAUSE, ATTEMPTS = 0.2, 3
 """Before a device is opened again, s, and how often this is tried: it may need a moment to see that it was left."""
 
@@ -145,9 +147,10 @@ def subject_of(case: Case) -> InstrumentSubject:
 @cache
 def truth(case: Case) -> Truth:
     """Return the session without a disturbance; on a busy computer it may miss a time limit, and is repeated."""
-    for _ in range(REPEATS):
+    for _ in range(UNDISTURBED):
         with suppress(InstrumentTimeoutError):
             return _undisturbed(case)
+        time.sleep(PAUSE)
     return _undisturbed(case)
 
 
