@@ -179,7 +179,7 @@ def ask(connection: http.client.HTTPConnection, path: str) -> tuple[bytes, float
     return (gzip.decompress(text) if answer.getheader("Content-Encoding") == "gzip" else text), needed
 
 
-def client(port: int, until: float, taken: Taken, lock: threading.Lock, page: str) -> None:
+def client(port: int, seconds: float, taken: Taken, lock: threading.Lock, page: str) -> None:
     """Ask for values ten times a second, and once for curves of 8 hours."""
     connection, names = http.client.HTTPConnection("127.0.0.1", port), "&".join(f"name=T0.{k}" for k in range(CHANNELS))
     names += "&" + "&".join(f"name=T1.{k}" for k in range(CURVES - CHANNELS))
@@ -193,6 +193,7 @@ def client(port: int, until: float, taken: Taken, lock: threading.Lock, page: st
         if page == NOW and b'"x"' in text:  # not of the bare server
             curves = [curve["y"] for curve in json.loads(text).values()]
             taken.highest += [max(each for each in curve if each is not None) for curve in curves]
+    until = time.perf_counter() + seconds
     while (start := time.perf_counter()) < until:
         text, needed = ask(connection, page)
         with lock:
@@ -218,9 +219,7 @@ def measured(arguments: list[str], seconds: float, page: str = NOW) -> Taken:
         with socket.create_connection(("127.0.0.1", port)) as hanging:
             hanging.sendall(f"GET {page} HTTP/1.1\r\nHost: 127.0.0.1\r\n".encode())  # and nothing more
             before, start = used(process.pid)[0], time.perf_counter()
-            threads = [
-                threading.Thread(target=client, args=(port, start + seconds, taken, lock, page)) for _ in range(CLIENTS)
-            ]
+            threads = [threading.Thread(target=client, args=(port, seconds, taken, lock, page)) for _ in range(CLIENTS)]
             for each in threads:
                 each.start()
             for each in threads:
