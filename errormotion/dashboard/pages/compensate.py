@@ -17,6 +17,7 @@ from errormotion.campaign.compensation.following import Status, is_working, read
 from errormotion.dashboard.compensations import Compensations, Start, rows
 from errormotion.dashboard.course import thin
 from errormotion.dashboard.figures import following_item
+from errormotion.dashboard.kept import Lately
 from errormotion.dashboard.pages.effect import EffectOfRuns, Report
 from errormotion.dashboard.pages.page import LONGEST_MESSAGE, Context, Guarded
 from errormotion.errors import CompensationError, ErrormotionError
@@ -109,7 +110,8 @@ class State(_Compensating):
         """Send it."""
         key = self.word("run", 255)
         self.set_header("Content-Type", "application/json")
-        self.finish(await self.apart(_state, self.compensations, key))
+        known = self.compensations
+        self.finish(await self.apart(_STATES.get, (known.runs, key, len(known.starts)), lambda: _state(known, key)))
 
 
 class Curves(_Compensating):
@@ -121,7 +123,8 @@ class Curves(_Compensating):
         if span not in {str(each) for _, each in SPANS}:
             raise HTTPError(400, reason="Unknown span")
         self.set_header("Content-Type", "application/json")
-        self.finish(await self.apart(_curves, self.compensations, self.word("run", 255), float(span)))
+        known, key = self.compensations, self.word("run", 255)
+        self.finish(await self.apart(_CURVES.get, (known.runs, key, span), lambda: _curves(known, key, float(span))))
 
 
 class Figure(_Compensating):
@@ -141,6 +144,11 @@ def handlers(context: Context) -> list[tuple[str, type[Guarded], dict[str, Any]]
     own = [(f"/compensate{path}", handler, given) for path, handler in {**pages, **data}.items()]
     effects = {"/compensate/effect": EffectOfRuns, r"/compensate/effect\.html": Report}
     return [*own, *((path, handler, {"context": context}) for path, handler in effects.items())]
+
+
+_STATES: Lately[str] = Lately(0.2)
+_CURVES: Lately[str] = Lately(1.0)
+"""What many clients ask for is read and made once for all of them."""
 
 
 def _state(known: Compensations, key: str) -> str:

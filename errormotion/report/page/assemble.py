@@ -22,7 +22,7 @@ from errormotion.report.page.head import PAPERS, Head, calibrations, facts, meas
 from errormotion.report.page.language import Catalogue
 from errormotion.report.page.verdict import Verdict
 
-_COMPOSED = ("Method", "Report", "Instruments")
+_COMPOSED = ("Method", "Report", "Instruments", "Reference state")
 """Facts with words of the page; the others are names."""
 
 

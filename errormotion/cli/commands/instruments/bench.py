@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 def probe(file: Path, as_json: bool) -> bool:
     """Open, identify and read every instrument of a bench; return whether all of them answered."""
     plan = load_bench(file)
-    with claimed(plan.machine, "a check of the bench"):
+    with claimed(plan.machine, "a probe of the bench"):
         return _probe(plan, as_json)
 
 
