@@ -31,6 +31,7 @@ from errormotion.campaign.sections.timeline import follower
 from errormotion.campaign.storage.journal import cause_of, journal
 from errormotion.campaign.storage.recorder import DiskFullError, Recorder
 from errormotion.campaign.storage.store import committed_length
+from errormotion.campaign.turns import claimed
 from errormotion.datasets import provenance
 from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
@@ -212,6 +213,7 @@ class _Session:
         self.progress = progress or Quiet()
         self.bench = OpenBench(campaign.bench, ask)
         self.report = report
+        self.records: Callable[[Path], None] = lambda run: None  # noqa: ARG005 - until the bench is opened
 
     def work(self, folders: dict[str, RunFolder]) -> list[RunFolder]:
         """Execute the unfinished tests."""
@@ -227,9 +229,11 @@ class _Session:
                     continue
                 if (folder is None or not folder.data["acquired"]) and not self.bench.answers:
                     self.progress.stage("opening the bench")
+                    self.records = opened.enter_context(claimed(self.campaign.bench.machine, "a run"))
                     opened.enter_context(self.bench)
                 if folder is None:
                     folder = folders[test.name] = self._new_folder(test)
+                self.records(folder.path)
                 self.progress.test(test.name, folder.path, number, len(self.campaign.tests))
                 with folder.locked(), journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
                     self._test(folder, test, folders)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import tempfile
 import threading
 from collections import deque
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from errormotion import datasets
+from errormotion.campaign.background.detached import printed, spawn
 from errormotion.campaign.compensation.following import AUDIT, STATUS, Status, compensations, is_working, read_status
 from errormotion.campaign.files import BenchPlan, load_bench
 from errormotion.compensation.online.audit import AuditReader
@@ -41,8 +41,6 @@ LARGEST_MODEL = 64 << 20
 """Bytes of a file that is looked at whether it is a model."""
 LONGEST_NAME = 255
 """Bytes of the name of a folder, at most."""
-LONGEST_OUTPUT = 4000
-"""Bytes at the end of what a command printed."""
 
 
 @dataclass(frozen=True)
@@ -119,12 +117,7 @@ class Start:
 
     def printed(self) -> str:
         """Return the end of what it printed."""
-        try:
-            with self.output.open("rb") as file:
-                file.seek(max(0, os.fstat(file.fileno()).st_size - LONGEST_OUTPUT))
-                return file.read(LONGEST_OUTPUT).decode("utf-8", "replace")
-        except OSError:
-            return ""
+        return printed(self.output)
 
 
 class Compensations:
@@ -214,17 +207,11 @@ class Compensations:
             raise CompensationError(
                 f"'{arm[:100]}' is not the name of the machine of {bench}. Nothing was started, nothing was written."
             )
-        command = [sys.executable, "-m", "errormotion", "compensate", "run", str(benches[bench].path)]
-        command += ["--model", str(models[model].path), "--runs", str(self.runs)]
-        command += [] if arm is None else ["--arm", arm]
+        command = ["compensate", "run", str(benches[bench].path), "--model", str(models[model].path)]
+        command += ["--runs", str(self.runs), *([] if arm is None else ["--arm", arm])]
         descriptor, name = tempfile.mkstemp(prefix="errormotion-compensate-", suffix=".log")
-        try:
-            process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=descriptor, stderr=descriptor, start_new_session=True
-            )
-        finally:
-            os.close(descriptor)
-        threading.Thread(target=process.wait, daemon=True).start()  # no zombie stays, whether anybody asks or not
+        os.close(descriptor)
+        process = spawn(command, Path(name))
         started = Start(bench, model, arm is not None, datetime.now(UTC), process, Path(name))
         self.starts.appendleft(started)
         return started

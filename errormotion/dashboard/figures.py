@@ -20,6 +20,10 @@ from errormotion.report.canvas import COLOURS, DASHES
 
 HEIGHT = 300
 """Height of one panel, pixels."""
+SMALLEST_MARGIN = 0.05
+"""Above and below the values, in field units: rounding errors of a computer are not drawn as a course."""
+FEW = 20
+"""Values of a curve up to which each is a dot as well."""
 LONGEST = 40
 """Characters of a name at an axis."""
 FONT = "system-ui, 'Segoe UI', 'Liberation Sans', Arial, sans-serif"
@@ -41,11 +45,8 @@ def errors_item(found: Course, freedoms: Sequence[str] = ()) -> dict[str, Any]:
         for curve in own:
             _draw(plot, found, curve, looks[curve.freedom])
         _legend(plot)
-        if panels:
-            plot.x_range = panels[0].x_range
         panels.append(plot)
-    rows = [[panel] for panel in panels]
-    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+    return _stacked(panels)
 
 
 def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
@@ -69,11 +70,8 @@ def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
             beside = 0.0 if joined else 0.12 * (i - (len(names) - 1) / 2)
             _draw(plot, replace(found, places=found.places + beside), curve, i)
         _legend(plot)
-        if panels:
-            plot.x_range = panels[0].x_range
         panels.append(plot)
-    rows = [[panel] for panel in panels]
-    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+    return _stacked(panels)
 
 
 def live_item(units: Mapping[str, str]) -> dict[str, Any]:
@@ -94,11 +92,8 @@ def live_item(units: Mapping[str, str]) -> dict[str, Any]:
             tips = [("time", "@x{%H:%M:%S}"), (plain(name), f"@y{{0.000}} {unit}")]
             plot.add_tools(HoverTool(renderers=[line], tooltips=tips, formatters={"@x": "datetime"}, mode="mouse"))
         _legend(plot)
-        if panels:
-            plot.x_range = panels[0].x_range
         panels.append(plot)
-    rows = [[panel] for panel in panels]
-    return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
+    return _stacked(panels)
 
 
 def following_item() -> dict[str, Any]:
@@ -120,9 +115,14 @@ def following_item() -> dict[str, Any]:
             plot.add_tools(HoverTool(renderers=[line], tooltips=tips, formatters={"@x": "datetime"}, mode="mouse"))
         if axis == "X":
             _legend(plot)
-        if panels:
-            plot.x_range = panels[0].x_range
         panels.append(plot)
+    return _stacked(panels)
+
+
+def _stacked(panels: Sequence[figure]) -> dict[str, Any]:
+    """Return panels one above the other, with one range of the abscissa."""
+    for panel in panels[1:]:
+        panel.x_range = panels[0].x_range
     rows = [[panel] for panel in panels]
     return dict(json_item(gridplot(rows, sizing_mode="stretch_width", toolbar_options={"logo": None})))
 
@@ -138,7 +138,7 @@ def _reach(curves: Sequence[Curve]) -> Range1d:
     ends = [each.values + sign * np.nan_to_num(each.expanded) for each in curves for sign in (-1.0, 1.0)]
     known = np.concatenate(ends)[np.isfinite(np.concatenate(ends))]
     low, high = float(known.min()), float(known.max())
-    margin = 0.06 * (high - low) or 1.0
+    margin = max(0.06 * (high - low), SMALLEST_MARGIN)
     return Range1d(low - margin, high + margin)
 
 
@@ -212,4 +212,6 @@ def _draw(plot: figure, found: Course, curve: Curve, number: int) -> None:
         drawn = plot.line(
             "x", "y", source=source, color=colour, line_width=1.8, line_dash=list(dash), legend_label=curve.name
         )
+        if len(kept) <= FEW:  # one alone makes no line
+            plot.scatter("x", "y", source=source, size=6, color=colour)
     plot.add_tools(HoverTool(renderers=[drawn], tooltips=tips, mode="mouse" if found.names else "vline"))

@@ -1,4 +1,7 @@
-"""The instruments of a bench, read by a monitor in a thread: what they say now, and the last hours in memory."""
+"""The instruments of a bench, read by a monitor in a thread: what they say now, and the last hours in memory.
+
+While another program has claimed the instruments, they are closed here, and what that program records is shown.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import logging
 import math
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -16,11 +19,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
+from errormotion.campaign.background.recorded import Recorded, Value, recorded
 from errormotion.campaign.files import BenchPlan
+from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.sources import Source
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.campaign.storage.journal import cause_of
+from errormotion.campaign.turns import Claim, holder, watching
 from errormotion.dashboard.course import thin
+from errormotion.errors import ErrormotionError
 
 SPAN = 8 * 3600.0
 """Time that is kept in memory, s; the log of the monitor holds everything."""
@@ -36,17 +43,29 @@ PARAMETERS = (
 )
 """Working parameters: name, unit on the page, and number of these in one SI unit."""
 _STATES = ("spindle_speed", "spindle_load", "feed")
+_OF_A_LOG = ("gap", "temperature_flag")
+"""Variables of a monitor's log that are no readings."""
 LONGEST_TEXT = 200
 """Characters of a text from a device."""
 RATE_SPAN = 10.0
 """Time over which the rate of readings is counted, s."""
+TURN_INTERVAL = 0.2
+"""Of the look whether another program wants the instruments, s."""
+RECORD_INTERVAL = 1.0
+"""Shortest time from one look into the record of another program to the next, s."""
+OLDEST_SAMPLE = 5.0
+"""Time without a new sample after which the last one is no present value, s."""
+_FIELD = {"m": ("mm", 1e3), "rad": ("arcsec", 3600 * 180 / math.pi), "degC": ("°C", 1.0), "1": ("", 1.0)}
+"""Unit on the page, and number of these in one unit of a record."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """One instrument: ``state`` is ``answers``, ``waiting`` or ``silent``; since when, and why.
+    """One instrument: ``state`` is ``answers``, ``waiting``, ``silent`` or ``lent``; since when, and why.
+
+    Another program has one that is lent.
 
     ``rate`` is the number of readings per second lately, ``missed`` that of rows of the log without a reading.
     """
@@ -83,6 +102,8 @@ class Present:
     """Everything that a bench says now; the same object until something has changed.
 
     ``running`` is False once the monitor has stopped, for the reason ``error``; ``rows`` counts those of its log.
+    ``lent`` says which program has the instruments, if any: the values are those of its record in ``run`` then, with
+    ``rows`` samples, and ``recorded`` holds those that are neither a temperature nor a parameter of this bench.
     """
 
     time: datetime
@@ -96,6 +117,8 @@ class Present:
     mode: str = ""
     program: str = ""
     alarms: tuple[str, ...] = ()
+    lent: str = ""
+    recorded: tuple[Quantity, ...] = ()
 
 
 @dataclass
@@ -143,26 +166,34 @@ class Watch:
     """
 
     def __init__(self, plan: BenchPlan, runs: Path, interval: float = 1.0) -> None:
-        self.plan, self.interval = plan, interval
-        self._monitor = Monitor(plan, runs, interval)
+        self.plan, self.runs, self.interval = plan, runs, interval
+        self._lock, self._end = threading.Lock(), threading.Event()
+        self._clock = _Turn(self._given_up)
+        self._monitor = Monitor(plan, runs, interval, self._clock)
         sensors = self._monitor.sensors
         parameters = PARAMETERS if self._monitor.controller is not None else ()
         self.units = {**dict.fromkeys(sensors, "°C"), **{name: unit for name, unit, _ in parameters}}
         self._places = dict(zip(sensors, self._monitor.places, strict=True))
         self._history = _History(tuple(self.units), min(MOST_ROWS, max(2, math.ceil(SPAN / interval))))
         self._extremes = np.full((3, len(self.units)), np.nan)  # first, lowest, highest
-        self._lock, self._end = threading.Lock(), threading.Event()
         self._last: Snapshot | None = None
+        self._shift = 0.0  # from the time of the present monitor to that of the history, s
+        self._used = False
+        self._lent: Claim | None = None
+        self._record: Recorded | None = None
+        self._record_time = self._looked = -math.inf  # of the history: of the last sample, and of the last look
         self._known: tuple[tuple[Any, ...], Present] | None = None
         self._since: dict[str, tuple[str, datetime]] = {}
         most = 1 + max(2, math.ceil(RATE_SPAN / interval))
         self._counts = {each.name: deque[tuple[float, int]](maxlen=most) for each in self._monitor.sources}
-        self._began, self._error, self._running = _now(), "", False
+        self._began: datetime | None = None
+        self._error, self._running, self._revision = "", False, 0
         self._thread = threading.Thread(target=self._work, name="errormotion-watch", daemon=True)
 
     def start(self) -> None:
         """Start reading."""
         self._running = True
+        self._clock.owner = self._thread
         self._thread.start()
 
     def stop(self) -> None:
@@ -174,40 +205,93 @@ class Watch:
         """Return what the bench says now."""
         errors = tuple(source.error for source in self._monitor.sources)
         with self._lock:
-            revision = (self._running, self._error, self._last.logged if self._last else 0, *errors)
+            revision = (self._running, self._error, self._revision, *errors)
             if self._known is None or self._known[0] != revision:
                 self._known = (revision, self._present())
             return self._known[1]
 
     def _present(self) -> Present:
-        last, running, error, run = self._last, self._running, self._error, self._run_name()
         instruments = tuple(self._instrument(source) for source in self._monitor.sources)
+        if self._lent is not None:
+            return self._of_record(self._lent, instruments)
+        last, running, error, run = self._last, self._running, self._error, self._run_name()
         if last is None:
             return Present(_now(), running, error, 0, run, instruments)
-        values = dict(zip(self.units, _row(last, self.units), strict=True))
-        quantities = {
-            name: Quantity(
-                name, value, self.units[name], last.flags.get(name, ""), low, high, value - first, self._place(name)
-            )
-            for (name, value), first, low, high in zip(values.items(), *self._extremes, strict=True)
-        }
+        temperatures, parameters = self._quantities(_row(last, self.units), last.flags)
         alarms = last.state.get("alarms") or ()
         alarms = alarms if isinstance(alarms, list | tuple) else (alarms,)
         if last.state.get("estop") is True:
             alarms = ("emergency stop", *alarms)
         return Present(
-            self._began + timedelta(seconds=last.time),
+            self._start_time() + timedelta(seconds=self._shift + last.time),
             running,
             error,
             last.logged,
             run,
             instruments,
-            tuple(each for each in quantities.values() if each.name in last.temperatures),
-            tuple(each for each in quantities.values() if each.name not in last.temperatures),
+            temperatures,
+            parameters,
             _text(last.state.get("mode")),
             _text(last.state.get("program")),
             tuple(_text(each) for each in alarms[:50]),
         )
+
+    def _of_record(self, claim: Claim, instruments: tuple[Instrument, ...]) -> Present:
+        found = self._record or Recorded("", 0)
+        age = self._elapsed() - self._record_time
+        row, others = self._split(found.values if age <= OLDEST_SAMPLE else ())
+        temperatures, parameters = self._quantities(row, {})
+        title = f" ({_text(found.title)})" if found.title else ""
+        words = f"{_text(claim.what)}{title} has the instruments. "
+        if not found.samples:
+            words += "It has recorded nothing yet."
+        elif age > OLDEST_SAMPLE:
+            words += f"Its last sample is {age:.0f} s old."
+        else:
+            words += "The values are those that it records."
+        return Present(
+            _now(),
+            self._running,
+            self._error,
+            found.samples,
+            claim.run.name if claim.run is not None else "",
+            instruments,
+            temperatures,
+            parameters,
+            program=_text(found.program),
+            alarms=("emergency stop",) if found.estop else (),
+            lent=words[:1].upper() + words[1:],
+            recorded=others,
+        )
+
+    def _quantities(
+        self, row: Sequence[float], flags: Mapping[str, str]
+    ) -> tuple[tuple[Quantity, ...], tuple[Quantity, ...]]:
+        """Return temperatures and parameters with their extremes."""
+        found = [
+            Quantity(name, value, self.units[name], flags.get(name, ""), low, high, value - first, self._place(name))
+            for name, value, first, low, high in zip(self.units, row, *self._extremes, strict=True)
+        ]
+        return tuple(e for e in found if e.name in self._places), tuple(e for e in found if e.name not in self._places)
+
+    def _split(self, values: Sequence[Value]) -> tuple[list[float], tuple[Quantity, ...]]:
+        """Return a row of the history from a record, and what has no column there."""
+        row, others = dict.fromkeys(self.units, math.nan), []
+        factors = {name: factor for name, _, factor in PARAMETERS}
+        for each in values:
+            if each.unit == "degC":
+                name = each.label if each.label in self._places else ""
+            elif each.variable in _STATES:
+                name = each.variable.replace("_", " ")
+            else:
+                name = each.label.upper() if each.variable == "position" else ""
+            if name in row:
+                row[name] = factors.get(name, 1.0) * each.value
+            elif each.variable not in _OF_A_LOG:
+                unit, factor = _FIELD.get(each.unit, (each.unit, 1.0))
+                label = _text(f"{each.variable.replace('_', ' ')} {each.label}".strip())
+                others.append(Quantity(label, factor * each.value, _text(unit)))
+        return list(row.values()), tuple(others)
 
     def history(self, names: Sequence[str], seconds: float) -> Mapping[str, tuple[Array, Array]]:
         """Return times (s since 1970, UTC) and values of the last seconds, reduced; unknown values are NaN.
@@ -215,7 +299,7 @@ class Watch:
         Names that are not known are left out.
         """
         found = {}
-        began, columns = self._began.timestamp(), {name: k for k, name in enumerate(self.units)}
+        began, columns = self._start_time().timestamp(), {name: k for k, name in enumerate(self.units)}
         for name in names:
             if name in columns:
                 with self._lock:
@@ -226,36 +310,97 @@ class Watch:
 
     def _work(self) -> None:
         try:
-            with self._monitor as monitor:
-                self._began = _now()
-                for snapshot in monitor.watch():
-                    self._take(snapshot)
-                    if self._end.is_set():
-                        break
+            while not self._end.is_set():
+                with watching(self.plan.machine) as free:
+                    if free:
+                        self._read()
+                while not self._end.is_set() and (claim := holder(self.plan.machine)) is not None:
+                    self._look(claim)
+                    self._end.wait(TURN_INTERVAL)
+                with self._lock:
+                    self._lent, self._record = None, None
+                    self._revision += 1
         except Exception as error:
             log.error("the monitor of the dashboard has stopped", exc_info=error)
             self._error = cause_of(error)
         finally:
             self._running = False
 
+    def _read(self) -> None:
+        """Read the instruments until this watch ends or another program has claimed them."""
+        if self._used:  # a monitor works once
+            self._monitor = Monitor(self.plan, self.runs, self.interval, self._clock)
+        self._used = True
+        with self._lock:
+            self._last = None
+            for counts in self._counts.values():
+                counts.clear()
+        with self._monitor as monitor:
+            for snapshot in monitor.watch():
+                self._take(snapshot)
+                if self._given_up():
+                    break
+
+    def _given_up(self) -> bool:
+        return self._end.is_set() or holder(self.plan.machine) is not None
+
+    def _start_time(self) -> datetime:
+        """Return the zero of the history."""
+        if self._began is None:
+            self._began = _now()
+        return self._began
+
+    def _elapsed(self) -> float:
+        return (_now() - self._start_time()).total_seconds()
+
     def _take(self, snapshot: Snapshot) -> None:
         row = np.array(_row(snapshot, self.units))
         with self._lock:
             if self._last is None:
-                self._began = _now() - timedelta(seconds=snapshot.time)
+                self._shift = 0.0 if self._began is None else self._elapsed() - snapshot.time
+                self._began = self._began or _now() - timedelta(seconds=snapshot.time)
             self._last = snapshot
             for source in self._monitor.sources:
                 self._counts[source.name].append((snapshot.time, source.readings))
                 self._instrument(source)
-            self._history.put(snapshot.time, row)
-            first, low, high = self._extremes
-            self._extremes = np.stack([np.where(np.isnan(first), row, first), np.fmin(low, row), np.fmax(high, row)])
+            self._put(self._shift + snapshot.time, row)
+
+    def _look(self, claim: Claim) -> None:
+        """Take what another program has recorded."""
+        now = self._elapsed()
+        if self._lent == claim and now < self._looked + RECORD_INTERVAL:
+            return
+        self._looked, found = now, None
+        if claim.run is not None:
+            try:
+                found = recorded(claim.run)
+            except ErrormotionError as error:  # not written yet, or gone
+                log.debug("%s: %s", claim.run, error)
+        with self._lock:
+            before = self._record if self._lent == claim else None
+            new = found is not None and found.samples > 0 and (before is None or found.samples != before.samples)
+            if new:
+                self._record_time = now
+            self._lent, self._record = claim, found
+            self._revision += 1
+            if new or now - self._record_time > OLDEST_SAMPLE:  # between two samples is no gap
+                row, _ = self._split(found.values if found is not None and new else ())
+                self._put(now, np.array(row))
+
+    def _put(self, time: float, row: Array) -> None:
+        """Add a row to the history."""
+        self._revision += 1
+        self._history.put(time, row)
+        first, low, high = self._extremes
+        self._extremes = np.stack([np.where(np.isnan(first), row, first), np.fmin(low, row), np.fmax(high, row)])
 
     def _instrument(self, source: Source) -> Instrument:
         """Return the state of a source, and note a change; a failed reading counts before the last one is too old."""
         silent = self._last.silent.get(source.name, "") if self._last is not None else ""
         why = source.error or silent
         state = "answers" if not why else "silent" if source.answer or self._last is not None else "waiting"
+        if self._lent is not None:
+            state, why = "lent", ""
         before, since = self._since.get(source.name, ("", _now()))
         if before != state:
             since = _now()
@@ -264,7 +409,7 @@ class Watch:
         model = f"{identity.manufacturer} {identity.model}" if identity is not None else ""
         missed = self._last.gaps.get(source.name, 0) if self._last is not None else 0
         kind = str(source.instrument.driver.info.kind)
-        rate = _rate(self._counts[source.name])
+        rate = _rate(self._counts[source.name]) if self._lent is None else math.nan
         return Instrument(source.name, kind, _text(model), state, since, _text(why), missed, rate)
 
     def _place(self, name: str) -> tuple[float, ...] | None:
@@ -274,6 +419,29 @@ class Watch:
     def _run_name(self) -> str:
         folder = getattr(self._monitor, "folder", None)
         return folder.path.name if folder is not None else ""
+
+
+class _Turn(Clock):
+    """The clock of a computer, on which the thread of a watch ends its waits once the instruments are given up."""
+
+    def __init__(self, given_up: Callable[[], bool]) -> None:
+        self._given_up = given_up
+        self.owner: threading.Thread | None = None
+
+    def sleep(self, seconds: float) -> None:
+        """Wait, in short steps."""
+        end = self.now() + seconds
+        while (left := end - self.now()) > 0 and not self._given_up():
+            super().sleep(min(left, TURN_INTERVAL))
+
+    def wait(self, event: threading.Event, seconds: float) -> None:
+        """Wait for an event, in short steps; threads that read instruments are not woken."""
+        if threading.current_thread() is not self.owner:
+            super().wait(event, seconds)
+            return
+        end = self.now() + seconds
+        while not event.is_set() and (left := end - self.now()) > 0 and not self._given_up():
+            event.wait(min(left, TURN_INTERVAL))
 
 
 def _rate(counts: Sequence[tuple[float, int]]) -> float:

@@ -1,8 +1,10 @@
 """Limits of an NC program (ISO 6983), read line by line; a block that may leave them is refused.
 
 Understood are straight moves in absolute machine coordinates and mm: G0, G1, G31, G38.2 to G38.5 with X, Y, Z and F,
-G4, G17, G21, G40, G49, G53, G80, G90, G94, M0 to M9, M30, S, T, comments, and the printing of positions. Arcs,
-incremental moves, inches, offsets, variables, macros and subprograms are not: where they lead is known to the control.
+G4 on a line of its own, G17, G21, G40, G49, G53, G80, G90, G94, M0 to M9, M30, S, T, comments, and the printing of
+positions. A program states its units, G1 and its feed before it depends on them; what a control keeps from before is
+unknown. Arcs, incremental moves, inches, offsets, variables, macros and subprograms are not understood: where they lead
+is known to the control.
 """
 
 from __future__ import annotations
@@ -15,8 +17,9 @@ from errormotion.instruments.door import Door
 MOST_CHARACTERS = 1 << 24
 _WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d{1,15}(?:\.\d{0,15})?|\.\d{1,15}))\s*")
 _COMMENT = re.compile(r"\([^()]*\)")
-_PRINTING = ("POPEN", "PCLOS", "DPRNT")
+_PRINTING = re.compile(r"(?:N\d{1,9}\s*)?(?:POPEN|PCLOS|DPRNT\s*\[(?:[^][]|\[[^][]*\])*\])")
 _MOVES = {"0", "1", "31", "38.2", "38.3", "38.4", "38.5"}
+_STRAIGHT = {f"G{code}" for code in _MOVES}
 _OTHERS = {"4", "17", "21", "40", "49", "53", "80", "90", "94"}
 _SWITCHES = {"0", "1", "2", "3", "4", "5", "6", "7", "8", "9", "30"}
 _MM, _MM_MIN = 1e-3, 1e-3 / 60  # m, m/s
@@ -39,7 +42,7 @@ def check_program(text: str, door: Door) -> None:
     stated: set[str] = set()
     for number, line in enumerate(text.splitlines(), 1):
         plain = _COMMENT.sub(" ", line.upper()).partition(";")[0].strip()
-        if plain in ("", "%") or re.sub(r"^N\d{1,9}\s*", "", plain).startswith(_PRINTING):
+        if plain in ("", "%") or _PRINTING.fullmatch(plain):
             continue
         try:
             _check_line(plain, door, stated)
@@ -55,25 +58,33 @@ def _check_line(plain: str, door: Door, stated: set[str]) -> None:
             raise _unknown(plain[position:][:20])
         words.append((word[1], word[2]))
         position = word.end()
-    dwell = False
+    codes = {f"{letter}{float(value):g}" for letter, value in words}
+    dwell = "G4" in codes
     for letter, value in words:
-        code = f"{float(value):g}"
-        if letter == "G":
-            if code not in _MOVES | _OTHERS:
-                raise _unknown(f"G{code}")
-            dwell = dwell or code == "4"
-            stated.add(code)
-        elif letter == "M" and code not in _SWITCHES:
-            raise _unknown(f"M{code}")
-        elif letter not in "GMNXYZFSTP" or (letter == "P" and "G4" not in {f"{a}{float(b):g}" for a, b in words}):
+        code = f"{letter}{float(value):g}"
+        if letter == "G" and code[1:] not in _MOVES | _OTHERS:
+            raise _unknown(code)
+        if letter == "M" and code[1:] not in _SWITCHES:
+            raise _unknown(code)
+        if letter not in "GMNXYZFSTP" or (letter == "P" and not dwell):
             raise _unknown(f"{letter}{value}")
-    if door.limits.feed is not None and any(letter == "G" and float(value) == 0 for letter, value in words):
+    if dwell:  # a control may move as well where other words stand beside a dwell
+        if sorted(letter for letter, _ in words if letter != "N") not in (["G", "P"], ["G", "X"]):
+            raise InstrumentError("a dwell with other words beside it; write G4 P on a line of its own")
+        return
+    if door.limits.feed is not None and "G0" in codes:
         raise InstrumentError("a rapid move, whose feed is that of the machine; write G1 with a feed within the limit")
-    stated |= {letter for letter, _ in words if letter == "F"}
+    if door.limits.feed is not None and any(letter == "F" for letter, _ in words) and not {"G21", "G94"} <= stated:
+        raise InstrumentError("a feed F before a line with G21 and G94; whether it is within the limit is unknown")
+    stated |= {letter for letter, _ in words if letter in "FS"} | {code for code in codes if code[0] == "G"}
+    if door.limits.spindle_speed is not None and {"M3", "M4"} & codes and "S" not in stated:
+        raise InstrumentError("the spindle is started before a speed S; whether it is within the limit is unknown")
     for letter, value in words:
-        if letter in "XYZ" and not dwell:
-            if not {"21", "90"} <= stated:
+        if letter in "XYZ":
+            if not {"G21", "G90"} <= stated:
                 raise InstrumentError("a position before G21 and G90; whether it is within the limits is unknown")
+            if not _STRAIGHT & codes and not {"G0", "G1"} & stated:
+                raise InstrumentError("a position before G0 or G1; along which line the machine moves is unknown")
             if door.limits.feed is not None and "F" not in stated:
                 raise InstrumentError("a move before a feed F; whether it is within the limit is unknown")
             door.coordinate(letter, float(value) * _MM)

@@ -125,7 +125,7 @@ def test_one_machine_is_measured_by_one_process(tmp_path: Path, write: Callable[
 def test_only_its_user_may_enter_the_folder_of_a_process(
     tmp_path: Path, write: Callable[..., Path], lab: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes.sys, "executable", "/bin/false")
+    monkeypatch.setattr("sys.executable", "/bin/false")
     name = processes.start(write('name = "a"'), tmp_path / "runs")
     root = tmp_path / "runs" / processes.FOLDER
     assert [stat.S_IMODE(path.stat().st_mode) for path in (root, root / name)] == [0o700, 0o700]
@@ -136,7 +136,7 @@ def test_only_its_user_may_enter_the_folder_of_a_process(
 def test_the_command_line_starts_and_stops_as_the_dashboard_does(
     tmp_path: Path, write: Callable[..., Path], lab: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes.sys, "executable", "/bin/false")
+    monkeypatch.setattr("sys.executable", "/bin/false")
     campaign, runs = write('name = "a"'), tmp_path / "runs"
     found = CliRunner().invoke(app, ["run", str(campaign), "--detach", "--json"])
     assert json.loads(found.output)["process"] == processes.found(runs)[0].name

@@ -25,6 +25,7 @@ from errormotion.compensation.online.settings import Limits
 from errormotion.compensation.thermal_model import ThermalModel
 from errormotion.compensation.thermal_model.features import Feature
 from errormotion.compensation.thermal_model.model import Parts
+from errormotion.datasets import provenance
 from errormotion.errors import BenchError, CompensationError, InstrumentError
 from errormotion.instruments.compensator.modbus_registers import ModbusRegisters
 from errormotion.instruments.simulators.compensator.plc import SimulatedPlc
@@ -198,6 +199,7 @@ def test_it_follows_the_temperature_and_ramps_to_zero_when_stopped(
     entries = [json.loads(line)["entry"] for line in (compensation.folder.path / AUDIT).read_text().splitlines()]
     assert len(entries) == count > 10
     assert entries[0]["event"] == "armed"
+    assert entries[0]["model"] == provenance.hash_dataset(model)
     assert {"state", "offset", "target", "cause", "inputs"} <= set(entries[5])
     assert entries[-1] == {**entries[-1], "event": "ended", "state": "off"}
     log = datasets.load(compensation.folder.raw)

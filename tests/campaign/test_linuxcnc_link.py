@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 from disturbed_link import HARMFUL, HARMLESS, Link
-from errormotion.campaign.compensating import Compensation, Moment
 from linuxcnc_follower import MACHINE, SENSITIVITY, Thermometer, model
 from linuxcnc_watch import DRIVERS, Machine, until
 
+from errormotion.campaign.compensation.compensating import Compensation, Moment
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, parse_bench
 from errormotion.compensation.online.settings import Limits
 from errormotion.instruments.compensator.linuxcnc import LinuxCNCCompensatorSettings

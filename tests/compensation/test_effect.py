@@ -132,6 +132,13 @@ def test_a_source_that_both_share_is_one_draw() -> None:
     assert shared.high - shared.low < 0.8 * (alone.high - alone.low)
 
 
+def test_a_result_may_state_references_without_identities() -> None:
+    after = warm_up(15, start=LATER)
+    states = {"source_reference": ("source", np.ones(after.sizes["source"], np.int8))}
+    after = after.drop_vars("source_id", errors="ignore").assign_coords(states)
+    assert effect(warm_up(30), after).part("EZ").reference > 0
+
+
 def test_results_of_different_days_have_one_time_0() -> None:
     found = effect(warm_up(30), warm_up(3, start=LATER))
     assert found.ground.estimates[1].value.shape == found.ground.estimates[0].value.shape == (13, 6)

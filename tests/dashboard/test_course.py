@@ -1,6 +1,8 @@
 """A result as curves, and their reduction."""
 
 import csv
+import json
+import re
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 
 from errormotion import datasets
 from errormotion.dashboard.course import Course, Curve, as_csv, course, thin
+from errormotion.dashboard.figures import errors_item
 from errormotion.dashboard.lab import Lab
 from errormotion.errors import DatasetError
 
@@ -63,3 +66,12 @@ def test_text_in_a_table_is_no_formula() -> None:
     found = Course("target", np.arange(2.0), ("=1+1", 'a,"b'), (curve,), np.zeros(3), {})
     rows = list(csv.reader(as_csv(found).splitlines()))
     assert rows == [["target", "EX / µm", "U (k=2) of EX / µm"], ["'=1+1", "1", "0.1"], ['a,"b', "", ""]]
+
+
+@pytest.mark.parametrize(("count", "dots"), [(1, True), (30, False)])
+def test_a_curve_of_one_value_is_a_dot_and_rounding_errors_are_no_course(count: int, dots: bool) -> None:
+    curve = Curve("EX", "EX", "µm", np.full(count, 1e-13), np.zeros(count))
+    text = json.dumps(errors_item(Course("time / min", np.arange(float(count)), (), (curve,), np.zeros(3), {})))
+    assert ('"Scatter"' in text) is dots
+    start, end = (float(re.findall(rf'"{name}": (-?[\d.e-]+)', text)[0]) for name in ("start", "end"))
+    assert end - start == pytest.approx(0.1)

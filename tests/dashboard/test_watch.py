@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from errormotion.campaign.background.recorded import Value
 from errormotion.campaign.files import load_bench
-from errormotion.campaign.monitor.watch import Snapshot
+from errormotion.campaign.monitor.watch import Monitor, Snapshot
+from errormotion.campaign.turns import claimed
 from errormotion.dashboard.watch import Present, Watch
 from errormotion.errors import BenchError
 
@@ -32,7 +34,8 @@ channels = ["hall"]
 
 
 @pytest.fixture
-def make(tmp_path: Path) -> Iterator[Callable[..., Watch]]:
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Watch]]:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     made: list[Watch] = []
 
     def build(text: str = MODULES, start: bool = True, interval: float = 0.2) -> Watch:
@@ -114,3 +117,55 @@ def test_a_bench_without_anything_to_read_is_refused(make: Callable[..., Watch])
             MODULES.partition("[instruments")[0]
             + '[instruments.lds]\ndriver = "keyence_lk"\naddress = "sim://cframe"\n'
         )
+
+
+def test_instruments_are_lent_to_who_measures_and_taken_again(make: Callable[..., Watch], tmp_path: Path) -> None:
+    watch = make()
+    wait(watch, lambda now: now.rows >= 2)
+    other = Monitor(watch.plan, tmp_path / "others", 0.1)
+    with claimed(watch.plan.machine, "a run <i>") as records:
+        # The claim is given once the instruments are closed here: nobody else has them now.
+        assert [source._driver for source in watch._monitor.sources] == [None]
+        present = wait(watch, lambda now: now.lent.startswith("A run <i>"))
+        assert "recorded nothing yet" in present.lent
+        assert [each.state for each in present.instruments] == ["lent"]
+        with other:
+            records(other.folder.path)
+            for snapshot in other.watch():
+                present = watch.present()
+                value = present.temperatures[0].value
+                if "it records" in present.lent and math.isfinite(value):
+                    break
+                assert snapshot.time < 30
+        assert (present.run, present.rows > 0) == (other.folder.path.name, True)
+    present = wait(watch, lambda now: now.lent == "" and now.rows >= 2)
+    assert [each.state for each in present.instruments] == ["answers"]
+    times, _ = watch.history(["spindle <i>"], 600)["spindle <i>"]
+    assert (np.diff(times) > 0).all()
+
+
+CONTROL = """\
+[instruments.control]
+driver = "virtual_controller"
+arm = true
+address = "sim://cframe/controller?seed=3"
+"""
+
+
+def test_a_record_of_a_run_is_shown_in_the_units_of_the_page(make: Callable[..., Watch]) -> None:
+    watch = make(MODULES + CONTROL, start=False)
+    values = [
+        Value("distance", "Z", 2e-4, "m"),
+        Value("position", "z", 0.3, "m"),
+        Value("spindle_speed", "", 1500.0, "1/min"),
+        Value("temperature", "column", 21.5, "degC"),
+        Value("temperature", "other", 22.0, "degC"),
+        Value("gap", "modules", 0.0, "1"),
+    ]
+    row, others = watch._split(values)
+    known = {name: value for name, value in zip(watch.units, row, strict=True) if math.isfinite(value)}
+    assert known == pytest.approx({"column": 21.5, "Z": 300.0, "spindle speed": 1500.0})
+    assert [(each.name, each.value, each.unit) for each in others] == [
+        ("distance Z", pytest.approx(0.2), "mm"),
+        ("temperature other", 22.0, "°C"),
+    ]

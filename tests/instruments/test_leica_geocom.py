@@ -9,25 +9,10 @@ from contextlib import contextmanager
 import pytest
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
-from errormotion.instruments import simulators
 from errormotion.instruments.laser_tracker.leica_geocom import GeoComSettings, LeicaGeoCom, air
 from errormotion.plugins.readings import Environment
-from errormotion.testing import InstrumentConformance, InstrumentSubject
 
 ADDRESS = "sim://cframe/station?seed=3&noise=0&angle_noise=0"
-
-
-class TestKit(InstrumentConformance):
-    """A station that looks at its reflector; nobody at a port."""
-
-    subject = InstrumentSubject(
-        LeicaGeoCom,
-        "sim://cframe/station?seed=3",
-        settings={"timeout": 0.7},
-        name="station",
-        vary=simulators.in_steps(seed=3),
-        dead_address="tcp://127.0.0.1:9",
-    )
 
 
 # ---------------------------------------------------------------------- the simulated station

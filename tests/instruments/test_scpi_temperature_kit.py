@@ -13,18 +13,6 @@ from errormotion.testing import InstrumentConformance, InstrumentSubject
 ADDRESS = "sim://cframe/unit?seed=3&noise=0"
 
 
-class TestResistanceThermometers(InstrumentConformance):
-    """Pt100 with four wires over TCP; nobody at a port."""
-
-    subject = InstrumentSubject(
-        ScpiTemperature,
-        "sim://cframe/unit?seed=3",
-        settings={"timeout": 0.7},
-        name="unit",
-        dead_address="tcp://127.0.0.1:9",
-    )
-
-
 class TestThermocouples(InstrumentConformance):
     """Thermocouples on a pty, one of them open; no such line."""
 

@@ -15,7 +15,6 @@ from armed import CONTROLLER
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.controller.shdr import Shdr, ShdrSettings
 from errormotion.instruments.controller.virtual import VirtualController
-from errormotion.testing import InstrumentConformance
 
 ADDRESS = "sim://cframe/shdr?seed=3&style=vmc"
 OKUMA = {
@@ -27,12 +26,6 @@ OKUMA = {
     "execution": "pexecution",
 }
 WAIT = 2.0  # s, for what an adapter that looks at the machine in turns reports
-
-
-class TestKit(InstrumentConformance):
-    """The kit at the adapter of the reference device."""
-
-    subject = Shdr.conformance()
 
 
 class Adapter:

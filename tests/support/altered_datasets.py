@@ -16,7 +16,7 @@ import numpy as np
 from altered import ANY, Alteration, UnsuitableError, json_deep, json_value, remove
 from numcodecs import GZip, Zstd
 
-from errormotion.datasets.storage.disk import disk as storage
+from errormotion.datasets.storage import disk as storage
 from errormotion.errors import ErrormotionError
 
 HUGE = 10**15

@@ -13,8 +13,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -24,6 +22,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from errormotion.campaign.background.detached import printed, spawn
 from errormotion.campaign.background.publishing import ANSWER, STATUS
 from errormotion.campaign.files import load_campaign
 from errormotion.campaign.folder import RunFolder, is_locked, now, replace_text
@@ -37,18 +36,15 @@ except ImportError:  # Windows
 
 FOLDER = ".background"
 """In the folder of runs."""
+OUTPUT = "output.txt"
+"""What a process has printed."""
 MOST = 50
 """Ended processes whose state is kept."""
 LARGEST_STATE = 1 << 20
 """Bytes of a state."""
-LONGEST_OUTPUT = 4000
-"""Bytes at the end of the output that are shown."""
 STOP_INTERVAL = 30.0
 """Time after which a process that was asked to stop is asked again, s."""
 _NAME = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}")
-
-_children: list[subprocess.Popen[bytes]] = []
-"""Processes that this one has started; they are waited for when they have ended."""
 
 
 @dataclass(frozen=True)
@@ -139,9 +135,6 @@ def resume(folder: Path) -> str:
 
 def found(runs: Path) -> list[Background]:
     """Return the processes of a folder of runs, the newest first."""
-    for child in list(_children):
-        if child.poll() is not None:
-            _children.remove(child)
     root = runs / FOLDER
     names = sorted((path.name for path in root.iterdir()), reverse=True) if root.is_dir() else []
     return [each for each in (_read(root / name) for name in names if _NAME.fullmatch(name)) if each is not None]
@@ -205,21 +198,11 @@ def _start(runs: Path, campaign: str, machine: str, arguments: list[str]) -> str
 
 def _spawn(folder: Path, runs: Path, state: dict[str, Any], arguments: list[str]) -> None:
     folder.mkdir(mode=0o700)
-    command = [sys.executable, "-P", "-m", "errormotion", "run", *arguments]
-    command += ["--runs", str(runs.resolve()), "--publish", str(folder.resolve())]
+    command = ["run", *arguments, "--runs", str(runs.resolve()), "--publish", str(folder.resolve())]
     lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with (folder / "output.txt").open("wb") as output:
-            child = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                pass_fds=[lock],
-            )
-        _children.append(child)
+        child = spawn(command, folder / OUTPUT, inherited=[lock])
         replace_text(folder / "process.json", json.dumps({**state, "pid": child.pid}))
     finally:
         os.close(lock)  # the process holds it from now on
@@ -259,7 +242,7 @@ def _read(folder: Path) -> Background | None:
     ended = "" if alive else str(state.get("ended") or "killed")
     message = str(state.get("message", ""))
     if ended in ("failed", "killed"):
-        message = _output(folder) or message
+        message = printed(folder / OUTPUT) or message
     request = state.get("request")
     waits = alive and isinstance(request, dict) and isinstance(request.get("number"), int)
     return Background(
@@ -291,14 +274,6 @@ def _state(path: Path) -> dict[str, Any]:
         if isinstance(content, dict):
             return content
     return {}
-
-
-def _output(folder: Path) -> str:
-    """Return the end of what a process has printed."""
-    with suppress(OSError), (folder / "output.txt").open("rb") as file:
-        file.seek(max(0, file.seek(0, os.SEEK_END) - LONGEST_OUTPUT))
-        return file.read().decode("utf-8", "replace").strip()
-    return ""
 
 
 def _whole(value: Any) -> int:

@@ -28,6 +28,7 @@ from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.campaign.storage.journal import cause_of
+from errormotion.campaign.turns import claimed
 from errormotion.compensation.online.audit import AuditLog
 from errormotion.compensation.online.follower import Conditions, Follower, State, Step
 from errormotion.compensation.online.prediction import PARAMETERS, Prediction, predictor, refusal
@@ -187,12 +188,14 @@ class Compensation:
         with ExitStack() as stack:
             if self.armed:
                 stack.enter_context(_only_one(self.plan.machine))
+            records = stack.enter_context(claimed(self.plan.machine, "a compensation"))
             if self.plan.compensator is not None:
                 each = self.plan.compensator
                 self._output = each.driver(each.address, each.settings)
                 self._output.open()
                 stack.callback(self._close)
             stack.enter_context(self._monitor)
+            records(self.folder.path)
             self._audit = stack.enter_context(AuditLog(self.folder.path / AUDIT))
             self._begin()
             self._stack = stack.pop_all()

@@ -119,7 +119,9 @@ def _references(estimate: Estimate, ds: xr.Dataset) -> set[str]:
     """Return the keys of the sources that are the uncertainty of a reference state."""
     found = {key for key in estimate.source if key.startswith(f"{estimate.name}: {REFERENCE}")}
     if "source_reference" in ds.coords:
-        rows = zip(ds["source"].values, ds["source_id"].values, ds["source_reference"].values, strict=True)
+        size = ds.sizes["source"]
+        identities = ds["source_id"].values if "source_id" in ds.coords else np.full(size, "")
+        rows = zip(ds["source"].values, identities, ds["source_reference"].values, strict=True)
         found |= {str(identity) or f"{estimate.name}: {name}" for name, identity, reference in rows if reference}
     return found
 

@@ -10,6 +10,7 @@ from typing import Any
 from tornado.web import HTTPError
 
 from errormotion.campaign.background import processes
+from errormotion.campaign.background.elsewhere import measuring_elsewhere
 from errormotion.campaign.background.preliminary import preliminary, samples
 from errormotion.campaign.background.processes import Background
 from errormotion.campaign.folder import RunFolder
@@ -79,18 +80,20 @@ class Fields(_OfCampaigns):
     async def post(self) -> None:
         """Send text, fields and mistakes."""
         name, text = self.body("file", "text")
+        number = self.found.get("remove")
         if self.found.get("add") is True:
-            return self.finish(_plain(await self.apart(self.campaigns().with_test, name, text)))
-        if (number := self.found.get("remove")) is not None:
+            form = await self.apart(self.campaigns().with_test, name, text)
+        elif number is not None:
             if type(number) is not int or number < 0:
                 raise HTTPError(400, reason="remove: expected the number of a test")
-            return self.finish(_plain(await self.apart(self.campaigns().without_test, name, text, number)))
-        place = self.found.get("place", [])
-        if not isinstance(place, list) or not all(type(each) in (str, int) for each in place) or len(place) > 20:
-            raise HTTPError(400, reason="place: expected keys")
-        written = self.found.get("value", "")
-        form = await self.apart(self.campaigns().form, name, text, tuple(place), str(written))
-        return self.finish(_plain(form))
+            form = await self.apart(self.campaigns().without_test, name, text, number)
+        else:
+            place = self.found.get("place", [])
+            if not isinstance(place, list) or not all(type(each) in (str, int) for each in place) or len(place) > 20:
+                raise HTTPError(400, reason="place: expected keys")
+            written = self.found.get("value", "")
+            form = await self.apart(self.campaigns().form, name, text, tuple(place), str(written))
+        self.finish(_plain(form))
 
 
 class Plan(_OfCampaigns):
@@ -201,7 +204,10 @@ def _processes(runs: Path) -> list[dict[str, Any]]:
     found = processes.found(runs)
     shown = [each for each in found if each.alive] + [each for each in found if not each.alive][:SHOWN]
     busy = {name for each in found if each.alive for name in each.tests.values()}
-    return [_process(runs, each, busy) for each in shown]
+    others = measuring_elsewhere(runs, busy)
+    busy |= {each.name for each in others}
+    own = [_process(runs, each, busy) | {"elsewhere": False} for each in shown]
+    return [*(_process(runs, each, busy) | {"elsewhere": True} for each in others), *own]
 
 
 def _process(runs: Path, each: Background, busy: set[str]) -> dict[str, Any]:

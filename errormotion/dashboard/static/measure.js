@@ -252,7 +252,8 @@ function process(each) { // made anew only when something but the progress has c
       link.href = `/run?${new URLSearchParams({ run: test.run })}`;
       links.append(link, " ");
     }
-    if (control && each.alive) links.append(button("Stop", (event) => command("/measure/stop", { process: each.name }, event.target), "stop"));
+    if (each.elsewhere) links.append(element("span", "It was started in a terminal or another program: Ctrl-C there stops it.", "note"));
+    else if (control && each.alive) links.append(button("Stop", (event) => command("/measure/stop", { process: each.name }, event.target), "stop"));
     if (control && each.resume) links.append(button("Resume", (event) => command("/measure/resume", { run: each.resume }, event.target)));
     if (links.childNodes.length) made.append(links);
     if (card) card.replaceWith(made);

@@ -10,11 +10,14 @@ const clock = (text) => new Date(text).toLocaleTimeString("en-GB");
 function show(found) {
   byId("clock").textContent = found.error ? `The monitor has stopped: ${found.error}`
     : !found.running ? "The monitor has stopped."
+    : found.lent ? `${clock(found.time)}, ${found.rows} samples${found.run ? ` in ${found.run}` : ""}`
     : found.rows ? `${clock(found.time)}, ${found.rows} rows in ${found.run}` : "Waiting for the first readings.";
+  byId("lent").textContent = found.lent && `${found.lent} This page reads the instruments again when it ends.`;
+  byId("lent").hidden = !found.lent;
   byId("alarms").replaceChildren(...found.alarms.map((text) => element("li", `Alarm: ${text}`)));
   byId("instruments").replaceChildren(...found.instruments.map((each) => {
     const tile = element("li", undefined, each.state);
-    const words = { answers: "● answers", waiting: "○ waiting", silent: `■ silent since ${clock(each.since)}` };
+    const words = { answers: "● answers", waiting: "○ waiting", silent: `■ silent since ${clock(each.since)}`, lent: `◐ lent since ${clock(each.since)}` };
     tile.append(element("strong", each.name), element("span", words[each.state], "said"), element("small", each.model || each.kind));
     if (each.why) tile.append(element("small", each.why));
     if (each.rate !== null) tile.append(element("small", `${number(each.rate, each.rate < 10 ? 2 : 0)} readings/s`, "rate"));
@@ -27,6 +30,13 @@ function show(found) {
     const value = element("dd", number(each.value, each.unit === "mm" ? 3 : 0));
     value.append(element("span", each.unit, "unit"));
     row.append(element("dt", each.name), value);
+    return row;
+  }));
+  byId("recorded-card").hidden = !found.recorded.length;
+  byId("recorded").replaceChildren(...found.recorded.map((each) => {
+    const row = element("tr"), name = element("th", each.name);
+    name.scope = "row";
+    row.append(name, element("td", number(each.value, 4), "number"), element("td", each.unit));
     return row;
   }));
   byId("program").textContent = [found.mode && `mode ${found.mode}`, found.program && `program ${found.program}`].filter(Boolean).join(", ");

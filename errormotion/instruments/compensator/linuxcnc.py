@@ -82,18 +82,8 @@ class LinuxCNCOffset(Driver):
 
     def identify(self) -> Identity:
         """Return the machine."""
-        facts = self._ask("identify")
-        try:
-            return Identity(
-                manufacturer=str(facts["manufacturer"]),
-                model=str(facts["model"]),
-                serial_number=str(facts["serial_number"]),
-                firmware=str(facts["firmware"]),
-                simulated=self.transport.simulated,
-                details={"address": self.address, "route": self.route},
-            )
-        except (KeyError, TypeError):
-            raise ProtocolError(f"Expected the identity of a LinuxCNC; found {str(facts)[:200]}") from None
+        details = {"address": self.address, "route": self.route}
+        return codec.decode_identity(self._ask("identify"), self.transport.simulated, details)
 
     def arm(self, limit: float) -> None:
         """Let offsets be written up to a limit of each axis, m; ask the bridge for the right to set them.

@@ -12,15 +12,15 @@ from typing import ClassVar
 from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator.door import ROUNDING, OffsetDoor
 from errormotion.instruments.compensator.register_map import SIZES, RegisterSettings, runs
-from errormotion.instruments.driver import Driver
-from errormotion.instruments.transports.modbus.client import READ_HOLDING, ModbusLine, open_modbus
+from errormotion.instruments.modbus_driver import ModbusDriver
+from errormotion.instruments.transports.modbus.client import READ_HOLDING
 from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo
 
 MOST_READ, MOST_WRITTEN = 125, 123
 """Registers of one request."""
 
 
-class ModbusRegisters(Driver):
+class ModbusRegisters(ModbusDriver):
     """Writes offsets to a PLC by Modbus TCP, RTU on a serial line, or RTU through a serial server.
 
     All registers that are adjacent are written by one request; the heartbeat is written with the last one, so that an
@@ -63,14 +63,6 @@ class ModbusRegisters(Driver):
         self._door = OffsetDoor(f"{self.info.id} at {address}")
         self._heartbeat = 0
 
-    @property
-    def line(self) -> ModbusLine:
-        """The open Modbus line; InstrumentError before ``open``."""
-        line = self.transport
-        if not isinstance(line, ModbusLine):
-            raise TypeError(f"expected a ModbusLine, found {type(line).__name__}")
-        return line
-
     def close(self) -> None:
         """Disconnect and disarm; the watchdog of the PLC ramps to zero. Idempotent."""
         self._door.disarm()
@@ -78,15 +70,8 @@ class ModbusRegisters(Driver):
 
     def identify(self) -> Identity:
         """Return the unit; PLCs report no name by their registers."""
-        line = self.line
-        line.registers(READ_HOLDING, self.settings.heartbeat, 1)
-        return Identity(
-            manufacturer="Modbus",
-            model="holding registers",
-            serial_number=f"unit {line.unit}",
-            simulated=line.simulated,
-            details={"address": self.address, "framing": line.framing},
-        )
+        self.line.registers(READ_HOLDING, self.settings.heartbeat, 1)
+        return self.identity("holding registers")
 
     def arm(self, limit: float) -> None:
         """Let offsets pass up to a limit of each axis, m; nothing is sent.
@@ -156,19 +141,6 @@ class ModbusRegisters(Driver):
         for first, part in runs(wanted, MOST_READ):
             found.update(enumerate(self.line.registers(READ_HOLDING, first, len(part)), start=first))
         return found
-
-    def _connect(self) -> ModbusLine:
-        settings = self.settings
-        return open_modbus(
-            self.address,
-            unit=settings.unit,
-            simulator=self.info.simulator,
-            record=self._record,
-            timeout=settings.timeout,
-            retry=settings.retry,
-            retries=settings.retries,
-            baudrate=settings.baudrate,
-        )
 
     def _start_session(self) -> None:
         """Go on from the last heartbeat, so that the first write is a sign of life; check the other registers."""

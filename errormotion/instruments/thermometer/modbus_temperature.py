@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from errormotion.instruments.modbus_driver import ModbusDriver
 from errormotion.instruments.thermometer.registers import SIZES, ModbusSettings
 from errormotion.instruments.thermometer.sensors import Thermometer
-from errormotion.instruments.transports.modbus.client import ModbusLine, open_modbus
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
 
-class ModbusTemperature(Thermometer):
+class ModbusTemperature(ModbusDriver, Thermometer):
     """A thermometer with Modbus TCP, RTU on a serial line, or RTU through a serial server.
 
     Parameters
@@ -39,29 +39,15 @@ class ModbusTemperature(Thermometer):
         return InstrumentSubject(cls, "sim://cframe?seed=3&noise=1")
 
     @property
-    def line(self) -> ModbusLine:
-        """The open Modbus line; InstrumentError before ``open``."""
-        line = self.transport
-        if not isinstance(line, ModbusLine):
-            raise TypeError(f"expected a ModbusLine, found {type(line).__name__}")
-        return line
-
-    @property
     def repeated(self) -> int:
         """Number of repeated requests after damaged answers since the connection was opened."""
         return self.line.repeated
 
     def identify(self) -> Identity:
         """Check that the device answers, by its first register; Modbus thermometers report no name."""
-        line, settings = self.line, self.settings
-        line.registers(settings.function, min(settings.addresses), SIZES[settings.type])
-        return Identity(
-            manufacturer="Modbus",
-            model=settings.map,
-            serial_number=f"unit {line.unit}",
-            simulated=line.simulated,
-            details={"address": self.address, "framing": line.framing},
-        )
+        settings = self.settings
+        self.line.registers(settings.function, min(settings.addresses), SIZES[settings.type])
+        return self.identity(settings.map)
 
     def configure(self, settings: ModbusSettings) -> None:
         """Use other settings from now on; the device itself is configured with the maker's tool."""
@@ -77,19 +63,6 @@ class ModbusTemperature(Thermometer):
             name: settings.temperature(i, [words[address + k] for k in range(size)])
             for i, (name, address) in enumerate(zip(settings.channels, settings.addresses, strict=True))
         }
-
-    def _connect(self) -> ModbusLine:
-        settings = self.settings
-        return open_modbus(
-            self.address,
-            unit=settings.unit,
-            simulator=self.info.simulator,
-            record=self._record,
-            timeout=settings.timeout,
-            retry=settings.retry,
-            retries=settings.retries,
-            baudrate=settings.baudrate,
-        )
 
     def _start_session(self) -> None:
         self.identify()

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+from collections.abc import Iterator
 from random import Random
 
 import numpy as np
@@ -13,7 +14,7 @@ from nc_programs import Programs
 
 from errormotion.compensation.program.reading.items import LINE
 from errormotion.compensation.program.reading.reader import Reader
-from errormotion.compensation.program.writing import dividing
+from errormotion.compensation.program.writing import dividing, rewriting
 from errormotion.compensation.program.writing.rewriting import Rewriting
 from errormotion.errors import ProgramError
 
@@ -85,6 +86,20 @@ def test_no_more_pieces_than_the_tolerance_demands() -> None:
 
     # A parabola of sag s over its length is within t of sqrt(s / t) chords.
     assert [pieces(1e-6 * n * n * 0.98) for n in (1, 2, 5, 9)] == [1, 2, 5, 9]
+
+
+def test_a_program_is_written_while_it_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rewriting, "_MOVES", 50)
+    read = []
+
+    def source() -> Iterator[str]:
+        for line in [*HEAD, *(f"G1 X{k % 7}" for k in range(400))]:
+            read.append(line)
+            yield line
+
+    ahead = [len(read) - written for written, _ in enumerate(Rewriting(Reader(ORIGINS), zero).lines(source()), 1)]
+    assert len(ahead) == len(HEAD) + 400
+    assert max(ahead) <= 50 + len(HEAD)
 
 
 def test_words_comments_and_codes_stay_in_place() -> None:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from errormotion.campaign.bench import OpenBench
-from errormotion.campaign.files import load_bench
+from errormotion.campaign.files import BenchPlan, load_bench
+from errormotion.campaign.turns import claimed
 from errormotion.cli.output import show, show_json, table
 
 MOST_NUMBERS = 12
@@ -20,7 +21,13 @@ log = logging.getLogger(__name__)
 
 def probe(file: Path, as_json: bool) -> bool:
     """Open, identify and read every instrument of a bench; return whether all of them answered."""
-    bench = OpenBench(load_bench(file))
+    plan = load_bench(file)
+    with claimed(plan.machine, "a check of the bench"):
+        return _probe(plan, as_json)
+
+
+def _probe(plan: BenchPlan, as_json: bool) -> bool:
+    bench = OpenBench(plan)
     found: list[dict[str, Any]] = []
     try:
         bench.try_open()

@@ -16,6 +16,7 @@ from rich.text import Text
 
 from errormotion.campaign.files import load_bench
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
+from errormotion.campaign.turns import claimed
 from errormotion.cli.curves import bars
 from errormotion.cli.output import show
 from errormotion.datasets.units import TIME
@@ -41,7 +42,12 @@ def run(file: Path, runs: Path, interval: str, duration: str | None, as_json: bo
     shown = sys.stderr.isatty() and not as_json
     last: Snapshot | None = None
     try:
-        with monitor, Live(console=console, auto_refresh=False, transient=True, screen=False) as live:
+        with (
+            claimed(monitor.plan.machine, "a monitor") as records,
+            monitor,
+            Live(console=console, auto_refresh=False, transient=True, screen=False) as live,
+        ):
+            records(monitor.folder.path)
             for last in monitor.watch(length):
                 screen.take(last)
                 if as_json:

@@ -2,7 +2,8 @@
 """Connects LinuxCNC with other programs: JSON lines on a Unix socket, or on a port of this computer.
 
 LinuxCNC's Python module works only in the Python of the system, beside LinuxCNC. This file therefore runs there, as the
-``DISPLAY`` of an INI file or as an ``APP`` beside another display, and needs only that Python. A request is
+``DISPLAY`` of an INI file or as an ``APP`` beside another display, and needs only that Python. It is copied to the
+machine as one file and imports nothing of this package: it is therefore not divided into modules. A request is
 ``{"id": 1, "op": "move_to", "position": [0.1, 0, 0]}``, its answer ``{"id": 1, "ok": true, "result": ...}`` or
 ``{"id": 1, "ok": false, "error": "..."}``. While an order runs, ``{"id": 1, "beat": 7, "time": 3.2}`` is sent five
 times a second. Lengths are in m, speeds in m/s, those of spindles in 1/min, times in s since the bridge started;

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.plugins import Identity
 
 LINE_END = b"\n"
 LONGEST_LINE = 1 << 16
@@ -100,6 +101,21 @@ def decode_welcome(result: Any) -> tuple[bool, str]:
             f"Expected the bridge of LinuxCNC with protocol {PROTOCOL}; found {str(result)[:200]} ({error!r}). Copy "
             "bridge.py of this version to the machine"
         ) from None
+
+
+def decode_identity(facts: Any, simulated: bool, details: Mapping[str, Any], *more: str) -> Identity:
+    """Return the identity of a machine, ``more`` facts among its details; ProtocolError where one is missing."""
+    try:
+        return Identity(
+            manufacturer=str(facts["manufacturer"]),
+            model=str(facts["model"]),
+            serial_number=str(facts["serial_number"]),
+            firmware=str(facts["firmware"]),
+            simulated=simulated,
+            details={**details, **{name: facts[name] for name in more}},
+        )
+    except (KeyError, TypeError):
+        raise ProtocolError(f"Expected the identity of a LinuxCNC; found {str(facts)[:200]}") from None
 
 
 def decode_right(result: Any) -> tuple[bool, str]:

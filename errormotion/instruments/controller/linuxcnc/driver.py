@@ -74,17 +74,7 @@ class LinuxCNC(Driver):
     def identify(self) -> Identity:
         """Request the identity of the machine."""
         facts = self._query("identify")
-        try:
-            return Identity(
-                manufacturer=str(facts["manufacturer"]),
-                model=str(facts["model"]),
-                serial_number=str(facts["serial_number"]),
-                firmware=str(facts["firmware"]),
-                simulated=self.transport.simulated,
-                details={"address": self.address, "travel": facts["travel"]},
-            )
-        except (KeyError, TypeError):
-            raise ProtocolError(f"Expected the identity of a LinuxCNC; found {str(facts)[:200]}") from None
+        return codec.decode_identity(facts, self.transport.simulated, {"address": self.address}, "travel")
 
     def configure(self, settings: LinuxCNCSettings) -> None:
         """Use other settings from now on; ``arm`` and the token hold for the next connection."""

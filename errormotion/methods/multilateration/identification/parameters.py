@@ -391,7 +391,8 @@ def _with_falloff(terms: list[Term], N: Array, b: Array, sources: int, square: f
         factor = linalg.cho_factor(scaled + np.diag(prior * unit**2))
         C = linalg.cho_solve(factor, np.eye(len(N))) * np.outer(unit, unit)
         x = unit * linalg.cho_solve(factor, right)
-        second = {name: float(np.sum((x[g] ** 2 + np.diag(C)[g]) / shape[g] ** 2)) for name, g in groups.items()}
+        variance = np.diag(C)
+        second = {name: float(np.sum((x[g] ** 2 + variance[g]) / shape[g] ** 2)) for name, g in groups.items()}
         typical = {
             kind: float(np.exp(np.mean([np.log(tau[name] ** 2) for name in groups if kinds[name] == kind] or [0.0])))
             for kind in (False, True)
@@ -401,7 +402,7 @@ def _with_falloff(terms: list[Term], N: Array, b: Array, sources: int, square: f
             tau[name] = float(np.sqrt((second[name] + _POOLED * typical[kinds[name]]) / (len(group) + _POOLED)))
         if max(abs(np.log(tau[name] / before[name])) for name in groups) < _SETTLED:
             break
-    determined = 1 - np.diag(C)[:n] * prior[:n]
+    determined = 1 - variance[:n] * prior[:n]
     # Twice the logarithm of the marginal likelihood, up to a constant that no choice changes.
     log_det = 2 * float(np.log(np.diag(factor[0])).sum()) - 2 * float(np.log(unit).sum())
     evidence = float(b @ x) - log_det + float(np.log(prior[prior > 0]).sum())

@@ -1,0 +1,109 @@
+"""The last values that another process has recorded: of a run, a monitor or a compensation that is at work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.campaign.compensation.following import STATUS, read_status
+from errormotion.campaign.folder import RunFolder
+from errormotion.campaign.runner import stored_plan
+from errormotion.campaign.storage.store import committed_length
+
+MOST_VALUES = 200
+"""Values of one sample that are shown."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """One number of the last sample: of a variable, at a label of its other dimensions, in the unit of the record."""
+
+    variable: str
+    label: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The last sample of a record.
+
+    Attributes
+    ----------
+    title : str
+        Test and campaign, or the kind of the record.
+    samples : int
+        How many there are.
+    values : tuple of Value
+        Of the last one; NaN where unknown.
+    estop : bool, optional
+        Emergency stop, where the record states it.
+    program : str
+    """
+
+    title: str
+    samples: int
+    values: tuple[Value, ...] = ()
+    estop: bool | None = None
+    program: str = ""
+
+
+def recorded(path: Path) -> Recorded:
+    """Return the last sample that a reader of a run folder sees.
+
+    Raises
+    ------
+    ErrormotionError
+        It is no run folder, or its record is damaged.
+    """
+    folder = RunFolder.open(path)
+    campaign = folder.data.get("campaign")
+    title = str(folder.data.get("test", ""))
+    if isinstance(campaign, dict):
+        title = f"{title} of {campaign.get('name', '')}"
+    estop, program = None, ""
+    if (path / STATUS).exists():
+        status = read_status(path)
+        estop, program = status.estop, status.program
+    dim = dim_of(folder)
+    samples = committed_length(folder.raw, dim) if (folder.raw / "zarr.json").exists() else 0
+    values: tuple[Value, ...] = ()
+    if samples:
+        with datasets.load(folder.raw) as raw:
+            count = min(samples, int(raw.sizes.get(dim, 0)))
+            values = tuple(islice(_last(raw, dim, count), MOST_VALUES)) if count else ()
+    return Recorded(title, samples, values, estop, program)
+
+
+def dim_of(folder: RunFolder) -> str:
+    """Return the dimension along which the record of a run grows."""
+    if "campaign" not in folder.data:
+        return "time"
+    tests = stored_plan(folder).tests
+    found = next((test for test in tests if test.name == folder.data.get("test")), None)
+    return found.method().append_dim(found.settings) if found is not None else "time"
+
+
+def _last(raw: xr.Dataset, dim: str, count: int) -> Iterator[Value]:
+    for name, variable in raw.data_vars.items():
+        if dim not in variable.dims or variable.dtype.kind not in "fiu":
+            continue
+        last = variable.isel({dim: count - 1})
+        numbers = np.atleast_1d(np.asarray(last.values, dtype=float))
+        unit = str(variable.attrs.get("units", ""))
+        for place in np.ndindex(numbers.shape):
+            labels = (_label(raw, str(d), k) for d, k in zip(last.dims, place, strict=False))
+            yield Value(str(name), " ".join(labels), float(numbers[place]), unit)
+
+
+def _label(raw: xr.Dataset, dim: str, index: int) -> str:
+    if dim in raw.coords and raw[dim].ndim == 1:
+        found = raw[dim].values[index]
+        return str(found) if isinstance(found, str) else f"{dim} {found:g}" if np.isreal(found) else str(found)
+    return f"{dim} {index + 1}"
