@@ -64,10 +64,9 @@ def test_a_small_file_that_states_many_values_is_refused_before_the_fit(
     times: int, sensors: int, pair: list[xr.Dataset]
 ) -> None:
     """Constant values compress a thousandfold; here they take no memory at all."""
-    small = pair[0].isel(time=0, sensor=0, drop=True)
-    packed = small.drop_vars("temperature").expand_dims(time=times)
-    temperature = np.broadcast_to(20.0, (times, sensors))
-    packed = packed.assign(temperature=(("time", "sensor"), temperature)).assign_coords(time=np.arange(float(times)))
+    small = pair[0].isel(time=0, drop=True).drop_dims("sensor")
+    packed = small.expand_dims(time=np.arange(float(times)))
+    packed["temperature"] = (("time", "sensor"), np.broadcast_to(20.0, (times, sensors)))
     with pytest.raises(DatasetError, match=r"Expected at most \d+ temperature"):
         fit([packed])
 

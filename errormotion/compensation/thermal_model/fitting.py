@@ -112,8 +112,8 @@ def _check_size(campaigns: Sequence[xr.Dataset]) -> None:
     values = sum(ds.sizes.get("time", 0) * max(1, ds.sizes.get("sensor", 0)) for ds in campaigns)
     if values > MOST_VALUES:
         raise DatasetError(
-            f"Expected at most {MOST_VALUES} temperatures (times by sensors) in all campaigns together; found {values}. "
-            "Select every tenth time, or fewer sensors."
+            f"Expected at most {MOST_VALUES} temperatures (times by sensors) in all campaigns together; "
+            f"found {values}. Select every tenth time, or fewer sensors."
         )
 
 

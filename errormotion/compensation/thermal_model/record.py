@@ -70,7 +70,9 @@ def read_inputs(ds: xr.Dataset, what: str = "the data") -> Inputs:
     if "time" not in ds.dims or "time" not in ds.coords:
         raise DatasetError(f"{what}: expected temperatures over time; found the dims {', '.join(map(str, ds.dims))}")
     if ds.sizes["time"] > MOST_TIMES:
-        raise DatasetError(f"{what}: expected at most {MOST_TIMES} times; found {ds.sizes['time']}. Select fewer first.")
+        raise DatasetError(
+            f"{what}: expected at most {MOST_TIMES} times; found {ds.sizes['time']}. Select fewer first."
+        )
     if "temperature" not in ds or set(ds["temperature"].dims) != {"time", "sensor"}:
         raise DatasetError(f"{what}: expected temperature(time, sensor); found none. Add a thermometer to the bench.")
     time = np.asarray(ds["time"].values, dtype=float)
