@@ -59,6 +59,28 @@ def test_the_prediction_is_an_error_dataset_with_sources(model: ThermalModel, pa
         assert float(predicted[name][0]) == 0.0
 
 
+@pytest.mark.parametrize(("times", "sensors"), [(2_000_000, 1), (1_100, 1_000), (300_000, 4)])
+def test_a_small_file_that_states_many_values_is_refused_before_the_fit(
+    times: int, sensors: int, pair: list[xr.Dataset]
+) -> None:
+    """Constant values compress a thousandfold; here they take no memory at all."""
+    small = pair[0].isel(time=0, drop=True).drop_dims("sensor")
+    packed = small.expand_dims(time=np.arange(float(times)))
+    packed["temperature"] = (("time", "sensor"), np.broadcast_to(20.0, (times, sensors)))
+    with pytest.raises(DatasetError, match=r"Expected at most \d+ temperature"):
+        fit([packed])
+
+
+def test_a_prediction_of_too_many_times_is_refused(model: ThermalModel) -> None:
+    """The covariance of a prediction takes far more memory than its inputs."""
+    log = xr.Dataset(
+        {"temperature": (("time", "sensor"), np.broadcast_to(20.0, (1_000_001, len(model.sensors))))},
+        {"time": np.arange(1_000_001.0), "sensor": list(model.sensors)},
+    )
+    with pytest.raises(DatasetError, match="expected at most 1000000 times; found 1000001"):
+        model.predict(log)
+
+
 def test_what_was_simulated_does_not_pass_for_measured(model: ThermalModel, pair: list[xr.Dataset]) -> None:
     behind = json.loads(pair[0].attrs["provenance"])["instruments"]
     assert behind

@@ -220,6 +220,16 @@ def test_a_lost_connection_is_an_error_and_the_next_reading_is_right() -> None:
                 time.sleep(0.1)
 
 
+def test_a_driver_that_is_opened_again_has_forgotten_the_values_of_the_session_before() -> None:
+    with adapter(b"2026-01-01T00:00:00Z|S1speed|240\n") as device:
+        driver = Shdr(device.url, ShdrSettings(items=OKUMA))
+        with driver:
+            assert driver.state()["spindle_speed"] == 240.0
+        device.first = b"* device: M1\n"  # its values come later
+        with driver:
+            assert math.isnan(driver.state()["spindle_speed"])
+
+
 def test_an_adapter_without_heartbeat_is_believed_for_a_time() -> None:
     settings = ShdrSettings(timeout=0.2, silence=1.0)
     with adapter(b"|Xact|1\n", b"") as there, Shdr(there.url, settings) as driver:

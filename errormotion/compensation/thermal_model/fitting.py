@@ -41,6 +41,10 @@ SAME = ("component", "frame", "reference", "machine", "lever_axes")
 FEWEST_SAMPLES = 8
 """Smallest number of known values of an error."""
 
+MOST_SENSORS = 500
+MOST_VALUES = 1_000_000
+"""Temperatures, times by sensors, of all campaigns: the time of a fit grows with them, memory with a multiple."""
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -82,11 +86,13 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     Raises
     ------
     DatasetError
-        Campaigns of different machines, components or functional points, no common sensors, or too few values.
+        Campaigns of different machines, components or functional points, no common sensors, too few values, or more
+        than `MOST_VALUES` or `MOST_SENSORS`.
     """
     settings = settings or Settings()
     if not campaigns:
         raise DatasetError("Expected the errors of at least one campaign; found none.")
+    _check_size(campaigns)
     _check_alike(campaigns)
     records = [read_record(ds, f"campaign {number + 1}") for number, ds in enumerate(campaigns)]
     seen = [k for k in range(6) if sum(int(np.isfinite(r.errors[:, k]).sum()) for r in records) >= FEWEST_SAMPLES]
@@ -97,6 +103,18 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     columns = regression.Columns(records)
     best, tried = _chosen(columns, seen, settings)
     return _made(campaigns, columns, seen, best, tried, settings)
+
+
+def _check_size(campaigns: Sequence[xr.Dataset]) -> None:
+    sensors = max(ds.sizes.get("sensor", 0) for ds in campaigns)
+    if sensors > MOST_SENSORS:
+        raise DatasetError(f"Expected at most {MOST_SENSORS} temperature sensors; found {sensors}.")
+    values = sum(ds.sizes.get("time", 0) * max(1, ds.sizes.get("sensor", 0)) for ds in campaigns)
+    if values > MOST_VALUES:
+        raise DatasetError(
+            f"Expected at most {MOST_VALUES} temperatures (times by sensors) in all campaigns together; "
+            f"found {values}. Select every tenth time, or fewer sensors."
+        )
 
 
 def _check_alike(campaigns: Sequence[xr.Dataset]) -> None:

@@ -324,6 +324,8 @@ class Shdr(Driver):
         )
 
     def _start_session(self) -> None:
+        self._lines.clear()
+        self._memory.forget()  # of a session before
         self._fresh, self.heartbeat = True, math.inf
         self._update()
 
