@@ -47,7 +47,7 @@ class Cnc:
         await self.server.start()
 
     def run(self, work):
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result(20)
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(60)
 
     def set(self, name, value, *, bad=False):
         node = self.nodes[name]
