@@ -1,4 +1,4 @@
-"""Figures of ISO 230-2 side by side, of one axis without and with a compensation."""
+"""Figures of ISO 230-2 and ISO 230-3 side by side, without and with a compensation."""
 
 import pytest
 
@@ -6,6 +6,9 @@ from errormotion.compensation.effect import effect
 from errormotion.datasets.results.merit import figures_of
 from errormotion.methods.linear_positioning import LinearPositioning, Settings
 from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
+from errormotion.methods.spindle_drift import Settings as DriftSettings
+from errormotion.methods.spindle_drift import SpindleDrift
+from errormotion.methods.spindle_drift.simulation import simulate
 
 
 def test_figures_of_iso_230_2_stand_side_by_side() -> None:
@@ -25,3 +28,20 @@ def test_figures_of_iso_230_2_stand_side_by_side() -> None:
         (pair,) = [pair for key, pair in pairs.items() if key.split()[0] == name]
         assert pair.reduction.value == pytest.approx(0.8, abs=0.02)
         assert pair.reduction.low < pair.reduction.value < pair.reduction.high
+
+
+def test_ranges_of_iso_230_3_stand_side_by_side() -> None:
+    settings = DriftSettings(compensate_frame=False)
+    raw, _ = simulate(DriftSettings(duration=6000.0), 3)
+    first = raw["distance"].isel(time=0)
+    less = raw.assign(distance=(first + 0.2 * (raw["distance"] - first)).transpose(*raw["distance"].dims))
+    less["distance"].attrs = raw["distance"].attrs
+    before, after = (SpindleDrift().identify(each, settings) for each in (raw, less))
+    ranges = [figure for figure in figures_of(before) if "ISO 230-3" in figure.name]
+    pairs = {pair.name: pair for pair in effect(before, after).figures}
+    assert {figure.name.split()[0] for figure in ranges} >= {"d(X1)", "d(X2)", "d(Y1)", "d(Y2)", "d(Z)", "d(A)", "d(B)"}
+    for figure in ranges:
+        pair = pairs[figure.name]
+        assert pair.before == (figure.value, figure.expanded_uncertainty)
+        assert pair.reduction.low < 0.8 < pair.reduction.high
+        assert pair.reduction.value == pytest.approx(0.8, abs=0.1)
