@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from errormotion.errors import DatasetError
 from errormotion.report.drawings.turntable import Dots, Lines, Scene, draw, enlargement
@@ -25,9 +25,10 @@ FAINT = "#9aa5ad"
 
 @dataclass(frozen=True)
 class Drawing:
-    """A drawing in space as HTML, and what is to be read below it."""
+    """A drawing in space as HTML, its name for who does not see it, and what is to be read below it."""
 
     markup: Markup
+    label: str
     caption: str
 
 
@@ -91,9 +92,8 @@ def drawing(ds: xr.Dataset, point: Sequence[float] | None = None, select: Mappin
         f"dark: up to two thirds, red: above.{fewer}{unknown} Drag or use the arrow keys to turn, Ctrl and the wheel "
         "to zoom; point at a target for its errors with U (k = 2)."
     )
-    label = escape(f"Error vectors of {picked.size} targets in space; the longest is {1e6 * longest:.2f} µm")
-    made = draw(Scene(list(parts)), "space")
-    return Drawing(Markup(made.replace("data-scene=", f'data-label="{label}" data-scene=', 1)), caption)
+    label = f"Error vectors of {picked.size} targets in space; the longest is {1e6 * longest:.2f} µm"
+    return Drawing(Markup(draw(Scene(list(parts)), "space")), label, caption)
 
 
 def _box(places: np.ndarray) -> Lines:

@@ -25,6 +25,7 @@ from errormotion.instruments.thermometer import sensors
 
 HEAD = 'schema = "errormotion.bench/1"\nname = "Shop"\nmachine = "Mill 5"\n'
 TICK = 0.05
+CALM = 0.25  # s, of a test in which no reading may be late on a computer with other work
 
 
 def bench(*tables: str) -> BenchPlan:
@@ -106,7 +107,7 @@ def until(snapshots: Iterator, condition: Callable, limit: float = 20.0) -> obje
 
 def test_temperatures_and_parameters_are_logged_on_one_clock(tmp_path: Path) -> None:
     plan = bench(dcon("modules", "sim://cframe/t?seed=11&sensors=spindle_front,column"), CONTROL)
-    with Monitor(plan, tmp_path, TICK) as monitor:
+    with Monitor(plan, tmp_path, CALM) as monitor:
         snapshots = list(islice(monitor.watch(), 12))
     folder = RunFolder.open(monitor.folder.path)
     assert folder.finished
@@ -117,7 +118,7 @@ def test_temperatures_and_parameters_are_logged_on_one_clock(tmp_path: Path) -> 
         assert log.sizes["time"] == 12
         assert list(log.sensor.values) == ["spindle", "column"]
         np.testing.assert_allclose(log.time, [snapshot.time for snapshot in snapshots])
-        np.testing.assert_allclose(np.diff(log.time), TICK, atol=TICK)
+        np.testing.assert_allclose(np.diff(log.time), CALM, atol=CALM)
         np.testing.assert_allclose(log.temperature[-1], list(snapshots[-1].temperatures.values()))
         assert not log.gap.any()
         assert not log.temperature_flag.any()

@@ -27,6 +27,7 @@ from errormotion.testing.sessions import numbers
 pytestmark = pytest.mark.slow
 
 WAIT = 60  # s
+ROOM = 600  # s; a computer has room for one LinuxCNC, and other tests use it
 MOST_LINES = 4
 
 
@@ -65,8 +66,8 @@ CASES = {
     "keyence_ljx": Case(lines=1),
     "keyence_lk": Case(),
     "leica_emscon": Case(),
-    # a computer has room for one; the simulated machine takes any token
-    "linuxcnc": Case(("--set", "wait=60"), settings="token_file = 'token'"),
+    # the simulated machine takes any token
+    "linuxcnc": Case(("--set", f"wait={ROOM:g}"), settings="token_file = 'token'"),
     "modbus_temperature": Case(),
     "mtconnect": Case(),
     "leica_geocom": Case(),
@@ -106,7 +107,9 @@ def simulated(commands: Commands, plugin_id: str, *arguments: str) -> Iterator[t
                 line = process.stdout.readline()
                 assert line, process.communicate(timeout=WAIT)[1]
                 text += line
-            yield json.loads(text), port
+            printed = json.loads(text)
+            assert printed["ok"], printed
+            yield printed, port
             process.send_signal(signal.SIGTERM)
             rest, complaints = process.communicate(timeout=WAIT)
             assert (process.returncode, rest) == (0, "")
@@ -142,6 +145,7 @@ def test_every_simulated_instrument_is_here() -> None:
     assert simulated == set(CASES)
 
 
+@pytest.mark.timeout(2 * WAIT + ROOM)
 @pytest.mark.parametrize("plugin_id", CASES)
 def test_a_bench_with_the_printed_address_reads_a_device_in_another_process(
     plugin_id: str, commands: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

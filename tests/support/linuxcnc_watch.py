@@ -101,6 +101,13 @@ class Machine:
         """Return the offset of X that the limit in the servo thread gives, um."""
         return self.pins("errormotion-limit-x.out")[0] / MICROMETRE
 
+    def offsets(self) -> list[float]:
+        """Return the offset of X that the limit gives and, on the route of the planner, that the planner has applied, um."""
+        names = ["errormotion-limit-x.out"]
+        if self.compensated.route == "external":
+            names.append("axis.x.eoffset")
+        return [value / MICROMETRE for value in self.pins(*names)]
+
     def watch(self) -> None:
         """Begin another record."""
         for value in (1, 0):
