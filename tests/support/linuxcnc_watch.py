@@ -102,7 +102,7 @@ class Machine:
         return self.pins("errormotion-limit-x.out")[0] / MICROMETRE
 
     def offsets(self) -> list[float]:
-        """Return the offset of X that the limit gives and, on the route of the planner, that the planner has applied, um."""
+        """Return the offset of X that the limit gives, and that the planner of LinuxCNC has applied if it does, um."""
         names = ["errormotion-limit-x.out"]
         if self.compensated.route == "external":
             names.append("axis.x.eoffset")
