@@ -310,6 +310,13 @@ def test_validate_counts_the_mistakes_of_a_campaign_and_of_its_bench(answer: Ans
     assert answer("validate", "bench.toml", code=3)["violations"][0].startswith("machine.chain: expected every axis")
 
 
+def test_validate_does_not_take_another_file_for_a_bench(answer: Answer, tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text('schema = "errormotion.map/1"\n')
+    [found] = answer("validate", "map.toml", code=3)["violations"]
+    assert found.startswith("schema: expected that of a bench, a campaign or tolerances")
+    assert "found 'errormotion.map/1'" in found
+
+
 def test_every_command_has_h_o_and_words_of_the_field(run: Run) -> None:
     import typer
 

@@ -52,7 +52,15 @@ def test_moves_without_a_stated_feed_and_duration_are_counted(folder: Path) -> N
     assert (motions["rapid"], motions["untimed"], motions["seconds"]) == (366, 366, 0.0)
 
 
-@pytest.mark.parametrize("arguments", [["--dry-run"], ["virtual_beam/campaign.toml", "--out", "x"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--dry-run"],
+        ["virtual_beam", "--dry-run"],
+        ["virtual_beam/campaign.toml", "--dry-run", "--resume"],
+        ["virtual_beam/campaign.toml", "--out", "x"],
+    ],
+)
 def test_options_that_do_not_go_together_are_refused(folder: Path, arguments: list[str]) -> None:
     result = CliRunner().invoke(app, ["run", *arguments])
     assert result.exit_code == 2

@@ -10,7 +10,12 @@ from pydantic.fields import FieldInfo
 
 from errormotion.datasets.units import Quantity, format_quantity
 
-_USUAL_UNITS = {"m": ("mm", "um", "m"), "rad": ("arcsec", "deg"), "s": ("s", "min", "h", "ms"), "Hz": ("Hz", "kHz")}
+_USUAL_UNITS = {
+    "m": ("mm", "um", "m"),
+    "rad": ("arcsec", "mrad", "deg"),
+    "s": ("s", "min", "h", "ms"),
+    "Hz": ("Hz", "kHz"),
+}
 """Units that people use, by the inside unit; of two alike the first."""
 
 

@@ -9,7 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from errormotion.methods.spindle_drift.identification import averaging
-from errormotion.methods.spindle_drift.identification.averaging import Averager, join, slices, window_sums
+from errormotion.methods.spindle_drift.identification.averaging import (
+    Averager,
+    EvenTimes,
+    increases,
+    join,
+    slices,
+    values_of,
+    window_sums,
+)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -51,6 +59,35 @@ def test_means_do_not_depend_on_the_pieces(pieces, length):
     assert total - 500 * length - 1 <= expected.expected.sum() <= total
 
 
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.integers(1, 400), min_size=1, max_size=12),
+    st.floats(0.05, 0.5),
+    st.floats(-10.0, 1e5),
+    st.sampled_from([100.0, 1000.0, 2048.0, 20e3]),
+)
+def test_even_times_give_the_means_of_the_same_times_one_by_one(pieces, length, start, rate):
+    total = sum(pieces)
+    values = np.random.default_rng(total).normal(size=(2, total))
+    even, single = Averager(2, length), Averager(2, length)
+    found, expected = [], []
+    for first, last in pairwise(np.cumsum([0, *pieces])):
+        time = EvenTimes(start + first / rate, 1 / rate, int(last - first))
+        found.append(even.update(time, values[:, first:last]))
+        expected.append(single.update(values_of(time), values[:, first:last]))
+    ours, theirs = join([*found, even.finish()]), join([*expected, single.finish()])
+    np.testing.assert_array_equal(ours.count, theirs.count)
+    np.testing.assert_array_equal(ours.mean, theirs.mean)
+    np.testing.assert_allclose(ours.time, theirs.time, rtol=1e-14, atol=1e-12)
+
+
+def test_times_that_do_not_increase_are_seen():
+    assert increases(EvenTimes(0.0, 0.1, 5))
+    assert increases(np.array([0.0, 0.1]))
+    assert not increases(EvenTimes(0.0, 0.0, 5))
+    assert not increases(np.array([0.0, 0.2, 0.2]))
+
+
 def test_windows_follow_the_clock_and_not_the_samples():
     time = np.concatenate([np.arange(0, 1, 0.01), np.arange(5, 6, 0.01)])
     averager = Averager(1, 0.5)
@@ -82,5 +119,5 @@ def test_slices_take_the_time_from_a_rate_where_there_is_no_variable():
     raw = xr.Dataset(
         {"distance": (("channel", "time"), np.zeros((5, 7)))}, attrs={"sample_rate": 10.0, "time_start": 2.0}
     )
-    times = np.concatenate([time for time, _ in slices(raw)])
+    times = np.concatenate([values_of(time) for time, _ in slices(raw)])
     np.testing.assert_allclose(times, 2.0 + np.arange(7) / 10)

@@ -73,8 +73,8 @@ def run(
     if dry_run:
         from errormotion.cli.commands.campaigns import dry_run as dry
 
-        if campaign is None:
-            typer.echo("--dry-run: expected a campaign file.", err=True)
+        if campaign is None or resume or campaign.is_dir():
+            typer.echo("--dry-run: expected a campaign file, without --resume.", err=True)
             raise typer.Exit(USAGE)
         dry.run(campaign, out, json_)
         return

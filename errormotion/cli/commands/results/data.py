@@ -324,8 +324,13 @@ def _of_toml(file: Path) -> list[str]:
             load_campaign(file)
         elif schema.startswith("errormotion.tolerances/"):
             load_tolerances(file)
-        else:
+        elif schema.startswith("errormotion.bench/") or not schema:
             load_bench(file)
+        else:
+            return [
+                "schema: expected that of a bench, a campaign or tolerances, such as errormotion.bench/1; "
+                f"found {schema!r}. Another file is checked by the command that uses it."
+            ]
     except ErrormotionError as error:
         return _mistakes(str(error), file)
     return []

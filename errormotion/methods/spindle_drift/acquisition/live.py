@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
-from errormotion.methods.spindle_drift.identification.averaging import Averager, slices
+from errormotion.methods.spindle_drift.identification.averaging import Averager, first_and_last, slices
 from errormotion.methods.spindle_drift.identification.bar import end_point, fit_axis
 from errormotion.methods.spindle_drift.identification.uncertainty import State, twist
 from errormotion.methods.spindle_drift.schema import CHANNELS
@@ -38,7 +38,7 @@ class LiveDrift:
         """Add a chunk of the raw dataset; return the errors of its last known mean as a line of text."""
         for time, part in slices(chunk):
             if self._start is None:
-                self._start = float(time[0])
+                self._start, _ = first_and_last(time)
             found = self._averager.update(time, part["distance"].transpose("channel", "time").values)
             known = np.isfinite(found.mean).all(axis=0)
             reference_time = self._settings.reference_time

@@ -70,6 +70,70 @@ def _small_window_sums(values: NDArray[Any], edges: NDArray[np.int64]) -> tuple[
 
 
 @dataclass(frozen=True)
+class EvenTimes:
+    """Times at equal intervals, which are not stored: ``start + k * interval`` for sample k.
+
+    Attributes
+    ----------
+    start, interval : float
+        s.
+    size : int
+        Number of samples.
+    """
+
+    start: float
+    interval: float
+    size: int
+
+    def values(self) -> Array:
+        """Return the times, (sample,), s."""
+        return np.asarray(self.start + np.arange(self.size, dtype=np.float64) * self.interval)
+
+
+Times = Array | EvenTimes
+
+
+def values_of(time: Times) -> Array:
+    """Return times as an array (sample,), s."""
+    return time.values() if isinstance(time, EvenTimes) else time
+
+
+def first_and_last(time: Times) -> tuple[float, float]:
+    """Return the first and the last of some times, s."""
+    if isinstance(time, EvenTimes):
+        return time.start, time.start + (time.size - 1) * time.interval
+    return float(time[0]), float(time[-1])
+
+
+def increases(time: Times) -> bool:
+    """Return whether every time is later than the one before it."""
+    if isinstance(time, EvenTimes):
+        return time.interval > 0 or time.size < 2
+    return bool((time[1:] > time[:-1]).all())
+
+
+def _usual_interval(time: Times) -> float:
+    """Return the median of the first intervals, s."""
+    return time.interval if isinstance(time, EvenTimes) else float(np.median(np.diff(time[:1000])))
+
+
+def _first_samples(time: Times, bounds: Array) -> NDArray[np.int64]:
+    """Return the first sample at or after each bound."""
+    if isinstance(time, EvenTimes):
+        found = np.ceil((bounds - time.start) / time.interval)
+        return np.clip(found, 0, time.size).astype(np.int64)
+    return np.searchsorted(time, bounds)
+
+
+def _time_sums(time: Times, edges: NDArray[np.int64]) -> Array:
+    """Return the sum of the times between consecutive edges, s, relative to the first time: a day would cost digits."""
+    samples = np.diff(edges)
+    if isinstance(time, EvenTimes):
+        return np.asarray(0.5 * time.interval * samples * (edges[:-1] + edges[1:] - 1))
+    return np.asarray(np.add.reduceat(time - time[0], np.minimum(edges[:-1], time.size - 1)) * (samples > 0))
+
+
+@dataclass(frozen=True)
 class Averages:
     """Window means of a drift record.
 
@@ -111,34 +175,33 @@ class Averager:
         self._time = 0.0
         self._samples = 0
 
-    def update(self, time: Array, values: NDArray[np.floating[Any]]) -> Averages:
+    def update(self, time: Times, values: NDArray[np.floating[Any]]) -> Averages:
         """Add ``values`` (channel, sample) at ``time`` (sample,); return the windows that are now complete."""
         if time.size == 0:
             return self._averages([], [], [], [])
         if self._first is not None:
-            time, values = np.append(self._first[0], time), np.concatenate([self._first[1], values], axis=1)
+            time, values = np.append(self._first[0], values_of(time)), np.concatenate([self._first[1], values], axis=1)
             self._first = None
         if self._single is None:
             if time.size == 1:  # the interval of the samples is not known yet
-                self._first = time.copy(), values.copy()
+                self._first = values_of(time).copy(), values.copy()
                 return self._averages([], [], [], [])
-            self._start = float(time[0])
-            interval = float(np.median(np.diff(time[:1000])))
+            self._start = first_and_last(time)[0]
+            interval = _usual_interval(time)
             self._single = interval > 0.5 * self._length
             self._tolerance = 0.5 * interval / self._length
             self._full = self._length / interval
         if self._single:
-            return _samples_as_windows(time, values)
+            return _samples_as_windows(values_of(time), values)
         # The tolerance of half a sample covers the rounding of times that were written as decimals.
-        first = int(np.floor((time[0] - self._start) / self._length + self._tolerance))
-        last = int(np.floor((time[-1] - self._start) / self._length + self._tolerance))
-        bounds = self._start + (np.arange(first + 1, last + 1) - self._tolerance) * self._length
-        edges = np.concatenate([[0], np.searchsorted(time, bounds), [time.size]]).astype(np.int64)
+        start, end = first_and_last(time)
+        first = int(np.floor((start - self._start) / self._length + self._tolerance))
+        last = int(np.floor((end - self._start) / self._length + self._tolerance))
+        bounds = np.asarray(self._start + (np.arange(first + 1, last + 1) - self._tolerance) * self._length, np.float64)
+        edges = np.concatenate([[0], _first_samples(time, bounds), [time.size]]).astype(np.int64)
         sums, counts = window_sums(values, edges, self._threads)
         samples = np.diff(edges)
-        # Times are summed relative to the slice's first one: a day in seconds would cost digits.
-        moments = np.add.reduceat(time - time[0], np.minimum(edges[:-1], time.size - 1)) * (samples > 0)
-        times = moments + samples * time[0]
+        times = _time_sums(time, edges) + samples * start
         done_sum, done_count, done_time, done_samples = [], [], [], []
         for k in range(samples.size):
             if first + k != self._index:
@@ -193,7 +256,7 @@ def join(parts: list[Averages]) -> Averages:
     )
 
 
-def slices(raw: xr.Dataset) -> Iterator[tuple[Array, xr.Dataset]]:
+def slices(raw: xr.Dataset) -> Iterator[tuple[Times, xr.Dataset]]:
     """Yield (time, slice of the dataset) of a record along ``time``, a few tens of megabytes at a time.
 
     The time comes from the variable ``time``, or from the attributes ``sample_rate`` (Hz) and ``time_start`` (s).
@@ -204,18 +267,17 @@ def slices(raw: xr.Dataset) -> Iterator[tuple[Array, xr.Dataset]]:
     chunk = distance.encoding.get("preferred_chunks", {}).get("time", 1)
     if chunk > 1:
         step = max(1, step // chunk) * chunk
-    positions = np.arange(min(step, samples), dtype=np.float64)
     for first in range(0, samples, step):
         part = raw.isel(time=slice(first, first + step))
         clock = part.xindexes.get("time")
-        if isinstance(clock, RangeIndex):  # its own values, without its integers
-            time = positions[: part.sizes["time"]] * clock.step
-            time += clock.start
+        time: Times
+        if isinstance(clock, RangeIndex):
+            time = EvenTimes(float(clock.start), float(clock.step), part.sizes["time"])
         elif "time" in raw.variables:
             time = np.asarray(part["time"].values, np.float64)
         elif "sample_rate" in raw.attrs:
-            index = np.arange(first, min(first + step, samples))
-            time = float(raw.attrs.get("time_start", 0.0)) + index / float(raw.attrs["sample_rate"])
+            interval = 1.0 / float(raw.attrs["sample_rate"])
+            time = EvenTimes(float(raw.attrs.get("time_start", 0.0)) + first * interval, interval, part.sizes["time"])
         else:
             raise MethodError(
                 "The raw dataset has no time: expected a coordinate 'time' (s) or the attribute 'sample_rate' (Hz)."

@@ -7,6 +7,8 @@ scatter of the readings at steady speed beyond their noise.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +17,16 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.identification.averaging import Averager, Averages, join, slices
+from errormotion.methods.spindle_drift.identification.averaging import (
+    Averager,
+    Averages,
+    Times,
+    first_and_last,
+    increases,
+    join,
+    slices,
+    values_of,
+)
 from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
@@ -68,17 +79,16 @@ def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -
     slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
     scatter: Array | None = None
     last, done = -np.inf, 0
-    for time, part in slices(raw):
-        increasing = last < time[0] and (time[1:] > time[:-1]).all()
-        if not (increasing and np.isfinite(time[[0, -1]]).all()):
+    for time, part in _read_ahead(raw, ("distance", *slow)):
+        first, end = first_and_last(time)
+        if not (last < first and increases(time) and np.isfinite([first, end]).all()):
             raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
-        last = float(time[-1])
+        last = end
         read: dict[str, NDArray[Any]] = {}
-        for name in ("distance", *slow):
-            values = np.asarray(part[name].values)
+        for name, values in part.items():
             hasher.update(name, values, time=slice(done, done + time.size))
             # The axis is moved after reading: a lazy transposition reads sample by sample.
-            read[name] = np.moveaxis(values, part[name].get_axis_num("time"), -1)
+            read[name] = np.moveaxis(values, raw[name].get_axis_num("time"), -1)
         done += time.size
         readings = read["distance"] if order == [0, 1, 2, 3, 4] else read["distance"][order]
         parts.append(averager.update(time, readings))
@@ -86,11 +96,28 @@ def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -
             values = read[name].astype(np.float64)
             slow_parts[name].append(slow_averagers[name].update(time, values.reshape(-1, time.size)))
             if name == "spindle_speed" and scatter is None:
-                scatter = _scatter(time, readings, values, settings)
+                scatter = _scatter(values_of(time), readings, values, settings)
     parts.append(averager.finish())
     means = {name: join([*complete, slow_averagers[name].finish()]).mean for name, complete in slow_parts.items()}
     speed = means.get("spindle_speed")
     return Record(join(parts), means.get("temperature"), None if speed is None else speed[0], scatter)
+
+
+def _read_ahead(raw: xr.Dataset, names: tuple[str, ...]) -> Iterator[tuple[Times, dict[str, NDArray[Any]]]]:
+    """Yield (time, values of the variables) slice by slice, while the next slice is read."""
+
+    def read(part: xr.Dataset) -> dict[str, NDArray[Any]]:
+        return {name: np.asarray(part[name].values) for name in names}
+
+    with ThreadPoolExecutor(1, thread_name_prefix="read") as pool:
+        before: tuple[Times, Future[dict[str, NDArray[Any]]]] | None = None
+        for time, part in slices(raw):
+            coming = time, pool.submit(read, part)
+            if before is not None:
+                yield before[0], before[1].result()
+            before = coming
+        if before is not None:
+            yield before[0], before[1].result()
 
 
 def _scatter(time: Array, readings: NDArray[np.floating[Any]], speed: Array, settings: Settings) -> Array | None:
