@@ -57,6 +57,26 @@ def _name_and_version(dist: Distribution | None) -> str:
         return "unknown"
 
 
+def _with_plugins() -> Iterator[tuple[Distribution, str]]:
+    """Yield every distribution with entry points of ours, and the text that lists them.
+
+    The name of a distribution is parsed slowly, and is asked only of these.
+    """
+    seen: set[str] = set()
+    for dist in distributions():
+        text = dist.read_text("entry_points.txt") or ""
+        if "errormotion." not in text:
+            continue
+        name = _name_and_version(dist).partition(" ")[0]
+        if name == "unknown":
+            yield dist, text
+        elif name not in seen:
+            seen.add(name)
+            first = next(iter(distributions(name=name)), dist)  # of two copies the first on the path counts
+            if first.read_text("entry_points.txt") == text:
+                yield dist, text
+
+
 @cache
 def _found() -> Mapping[Group, tuple[EntryPoint, ...]]:
     """Read the entry points of every distribution.
@@ -64,17 +84,11 @@ def _found() -> Mapping[Group, tuple[EntryPoint, ...]]:
     Where a distribution's list cannot be read, an entry point without a value replaces it.
     """
     found: dict[Group, list[EntryPoint]] = {group: [] for group in GROUPS}
-    seen: set[str] = set()
-    for dist in distributions():
-        name = _name_and_version(dist).partition(" ")[0]
-        if name in seen:  # an older copy further down the path
-            continue
-        if name != "unknown":
-            seen.add(name)
+    for dist, text in _with_plugins():
         try:
             points = tuple(dist.entry_points)
         except Exception:  # noqa: BLE001 - a faulty list affects no other distribution
-            text = dist.read_text("entry_points.txt") or ""
+            name = _name_and_version(dist).partition(" ")[0]
             points = tuple(EntryPoint(name, "", f"errormotion.{group}") for group in GROUPS if group in text)
         for group in GROUPS:
             found[group].extend(point for point in points if point.group == f"errormotion.{group}")

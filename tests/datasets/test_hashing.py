@@ -1,9 +1,11 @@
 import hashlib
 import json
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import xarray as xr
+from blake3 import blake3
 
 from errormotion.datasets import hash_dataset, load, save
 from errormotion.datasets.files.hashing import LEAF, DatasetHasher, has_hash
@@ -25,7 +27,7 @@ def record(samples: int = 3 * LEAF + 777, seed: int = 0) -> xr.Dataset:
     )
 
 
-def defined(variable: xr.Variable) -> bytes:
+def defined(variable: xr.Variable, new: Callable) -> bytes:
     """The digests of the leaves of a numeric variable, as the definition says, value by value."""
     values = variable.values
     axis, inner = values.ndim, 1
@@ -33,11 +35,11 @@ def defined(variable: xr.Variable) -> bytes:
         axis -= 1
         inner *= values.shape[axis]
     if axis == 0:
-        return hashlib.sha256(values.tobytes()).digest() if values.size else b""
+        return new(values.tobytes()).digest() if values.size else b""
     rows = values.reshape(-1, values.shape[axis - 1], inner)
     step = LEAF // inner
     leaves = [row[k : k + step] for row in rows for k in range(0, row.shape[0], step)]
-    return b"".join(hashlib.sha256(leaf.tobytes()).digest() for leaf in leaves)
+    return b"".join(new(leaf.tobytes()).digest() for leaf in leaves)
 
 
 @pytest.mark.parametrize(
@@ -57,12 +59,15 @@ def defined(variable: xr.Variable) -> bytes:
     ],
 )
 @pytest.mark.parametrize("dtype", ["<f4", "<f8", "<u2"])
-def test_the_hash_is_the_one_that_is_defined(shape, dtype) -> None:
+@pytest.mark.parametrize(("form", "new"), [("blake3-tree", blake3), ("sha256-tree", hashlib.sha256)])
+def test_the_hash_is_the_one_that_is_defined(shape, dtype, form, new) -> None:
     values = np.random.default_rng(1).integers(0, 1000, shape).astype(dtype)
     ds = xr.Dataset({"a": ([f"d{k}" for k in range(len(shape))], values)}, attrs={"machine": "m"})
     lines = [["attributes", {"machine": "m"}], ["a", list(ds["a"].dims), list(shape), dtype, {}]]
     text = "".join(json.dumps(line) + "\n" for line in lines).encode()
-    assert hash_dataset(ds) == "sha256-tree:" + hashlib.sha256(text + defined(ds["a"].variable)).hexdigest()
+    assert hash_dataset(ds, form) == f"{form}:" + new(text + defined(ds["a"].variable, new)).hexdigest()
+    assert has_hash(ds, hash_dataset(ds, form))
+    assert hash_dataset(ds).startswith("blake3-tree:")
 
 
 @pytest.mark.parametrize("step", [LEAF, 2 * LEAF, 1000, LEAF + 1, 10**6])
@@ -129,7 +134,7 @@ def test_a_hash_of_the_first_form_is_still_recognised() -> None:
     assert has_hash(ds, hash_dataset(ds))
     assert not has_hash(large, stored)
     assert not has_hash(ds, "md5:0")
-    with pytest.raises(DatasetError, match="'md5' is unknown; expected one of sha256-tree, sha256"):
+    with pytest.raises(DatasetError, match="'md5' is unknown; expected one of blake3-tree, sha256-tree, sha256"):
         hash_dataset(ds, "md5")
 
 

@@ -114,6 +114,17 @@ def test_two_distributions_that_claim_one_id_are_both_named(install):
         plugins.get("instruments", "good")
 
 
+def test_of_two_copies_the_first_on_the_path_counts_even_without_plugins(install, tmp_path, monkeypatch):
+    install("copied", instrument("copied_sensor", "copied:Good"), GOOD.format(id="copied_sensor"))
+    assert "copied_sensor" in by_id()
+    first = tmp_path / "first" / "copied-1.3.dist-info"
+    first.mkdir(parents=True)
+    (first / "METADATA").write_text("Metadata-Version: 2.1\nName: copied\nVersion: 1.3\n")
+    monkeypatch.syspath_prepend(first.parent)
+    plugins.refresh()
+    assert "copied_sensor" not in by_id()
+
+
 def test_an_unknown_id_names_the_nearest():
     with pytest.raises(PluginError, match=r"Did you mean 'optoncdt'\?"):
         plugins.get("instruments", "optonct")

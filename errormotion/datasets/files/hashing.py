@@ -1,17 +1,18 @@
 """The hash of a dataset: of its names, attributes and values, whatever the file format.
 
-The form ``sha256-tree`` is a SHA-256 over, in this order,
+The form ``blake3-tree`` is a BLAKE3 hash over, in this order,
 
 * ``["attributes", {...}]``, as a line of JSON with sorted keys;
-* for each variable, sorted by name: ``[name, dims, shape, type, attributes]``, as such a line, then the SHA-256 digests
+* for each variable, sorted by name: ``[name, dims, shape, type, attributes]``, as such a line, then the BLAKE3 digests
   of its leaves, 32 bytes each.
 
 A leaf is a run of values in C order, little-endian, with one bit pattern for NaN. The last axes that together hold at
 most `LEAF` values stay whole, the axis before them is divided into pieces of as many indices as fit, and each index of
 the axes before that one has leaves of its own. Texts are one leaf: a JSON list.
 
-Leaves are hashed side by side in threads, in any order, from parts that are read once. The form ``sha256`` of earlier
-versions is one SHA-256 over all values in turn; it is kept to compare a dataset with a hash that was stored then.
+Leaves are hashed side by side in threads, in any order, from parts that are read once. Two forms of earlier versions
+are kept to compare a dataset with a hash that was stored then: ``sha256-tree``, the same with SHA-256, and ``sha256``,
+one SHA-256 over all values in turn.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from typing import Any, Self
 
 import numpy as np
 import xarray as xr
+from blake3 import blake3
 from pydantic import BaseModel
 from xarray.indexes import RangeIndex
 
@@ -35,7 +37,8 @@ from errormotion.errors import DatasetError
 LEAF = 2**16
 """Most values of one leaf; part of the form's definition."""
 
-_FORMS = ("sha256-tree", "sha256")
+_TREES: dict[str, Any] = {"blake3-tree": blake3, "sha256-tree": hashlib.sha256}
+_FORMS = (*_TREES, "sha256")
 _TILE = 2**25  # bytes read at a time
 _PENDING = 2**26  # bytes that wait to be hashed
 _TASK = 2**21  # bytes that one thread hashes in a row
@@ -59,7 +62,7 @@ def plain(value: Any) -> Any:
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
-def hash_dataset(ds: xr.Dataset, form: str = "sha256-tree") -> str:
+def hash_dataset(ds: xr.Dataset, form: str = "blake3-tree") -> str:
     """Return the hash of a dataset's names, dimensions, attributes and values.
 
     Memory stays constant however large the dataset; file format, chunks, byte order and the width of texts do not
@@ -69,7 +72,7 @@ def hash_dataset(ds: xr.Dataset, form: str = "sha256-tree") -> str:
     ----------
     ds : Dataset
     form : str
-        ``sha256-tree``; or ``sha256``, the form of earlier versions.
+        ``blake3-tree``; or ``sha256-tree`` or ``sha256``, the forms of earlier versions.
 
     Returns
     -------
@@ -85,7 +88,7 @@ def hash_dataset(ds: xr.Dataset, form: str = "sha256-tree") -> str:
         return _first_form(ds)
     if form not in _FORMS:
         raise DatasetError(f"The form of hash '{form}' is unknown; expected one of {', '.join(_FORMS)}")
-    with DatasetHasher(ds) as hasher:
+    with DatasetHasher(ds, form) as hasher:
         return hasher.value()
 
 
@@ -96,13 +99,13 @@ def has_hash(ds: xr.Dataset, stored: str) -> bool:
 
 
 class DatasetHasher:
-    """The hash of a dataset in the form ``sha256-tree``, from parts as they are read for another purpose.
+    """The hash of a dataset in the form of a tree, from parts as they are read for another purpose.
 
     What is not handed over, or not in order, is read by `value`. To be used as a context manager.
     """
 
-    def __init__(self, ds: xr.Dataset) -> None:
-        self._ds = ds
+    def __init__(self, ds: xr.Dataset, form: str = "blake3-tree") -> None:
+        self._ds, self._form, self._new = ds, form, _TREES[form]
         self._pool = ThreadPoolExecutor(_cores(), thread_name_prefix="hash")
         self._queue: deque[tuple[Future[None], int]] = deque()
         self._pending = 0
@@ -132,22 +135,22 @@ class DatasetHasher:
             self._hash(leaves, starts, values)
 
     def value(self) -> str:
-        """Return ``sha256-tree:...``; reads what was not handed over."""
-        digest = hashlib.sha256(_line("attributes", _canonical(self._ds.attrs)))
+        """Return ``form:digest``; reads what was not handed over."""
+        digest = self._new(_line("attributes", _canonical(self._ds.attrs)))
         for name in sorted(map(str, self._ds.variables)):
             if isinstance(self._ds.xindexes.get(name), RangeIndex):
                 continue
             variable = self._ds.variables[name]
             digest.update(_header(name, variable))
             if _is_text(variable):
-                digest.update(hashlib.sha256(_texts(variable)).digest())
+                digest.update(self._new(_texts(variable)).digest())
                 continue
             leaves = self._leaves.get(name) or _Leaves(variable)
             if not leaves.complete:
                 leaves = self._read(variable)
             self._wait(0)
             digest.update(leaves.digests.tobytes())
-        return f"sha256-tree:{digest.hexdigest()}"
+        return f"{self._form}:{digest.hexdigest()}"
 
     def _read(self, variable: xr.Variable) -> _Leaves:
         leaves = _Leaves(variable)
@@ -158,9 +161,10 @@ class DatasetHasher:
 
     def _hash(self, leaves: _Leaves, starts: Sequence[int], values: np.ndarray) -> None:
         self._wait(_PENDING - values.nbytes)
-        for run, out in leaves.take(starts, values):
-            self._queue.append((self._pool.submit(_hash_run, run, leaves.piece, out), run.nbytes))
-            self._pending += run.nbytes
+        for runs, out in leaves.take(starts, values):
+            size = sum(run.nbytes for run in runs)
+            self._queue.append((self._pool.submit(_hash_leaves, runs, leaves.piece, out, self._new), size))
+            self._pending += size
 
     def _wait(self, most: int) -> None:
         """Wait until at most so many bytes are pending."""
@@ -197,7 +201,7 @@ class _Leaves:
         self._rows = np.arange(math.prod(self.shape[:axis])).reshape(self.shape[:axis])
         self.digests = np.empty((self._rows.size, -(-self._length // self.piece), 32), np.uint8)
         self._done = np.zeros(self._rows.size, np.int64)
-        self._open: dict[int, Any] = {}
+        self._open: dict[int, list[np.ndarray]] = {}
 
     @property
     def complete(self) -> bool:
@@ -209,34 +213,35 @@ class _Leaves:
         whole = self.shape[self._axis + 1 :] == tuple(shape[self._axis + 1 :])
         return whole and bool(np.all(self._done[self._within(starts, shape)] == starts[self._axis]))
 
-    def take(self, starts: Sequence[int], values: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield runs of whole leaves with the digests to fill; hash what is less than a leaf at once."""
+    def take(self, starts: Sequence[int], values: np.ndarray) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+        """Yield the values of whole leaves with the digests to fill; keep what is less than a leaf for the next part.
+
+        The values are one run of several leaves, or several runs that make one leaf.
+        """
         starts, shape = (0, *starts), (1, *values.shape)
-        start = starts[self._axis]
-        block = values.reshape(-1, shape[self._axis], *values.shape[self._axis :])
-        count = shape[self._axis]
+        start, count = starts[self._axis], shape[self._axis]
+        block = values.reshape(-1, count, *values.shape[self._axis :])
         for row, run in zip(self._within(starts, shape).ravel(), block, strict=True):
             first = min(-start % self.piece, count)
             last = first + (count - first) // self.piece * self.piece
-            self._part(row, start, run[:first])
+            yield from self._part(row, start, run[:first])
             step = max(1, _TASK // (self.piece * self._inner * values.itemsize)) * self.piece
             for k in range(first, last, step):
                 leaf = (start + k) // self.piece
                 task = run[k : min(k + step, last)]
-                yield task, self.digests[row, leaf : leaf + len(task) // self.piece]
-            self._part(row, start + last, run[last:])
+                yield [task], self.digests[row, leaf : leaf + len(task) // self.piece]
+            yield from self._part(row, start + last, run[last:])
             self._done[row] = start + count
 
-    def _part(self, row: int, start: int, values: np.ndarray) -> None:
+    def _part(self, row: int, start: int, values: np.ndarray) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
         if not len(values):
             return
-        digest = self._open.pop(row, None) or hashlib.sha256()
-        digest.update(_bytes(values))
-        end = start + len(values)
+        runs, end = [*self._open.pop(row, []), values], start + len(values)
         if end % self.piece == 0 or end == self._length:
-            self.digests[row, start // self.piece] = np.frombuffer(digest.digest(), np.uint8)
+            leaf = start // self.piece
+            yield runs, self.digests[row, leaf : leaf + 1]
         else:
-            self._open[row] = digest
+            self._open[row] = runs
 
     def _within(self, starts: Sequence[int], shape: Sequence[int]) -> np.ndarray:
         """Return the numbers of the rows of a part."""
@@ -244,9 +249,12 @@ class _Leaves:
         return np.asarray(self._rows[window[: self._axis]])
 
 
-def _hash_run(run: np.ndarray, piece: int, out: np.ndarray) -> None:
+def _hash_leaves(runs: list[np.ndarray], piece: int, out: np.ndarray, new: Any) -> None:
     for k in range(len(out)):
-        out[k] = np.frombuffer(hashlib.sha256(_bytes(run[k * piece : (k + 1) * piece])).digest(), np.uint8)
+        digest = new()
+        for run in runs:
+            digest.update(_bytes(run[k * piece : (k + 1) * piece]))
+        out[k] = np.frombuffer(digest.digest(), np.uint8)
 
 
 def _tiles(variable: xr.Variable, axis: int) -> Iterator[tuple[slice, ...]]:
