@@ -43,5 +43,12 @@ def test_a_run_is_a_tree_of_its_datasets(tmp_path: Path) -> None:
     assert list(tree) == ["raw", "errors"]
     xr.testing.assert_identical(tree["errors"].to_dataset(), errors())
     assert tree["errors"].to_dataset().em.names[0] == "EX"
+    with xr.open_datatree(run, engine="errormotion") as opened:
+        assert (opened.name, opened.attrs["machine"], list(opened)) == ("run-1", "M", ["raw", "errors"])
+        xr.testing.assert_identical(opened["errors"].to_dataset(), errors())
+    with xr.open_groups(run, engine="errormotion")["/raw"] as raw:
+        assert raw["distance"].values.tolist() == [1.0]
     with pytest.raises(RunError, match=r"run\.json"):
         open_run(tmp_path)
+    with pytest.raises(RunError, match=r"run\.json"):
+        xr.open_datatree(tmp_path, engine="errormotion")
