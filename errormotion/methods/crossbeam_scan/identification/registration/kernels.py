@@ -7,8 +7,8 @@ number of threads. The threads are Python's and not numba's: code for these take
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -54,12 +54,12 @@ def in_threads(work: Callable[..., Any], rows: int, blocks: int, *given: Any) ->
         Further arguments.
     """
     limits = np.linspace(0, rows, min(threads() if blocks > MANY else 1, rows) + 1).astype(int).tolist()
-    others = [Thread(target=work, args=(*given, *part)) for part in pairwise(limits[1:])]
-    for thread in others:
-        thread.start()
-    work(*given, *limits[:2])
-    for thread in others:
-        thread.join()
+    own, *others = pairwise(limits)
+    with ThreadPoolExecutor(max(len(others), 1)) as pool:  # starts no thread before there is work for it
+        running = [pool.submit(work, *given, *part) for part in others]
+        work(*given, *own)
+        for each in running:
+            each.result()
 
 
 def threads() -> int:
