@@ -53,6 +53,8 @@ TURN_INTERVAL = 0.2
 """Of the look whether another program wants the instruments, s."""
 RECORD_INTERVAL = 1.0
 """Shortest time from one look into the record of another program to the next, s."""
+EMERGENCY_STOP = "emergency stop"
+"""The alarm; controllers with alarms of their own may state it too."""
 OLDEST_SAMPLE = 5.0
 """Time without a new sample after which the last one is no present value, s."""
 _FIELD = {"m": ("mm", 1e3), "rad": ("arcsec", 3600 * 180 / math.pi), "degC": ("°C", 1.0), "1": ("", 1.0)}
@@ -220,8 +222,8 @@ class Watch:
         temperatures, parameters = self._quantities(_row(last, self.units), last.flags)
         alarms = last.state.get("alarms") or ()
         alarms = alarms if isinstance(alarms, list | tuple) else (alarms,)
-        if last.state.get("estop") is True:
-            alarms = ("emergency stop", *alarms)
+        if last.state.get("estop") is True and EMERGENCY_STOP not in alarms:
+            alarms = (EMERGENCY_STOP, *alarms)
         return Present(
             self._start_time() + timedelta(seconds=self._shift + last.time),
             running,
@@ -259,7 +261,7 @@ class Watch:
             temperatures,
             parameters,
             program=_text(found.program),
-            alarms=("emergency stop",) if found.estop else (),
+            alarms=(EMERGENCY_STOP,) if found.estop else (),
             lent=words[:1].upper() + words[1:],
             recorded=others,
         )

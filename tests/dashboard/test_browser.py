@@ -136,6 +136,16 @@ def _shows_the_same(page: Any, address: str) -> None:
     other.close()
 
 
+def test_the_emergency_stop_of_a_controller_is_shown(page: Any, serving: Callable[..., Any], tmp_path: Path) -> None:
+    bench = tmp_path / "bench.toml"
+    stopped = "controller?seed=3&clock=60&fault=estop&fault_at=30"
+    bench.write_text(BENCH.replace("{markup}", "").replace("controller?seed=3&clock=60", stopped))
+    page.goto(serving(tmp_path / "runs", bench=bench, interval=0.5).address)
+    page.wait_for_selector(".tiles li.answers:has-text('control')")
+    assert page.inner_text("#alarms") == ""
+    sync_api.expect(page.locator("#alarms")).to_have_text("Alarm: emergency stop")
+
+
 def test_two_results_are_compared(
     page: Any, accessible: Callable[[], None], serving: Callable[..., Any], pair_of_runs: tuple[Path, list[str]]
 ) -> None:

@@ -87,6 +87,8 @@ def test_an_emergency_stop_is_an_alarm(make: Callable[..., Watch]) -> None:
     watch = make(start=False)
     watch._take(Snapshot(0.0, {}, {}, {"estop": True, "alarms": ["door <b>open</b>"]}, {}, 1))
     assert watch.present().alarms == ("emergency stop", "door <b>open</b>")
+    watch._take(Snapshot(1.0, {}, {}, {"estop": True, "alarms": ["emergency stop"]}, {}, 2))
+    assert watch.present().alarms == ("emergency stop",)
 
 
 def test_a_monitor_that_ends_says_why(make: Callable[..., Watch], tmp_path: Path) -> None:
