@@ -12,8 +12,8 @@ import logging
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -187,7 +187,10 @@ def resume(
             log.warning("skipped: %s", skipped[-1])
             continue
         session = _Session(plan, runs, run_id, progress, ask, report)
-        return session.work({str(folder.data["test"]): folder for folder in folders})
+        with folders[0].locked():  # one process at a time continues a campaign
+            for reason in skipped:
+                session.progress.announce(f"skipped: {reason}")
+            return session.work({str(folder.data["test"]): folder for folder in _as_it_is(runs, run_id, folders)})
     if changed and campaign:
         raise RunError(
             f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Continue with the "
@@ -195,6 +198,35 @@ def resume(
         )
     message = f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished."
     raise RunError("\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]))
+
+
+def _as_it_is(runs: Path, run_id: str, known: Sequence[RunFolder]) -> list[RunFolder]:
+    """Return the run folders of a campaign, read again: another process may have continued it meanwhile.
+
+    Raises
+    ------
+    RunError
+        One of them cannot be read: its test would be measured again.
+    """
+    found = {folder.path: folder for folder in known}
+    unreadable = []
+    for path in sorted({*found, *(path for path in runs.iterdir() if _belongs(path, run_id))}):
+        try:
+            found.setdefault(path, RunFolder.open(path)).read()
+        except RunError as error:
+            unreadable.append(str(error))
+    if unreadable:
+        what = (
+            "The campaign cannot be continued, since a run folder of it cannot be read. Restore its run.json from a "
+            f"copy, or move the folder out of {runs} to measure its test again:"
+        )
+        raise RunError("\n  - ".join([what, *unreadable]))
+    return list(found.values())
+
+
+def _belongs(path: Path, run_id: str) -> bool:
+    """Return whether a path has the name of a run folder of this campaign."""
+    return bool(run_id) and path.name.endswith(f"-{run_id}") and not path.name.startswith(".") and path.is_dir()
 
 
 class _Session:
@@ -235,7 +267,8 @@ class _Session:
                     folder = folders[test.name] = self._new_folder(test)
                 self.records(folder.path)
                 self.progress.test(test.name, folder.path, number, len(self.campaign.tests))
-                with folder.locked(), journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
+                opened.enter_context(folder.locked())  # to the end: nobody continues the campaign between two tests
+                with journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
                     self._test(folder, test, folders)
         return [folders[test.name] for test in self.campaign.tests]
 
@@ -351,15 +384,16 @@ class _Session:
                     if note:
                         self.progress.note(note(chunk))
         finally:
-            if recorder.committed == 0 and folder.raw.exists():  # created, but without samples
-                shutil.rmtree(folder.raw)
-            folder.give_reserve()
             folder.data["samples"] = {
                 "dim": dim,
                 "count": recorder.committed,
                 "dropped": recorder.attrs.get("dropped", 0),
                 "invalid": json.loads(recorder.attrs.get("invalid", "{}")),
             }
+            with suppress(OSError):  # of a disk that takes no more changes: the recorder states the cause
+                if recorder.committed == 0 and folder.raw.exists():  # created, but without samples
+                    shutil.rmtree(folder.raw)
+                folder.give_reserve()
         if recorder.committed == 0:
             raise RunError(f"The method '{method.info.id}' yielded no data.")
         folder.step("acquire", "done", samples=recorder.committed)
