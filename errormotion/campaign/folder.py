@@ -296,10 +296,13 @@ def now() -> str:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text file under a temporary name, synchronise it to disk, and rename it."""
+    """Write a text file under a temporary name, synchronise it to disk, and rename it; an OSError names the file."""
     part = path.with_name(f"{path.name}.part")
-    with part.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    try:
+        with part.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
