@@ -34,6 +34,7 @@ from errormotion.campaign.storage.store import committed_length
 from errormotion.campaign.turns import claimed
 from errormotion.datasets import provenance
 from errormotion.datasets.certificates import ATTRIBUTE
+from errormotion.datasets.clock import noted
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
@@ -190,7 +191,7 @@ def resume(
         with folders[0].locked():  # one process at a time continues a campaign
             for reason in skipped:
                 session.progress.announce(f"skipped: {reason}")
-            return session.work({str(folder.data["test"]): folder for folder in _as_it_is(runs, run_id, folders)})
+            return session.work(_as_it_is(runs, run_id, folders, [test.name for test in plan.tests]))
     if changed and campaign:
         raise RunError(
             f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Continue with the "
@@ -200,28 +201,37 @@ def resume(
     raise RunError("\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]))
 
 
-def _as_it_is(runs: Path, run_id: str, known: Sequence[RunFolder]) -> list[RunFolder]:
-    """Return the run folders of a campaign, read again: another process may have continued it meanwhile.
+def _as_it_is(runs: Path, run_id: str, known: Sequence[RunFolder], tests: Sequence[str]) -> dict[str, RunFolder]:
+    """Return the run folders of a campaign by their tests, read again: another process may have continued it meanwhile.
 
     Raises
     ------
     RunError
-        One of them cannot be read: its test would be measured again.
+        It is not clear which test a run folder is of: this test would be measured again.
     """
-    found = {folder.path: folder for folder in known}
-    unreadable = []
-    for path in sorted({*found, *(path for path in runs.iterdir() if _belongs(path, run_id))}):
+    by_path = {folder.path: folder for folder in known}
+    found: dict[str, RunFolder] = {}
+    unclear = []
+    for path in sorted({*by_path, *(path for path in runs.iterdir() if _belongs(path, run_id))}):
         try:
-            found.setdefault(path, RunFolder.open(path)).read()
+            folder = by_path.get(path) or RunFolder.open(path)
+            folder.read()
         except RunError as error:
-            unreadable.append(str(error))
-    if unreadable:
+            unclear.append(str(error))
+            continue
+        test = str(folder.data["test"])
+        if test not in tests:
+            unclear.append(f"{path / 'run.json'}: test: expected one of {', '.join(tests)}; found {test!a:.100}")
+        elif test in found:
+            unclear.append(f"{path} and {found[test].path} are of the same test, {test!r}")
+        found.setdefault(test, folder)
+    if unclear:
         what = (
-            "The campaign cannot be continued, since a run folder of it cannot be read. Restore its run.json from a "
-            f"copy, or move the folder out of {runs} to measure its test again:"
+            "The campaign cannot be continued: it is not clear which of its tests were measured. Restore run.json from "
+            f"a copy, or move the folder out of {runs} to measure its test again:"
         )
-        raise RunError("\n  - ".join([what, *unreadable]))
-    return list(found.values())
+        raise RunError("\n  - ".join([what, *unclear]))
+    return found
 
 
 def _belongs(path: Path, run_id: str) -> bool:
@@ -420,7 +430,7 @@ class _Session:
             errors = datasets.load(folder.path / path)
         else:
             with datasets.load(folder.raw) as raw, explained(folder.raw, raw):
-                errors = method.identify(raw, test.settings)
+                errors = noted(method.identify(raw, test.settings), raw)
             datasets.validate(errors)
             (folder.path / path).parent.mkdir(parents=True, exist_ok=True)
             datasets.save(errors, folder.path / path)

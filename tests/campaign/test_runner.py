@@ -285,19 +285,36 @@ def test_a_campaign_that_another_process_has_finished_meanwhile_is_left_as_it_is
         assert [step["outcome"] for step in folder.data["steps"] if step["step"] == "acquire"].count("done") == 1
 
 
-@pytest.mark.parametrize("text", ["", None])
-def test_a_test_is_not_measured_again_because_its_record_cannot_be_read(
-    plan: Plan, tmp_path: Path, text: str | None
+def _unlink(file: Path) -> None:
+    file.unlink()
+
+
+def _empty(file: Path) -> None:
+    file.write_text("")
+
+
+def _rename_test(file: Path) -> None:
+    file.write_text(file.read_text().replace('"test": "a"', '"test": "x"'))
+
+
+def _copy(file: Path) -> None:
+    shutil.copytree(file.parent, file.parent.with_name(f"copy-{file.parent.name}"))
+
+
+@pytest.mark.parametrize("damage", [_unlink, _empty, _rename_test, _copy])
+def test_a_test_is_not_measured_again_because_its_record_is_damaged(
+    plan: Plan, tmp_path: Path, damage: Callable[[Path], None]
 ) -> None:
     with pytest.raises(RunError, match="Test 'b' failed"):
         runner.run(plan('name = "a"', f'name = "b"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}'))
     (tmp_path / "needed").touch()
     first = list_runs(tmp_path / "runs")[0].path
     stated = (first / "run.json").read_text()
-    (first / "run.json").unlink() if text is None else (first / "run.json").write_text(text)
-    with pytest.raises(RunError, match=rf"a run folder of it cannot be read(.|\n)*{first.name}"):
+    damage(first / "run.json")
+    with pytest.raises(RunError, match=rf"not clear which of its tests were measured(.|\n)*{first.name}"):
         runner.resume(runs=tmp_path / "runs")
     assert len(list(tmp_path.glob("runs/2*"))) == 2
+    shutil.rmtree(tmp_path / "runs" / f"copy-{first.name}", ignore_errors=True)
     (first / "run.json").write_text(stated)
     assert first.name in [folder.path.name for folder in runner.resume(runs=tmp_path / "runs")]
 
