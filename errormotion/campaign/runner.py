@@ -538,21 +538,24 @@ def _continuation(folder: RunFolder) -> str:
 
 @contextmanager
 def _in_order() -> Iterator[None]:
-    """Let the first Ctrl-C stop the measurement; ignore further ones while the last samples are written."""
+    """Let the first Ctrl-C or request to end stop the measurement; ignore more until the last samples are written."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.getsignal(signal.SIGINT)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def stop(*_: Any) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for number in before:
+            signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, stop)
+    for number in before:
+        signal.signal(number, stop)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def results_of(errors: xr.Dataset) -> list[dict[str, Any]] | None:

@@ -6,7 +6,9 @@ import json
 import logging
 import os
 import shutil
+import signal
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -234,6 +236,43 @@ def test_whoever_only_looks_at_a_lock_does_not_hold_it_against_a_run(plan: Plan,
     timer.start()
     with RunFolder.open(folder.path).locked():
         timer.join()
+
+
+class Impatient(runner.Quiet):
+    """An operator who stops the run at its first samples."""
+
+    def advance(self, done: float) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_request_to_end_does_not_lose_the_last_samples(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, second: signal.Signals
+) -> None:
+    commit = RawStore.commit
+
+    def slowly(self: RawStore) -> None:
+        time.sleep(0.2)
+        if self.count:
+            os.kill(os.getpid(), second)
+            time.sleep(0.2)
+        commit(self)
+
+    def end(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, end)  # as the command line does
+    monkeypatch.setattr(RawStore, "commit", slowly)
+    try:
+        with pytest.raises(KeyboardInterrupt) as caught:
+            runner.run(plan('name = "a"\nsettings = {count = 4000}', bench='rate = "1 kHz"'), progress=Impatient())
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    (folder,) = list_runs(tmp_path / "runs")
+    count = folder.data["samples"]["count"]
+    assert count > 0
+    assert f"{count} samples are stored in" in str(caught.value)
+    whole(folder, count)
 
 
 class Nobody(runner.Quiet):
