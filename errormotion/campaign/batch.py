@@ -26,6 +26,7 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.runner import Progress, Quiet, settings_hash
 from errormotion.campaign.storage.raw_paths import is_runs_folder, raw_of
 from errormotion.datasets import provenance
+from errormotion.datasets.clock import noted
 from errormotion.datasets.files.hashing import has_hash
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.validation import explained
@@ -291,7 +292,7 @@ def _identify_or_raise(task: Task) -> bool:
                 "a result is never overwritten; specify another folder with --out"
             )
         with _turn if one_thread_at_a_time() else nullcontext(), explained(task.raw, dataset):
-            errors = method().identify(dataset, settings)
+            errors = noted(method().identify(dataset, settings), dataset)
         mark = {"raw": datasets.hash_dataset(dataset), "settings": settings_mark}
     datasets.validate(errors)
     with _local_locks():

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -21,6 +22,9 @@ from errormotion.errors import RunError
 
 RESERVE_BYTES = 2**18
 """Reserved during a measurement and released at its end, so that run.json and the log fit on a full disk, bytes."""
+
+LOOK_DURATION = 0.2
+"""Time for which whoever only looks may hold a lock, s; beyond it another process works on the run."""
 
 log = logging.getLogger(__name__)
 
@@ -92,6 +96,7 @@ class RunFolder:
     def __init__(self, path: Path, data: dict[str, Any]) -> None:
         self.path = path
         self.data = data
+        self._is_locked = False
 
     @classmethod
     def create(cls, runs: Path, test: str, run_id: str, data: dict[str, Any]) -> Self:
@@ -127,6 +132,16 @@ class RunFolder:
         """
         path = Path(path)
         return cls(path, read_run(path))
+
+    def read(self) -> None:
+        """Read ``run.json`` again.
+
+        Raises
+        ------
+        RunError
+            It is damaged, or gone.
+        """
+        self.data = read_run(self.path)
 
     def save(self, **changes: Any) -> None:
         """Change fields of ``run.json`` and write the file.
@@ -210,7 +225,7 @@ class RunFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder against other processes; the lock ends with the process.
+        """Lock the folder against other processes, once; the lock ends with the process.
 
         Raises
         ------
@@ -222,16 +237,25 @@ class RunFolder:
         except ImportError:  # Windows: no lock
             yield
             return
+        if self._is_locked:
+            yield
+            return
         descriptor = os.open(self.path, os.O_RDONLY)
         try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise RunError(
-                    f"{self.path}: another process is working on this run; wait until it ends, or stop it"
-                ) from error
+            end = time.monotonic() + LOOK_DURATION
+            while not self._is_locked:
+                try:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    self._is_locked = True
+                except BlockingIOError as error:
+                    if time.monotonic() > end:
+                        raise RunError(
+                            f"{self.path}: another process is working on this run; wait until it ends, or stop it"
+                        ) from error
+                    time.sleep(LOOK_DURATION / 10)
             yield
         finally:
+            self._is_locked = False
             os.close(descriptor)
 
 
@@ -272,10 +296,13 @@ def now() -> str:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text file under a temporary name, synchronise it to disk, and rename it."""
+    """Write a text file under a temporary name, synchronise it to disk, and rename it; an OSError names the file."""
     part = path.with_name(f"{path.name}.part")
-    with part.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    try:
+        with part.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error

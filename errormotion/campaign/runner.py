@@ -12,8 +12,8 @@ import logging
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -34,6 +34,7 @@ from errormotion.campaign.storage.store import committed_length
 from errormotion.campaign.turns import claimed
 from errormotion.datasets import provenance
 from errormotion.datasets.certificates import ATTRIBUTE
+from errormotion.datasets.clock import noted
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
@@ -187,7 +188,10 @@ def resume(
             log.warning("skipped: %s", skipped[-1])
             continue
         session = _Session(plan, runs, run_id, progress, ask, report)
-        return session.work({str(folder.data["test"]): folder for folder in folders})
+        with folders[0].locked():  # one process at a time continues a campaign
+            for reason in skipped:
+                session.progress.announce(f"skipped: {reason}")
+            return session.work(_as_it_is(runs, run_id, folders, [test.name for test in plan.tests]))
     if changed and campaign:
         raise RunError(
             f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Continue with the "
@@ -195,6 +199,44 @@ def resume(
         )
     message = f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished."
     raise RunError("\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]))
+
+
+def _as_it_is(runs: Path, run_id: str, known: Sequence[RunFolder], tests: Sequence[str]) -> dict[str, RunFolder]:
+    """Return the run folders of a campaign by their tests, read again: another process may have continued it meanwhile.
+
+    Raises
+    ------
+    RunError
+        It is not clear which test a run folder is of: this test would be measured again.
+    """
+    by_path = {folder.path: folder for folder in known}
+    found: dict[str, RunFolder] = {}
+    unclear = []
+    for path in sorted({*by_path, *(path for path in runs.iterdir() if _belongs(path, run_id))}):
+        try:
+            folder = by_path.get(path) or RunFolder.open(path)
+            folder.read()
+        except RunError as error:
+            unclear.append(str(error))
+            continue
+        test = str(folder.data["test"])
+        if test not in tests:
+            unclear.append(f"{path / 'run.json'}: test: expected one of {', '.join(tests)}; found {test!a:.100}")
+        elif test in found:
+            unclear.append(f"{path} and {found[test].path} are of the same test, {test!r}")
+        found.setdefault(test, folder)
+    if unclear:
+        what = (
+            "The campaign cannot be continued: it is not clear which of its tests were measured. Restore run.json from "
+            f"a copy, or move the folder out of {runs} to measure its test again:"
+        )
+        raise RunError("\n  - ".join([what, *unclear]))
+    return found
+
+
+def _belongs(path: Path, run_id: str) -> bool:
+    """Return whether a path has the name of a run folder of this campaign."""
+    return bool(run_id) and path.name.endswith(f"-{run_id}") and not path.name.startswith(".") and path.is_dir()
 
 
 class _Session:
@@ -235,7 +277,8 @@ class _Session:
                     folder = folders[test.name] = self._new_folder(test)
                 self.records(folder.path)
                 self.progress.test(test.name, folder.path, number, len(self.campaign.tests))
-                with folder.locked(), journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
+                opened.enter_context(folder.locked())  # to the end: nobody continues the campaign between two tests
+                with journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
                     self._test(folder, test, folders)
         return [folders[test.name] for test in self.campaign.tests]
 
@@ -351,15 +394,16 @@ class _Session:
                     if note:
                         self.progress.note(note(chunk))
         finally:
-            if recorder.committed == 0 and folder.raw.exists():  # created, but without samples
-                shutil.rmtree(folder.raw)
-            folder.give_reserve()
             folder.data["samples"] = {
                 "dim": dim,
                 "count": recorder.committed,
                 "dropped": recorder.attrs.get("dropped", 0),
                 "invalid": json.loads(recorder.attrs.get("invalid", "{}")),
             }
+            with suppress(OSError):  # of a disk that takes no more changes: the recorder states the cause
+                if recorder.committed == 0 and folder.raw.exists():  # created, but without samples
+                    shutil.rmtree(folder.raw)
+                folder.give_reserve()
         if recorder.committed == 0:
             raise RunError(f"The method '{method.info.id}' yielded no data.")
         folder.step("acquire", "done", samples=recorder.committed)
@@ -386,7 +430,7 @@ class _Session:
             errors = datasets.load(folder.path / path)
         else:
             with datasets.load(folder.raw) as raw, explained(folder.raw, raw):
-                errors = method.identify(raw, test.settings)
+                errors = noted(method.identify(raw, test.settings), raw)
             datasets.validate(errors)
             (folder.path / path).parent.mkdir(parents=True, exist_ok=True)
             datasets.save(errors, folder.path / path)
@@ -494,21 +538,24 @@ def _continuation(folder: RunFolder) -> str:
 
 @contextmanager
 def _in_order() -> Iterator[None]:
-    """Let the first Ctrl-C stop the measurement; ignore further ones while the last samples are written."""
+    """Let the first Ctrl-C or request to end stop the measurement; ignore more until the last samples are written."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.getsignal(signal.SIGINT)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def stop(*_: Any) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for number in before:
+            signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, stop)
+    for number in before:
+        signal.signal(number, stop)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def results_of(errors: xr.Dataset) -> list[dict[str, Any]] | None:

@@ -217,3 +217,11 @@ def notes(attrs: Mapping[Any, Any]) -> list[str]:
         for join in joins(attrs)
         if join.seconds is None
     ]
+
+
+def noted(errors: xr.Dataset, raw: xr.Dataset) -> xr.Dataset:
+    """Return errors whose notes state every interruption of unknown duration of their raw data, whatever the method."""
+    stated = errors.attrs.get("notes", [])
+    before = [note for note in ([stated] if isinstance(stated, str) else stated) if note]
+    missing = [note for note in notes(raw.attrs) if note not in before]
+    return errors.assign_attrs(notes=[*before, *missing]) if missing else errors

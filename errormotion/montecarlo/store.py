@@ -57,7 +57,7 @@ class Store:
                         f"{self.folder}: holds trials of another evaluation ({', '.join(differ)} differ). Remove the "
                         "folder, or give another name to --out"
                     )
-            elif any(self.folder.iterdir()):
+            elif any(each != _part(file) for each in self.folder.iterdir()):  # of a process that ended while it began
                 raise RunError(f"{self.folder}: expected an empty folder or trials of this evaluation; found others")
             else:
                 self._write(file, json.dumps(self._key, indent=1).encode())
@@ -123,7 +123,7 @@ class Store:
         return values if values.ndim == 2 and len(values) == size and values.dtype == np.float64 else None
 
     def _save(self, file: Path, values: Array) -> None:
-        part = file.with_name(f".{file.name}.part")
+        part = _part(file)
         with part.open("wb") as stream:
             np.save(stream, np.asarray(values, dtype=np.float64), allow_pickle=False)
             stream.flush()
@@ -132,9 +132,14 @@ class Store:
         part.replace(file)
 
     def _write(self, file: Path, content: bytes) -> None:
-        part = file.with_name(f".{file.name}.part")
+        part = _part(file)
         part.write_bytes(content)
         part.replace(file)
+
+
+def _part(file: Path) -> Path:
+    """Return where a file is written before it is renamed."""
+    return file.with_name(f".{file.name}.part")
 
 
 def _small(file: Path) -> str:

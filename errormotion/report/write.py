@@ -12,6 +12,7 @@ from typing import Any
 import xarray as xr
 
 from errormotion import plugins
+from errormotion.datasets.files.writing import whole
 from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError, RunError
 from errormotion.report import provenance
@@ -269,12 +270,8 @@ def _check_reportable(dataset: xr.Dataset) -> None:
 
 def _write(text: str, out: Path) -> Path:
     """Write a page beside its place, and rename it."""
-    beside = out.with_name(out.name + ".part")
-    try:
+    with whole(out) as beside:
         beside.write_text(text, encoding="utf-8")
-        os.replace(beside, out)
-    finally:
-        beside.unlink(missing_ok=True)
     return out
 
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -340,6 +341,35 @@ def test_a_restart_does_not_jump(plan: BenchPlan, model: xr.Dataset, tmp_path: P
     moments = run(second, {}, 5)
     assert moments[-1].step.offset == pytest.approx(np.array(before), abs=1e-9)
     never_beyond(before[0])
+
+
+def earlier_by(log: xr.Dataset, seconds: float, **changes: Any) -> xr.Dataset:
+    """Return a log that a wall clock would have made that was behind by these seconds."""
+    start = datetime.fromisoformat(log.attrs["start"]) - timedelta(seconds=seconds)
+    clock = json.loads(log.attrs["clock"])
+    clock |= {name: clock[name] - seconds for name in ("wall", "began")} | changes
+    return log.assign_attrs(start=start.isoformat(), clock=json.dumps(clock))
+
+
+@pytest.mark.parametrize("seconds", [3600.0, 86400.0])
+def test_a_wall_clock_that_was_set_does_not_change_the_time_since_earlier_readings(
+    plan: BenchPlan, model: xr.Dataset, tmp_path: Path, seconds: float
+) -> None:
+    first = Compensation(plan, model, tmp_path)
+    run(first, {}, 5)
+    log = earlier_by(datasets.load(first.folder.raw), seconds)
+    second = Compensation(plan, model, tmp_path, since=log)
+    run(second, {}, 1)
+    (begun, *_) = (json.loads(line)["entry"] for line in (second.folder.path / AUDIT).read_text().splitlines())
+    assert 0 < begun["since_last_reading"] < seconds / 2
+
+
+def test_earlier_readings_at_an_unknown_time_are_refused(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
+    first = Compensation(plan, model, tmp_path)
+    run(first, {}, 2)
+    log = earlier_by(datasets.load(first.folder.raw), -86400.0, boot="before a restart")
+    with pytest.raises(CompensationError, match="time since the earlier readings is unknown"):
+        Compensation(plan, model, tmp_path, since=log)
 
 
 def test_one_machine_has_one_compensation(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:

@@ -1,9 +1,14 @@
 """The runner stores everything before it uses it, and continues a run where it ended."""
 
 import errno
+import fcntl
 import json
 import logging
+import os
 import shutil
+import signal
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +18,7 @@ import pytest
 from errormotion import datasets, plugins
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
-from errormotion.campaign.folder import RunFolder, list_runs
+from errormotion.campaign.folder import LOOK_DURATION, RunFolder, list_runs
 from errormotion.campaign.storage.journal import journal
 from errormotion.campaign.storage.store import RawStore
 from errormotion.errors import BenchError, RunError
@@ -173,6 +178,27 @@ def test_full_disk_says_how_much_is_safe_and_can_be_resumed(
     whole(folder, 4000)
 
 
+def test_a_disk_that_becomes_read_only_says_how_much_is_safe(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = RawStore.append
+
+    def append_some(self: RawStore, chunk: object) -> None:
+        if self.count >= 1000:
+            raise OSError(errno.EROFS, "Read-only file system")
+        append(self, chunk)  # type: ignore[arg-type]
+        self.commit()
+
+    def refuse(self: RunFolder) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(RawStore, "append", append_some)
+    monkeypatch.setattr(RunFolder, "give_reserve", refuse)
+    with pytest.raises(RunError, match=r"cannot be written: Read-only file system; 1000 samples") as caught:
+        runner.run(plan('name = "a"\nsettings = {count = 4000}', bench='rate = "1 kHz"'))
+    assert "1000 samples are stored in" in str(caught.value)
+
+
 def test_changed_files_are_not_resumed_by_mistake(plan: Plan, tmp_path: Path) -> None:
     setting = f'settings = {{needs_file = "{tmp_path / "needed"}"}}'
     with pytest.raises(RunError, match="failed"):
@@ -200,6 +226,150 @@ def test_two_processes_cannot_work_on_one_run(plan: Plan, tmp_path: Path) -> Non
     (folder,) = list_runs(tmp_path / "runs")
     with folder.locked(), pytest.raises(RunError, match="another process is working on this run"):
         runner.resume(runs=tmp_path / "runs")
+
+
+def test_whoever_only_looks_at_a_lock_does_not_hold_it_against_a_run(plan: Plan, tmp_path: Path) -> None:
+    (folder,) = runner.run(plan('name = "a"'))
+    looking = os.open(folder.path, os.O_RDONLY)
+    fcntl.flock(looking, fcntl.LOCK_SH)
+    timer = threading.Timer(LOOK_DURATION / 2, os.close, [looking])
+    timer.start()
+    with RunFolder.open(folder.path).locked():
+        timer.join()
+
+
+class Impatient(runner.Quiet):
+    """An operator who stops the run at its first samples."""
+
+    def advance(self, done: float) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_request_to_end_does_not_lose_the_last_samples(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, second: signal.Signals
+) -> None:
+    commit = RawStore.commit
+
+    def slowly(self: RawStore) -> None:
+        time.sleep(0.2)
+        if self.count:
+            os.kill(os.getpid(), second)
+            time.sleep(0.2)
+        commit(self)
+
+    def end(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, end)  # as the command line does
+    monkeypatch.setattr(RawStore, "commit", slowly)
+    try:
+        with pytest.raises(KeyboardInterrupt) as caught:
+            runner.run(plan('name = "a"\nsettings = {count = 4000}', bench='rate = "1 kHz"'), progress=Impatient())
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    (folder,) = list_runs(tmp_path / "runs")
+    count = folder.data["samples"]["count"]
+    assert count > 0
+    assert f"{count} samples are stored in" in str(caught.value)
+    whole(folder, count)
+
+
+class Nobody(runner.Quiet):
+    """Another process, which tries to continue the campaign at the start of each test; and what was announced."""
+
+    def __init__(self, runs: Path) -> None:
+        self.runs = runs
+        self.refused: list[str] = []
+        self.announced: list[str] = []
+
+    def test(self, name: str, folder: Path, number: int, total: int) -> None:
+        with pytest.raises(RunError, match="another process is working on this run"):
+            runner.resume(runs=self.runs)
+        self.refused.append(name)
+
+    def announce(self, text: str) -> None:
+        self.announced.append(text)
+
+
+def test_nobody_continues_a_campaign_between_two_tests(plan: Plan, tmp_path: Path) -> None:
+    made = plan('name = "a"', f'name = "b"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}', 'name = "c"')
+    other = Nobody(tmp_path / "runs")
+    with pytest.raises(RunError, match="Test 'b' failed"):
+        runner.run(made)
+    (tmp_path / "needed").touch()
+    runner.resume(runs=tmp_path / "runs", progress=other)
+    assert other.refused == ["a", "b", "c"]
+    assert [folder.data["test"] for folder in list_runs(tmp_path / "runs")] == ["a", "b", "c"]
+
+
+def test_a_campaign_that_another_process_has_finished_meanwhile_is_left_as_it_is(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(RunError, match="Test 'a' failed"):
+        runner.run(plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}', 'name = "b"'))
+    (tmp_path / "needed").touch()
+    stored = runner.stored_plan
+
+    def after_another_process(folder: RunFolder) -> CampaignPlan:
+        monkeypatch.setattr(runner, "stored_plan", stored)
+        runner.resume(runs=tmp_path / "runs")
+        return stored(folder)
+
+    monkeypatch.setattr(runner, "stored_plan", after_another_process)
+    folders = runner.resume(runs=tmp_path / "runs")
+    assert [folder.data["test"] for folder in folders] == ["a", "b"]
+    assert len(list_runs(tmp_path / "runs")) == 2
+    for folder in folders:
+        assert [step["outcome"] for step in folder.data["steps"] if step["step"] == "acquire"].count("done") == 1
+
+
+def _unlink(file: Path) -> None:
+    file.unlink()
+
+
+def _empty(file: Path) -> None:
+    file.write_text("")
+
+
+def _rename_test(file: Path) -> None:
+    file.write_text(file.read_text().replace('"test": "a"', '"test": "x"'))
+
+
+def _copy(file: Path) -> None:
+    shutil.copytree(file.parent, file.parent.with_name(f"copy-{file.parent.name}"))
+
+
+@pytest.mark.parametrize("damage", [_unlink, _empty, _rename_test, _copy])
+def test_a_test_is_not_measured_again_because_its_record_is_damaged(
+    plan: Plan, tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    with pytest.raises(RunError, match="Test 'b' failed"):
+        runner.run(plan('name = "a"', f'name = "b"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}'))
+    (tmp_path / "needed").touch()
+    first = list_runs(tmp_path / "runs")[0].path
+    stated = (first / "run.json").read_text()
+    damage(first / "run.json")
+    with pytest.raises(RunError, match=rf"not clear which of its tests were measured(.|\n)*{first.name}"):
+        runner.resume(runs=tmp_path / "runs")
+    assert len(list(tmp_path.glob("runs/2*"))) == 2
+    shutil.rmtree(tmp_path / "runs" / f"copy-{first.name}", ignore_errors=True)
+    (first / "run.json").write_text(stated)
+    assert first.name in [folder.path.name for folder in runner.resume(runs=tmp_path / "runs")]
+
+
+def test_a_record_that_cannot_be_read_is_named_before_an_older_campaign_is_continued(
+    plan: Plan, tmp_path: Path
+) -> None:
+    with pytest.raises(RunError, match="Test 'a' failed"):
+        runner.run(plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}'))
+    (tmp_path / "needed").touch()
+    newest = tmp_path / "runs" / "99990101T000000Z-b-0123abcd"
+    newest.mkdir()
+    (newest / "run.json").write_text("{")
+    other = Nobody(tmp_path / "runs")
+    runner.resume(runs=tmp_path / "runs", progress=other)
+    assert any(newest.name in text for text in other.announced)
 
 
 def test_bench_that_does_not_come_up_leaves_no_run_folder(plan: Plan, tmp_path: Path) -> None:

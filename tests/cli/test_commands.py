@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+import xarray as xr
 from typer.testing import Result
 
 from errormotion import datasets, plugins
@@ -105,6 +106,21 @@ def test_identify_writes_errors_once(run: Run, answer: Answer, raw: Path, tmp_pa
     assert json.loads(errors.attrs["provenance"])["settings"]["average"] == 2.0
     again = run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc", code=1)
     assert "never overwritten" in again.stderr
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_identify_states_an_interruption_of_unknown_duration(
+    run: Run, record: xr.Dataset, tmp_path: Path, many: bool
+) -> None:
+    """The method overwrites the notes with its own."""
+    join = {"index": 100, "seconds": None, "reason": "the wall clock was set back", "time": 50.25}
+    raw = datasets.save(record.assign_attrs(joins=json.dumps([join])), tmp_path / "interrupted.nc")
+    other = [datasets.save(record, tmp_path / "other.nc")] if many else []
+    out, how = ("many", ["--scheduler", "sync"]) if many else ("errors.nc", [])
+    run("identify", raw, *other, "--method", "spindle_drift", *how, "--out", out)
+    errors = datasets.load(tmp_path / (f"{out}/interrupted.nc" if many else out))
+    assert any("before sample 100, for an unknown time" in note for note in errors.em.notes)
+    assert len(errors.em.notes) > 1
 
 
 def test_identify_takes_many_runs_and_tells_those_that_fail(

@@ -1,16 +1,20 @@
 """`errormotion monitor`: what a person sees, and what a program reads."""
 
+import errno
 import io
 import json
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from errormotion.campaign.monitor.watch import Snapshot
+from errormotion.campaign.folder import RunFolder, list_runs
+from errormotion.campaign.monitor.watch import Monitor, Snapshot
+from errormotion.campaign.storage.store import RawStore
 from errormotion.cli.app import app
 from errormotion.cli.commands.instruments.monitor import LEAST_SPAN, Screen, clock
 from errormotion.cli.curves import bars
@@ -49,6 +53,62 @@ def test_each_row_is_a_line_of_json_for_a_program(bench: Path) -> None:
 def test_the_end_says_where_the_log_is(bench: Path) -> None:
     result = CliRunner().invoke(app, ["monitor", str(bench), "--interval", "50 ms", "--duration", "100 ms"])
     assert re.match(r"[123] rows over 00:00:00 in runs/\S+-monitor-\S+\.", result.stdout)
+
+
+def test_a_monitor_that_is_stopped_before_its_log_has_begun_ends_as_such(
+    bench: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(self: Monitor) -> Monitor:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Monitor, "__enter__", stop)
+    result = CliRunner().invoke(app, ["monitor", str(bench), "--duration", "1 s"])
+    assert result.exit_code == 130, result.output
+    assert "Interrupted" in result.output
+
+
+@pytest.mark.parametrize(
+    ("error", "status"), [(OSError(errno.ENOSPC, "full"), "failed"), (KeyboardInterrupt(), "interrupted")]
+)
+def test_a_monitor_that_cannot_begin_states_it_in_its_run(
+    bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, status: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(RawStore, "create", fail)
+    result = CliRunner().invoke(app, ["monitor", str(bench), "--duration", "1 s"])
+    assert result.exit_code in (1, 130), result.output
+    (run,) = list_runs(tmp_path / "runs")
+    assert run.data["status"] == status
+    assert run.data["reason"]
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_monitor_on_a_full_disk_says_how_much_is_stored(
+    bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stopped: bool
+) -> None:
+    """It says so where run.json cannot be written either, and where the last rows of a stopped monitor are lost."""
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def watch(self: Monitor, duration: float) -> Iterator[Snapshot]:
+        for number, snapshot in enumerate(rows(self, duration)):
+            yield snapshot
+            if number == 1:
+                monkeypatch.setattr(RawStore, "commit", full)
+                monkeypatch.setattr(RunFolder, "save", full) if not stopped else None
+                if stopped:
+                    raise KeyboardInterrupt
+
+    rows = Monitor.watch
+    monkeypatch.setattr(Monitor, "watch", watch)
+    result = CliRunner().invoke(app, ["monitor", str(bench), "--interval", "100 ms", "--duration", "20 s"])
+    assert result.exit_code == 1, result.output
+    assert re.search(r"The disk is full: \d+ along 'time' are stored in", result.output)
+    (run,) = list_runs(tmp_path / "runs")
+    assert run.data["status"] == ("failed" if stopped else "running")
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.reading import DEEPEST, parse_json, read_bytes
+from errormotion.datasets.files.runfile import SCHEMA, read_run
+from errormotion.errors import RunError
 
 
 def test_a_small_file_takes_little_memory_whatever_the_bound(tmp_path: Path) -> None:
@@ -24,3 +26,19 @@ def test_a_file_beyond_the_bound_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"x" * 1001)
     with pytest.raises(OSError, match="expected at most 1000 bytes"):
         read_bytes(path, 1000)
+
+
+@pytest.mark.parametrize(("start", "end"), [('{"a":', "}"), ("[", "]")])
+def test_json_is_read_to_a_depth_that_everything_can_walk(start: str, end: str) -> None:
+    parse_json(start * DEEPEST + "1" + end * DEEPEST)
+    for levels in (DEEPEST + 1, 900, 100_000):
+        with pytest.raises(ValueError, match="nested too deeply"):
+            parse_json(start * levels + "1" + end * levels)
+
+
+def test_a_nested_run_json_is_refused_with_its_name(tmp_path: Path) -> None:
+    """Python reads 900 levels, and ends in a RecursionError when they are walked."""
+    deep = '{"a":' * 900 + "1" + "}" * 900
+    (tmp_path / "run.json").write_text(f'{{"schema": "{SCHEMA}", "x": {deep}}}')
+    with pytest.raises(RunError, match=r"run\.json: is not valid JSON \(nested too deeply"):
+        read_run(tmp_path)

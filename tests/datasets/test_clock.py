@@ -112,3 +112,16 @@ def test_damaged_clocks_of_a_record_are_none(text):
         assert clock.joins(stated) == []
         assert clock.age(xr.Dataset(attrs=stated)) >= 0 or math.isnan(clock.age(xr.Dataset(attrs=stated)))
         assert clock.RecordClock(stated).attributes().keys() == {clock.CLOCK}
+
+
+def test_an_interruption_of_unknown_duration_is_in_the_notes_of_the_errors_whatever_the_method():
+    unknown = clock.Join(index=60, seconds=None, reason="the wall clock was set", time=5.9)
+    raw = xr.Dataset(attrs={clock.JOINS: json.dumps([asdict(unknown), asdict(replace(unknown, seconds=3.0))])})
+    (expected,) = clock.notes(raw.attrs)
+    for before in ([""], ["Sensor X1 was cold."], [], "Sensor X1 was cold.", [expected]):
+        errors = clock.noted(xr.Dataset(attrs={"notes": before}), raw)
+        assert errors.attrs["notes"].count(expected) == 1
+        assert "" not in errors.attrs["notes"]
+        assert ("Sensor X1 was cold." in errors.attrs["notes"]) == ("cold" in str(before))
+    errors = xr.Dataset(attrs={"notes": [""]})
+    assert clock.noted(errors, xr.Dataset()) is errors

@@ -15,6 +15,7 @@ from xarray.indexes import RangeIndex
 
 from errormotion import datasets
 from errormotion.datasets import load, save, validate
+from errormotion.datasets.files.writing import whole
 from errormotion.datasets.storage.compression import as_stored, round_significand
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
@@ -185,6 +186,36 @@ def test_a_full_disk_leaves_nothing_behind_and_the_old_file_as_it_was(
     monkeypatch.undo()
     assert names(tmp_path) == [path.name]
     xr.testing.assert_identical(load(path), errors(seed=1))
+
+
+def test_a_disk_that_is_read_only_ends_in_a_message(errors, tmp_path, monkeypatch) -> None:
+    """What was begun cannot even be removed then."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(DatasetError, match=r"new\.nc: cannot be written: the file system is read-only"):
+        save(errors(seed=1), tmp_path / "new.nc")
+
+
+def test_a_file_is_written_whole_or_is_as_it_was(tmp_path, monkeypatch) -> None:
+    path = tmp_path / "page.html"
+    path.write_text("old")
+    with whole(path) as part:
+        part.write_text("new")
+    assert path.read_text() == "new"
+
+    def fill(path: Path) -> None:
+        with whole(path) as part:
+            part.write_text("ne")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(DatasetError, match=r"page\.html: cannot be written: the disk is full"):
+        fill(path)
+    assert path.read_text() == "new"
+    assert names(tmp_path) == ["page.html"]
 
 
 def test_a_limit_of_the_system_ends_in_a_message(errors, tmp_path) -> None:

@@ -158,6 +158,14 @@ def test_trials_of_another_evaluation_are_not_used(measured, tmp_path):
         _evaluate(measured, tmp_path / "trials", scheduler="sync")
 
 
+def test_a_folder_in_which_an_evaluation_had_only_begun_is_used(tmp_path):
+    """Its process was killed, or its disk was full, while the key was written."""
+    (tmp_path / ".evaluation.json.part").write_text('{"se')
+    with Store(tmp_path, {"seed": 1}):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["evaluation.json"]
+
+
 @pytest.mark.parametrize("text", ["", "[" * 10**5, "3", " " * (2**20 + 1)])
 def test_a_damaged_folder_is_refused_in_words(tmp_path, text):
     (tmp_path / "evaluation.json").write_text(text)

@@ -11,6 +11,7 @@ from errormotion.campaign.files import TestPlan
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.runner import stored_plan
 from errormotion.campaign.storage.store import committed_length
+from errormotion.datasets.clock import noted
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.errors import DatasetError, RunError
 
@@ -41,7 +42,7 @@ def preliminary(folder: RunFolder) -> xr.Dataset:
     with looking_beside(Path(str(folder.data["campaign"].get("folder", folder.path)))):
         try:
             with datasets.load(folder.raw) as raw:
-                errors: xr.Dataset = test.method().identify(raw, test.settings).load()
+                errors = noted(test.method().identify(raw, test.settings).load(), raw)
         except (ArithmeticError, LookupError, ValueError) as error:  # half a record is no defect of a method
             raise DatasetError(f"the samples so far do not determine the errors ({error})") from error
     datasets.validate(errors)

@@ -34,6 +34,7 @@ from errormotion.compensation.online.follower import Conditions, Follower, State
 from errormotion.compensation.online.prediction import PARAMETERS, Prediction, predictor, refusal
 from errormotion.compensation.online.settings import Limits
 from errormotion.datasets import provenance
+from errormotion.datasets.clock import age
 from errormotion.errors import BenchError, CompensationError, InstrumentError
 
 FRAME = "machine"
@@ -161,9 +162,13 @@ class Compensation:
 
     def _replay(self, earlier: xr.Dataset) -> float:
         """Take the readings of a log, on a clock whose zero is now; return the time since its last row, s."""
-        start = datetime.fromisoformat(str(earlier.attrs["start"]))
-        shift = (start - datetime.now(UTC)).total_seconds()
-        times = np.asarray(earlier["time"].values, dtype=float) + shift
+        passed = age(earlier)
+        if math.isnan(passed):
+            raise CompensationError(
+                "The time since the earlier readings is unknown: the clocks of their log and of this computer "
+                "contradict each other. Start without them, on a cold machine."
+            )
+        times = np.asarray(earlier["time"].values, dtype=float) - passed
         if not times.size or not times[-1] < 0:
             raise CompensationError("The log of the earlier readings ends after now: its clock or this one is wrong.")
         names = [str(name) for name in earlier["sensor"].values]

@@ -12,7 +12,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -32,7 +32,7 @@ from errormotion.campaign.storage.journal import cause_of, journal
 from errormotion.campaign.storage.recorder import Recorder
 from errormotion.campaign.storage.store import RawStore
 from errormotion.datasets import provenance
-from errormotion.errors import BenchError
+from errormotion.errors import BenchError, RunError
 
 TEST = "monitor"
 
@@ -135,8 +135,19 @@ class Monitor:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
+        self.folder = self._new_folder()
+        try:
+            self._start()
+        except BaseException as error:
+            with suppress(OSError, RunError):
+                failed = isinstance(error, Exception)
+                reason = cause_of(error) if failed else "stopped by the operator"
+                self.folder.save(status="failed" if failed else "interrupted", reason=reason)
+            raise
+        return self
+
+    def _start(self) -> None:
         with ExitStack() as stack:
-            self.folder = self._new_folder()
             stack.enter_context(self.folder.locked())
             stack.enter_context(journal(self.folder.log))
             stack.callback(self._stop)
@@ -151,29 +162,40 @@ class Monitor:
             RawStore.create(self.folder.raw, empty.assign_attrs(attrs), "time", BLOCK)
             self._recorder = stack.enter_context(Recorder(self.folder.raw, "time", BLOCK, attrs))
             self._stack = stack.pop_all()
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        status, reason = "finished", ""
-        if error is not None and isinstance(error, Exception):
-            log.error("the monitor stopped", exc_info=error)
-            status, reason = "failed", cause_of(error)
+        failure = error if isinstance(error, Exception) else None
         try:
             self._stack.__exit__(kind, error, trace)
+        except Exception as late:  # the last rows could not be written
+            failure = failure or late
+            raise
         finally:
-            answers = [source.answer.record() for source in self.sources if source.answer]
-            self.folder.data["instruments"] = answers
-            self.folder.data["samples"] = {
-                "dim": "time",
-                "count": self._recorder.committed,
-                "dropped": 0,
-                "invalid": {f"no answer of {name}": count for name, count in self._gaps.items()},
-            }
-            self.folder.step("monitor", "done" if status == "finished" else status, samples=self._recorder.committed)
-            if not isinstance(error, FolderGoneError):  # nothing is written where the folder was
-                self.folder.save(status=status, reason=reason, acquired=status == "finished")
+            self._state_end(failure)
+
+    def _state_end(self, failure: Exception | None) -> None:
+        """Write how the log has ended to ``run.json``; where this fails as well, the failure before it is the cause."""
+        if failure is not None:
+            log.error("the monitor stopped", exc_info=failure)
+        status, reason = ("finished", "") if failure is None else ("failed", cause_of(failure))
+        self.folder.data["instruments"] = [source.answer.record() for source in self.sources if source.answer]
+        self.folder.data["samples"] = {
+            "dim": "time",
+            "count": self._recorder.committed,
+            "dropped": 0,
+            "invalid": {f"no answer of {name}": count for name, count in self._gaps.items()},
+        }
+        self.folder.step("monitor", "done" if failure is None else status, samples=self._recorder.committed)
+        if isinstance(failure, FolderGoneError):  # nothing is written where the folder was
+            return
+        try:
+            self.folder.save(status=status, reason=reason, acquired=failure is None)
+        except (OSError, RunError):
+            if failure is None:
+                raise
+            log.exception("run.json cannot be written")
 
     def watch(self, duration: float = math.inf) -> Iterator[Snapshot]:
         """Log rows, and yield each as a snapshot.

@@ -6,8 +6,12 @@ import errno
 import json
 import os
 import stat
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
+DEEPEST = 64
+"""Levels of objects and lists in JSON."""
 
 
 def require_regular(path: str | Path) -> os.stat_result:
@@ -47,9 +51,19 @@ def parse_json(text: str | bytes) -> Any:
     Raises
     ------
     ValueError
-        It is not JSON in UTF-8, or nested too deeply.
+        It is not JSON in UTF-8, or has more than DEEPEST levels.
     """
     try:
-        return json.loads(text)
+        found = json.loads(text)
     except RecursionError:
         raise ValueError("nested too deeply") from None
+    level = [found]
+    for _ in range(DEEPEST):
+        level = [each for outer in level for each in _inside(outer) if isinstance(each, dict | list)]
+        if not level:
+            return found
+    raise ValueError(f"nested too deeply; expected at most {DEEPEST} levels")
+
+
+def _inside(value: Any) -> Iterable[Any]:
+    return value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()

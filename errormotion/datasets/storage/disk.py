@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import json
 import math
 import os
-import re
-import shutil
 import traceback
 import uuid
 from collections.abc import Iterator, Mapping
@@ -23,6 +20,7 @@ from xarray.indexes import RangeIndex
 from errormotion.datasets.checks import storable_violations
 from errormotion.datasets.files.containers import check_netcdf, check_zarr
 from errormotion.datasets.files.reading import require_regular
+from errormotion.datasets.files.writing import reason, remove, sync, writing
 from errormotion.datasets.schemas import SCHEMA
 from errormotion.datasets.storage.compression import as_stored, encoding
 from errormotion.errors import DatasetError, ErrormotionError
@@ -35,17 +33,6 @@ _CLASSIC_SIGNATURE = b"CDF"
 
 # Longer time coordinates are left on disk: an index would pull them into memory.
 _LONGEST_INDEX = 100_000
-
-_REASONS = {
-    errno.ENOENT: "there is no such folder",
-    errno.EACCES: "permission denied; choose a place where you may write, or have the permission given",
-    errno.EPERM: "permission denied; choose a place where you may write, or have the permission given",
-    errno.EROFS: "the file system is read-only; choose another place",
-    errno.ENOSPC: "the disk is full; free some space or choose another disk. Nothing was left behind there",
-    errno.EDQUOT: "your disk quota is used up; free some space or choose another disk. Nothing was left behind there",
-    errno.EFBIG: "the file would be larger than allowed. Nothing was left behind there",
-    errno.ENAMETOOLONG: "the name is too long",
-}
 
 
 def load(path: str | Path) -> xr.Dataset:
@@ -128,7 +115,7 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     if unstorable:
         raise DatasetError(f"{path}: cannot be written:", unstorable)
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
-    with _writing(path, part):
+    with writing(path, part):
         if path.suffix == ".zarr":
             # xarray's overloads do not know the type of a plain path together with zarr_format
             storable(ds).to_zarr(part, mode="w-", zarr_format=3, consolidated=False)
@@ -141,7 +128,7 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
         _sync(part)
         _refuse_existing(path, overwrite)
         _replace(part, path)
-        _sync_one(path.parent)
+        sync(path.parent)
     return path
 
 
@@ -173,7 +160,7 @@ def _engine_of(path: Path) -> str:
         with path.open("rb") as file:
             head = file.read(8)
     except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {_reason(error, 'there is no such file')}") from error
+        raise DatasetError(f"{path}: cannot be read: {reason(error, 'there is no such file')}") from error
     if head == _HDF5_SIGNATURE:
         return "h5netcdf"
     if not head:
@@ -234,27 +221,6 @@ def reading(path: str | Path) -> Iterator[None]:
         ) from error
 
 
-@contextmanager
-def _writing(path: Path, part: Path) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        # HDF5 closes a file on a full disk with a RuntimeError that carries the system's words.
-        raise DatasetError(f"{path}: cannot be written: {_reason(error, 'there is no such folder')}") from error
-    finally:
-        _remove(part)
-
-
-def _reason(error: Exception, missing: str) -> str:
-    code = getattr(error, "errno", None)
-    stated = re.search(r"errno = (\d+)", str(error))
-    if stated is not None and code not in _REASONS:
-        code = int(stated[1])
-    if code == errno.ENOENT:
-        return missing
-    return _REASONS.get(code or 0, getattr(error, "strerror", None) or str(error))
-
-
 def _refuse_existing(path: Path, overwrite: bool) -> None:
     if not overwrite and (path.exists() or path.is_symlink()):
         raise DatasetError(f"{path}: exists already; choose another name, or allow overwriting")
@@ -272,32 +238,17 @@ def _replace(part: Path, path: Path) -> None:
     except OSError:
         old.rename(path)
         raise
-    _remove(old)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
+    remove(old)
 
 
 def _sync(path: Path) -> None:
     """Bring a file, or a folder with all that is in it, to the disk."""
     for folder, _, names in os.walk(path):
         for name in names:
-            _sync_one(Path(folder) / name)
-        _sync_one(Path(folder))
+            sync(Path(folder) / name)
+        sync(Path(folder))
     if path.is_file():
-        _sync_one(path)
-
-
-def _sync_one(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        sync(path)
 
 
 def _tidy(ds: xr.Dataset) -> xr.Dataset:

@@ -12,6 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from errormotion.datasets.files.writing import whole
 from errormotion.errors import RunError
 
 BROWSERS = (
@@ -60,8 +61,7 @@ def write(page: Path, out: Path) -> Path:
     RunError
         Nothing on this computer prints, or printing failed.
     """
-    beside = out.with_name(out.name + ".part")
-    try:
+    with whole(out) as beside:
         program = browser()
         if program:
             _by_browser(program, page, beside)
@@ -69,9 +69,6 @@ def write(page: Path, out: Path) -> Path:
             _by_weasyprint(page, beside)
         if not beside.is_file() or not beside.read_bytes()[:5] == b"%PDF-":
             raise RunError(f"{out}: {program or 'weasyprint'} has not written a PDF file")
-        os.replace(beside, out)
-    finally:
-        beside.unlink(missing_ok=True)
     return out
 
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import re
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from markupsafe import Markup
 
+from errormotion.datasets.files.writing import remove, writing
 from errormotion.report.document import Cell, Table
 
 Entry = float | str | None
@@ -91,20 +90,21 @@ def write_csv(sheets: Sequence[Sheet], folder: Path, *, comma: bool = False) -> 
     With ``comma``, numbers have a decimal comma and columns are separated by semicolons.
     """
     beside = folder.with_name(folder.name + ".part")
-    shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir(parents=True)
-    for each in sheets:
-        text = io.StringIO()
-        writer = csv.writer(text, delimiter=";" if comma else ",", lineterminator="\r\n")
-        writer.writerow([_safe(name) for name in each.head])
-        for row, decimals in zip(each.rows, each.decimals, strict=True):
-            writer.writerow([_written(entry, places, comma) for entry, places in zip(row, decimals, strict=True)])
-        for note in (each.caption, *each.notes):
-            writer.writerow([_safe(f"# {note}")])
-        name = f"{each.number:02d}-{re.sub(r'[^a-z0-9]+', '-', each.section.lower()).strip('-')[:40]}.csv"
-        (beside / name).write_bytes(text.getvalue().encode("utf-8-sig"))
-    shutil.rmtree(folder, ignore_errors=True)
-    os.replace(beside, folder)
+    remove(beside)
+    with writing(folder, beside):
+        beside.mkdir(parents=True)
+        for each in sheets:
+            text = io.StringIO()
+            writer = csv.writer(text, delimiter=";" if comma else ",", lineterminator="\r\n")
+            writer.writerow([_safe(name) for name in each.head])
+            for row, decimals in zip(each.rows, each.decimals, strict=True):
+                writer.writerow([_written(entry, places, comma) for entry, places in zip(row, decimals, strict=True)])
+            for note in (each.caption, *each.notes):
+                writer.writerow([_safe(f"# {note}")])
+            name = f"{each.number:02d}-{re.sub(r'[^a-z0-9]+', '-', each.section.lower()).strip('-')[:40]}.csv"
+            (beside / name).write_bytes(text.getvalue().encode("utf-8-sig"))
+        remove(folder)
+        beside.replace(folder)
     return folder
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from xml.sax.saxutils import escape, quoteattr
 from zipfile import ZIP_DEFLATED, ZipFile
 
+from errormotion.datasets.files.writing import whole
 from errormotion.report.exports.tables import Entry, Sheet
 
 _MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
@@ -26,24 +26,19 @@ _LONGEST = 32_000
 def write(sheets: Sequence[Sheet], out: Path) -> Path:
     """Write a workbook; an older file is replaced in one step."""
     names = _names(sheets)
-    beside = out.with_name(out.name + ".part")
-    try:
-        with ZipFile(beside, "w", ZIP_DEFLATED) as archive:
-            for name, text in {
-                "[Content_Types].xml": _types(len(sheets)),
-                "_rels/.rels": _relations([(f"{_OFFICE}/officeDocument", "xl/workbook.xml")]),
-                "xl/workbook.xml": _workbook(names),
-                "xl/_rels/workbook.xml.rels": _relations(
-                    [(f"{_OFFICE}/worksheet", f"worksheets/sheet{k}.xml") for k in range(1, len(sheets) + 1)]
-                    + [(f"{_OFFICE}/styles", "styles.xml")]
-                ),
-                "xl/styles.xml": _styles(),
-                **{f"xl/worksheets/sheet{k}.xml": _sheet(each) for k, each in enumerate(sheets, 1)},
-            }.items():
-                archive.writestr(name, _HEAD + text)
-        os.replace(beside, out)
-    finally:
-        beside.unlink(missing_ok=True)
+    with whole(out) as beside, ZipFile(beside, "w", ZIP_DEFLATED) as archive:
+        for name, text in {
+            "[Content_Types].xml": _types(len(sheets)),
+            "_rels/.rels": _relations([(f"{_OFFICE}/officeDocument", "xl/workbook.xml")]),
+            "xl/workbook.xml": _workbook(names),
+            "xl/_rels/workbook.xml.rels": _relations(
+                [(f"{_OFFICE}/worksheet", f"worksheets/sheet{k}.xml") for k in range(1, len(sheets) + 1)]
+                + [(f"{_OFFICE}/styles", "styles.xml")]
+            ),
+            "xl/styles.xml": _styles(),
+            **{f"xl/worksheets/sheet{k}.xml": _sheet(each) for k, each in enumerate(sheets, 1)},
+        }.items():
+            archive.writestr(name, _HEAD + text)
     return out
 
 

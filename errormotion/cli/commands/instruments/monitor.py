@@ -41,13 +41,15 @@ def run(file: Path, runs: Path, interval: str, duration: str | None, as_json: bo
     console = Console(stderr=True, highlight=False)
     shown = sys.stderr.isatty() and not as_json
     last: Snapshot | None = None
+    place: Path | None = None
     try:
         with (
             claimed(monitor.plan.machine, "a monitor") as records,
             monitor,
             Live(console=console, auto_refresh=False, transient=True, screen=False) as live,
         ):
-            records(monitor.folder.path)
+            place = monitor.folder.path
+            records(place)
             for last in monitor.watch(length):
                 screen.take(last)
                 if as_json:
@@ -56,7 +58,8 @@ def run(file: Path, runs: Path, interval: str, duration: str | None, as_json: bo
                 elif shown:
                     live.update(screen.page(monitor.plan.machine, last, monitor.folder.path), refresh=True)
     except KeyboardInterrupt:  # the way to end it
-        pass
+        if place is None:  # before there was a log
+            raise
     if not as_json:
         show(summary(last, monitor.folder.path))
 

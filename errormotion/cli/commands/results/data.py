@@ -18,6 +18,7 @@ from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.cli.tolerances import end_with, lines_of, remarks
+from errormotion.datasets.clock import noted
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.validation import explained
@@ -195,7 +196,7 @@ def _identify_one(
         with reading(raw), datasets.load(raw) as dataset:
             bars.stage("identifying")
             with explained(raw, dataset):
-                errors = method().identify(dataset, settings)
+                errors = noted(method().identify(dataset, settings), dataset)
         datasets.validate(errors)
         if trials is not None:
             evaluation = evaluate_beside(

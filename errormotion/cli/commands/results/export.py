@@ -16,6 +16,7 @@ from errormotion import datasets
 from errormotion.cli.output import show, show_json
 from errormotion.cli.results import load
 from errormotion.cli.summary import as_printed
+from errormotion.datasets.files.writing import whole
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.results.tables import to_dataframe
 from errormotion.datasets.storage.disk import reading
@@ -66,8 +67,8 @@ def export(
         sheets = [_errors(errors, freedoms, k), _figures(errors), _about(errors, k)]
         rows = len(sheets[0].rows)
         if out.suffix.lower() == ".csv":
-            with out.open("xb") as file:
-                file.write(_csv(sheets[0]))
+            with whole(out) as beside:
+                beside.write_bytes(_csv(sheets[0]))
         elif rows > MOST_ROWS:
             raise DatasetError(f"{out}: a workbook holds {MOST_ROWS} rows; found {rows}. Write .csv or .nc")
         else:
