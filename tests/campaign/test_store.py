@@ -17,6 +17,14 @@ RATE = 1000.0
 LSB = 3.1e-8  # m; a step of a 16 bit sensor of 2 mm range
 
 
+def test_a_new_store_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: set[str] = set()
+    monkeypatch.setattr(store_module, "_sync", lambda path: synced.add(str(path)))
+    RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 1.0)
+    files = {str(tmp_path / "raw.zarr.part" / name) for name in ("zarr.json", "distance/zarr.json", "level/c/0")}
+    assert synced >= files | {str(tmp_path / "raw.zarr.part"), str(tmp_path)}
+
+
 def chunk(first: int, n: int, packed: bool = True) -> xr.Dataset:
     """Five channels, two temperatures; every sample differs from its neighbours."""
     index = np.arange(first, first + n)

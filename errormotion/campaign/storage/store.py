@@ -133,7 +133,10 @@ class RawStore:
         part = path.with_name(path.name + ".part")
         # xarray's stub lacks zarr_format=3 with encodings per variable
         cast(Any, skeleton).to_zarr(part, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
+        for each in (*part.rglob("*"), part):  # a power cut would leave empty files under their names
+            _sync(each)
         part.rename(path)
+        _sync(path.parent)
         store = cls(path, dim)
         store.commit()
         return store

@@ -145,6 +145,12 @@ def test_what_is_no_scan_of_a_pocket_is_refused_in_words(scan_pocket, change, me
         calibrate(*change(*scan_pocket(1, Disturbances.white(), lines=40)), POCKET)
 
 
+def test_lines_that_all_cross_the_rim_obliquely_are_counted(scan_pocket, monkeypatch):
+    monkeypatch.setattr(calibration, "OBLIQUE", 1.0)
+    with pytest.raises(MethodError, match="Ten lines across the pocket must fit one circle; 0 do"):
+        calibrate(*scan_pocket(1, Disturbances.white(), lines=40), POCKET)
+
+
 def test_a_raw_dataset_gives_what_its_arrays_give(gantry, truth, tmp_path):
     raw = simulation.raw_pocket(gantry, seed=1, profiles=80, feed=350e-6)
     save(raw, tmp_path / "pocket.nc")

@@ -30,6 +30,7 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose.edges impor
 
 #: a, b, g (rad), dx, dy, dz (m)
 PARAMETERS = ("a", "b", "g", "dx", "dy", "dz")
+_FEWEST_LINES = 10
 #: least |cos| of the angle at which a line crosses the rim, seen from the centre
 OBLIQUE = 0.35
 #: half differences and half sums of the edges' radii beyond this many standard deviations are left out. Edges scatter
@@ -223,12 +224,12 @@ class _Fit:
         used = self._rim(p)[2] > OBLIQUE
         fitted = used
         for _ in range(4):
+            if (lines := int(used.sum())) < _FEWEST_LINES:
+                raise MethodError(f"Ten lines across the pocket must fit one circle; {lines} do.")
             solution = least_squares(self._residuals, p / _UNIT, args=(used,), method="lm")
             p, fitted = solution.x * _UNIT, used
             used = self._weigh(p, used)
         lines = int(fitted.sum())
-        if lines < 10:
-            raise MethodError(f"Ten lines across the pocket must fit one circle; {lines} do.")
         covariance = self._covariance(np.array(solution.jac), np.array(solution.fun), 2 * lines)
         return ProfilerPose(p[:6], covariance, float(p[6]), self.size_x, self.size_y, lines)
 
