@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from errormotion.datasets.files.runfile import SCHEMA, read_run
+from errormotion.datasets.files.writing import sync
 from errormotion.datasets.provenance import plain
 from errormotion.errors import RunError
 
@@ -299,10 +300,8 @@ def replace_text(path: Path, text: str) -> None:
     """Write a text file under a temporary name, synchronise it to disk, and rename it; an OSError names the file."""
     part = path.with_name(f"{path.name}.part")
     try:
-        with part.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
+        part.write_text(text, encoding="utf-8")
+        sync(part)
         part.replace(path)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error

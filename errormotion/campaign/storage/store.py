@@ -12,7 +12,6 @@ Chunks written before a crash between 1 and 2 are invisible; the next opening of
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self, cast
@@ -26,6 +25,7 @@ from zarr.codecs import BloscCodec
 from errormotion.campaign.folder import Presence, replace_text
 from errormotion.datasets.files.containers import LARGEST_METADATA
 from errormotion.datasets.files.reading import parse_json, read_bytes
+from errormotion.datasets.files.writing import sync
 from errormotion.errors import RunError
 
 BLOCK_BYTES = 24 * 2**20
@@ -338,13 +338,8 @@ def _dims(metadata: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _sync(path: Path) -> None:
-    if not path.exists():  # a chunk that is entirely NaN has no file
-        return
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    if path.exists():  # a chunk that is entirely NaN has no file
+        sync(path)
 
 
 def _stored(dataset: xr.Dataset, dim: str) -> dict[str, xr.Variable]:

@@ -9,15 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from errormotion.methods.spindle_drift.identification import averaging
-from errormotion.methods.spindle_drift.identification.averaging import (
-    Averager,
-    EvenTimes,
-    increases,
-    join,
-    slices,
-    values_of,
-    window_sums,
-)
+from errormotion.methods.spindle_drift.identification.averaging import Averager, join, slices, window_sums
+from errormotion.methods.spindle_drift.identification.times import EvenTimes, increases, values_of
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

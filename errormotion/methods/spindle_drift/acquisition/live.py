@@ -8,8 +8,9 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
-from errormotion.methods.spindle_drift.identification.averaging import Averager, first_and_last, slices
+from errormotion.methods.spindle_drift.identification.averaging import Averager, slices
 from errormotion.methods.spindle_drift.identification.bar import end_point, fit_axis
+from errormotion.methods.spindle_drift.identification.times import first_and_last
 from errormotion.methods.spindle_drift.identification.uncertainty import State, twist
 from errormotion.methods.spindle_drift.schema import CHANNELS
 

@@ -16,6 +16,15 @@ from xarray.indexes import RangeIndex
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.methods.spindle_drift.identification.times import (
+    EvenTimes,
+    Times,
+    first_and_last,
+    first_samples,
+    time_sums,
+    usual_interval,
+    values_of,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -67,70 +76,6 @@ def _small_window_sums(values: NDArray[Any], edges: NDArray[np.int64]) -> tuple[
         sums[:, full] = np.add.reduceat(filled[:, inside], starts, axis=1)
         counts[:, full] = np.add.reduceat(valid[:, inside], starts, axis=1, dtype=np.int64)
     return sums, counts
-
-
-@dataclass(frozen=True)
-class EvenTimes:
-    """Times at equal intervals, which are not stored: ``start + k * interval`` for sample k.
-
-    Attributes
-    ----------
-    start, interval : float
-        s.
-    size : int
-        Number of samples.
-    """
-
-    start: float
-    interval: float
-    size: int
-
-    def values(self) -> Array:
-        """Return the times, (sample,), s."""
-        return np.asarray(self.start + np.arange(self.size, dtype=np.float64) * self.interval)
-
-
-Times = Array | EvenTimes
-
-
-def values_of(time: Times) -> Array:
-    """Return times as an array (sample,), s."""
-    return time.values() if isinstance(time, EvenTimes) else time
-
-
-def first_and_last(time: Times) -> tuple[float, float]:
-    """Return the first and the last of some times, s."""
-    if isinstance(time, EvenTimes):
-        return time.start, time.start + (time.size - 1) * time.interval
-    return float(time[0]), float(time[-1])
-
-
-def increases(time: Times) -> bool:
-    """Return whether every time is later than the one before it."""
-    if isinstance(time, EvenTimes):
-        return time.interval > 0 or time.size < 2
-    return bool((time[1:] > time[:-1]).all())
-
-
-def _usual_interval(time: Times) -> float:
-    """Return the median of the first intervals, s."""
-    return time.interval if isinstance(time, EvenTimes) else float(np.median(np.diff(time[:1000])))
-
-
-def _first_samples(time: Times, bounds: Array) -> NDArray[np.int64]:
-    """Return the first sample at or after each bound."""
-    if isinstance(time, EvenTimes):
-        found = np.ceil((bounds - time.start) / time.interval)
-        return np.clip(found, 0, time.size).astype(np.int64)
-    return np.searchsorted(time, bounds)
-
-
-def _time_sums(time: Times, edges: NDArray[np.int64]) -> Array:
-    """Return the sum of the times between consecutive edges, s, relative to the first time: a day would cost digits."""
-    samples = np.diff(edges)
-    if isinstance(time, EvenTimes):
-        return np.asarray(0.5 * time.interval * samples * (edges[:-1] + edges[1:] - 1))
-    return np.asarray(np.add.reduceat(time - time[0], np.minimum(edges[:-1], time.size - 1)) * (samples > 0))
 
 
 @dataclass(frozen=True)
@@ -187,7 +132,7 @@ class Averager:
                 self._first = values_of(time).copy(), values.copy()
                 return self._averages([], [], [], [])
             self._start = first_and_last(time)[0]
-            interval = _usual_interval(time)
+            interval = usual_interval(time)
             self._single = interval > 0.5 * self._length
             self._tolerance = 0.5 * interval / self._length
             self._full = self._length / interval
@@ -198,10 +143,10 @@ class Averager:
         first = int(np.floor((start - self._start) / self._length + self._tolerance))
         last = int(np.floor((end - self._start) / self._length + self._tolerance))
         bounds = np.asarray(self._start + (np.arange(first + 1, last + 1) - self._tolerance) * self._length, np.float64)
-        edges = np.concatenate([[0], _first_samples(time, bounds), [time.size]]).astype(np.int64)
+        edges = np.concatenate([[0], first_samples(time, bounds), [time.size]]).astype(np.int64)
         sums, counts = window_sums(values, edges, self._threads)
         samples = np.diff(edges)
-        times = _time_sums(time, edges) + samples * start
+        times = time_sums(time, edges) + samples * start
         done_sum, done_count, done_time, done_samples = [], [], [], []
         for k in range(samples.size):
             if first + k != self._index:

@@ -17,16 +17,8 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.identification.averaging import (
-    Averager,
-    Averages,
-    Times,
-    first_and_last,
-    increases,
-    join,
-    slices,
-    values_of,
-)
+from errormotion.methods.spindle_drift.identification.averaging import Averager, Averages, join, slices
+from errormotion.methods.spindle_drift.identification.times import Times, first_and_last, increases, values_of
 from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
