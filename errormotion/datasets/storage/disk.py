@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import os
@@ -23,6 +22,7 @@ from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.files.writing import reason, remove, sync, writing
 from errormotion.datasets.schemas import SCHEMA
 from errormotion.datasets.storage.compression import as_stored, encoding
+from errormotion.datasets.storage.netcdf import compose_netcdf, open_netcdf
 from errormotion.errors import DatasetError, ErrormotionError
 
 _NETCDF = (".nc", ".nc4", ".h5")
@@ -65,16 +65,18 @@ def load(path: str | Path) -> xr.Dataset:
     with _reading(path):
         if engine == "h5netcdf":
             check_netcdf(path)
-        elif engine == "zarr":
-            check_zarr(path)
-        ds = xr.open_dataset(
-            path,
-            engine=engine,
-            backend_kwargs={"consolidated": _is_consolidated(path)} if engine == "zarr" else {},
-            decode_times=False,
-            decode_timedelta=False,
-            create_default_indexes=False,
-        )
+            ds = open_netcdf(path)
+        else:
+            if engine == "zarr":
+                check_zarr(path)
+            ds = xr.open_dataset(
+                path,
+                engine=engine,
+                backend_kwargs={"consolidated": _is_consolidated(path)} if engine == "zarr" else {},
+                decode_times=False,
+                decode_timedelta=False,
+                create_default_indexes=False,
+            )
         ds = _tidy(ds)
         if ds.attrs.get("schema") == SCHEMA:
             with ds:
@@ -122,9 +124,7 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
         else:
             # Composed in memory: HDF5 crashes the process when the disk fills up under an open file.
             ready = storable(ds)
-            composed = io.BytesIO()  # ours: Python 3.13 complains of one that is closed while its contents are in use
-            ready.to_netcdf(composed, engine="h5netcdf", encoding=encoding(ready))
-            part.write_bytes(composed.getvalue())
+            part.write_bytes(compose_netcdf(ready, encoding(ready)))
         _sync(part)
         _refuse_existing(path, overwrite)
         _replace(part, path)

@@ -1,0 +1,97 @@
+"""NetCDF-4 files hold what xarray's own reader and writer make of them, and each object is looked up once."""
+
+import io
+import pickle
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion.datasets.storage.compression import encoding
+from errormotion.datasets.storage.disk import storable
+from errormotion.datasets.storage.netcdf import compose_netcdf, open_netcdf
+
+PLAIN = {"decode_times": False, "decode_timedelta": False, "create_default_indexes": False}
+
+
+def example(kind: str) -> xr.Dataset:
+    rng = np.random.default_rng(5)
+    if kind == "empty":
+        return xr.Dataset()
+    if kind == "dimension named like a variable of others":
+        return xr.Dataset({"x": (("y", "z"), rng.normal(size=(2, 3)))}, coords={"y": [1.0, 2.0]}, attrs={"n": [1, 2]})
+    if kind == "coordinates after the variables that use them":
+        return xr.Dataset({"a": (("t", "s"), rng.normal(size=(4, 2))), "b": ("s", [1, 2]), "t": ("t", np.arange(4.0))})
+    return xr.Dataset(
+        {
+            "value": (("place", "freedom"), rng.normal(size=(6, 3)), {"units": "m"}),
+            "long": (("place", "k"), rng.normal(size=(6, 4000))),
+            "count": ("place", np.arange(6)),
+            "gap": ("place", [1.0, np.nan, 2.0, 3.0, 4.0, 5.0]),
+            "whether": ("place", [True, False] * 3),
+            "alone": ((), 4.5),
+            "none": ("nothing", np.zeros(0)),
+        },
+        coords={
+            "freedom": ["EX", "EY", "EZ"],
+            "place": np.linspace(0, 1, 6),
+            "name": ("place", ["a", "ö", "", "b", "c", "d"]),
+        },
+        attrs={"schema": "other", "notes": ["one", "two"], "number": 3, "rate": 2.5, "long": "ü" * 400},
+    )
+
+
+KINDS = ("empty", "dimension named like a variable of others", "coordinates after the variables that use them", "usual")
+
+
+def by_xarray(ds: xr.Dataset) -> bytes:
+    composed = io.BytesIO()
+    ds.to_netcdf(composed, engine="h5netcdf", encoding=encoding(ds))
+    return composed.getvalue()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_are_those_of_xarray_to_the_last_bit(kind: str) -> None:
+    ready = storable(example(kind))
+    assert compose_netcdf(ready, encoding(ready)) == by_xarray(ready)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_are_read_as_xarray_reads_them(kind: str, tmp_path: Path) -> None:
+    file = tmp_path / "some.nc"
+    file.write_bytes(by_xarray(storable(example(kind))))
+    with open_netcdf(file) as found, xr.open_dataset(file, engine="h5netcdf", **PLAIN) as expected:
+        assert found.encoding["source"] == expected.encoding["source"]
+        for name in expected.variables:
+            assert repr(found[name].encoding) == repr(expected[name].encoding)  # a fill value is NaN
+        xr.testing.assert_identical(found.load(), expected.load())
+
+
+def test_an_open_file_can_be_handed_to_another_process(tmp_path: Path) -> None:
+    file = tmp_path / "some.nc"
+    file.write_bytes(by_xarray(storable(example("usual"))))
+    with open_netcdf(file) as found, pickle.loads(pickle.dumps(found)) as other:
+        xr.testing.assert_identical(found.load(), other.load())
+
+
+def test_each_object_is_looked_up_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ds = storable(example("usual"))
+    lookups, plain = [], h5py.Group._get
+    monkeypatch.setattr(h5py.Group, "_get", lambda *args, **kwargs: lookups.append(args) or plain(*args, **kwargs))
+
+    def count(act: object) -> float:
+        lookups.clear()
+        act()  # type: ignore[operator]
+        return len(lookups) / len(ds.variables)
+
+    file = tmp_path / "some.nc"
+    ours = count(lambda: file.write_bytes(compose_netcdf(ds, encoding(ds))))
+    assert ours < count(lambda: by_xarray(ds)) / 2
+
+    def read() -> None:
+        with open_netcdf(file) as found:
+            found.load()
+
+    assert count(read) < 8
