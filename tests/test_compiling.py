@@ -3,8 +3,10 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
+from errormotion import compiling
 from errormotion.compiling import Compiler
 
 MODULE = """
@@ -64,3 +66,19 @@ def test_a_function_that_only_compiled_code_calls_refuses_a_call_from_python():
 
     with pytest.raises(TypeError, match=r"halved is declared with inner=True"):
         halved(1.0)
+
+
+def test_what_fails_on_another_thread_is_raised(monkeypatch):
+    monkeypatch.setattr(compiling, "threads", lambda: 3)
+    done = np.zeros(30, bool)
+
+    def work(first, last):
+        if first == 20:
+            raise MemoryError("no room")
+        done[first:last] = True
+
+    with pytest.raises(MemoryError, match="no room"):
+        compiling.in_threads(work, 30, True)
+    assert done.sum() == 20
+    compiling.in_threads(lambda first, last: done.fill(last == 30), 30, False)  # one thread
+    assert done.all()

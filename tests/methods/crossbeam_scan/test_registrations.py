@@ -5,26 +5,10 @@ import pytest
 
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
-from errormotion.methods.crossbeam_scan.identification.registration import kernels, prepare
+from errormotion.methods.crossbeam_scan.identification.registration import prepare
 from errormotion.methods.crossbeam_scan.identification.registrations import register_all
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin.sensors.profiler import Profiler
-
-
-def test_what_fails_on_another_thread_is_raised(monkeypatch):
-    monkeypatch.setattr(kernels, "threads", lambda: 3)
-    done = np.zeros(30, bool)
-
-    def work(first, last):
-        if first == 20:
-            raise MemoryError("no room")
-        done[first:last] = True
-
-    with pytest.raises(MemoryError, match="no room"):
-        kernels.in_threads(work, 30, kernels.MANY + 1)
-    assert done.sum() == 20
-    kernels.in_threads(lambda first, last: done.fill(last == 30), 30, 1)  # one thread
-    assert done.all()
 
 
 def test_bending_of_a_block_is_that_of_its_parabola():

@@ -1,21 +1,16 @@
 """Compiled loops over the points of a scan, which reduce them to blocks.
 
 Threads share the rows of blocks, and every block is computed within one thread: the result has the same bits on any
-number of threads. The threads are Python's and not numba's: code for these takes twice as long to compile.
+number of threads.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import NORMAL_MAD, Array
-from errormotion.compiling import Compiler
+from errormotion.compiling import Compiler, in_threads
 
 COLUMNS = 16
 """Points of a block along x, the profile."""
@@ -25,7 +20,7 @@ POINTS = ROWS * COLUMNS
 FEWEST = 20
 """A block with fewer valid points carries no information."""
 MANY = 10000
-"""More blocks than these are shared by several threads."""
+"""More points or blocks than these are shared by several threads."""
 
 # Sums may be taken in any order (so that they vectorise), but NaN stays NaN.
 FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -38,35 +33,7 @@ _FEW_OF_ROW, _OF_ROW = 6, 16
 _OFF = 1.3
 
 
-compiled = Compiler("the registration of scans", seconds=5, error_model="numpy")
-
-
-def in_threads(work: Callable[..., Any], rows: int, blocks: int, *given: Any) -> None:
-    """Call ``work(*given, first, last)`` for parts of the rows of blocks, on several threads if there are many.
-
-    Parameters
-    ----------
-    work : callable
-        Computes the rows from ``first`` to before ``last``, each by itself.
-    rows, blocks : int
-        How many there are; few blocks take one thread.
-    given : tuple
-        Further arguments.
-    """
-    limits = np.linspace(0, rows, min(threads() if blocks > MANY else 1, rows) + 1).astype(int).tolist()
-    own, *others = pairwise(limits)
-    with ThreadPoolExecutor(max(len(others), 1)) as pool:  # starts no thread before there is work for it
-        running = [pool.submit(work, *given, *part) for part in others]
-        work(*given, *own)
-        for each in running:
-            each.result()
-
-
-def threads() -> int:
-    """Return how many threads share the rows: as many as numba uses (``NUMBA_NUM_THREADS``)."""
-    import numba
-
-    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined, unused-ignore]
+compiled = Compiler("the registration of scans", seconds=4, error_model="numpy")
 
 
 @compiled(inner=True)
@@ -211,7 +178,7 @@ def _trimmed_plane(
     return True
 
 
-@compiled(inner=True)
+@compiled(inline="always")
 def _refit(
     z: NDArray[np.float32],
     r0: int,
@@ -246,7 +213,7 @@ def _refit(
     out[4] = 0.0
 
 
-@compiled(inner=True, fastmath=FAST)
+@compiled(inline="always")
 def _block_sums(
     z: NDArray[np.float32], r0: int, dx: NDArray[np.float32], dy: NDArray[np.float32], sums: NDArray[np.float32]
 ) -> None:  # pragma: no cover - compiled
@@ -272,7 +239,7 @@ def _block_sums(
         sums[0, column], sums[1, column], sums[2, column], sums[3, column] = S0, S1, S2, SS
 
 
-@compiled(inner=True)
+@compiled(inline="always")
 def _row_scale(
     z: NDArray[np.float32],
     r0: int,
@@ -339,7 +306,7 @@ def reduce_blocks(z: NDArray[np.float32], dx: Array, dy: Array, usual: float) ->
     of_row = np.hstack([mean, Syy, 1.0 / POINTS + mean**2 / Syy, qy])
     out = np.empty((9, len(dy), z.shape[1] // COLUMNS))
     single = (each.astype(np.float32) for each in (dx, dy, centred))
-    in_threads(_reduce_rows, len(dy), z.size, z, dx, dy, *single, of_row, Sxx, usual, out)
+    in_threads(_reduce_rows, len(dy), z.size > MANY, z, dx, dy, *single, of_row, Sxx, usual, out)
     return out
 
 

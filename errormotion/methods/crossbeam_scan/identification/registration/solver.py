@@ -26,13 +26,9 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.methods.crossbeam_scan.identification.registration.blocks import BlockMap, some_of, upper_median
-from errormotion.methods.crossbeam_scan.identification.registration.comparison import (
-    accumulate,
-    lag_sums,
-)
+from errormotion.methods.crossbeam_scan.identification.registration.comparison import compare, lag_sums
 from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import scales
-from errormotion.methods.crossbeam_scan.identification.registration.kernels import in_threads
 
 NONE = Extra.of(None)
 LINE = [2, 1]
@@ -73,13 +69,9 @@ class Problem:
         """Return residuals and sums at a state; blocks further off than ``gate`` (m) are left out of the sums."""
         matrix, normal = self.map(state)
         n = 6 + len(self.extra.bases)
-        residual, weight = np.empty((2, *self.stack.shape[1:]))
-        rows = np.empty((len(self.y), n * n + n + 3))
-        surface = self.cold.surface
-        in_threads(
-            accumulate, len(self.y), residual.size,
-            self.stack, self.x, self.y, matrix, normal, self.centre, self.extra.bases, surface.coefficients,
-            self.cold.variance, surface.grid, gate, residual, weight, rows,
+        residual, weight, rows = compare(
+            self.stack, self.x, self.y, matrix, normal, self.centre, self.extra.bases, self.cold.surface.coefficients,
+            self.cold.variance, self.cold.surface.grid, gate,
         )  # fmt: skip
         A, g = rows[:, : n * n].reshape(-1, n, n), rows[:, n * n : n * n + n]
         return Sums(residual, weight, A, g, *rows[:, n * n + n :].T)
@@ -295,8 +287,7 @@ def _long_run(residual: Array, weight: Array, fitted: int, of_line: float = 0.0)
 
     ``fitted`` parameters have been taken out of all blocks, and line effects the share ``of_line`` out of each line.
     """
-    sums, pairs = np.empty((2, LAGS + 1, 2 * LAGS + 1))
-    lag_sums(residual, weight, LAGS, sums, pairs)
+    sums, pairs = lag_sums(residual, weight, LAGS)
     covariance = sums / np.maximum(pairs, 1.0)
     count, alone = float(pairs[0, LAGS]), float(covariance[0, LAGS])
     total = float(2 * covariance[1:].sum() + covariance[0].sum())

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from errormotion.compiling import Compiler
+from collections.abc import Callable
+from typing import Any
+
+from errormotion.arrays import Array
+from errormotion.compiling import Compiler, in_threads
 
 CHUNK = 1024
 """Targets that one thread adds up."""
@@ -19,7 +23,16 @@ EXACT = {"contract", "nsz"}
 compiled = Compiler("the loops for large networks of stations and targets", seconds=30, error_model="numpy")
 
 
-@compiled()
-def chunks(targets: int) -> int:  # pragma: no cover - compiled
+def chunks(targets: int) -> int:
     """Return into how many chunks so many targets are cut."""
-    return (targets + CHUNK - 1) // CHUNK
+    return -(-targets // CHUNK)
+
+
+def in_chunks(work: Callable[..., Any], targets: int, *given: Any) -> None:
+    """Call ``work(*given, first, last)`` for ranges of chunks; where there are many targets, threads share them."""
+    in_threads(work, chunks(targets), targets > MANY, *given)
+
+
+def of_four(station: Array, further: Array) -> bool:
+    """Return whether these are four stations (n, 3) without further parameters (k, ...): `four` has loops for them."""
+    return len(station) == 4 and len(further) == 0

@@ -8,10 +8,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, FAST, MANY, chunks, compiled
+from errormotion.methods.multilateration.network.kernels.compiling import (
+    CHUNK,
+    FAST,
+    chunks,
+    compiled,
+    in_chunks,
+    of_four,
+)
 from errormotion.methods.multilateration.network.kernels.four_examined import Flags, datum_four, examine_four
 from errormotion.methods.multilateration.network.kernels.general import sight
 
@@ -58,48 +64,32 @@ def _spread_motions(D: Array, c: Array, DG: Array) -> None:  # pragma: no cover 
         DG[k, 5] = D[k, 1] * c[0] - D[k, 0] * c[1]
 
 
-@compiled(inner=True)
-def _datum_part(
-    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, part: int, sums: Array
-) -> None:  # pragma: no cover - compiled
-    n, first, last = len(station), part * CHUNK, min(len(target), (part + 1) * CHUNK)
-    if n == 4 and len(extra) == 0:
-        datum_four(weight, station, target, carries, centre, first, last, sums)
-        return
+@compiled()
+def _datum_chunks(
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, sums: Array, first: int,
+    last: int,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `datum_sums` for some chunks."""
+    n = len(station)
     w, c, e, distance, D = np.empty(n), np.empty(3), np.empty((n, 3)), np.empty(n), np.empty((3, 3))
     v, DG = np.empty(6), np.empty((3, 6))
-    for i in range(first, last):
+    for i in range(first * CHUNK, min(last * CHUNK, len(target))):
         for j in range(n):
             w[j] = weight[j, i]
         if not carries[i] or not sight(w, station, target[i], e, distance, D):
             continue
+        own = sums[i // CHUNK]
         for k in range(3):
             c[k] = target[i, k] - centre[k]
-        _add_response(e, w, D, c, extra, i, v, sums[:, 12:])
+        _add_response(e, w, D, c, extra, i, v, own[:, 12:])
         _spread_motions(D, c, DG)
-        _add_motions(DG, c, sums[:, 6:12])
+        _add_motions(DG, c, own[:, 6:12])
         for a in range(3):
-            sums[a, a] += 1.0
+            own[a, a] += 1.0
         square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
         for a in range(3):
             for b in range(3):
-                sums[3 + a, 3 + b] += (square if a == b else 0.0) - c[a] * c[b]
-
-
-@compiled()
-def _datum_alone(
-    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, sums: Array
-) -> None:  # pragma: no cover - compiled
-    for part in range(len(sums)):
-        _datum_part(weight, station, extra, target, carries, centre, part, sums[part])
-
-
-@compiled(parallel=True)
-def _datum_shared(
-    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, sums: Array
-) -> None:  # pragma: no cover - compiled
-    for part in prange(len(sums)):
-        _datum_part(weight, station, extra, target, carries, centre, part, sums[part])
+                own[3 + a, 3 + b] += (square if a == b else 0.0) - c[a] * c[b]
 
 
 def datum_sums(
@@ -111,8 +101,11 @@ def datum_sums(
     the stations' parameters.
     """
     sums = np.zeros((chunks(len(target)), 6, 12 + 4 * len(station) + len(extra)))
-    work = _datum_shared if len(target) > MANY else _datum_alone
-    work(weight, station, extra, target, carries, centre, sums)
+    weight = np.ascontiguousarray(weight)  # for another order of memory the loops would be compiled once more
+    if of_four(station, extra):
+        in_chunks(datum_four, len(target), weight, station, target, carries, centre, sums)
+    else:
+        in_chunks(_datum_chunks, len(target), weight, station, extra, target, carries, centre, sums)
     total = sums.sum(axis=0)
     return total[:, :6], total[:, 6:12], total[:, 12:]
 
@@ -139,23 +132,18 @@ def _covariance(
             out[a, b] = s
 
 
-@compiled(inner=True, fastmath=FAST)
-def _examine_part(
+@compiled(fastmath=FAST)
+def _examine_chunks(
     weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
     centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
-    part: int,
+    first: int, last: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `examine` for some chunks."""
     stations, p = len(station), W.shape[1]
-    first, last = part * CHUNK, min(len(target), (part + 1) * CHUNK)
-    if stations == 4 and len(extra) == 0:
-        examine_four(
-            weight, station, target, carries, centre, W, shift, H, K, first, last, covariance, redundancy
-        )  # fmt: skip
-        return
     w, distance, c = np.empty(stations), np.empty(stations), np.empty(3)
     e, D, FW, q = np.empty((stations, 3)), np.empty((3, 3)), np.empty((3, p)), np.empty((stations, p))
     DG, G, room = np.empty((3, 6)), np.zeros((3, 6)), np.empty((3, 6))
-    for i in range(first, last):
+    for i in range(first * CHUNK, min(last * CHUNK, len(target))):
         for j in range(stations):
             w[j], redundancy[j, i] = weight[j, i], np.nan
         if not sight(w, station, target[i], e, distance, D):
@@ -203,28 +191,6 @@ def _examine_part(
         _covariance(D, DG, FW, G, H, K, room, covariance[i])
 
 
-@compiled()
-def _examine_alone(
-    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
-    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
-) -> None:  # pragma: no cover - compiled  # fmt: skip
-    for part in range((len(target) + CHUNK - 1) // CHUNK):
-        _examine_part(
-            weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy, part
-        )  # fmt: skip
-
-
-@compiled(parallel=True)
-def _examine_shared(
-    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
-    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
-) -> None:  # pragma: no cover - compiled  # fmt: skip
-    for part in prange((len(target) + CHUNK - 1) // CHUNK):
-        _examine_part(
-            weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy, part
-        )  # fmt: skip
-
-
 def examine(
     weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
     centre: Array, W: Array, shift: Array, H: Array, K: Array,
@@ -242,8 +208,12 @@ def examine(
     """
     n, m = weight.shape
     covariance, redundancy = np.empty((m, 3, 3)), np.empty((n, m))
-    work = _examine_shared if m > MANY else _examine_alone
-    work(weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy)
+    found = target, carries, centre, W, shift, H, K, covariance, redundancy
+    weight = np.ascontiguousarray(weight)
+    if of_four(station, extra):
+        in_chunks(examine_four, m, weight, station, *found)
+    else:
+        in_chunks(_examine_chunks, m, weight, station, extra, *found)
     return covariance, redundancy
 
 

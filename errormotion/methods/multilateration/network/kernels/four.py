@@ -11,9 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.kernels.compiling import EXACT, FAST, LANES, compiled
+from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, EXACT, FAST, LANES, compiled
 
 # A target with its directions this close to a plane is not moved, and has no place.
 _FLAT = 1e-13
@@ -159,51 +160,50 @@ def _equate(R: Array, W: Array, station: Array, U: Array, v: Array) -> None:  # 
         v[16, t] = -(na * ra + nb * rb + nc * rc + nd * rd)
 
 
-@compiled(inner=True, fastmath=EXACT)
+@compiled(fastmath=EXACT)
 def reduce_four(
-    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, first: int, last: int, sums: Array
-) -> float:  # pragma: no cover - compiled
-    """Do the work of `kernels.reduce_targets` for some targets; return the square of the longest first step, m^2."""
+    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, sums: Array, moved: Array,
+    first: int, last: int,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `general.reduce_targets` for some chunks: their sums, and the squares of the first steps, m^2."""
     R, W, U = np.empty((4, LANES)), np.empty((4, LANES)), np.empty((3, LANES))
-    v, size, spread, furthest = np.empty((17, LANES)), np.empty(LANES), np.empty(LANES), 0.0
-    for begin in range(first, last, LANES):
-        count = min(LANES, last - begin)
+    v, size, spread = np.empty((17, LANES)), np.empty(LANES), np.empty(LANES)
+    for begin in range(first * CHUNK, min(last * CHUNK, place.shape[1]), LANES):
+        part, count = begin // CHUNK, min(LANES, place.shape[1] - begin)
         _load(reading, weight, dead_path, place, begin, count, R, W, U)
         for step in range(_STEPS):
             far = _move(R, W, station, U, size, spread)
             if step == 0:
-                furthest = max(furthest, far)
+                moved[part] = max(moved[part], far)
             if far < _SHORT:
                 break
         for k in range(3):
-            place[k, begin : begin + count] = U[k, :count]
+            for t in range(count):
+                place[k, begin + t] = U[k, t]
         _equate(R, W, station, U, v)
-        _add_products(v, sums)
-    return furthest
+        _add_products(v, sums[part])
 
 
-@compiled(inner=True, fastmath=EXACT)
+@compiled(fastmath=EXACT)
 def settle_four(
-    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, first: int, last: int,
-    nominal: Array, centre: Array, openness: Array, sums: Array,
-) -> float:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `kernels.settle_targets` for some targets; return the square of the longest first step, m^2."""
+    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, nominal: Array, centre: Array,
+    openness: Array, sums: Array, first: int, last: int,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `general.settle_targets` for some chunks."""
     R, W, U = np.empty((4, LANES)), np.empty((4, LANES)), np.empty((3, LANES))
-    size, spread, furthest = np.empty(LANES), np.empty(LANES), 0.0
-    for begin in range(first, last, LANES):
-        count = min(LANES, last - begin)
+    size, spread = np.empty(LANES), np.empty(LANES)
+    for begin in range(first * CHUNK, min(last * CHUNK, place.shape[1]), LANES):
+        count = min(LANES, place.shape[1] - begin)
         _load(reading, weight, dead_path, place, begin, count, R, W, U)
-        for step in range(_LAST_STEPS):
-            far = _move(R, W, station, U, size, spread)
-            if step == 0:
-                furthest = max(furthest, far)
-            if far < _SETTLED:
+        for _ in range(_LAST_STEPS):
+            if _move(R, W, station, U, size, spread) < _SETTLED:
                 break
-        openness[begin : begin + count] = spread[:count]
+        for t in range(count):
+            openness[begin + t] = spread[t]
         for k in range(3):
-            place[k, begin : begin + count] = U[k, :count]
-        _add_moments(U, nominal, centre, spread, begin, count, sums)
-    return furthest
+            for t in range(count):
+                place[k, begin + t] = U[k, t]
+        _add_moments(U, nominal, centre, spread, begin, count, sums[begin // CHUNK])
 
 
 @compiled(inner=True, fastmath=FAST)
@@ -252,19 +252,19 @@ def _add_moments(
     sums[15] += cz
 
 
-@compiled(inner=True, fastmath=EXACT)
+@compiled(fastmath=EXACT)
 def screen_four(
-    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, first: int, last: int, factor: Array,
-    weak: float, largest: Array,
-) -> int:  # pragma: no cover - compiled  # fmt: skip
-    """Return how many readings of some targets are checked by others; ``largest`` (1,) is their worst residual.
+    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float,
+    checked: NDArray[np.int64], largest: Array, first: int, last: int,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    """Count for some chunks the readings that are checked by others; ``largest`` is the square of the worst residual.
 
     Residuals are over what they should be. With one equation left they are alike for all readings of a target.
     """
     R, W, U, v = np.empty((4, LANES)), np.empty((4, LANES)), np.empty((3, LANES)), np.empty((17, LANES))
-    taken, part, count, worst = np.empty(LANES), np.empty(LANES), 0, largest[0]
-    for begin in range(first, last, LANES):
-        some = min(LANES, last - begin)
+    taken, part = np.empty(LANES), np.empty(LANES)
+    for begin in range(first * CHUNK, min(last * CHUNK, place.shape[1]), LANES):
+        chunk, some = begin // CHUNK, min(LANES, place.shape[1] - begin)
         _load(reading, weight, dead_path, place, begin, some, R, W, U)
         _equate(R, W, station, U, v)
         for t in range(LANES):
@@ -286,8 +286,8 @@ def screen_four(
                 checks += 1 if share * share * left > weak else 0
             # In squares: no root for those that are not the worst.
             taken[t] = v[16, t] * v[16, t] / left if left > weak else 0.0
-        count += checks
+        checked[chunk] += checks
+        worst = largest[chunk]
         for t in range(LANES):
             worst = taken[t] if taken[t] > worst else worst
-    largest[0] = worst
-    return count
+        largest[chunk] = worst

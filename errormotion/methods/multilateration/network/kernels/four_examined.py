@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.kernels.compiling import EXACT, FAST, LANES, compiled
+from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, EXACT, FAST, LANES, compiled
 
 Flags = NDArray[np.bool_]
 # Directions to the stations closer to a plane than this, squared, leave a target without a place.
@@ -74,15 +74,15 @@ def _sight(
             C[k, t] -= centre[k]
 
 
-@compiled(inner=True, fastmath=EXACT)
+@compiled(fastmath=EXACT)
 def datum_four(
-    weight: Array, station: Array, target: Array, carries: Flags, centre: Array, first: int, last: int, sums: Array
+    weight: Array, station: Array, target: Array, carries: Flags, centre: Array, sums: Array, first: int, last: int
 ) -> None:  # pragma: no cover - compiled
-    """Add what some targets say to the sums (6, 28) of `examination.datum_sums`."""
+    """Add what the targets of some chunks say to the sums (chunk, 6, 28) of `examination.datum_sums`."""
     W, E, C, D = np.empty((4, LANES)), np.empty((12, LANES)), np.empty((3, LANES)), np.empty((6, LANES))
     own, v, P = np.empty(LANES), np.empty((24, LANES)), np.empty((36, LANES))
-    for begin in range(first, last, LANES):
-        count = min(LANES, last - begin)
+    for begin in range(first * CHUNK, min(last * CHUNK, len(target)), LANES):
+        count = min(LANES, len(target) - begin)
         _sight(weight, station, target, centre, begin, count, W, E, C, D)
         says = carries[begin : begin + count]
         for t in range(count):
@@ -124,7 +124,7 @@ def datum_four(
                 P[18 + k, t] = C[1, t] * z - C[2, t] * y
                 P[24 + k, t] = C[2, t] * x - C[0, t] * z
                 P[30 + k, t] = C[0, t] * y - C[1, t] * x
-        _add_sums(own, C, E, v, P, sums)
+        _add_sums(own, C, E, v, P, sums[begin // CHUNK])
 
 
 @compiled(inner=True, fastmath=FAST)
@@ -195,17 +195,17 @@ def _between(H: Array, C: Array, X: Array) -> None:  # pragma: no cover - compil
         X[5, t] = r2 + b * r3 - a * r4
 
 
-@compiled(inner=True, fastmath=EXACT)
+@compiled(fastmath=EXACT)
 def examine_four(
     weight: Array, station: Array, target: Array, carries: Flags, centre: Array, factor: Array, shift: Array,
-    H: Array, K: Array, first: int, last: int, covariance: Array, redundancy: Array,
+    H: Array, K: Array, covariance: Array, redundancy: Array, first: int, last: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `examination.examine` for some targets."""
+    """Do the work of `examination.examine` for some chunks."""
     W, E, C, D = np.empty((4, LANES)), np.empty((12, LANES)), np.empty((3, LANES)), np.empty((6, LANES))
     S, R, X, Y = np.empty((12, LANES)), np.empty((4, LANES)), np.empty((6, LANES)), np.empty((6, LANES))
     V, own = np.empty((6, LANES)), np.empty(LANES)
-    for begin in range(first, last, LANES):
-        count = min(LANES, last - begin)
+    for begin in range(first * CHUNK, min(last * CHUNK, len(target)), LANES):
+        count = min(LANES, len(target) - begin)
         _sight(weight, station, target, centre, begin, count, W, E, C, D)
         _between(H, C, X)
         _between(K, C, Y)

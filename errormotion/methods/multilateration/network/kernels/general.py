@@ -13,10 +13,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, FAST, MANY, chunks, compiled
+from errormotion.methods.multilateration.network.kernels.compiling import (
+    CHUNK,
+    FAST,
+    chunks,
+    compiled,
+    in_chunks,
+    of_four,
+)
 from errormotion.methods.multilateration.network.kernels.four import reduce_four, screen_four, settle_four
 
 LANES = 128
@@ -154,41 +160,43 @@ def reach_of(
         reach[j] = d
 
 
-@compiled(inner=True)
-def _reduce_chunk(
+@compiled()
+def _reduce_chunks(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array, first: int, last: int, sums: Array,
-) -> float:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `reduce_targets` for some targets; return the square of the longest first step, m^2."""
+    place: Array, sums: Array, moved: Array, first: int, last: int,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `reduce_targets` for some chunks: their sums, and the squares of the first steps, m^2."""
     n, more = len(station), len(value)
     q = 4 * n + more
     reach, w, r, u = np.empty(n), np.empty(n), np.empty(n), np.empty(3)
     e, E, Q = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, n))
-    v, filled, furthest = np.empty((q + 1, LANES)), 0, 0.0
-    for i in range(first, last):
-        reach_of(reading, weight, dead_path, extra, value, i, reach, w)
-        u[0], u[1], u[2] = place[0, i], place[1, i], place[2, i]
-        furthest = max(furthest, _place(reach, w, station, u, _STEPS, _SHORT))
-        place[0, i], place[1, i], place[2, i] = u[0], u[1], u[2]
-        reflect(reach, w, station, u, e, r, E, Q)
-        for a in range(3, n):
-            rest = 0.0
-            for k in range(more):
-                v[4 * n + k, filled] = 0.0
-            for j in range(n):
-                c = Q[a, j] * w[j]
-                v[4 * j, filled], v[4 * j + 1, filled] = -c * e[j, 0], -c * e[j, 1]
-                v[4 * j + 2, filled], v[4 * j + 3, filled] = -c * e[j, 2], -c
-                rest += Q[a, j] * r[j]
+    v = np.empty((q + 1, LANES))
+    for part in range(first, last):
+        filled, furthest = 0, 0.0
+        for i in range(part * CHUNK, min((part + 1) * CHUNK, place.shape[1])):
+            reach_of(reading, weight, dead_path, extra, value, i, reach, w)
+            u[0], u[1], u[2] = place[0, i], place[1, i], place[2, i]
+            furthest = max(furthest, _place(reach, w, station, u, _STEPS, _SHORT))
+            place[0, i], place[1, i], place[2, i] = u[0], u[1], u[2]
+            reflect(reach, w, station, u, e, r, E, Q)
+            for a in range(3, n):
+                rest = 0.0
                 for k in range(more):
-                    v[4 * n + k, filled] += c * extra[k, j, i]
-            v[q, filled] = rest
-            filled += 1
-            if filled == LANES:
-                _add_products(v, filled, sums)
-                filled = 0
-    _add_products(v, filled, sums)
-    return furthest * furthest
+                    v[4 * n + k, filled] = 0.0
+                for j in range(n):
+                    c = Q[a, j] * w[j]
+                    v[4 * j, filled], v[4 * j + 1, filled] = -c * e[j, 0], -c * e[j, 1]
+                    v[4 * j + 2, filled], v[4 * j + 3, filled] = -c * e[j, 2], -c
+                    rest += Q[a, j] * r[j]
+                    for k in range(more):
+                        v[4 * n + k, filled] += c * extra[k, j, i]
+                v[q, filled] = rest
+                filled += 1
+                if filled == LANES:
+                    _add_products(v, filled, sums[part])
+                    filled = 0
+        _add_products(v, filled, sums[part])
+        moved[part] = furthest * furthest
 
 
 @compiled(inner=True)
@@ -235,124 +243,31 @@ def sight(
     return True
 
 
-@compiled(inner=True)
-def _settle_chunk(
+@compiled()
+def _settle_chunks(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array, first: int, last: int, nominal: Array, centre: Array, openness: Array, sums: Array,
-) -> float:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `settle_targets` for some targets; return the square of the longest first step, m^2."""
+    place: Array, nominal: Array, centre: Array, openness: Array, sums: Array, first: int, last: int,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `settle_targets` for some chunks."""
     n = len(station)
     reach, w, u, e = np.empty(n), np.empty(n), np.empty(3), np.empty((n, 3))
-    distance, D, furthest = np.empty(n), np.empty((3, 3)), 0.0
-    for i in range(first, last):
+    distance, D = np.empty(n), np.empty((3, 3))
+    for i in range(first * CHUNK, min(last * CHUNK, place.shape[1])):
         reach_of(reading, weight, dead_path, extra, value, i, reach, w)
         u[0], u[1], u[2] = place[0, i], place[1, i], place[2, i]
-        furthest = max(furthest, _place(reach, w, station, u, _LAST_STEPS, _SETTLED))
+        _place(reach, w, station, u, _LAST_STEPS, _SETTLED)
         place[0, i], place[1, i], place[2, i] = u[0], u[1], u[2]
         openness[i] = math.inf
         if not sight(w, station, u, e, distance, D):
             continue
         openness[i] = D[0, 0] + D[1, 1] + D[2, 2]
-        sums[0] += 1.0
+        own = sums[i // CHUNK]
+        own[0] += 1.0
         for k in range(3):
-            sums[1 + k] += u[k] - centre[k]
-            sums[4 + k] += nominal[i, k] - centre[k]
+            own[1 + k] += u[k] - centre[k]
+            own[4 + k] += nominal[i, k] - centre[k]
             for h in range(3):
-                sums[7 + 3 * k + h] += (nominal[i, k] - centre[k]) * (u[h] - centre[h])
-    return furthest * furthest
-
-
-@compiled(inner=True)
-def reduce_part(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array, part: int, sums: Array,
-) -> float:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `reduce_targets` for one chunk; return the square of the longest first step, m^2."""
-    first, last = part * CHUNK, min(place.shape[1], (part + 1) * CHUNK)
-    if len(station) == 4 and len(value) == 0:
-        return reduce_four(reading, weight, station, dead_path, place, first, last, sums)
-    return _reduce_chunk(reading, weight, station, dead_path, extra, value, place, first, last, sums)
-
-
-@compiled(inner=True)
-def _settle_part(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array, part: int, nominal: Array, centre: Array, openness: Array, sums: Array,
-) -> float:  # pragma: no cover - compiled  # fmt: skip
-    first, last = part * CHUNK, min(place.shape[1], (part + 1) * CHUNK)
-    if len(station) == 4 and len(value) == 0:
-        return settle_four(
-            reading, weight, station, dead_path, place, first, last, nominal, centre, openness, sums
-        )  # fmt: skip
-    return _settle_chunk(
-        reading, weight, station, dead_path, extra, value, place, first, last, nominal, centre, openness, sums
-    )
-
-
-@compiled()
-def total(sums: Array) -> Array:  # pragma: no cover - compiled
-    """Return the sum of the chunks' sums (k, q, q), in their order, with the lower triangle that they leave out."""
-    q = sums.shape[1]
-    whole = np.zeros((q, q))
-    for part in range(len(sums)):
-        for i in range(q):
-            for j in range(i, q):
-                whole[i, j] += sums[part, i, j]
-    for i in range(q):
-        for j in range(i):
-            whole[i, j] = whole[j, i]
-    return whole
-
-
-@compiled()
-def _reduce_alone(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array,
-) -> tuple[Array, float]:  # pragma: no cover - compiled  # fmt: skip
-    q, count = 4 * len(station) + len(value) + 1, chunks(place.shape[1])
-    sums, moved = np.zeros((count, q, q)), 0.0
-    for part in range(count):
-        far = reduce_part(reading, weight, station, dead_path, extra, value, place, part, sums[part])
-        moved = max(moved, far)
-    return total(sums), math.sqrt(moved)
-
-
-@compiled(parallel=True)
-def _reduce_shared(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array,
-) -> tuple[Array, float]:  # pragma: no cover - compiled  # fmt: skip
-    q, count = 4 * len(station) + len(value) + 1, chunks(place.shape[1])
-    sums, moved = np.zeros((count, q, q)), np.zeros(count)
-    for part in prange(count):
-        moved[part] = reduce_part(reading, weight, station, dead_path, extra, value, place, part, sums[part])
-    return total(sums), math.sqrt(moved.max())
-
-
-@compiled()
-def _settle_alone(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array, nominal: Array, centre: Array, openness: Array,
-) -> Array:  # pragma: no cover - compiled  # fmt: skip
-    sums = np.zeros((chunks(place.shape[1]), 16))
-    for part in range(len(sums)):
-        _settle_part(
-            reading, weight, station, dead_path, extra, value, place, part, nominal, centre, openness, sums[part]
-        )
-    return sums
-
-
-@compiled(parallel=True)
-def _settle_shared(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array, nominal: Array, centre: Array, openness: Array,
-) -> Array:  # pragma: no cover - compiled  # fmt: skip
-    sums = np.zeros((chunks(place.shape[1]), 16))
-    for part in prange(len(sums)):
-        _settle_part(
-            reading, weight, station, dead_path, extra, value, place, part, nominal, centre, openness, sums[part]
-        )
-    return sums
+                own[7 + 3 * k + h] += (nominal[i, k] - centre[k]) * (u[h] - centre[h])
 
 
 def reduce_targets(
@@ -380,9 +295,14 @@ def reduce_targets(
     moved : float
         Longest first step of a target, m.
     """
-    work = _reduce_shared if place.shape[1] > MANY else _reduce_alone
-    sums, moved = work(reading, weight, station, dead_path, extra, value, place)
-    return sums, moved
+    q, m = 4 * len(station) + len(value) + 1, place.shape[1]
+    sums, moved = np.zeros((chunks(m), q, q)), np.zeros(chunks(m))
+    if of_four(station, value):
+        in_chunks(reduce_four, m, reading, weight, station, dead_path, place, sums, moved)
+    else:
+        in_chunks(_reduce_chunks, m, reading, weight, station, dead_path, extra, value, place, sums, moved)
+    total = np.triu(sums.sum(axis=0))  # chunks leave out the lower triangle
+    return total + np.triu(total, 1).T, math.sqrt(moved.max())
 
 
 def settle_targets(
@@ -399,33 +319,14 @@ def settle_targets(
         Of the targets with a place: their number, sums of targets and of nominal ones (m, 3) about ``centre`` (3,), and
         the sum (3, 3) of nominal times target.
     """
-    openness = np.empty(place.shape[1])
-    work = _settle_shared if place.shape[1] > MANY else _settle_alone
-    sums = work(reading, weight, station, dead_path, extra, value, place, nominal, centre, openness)
+    m = place.shape[1]
+    openness, sums = np.empty(m), np.zeros((chunks(m), 16))
+    found = place, nominal, centre, openness, sums
+    if of_four(station, value):
+        in_chunks(settle_four, m, reading, weight, station, dead_path, *found)
+    else:
+        in_chunks(_settle_chunks, m, reading, weight, station, dead_path, extra, value, *found)
     return openness, sums.sum(axis=0)
-
-
-@compiled()
-def _screen_alone(
-    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float
-) -> tuple[int, float]:  # pragma: no cover - compiled
-    largest = np.zeros(1)
-    count = screen_four(reading, weight, station, dead_path, place, 0, place.shape[1], factor, weak, largest)
-    return count, largest[0]
-
-
-@compiled(parallel=True)
-def _screen_shared(
-    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float
-) -> tuple[int, float]:  # pragma: no cover - compiled
-    parts, m = chunks(place.shape[1]), place.shape[1]
-    largest, count = np.zeros((parts, 1)), np.zeros(parts, dtype=np.int64)
-    for part in prange(parts):
-        count[part] = screen_four(
-            reading, weight, station, dead_path, place, part * CHUNK, min(m, (part + 1) * CHUNK), factor, weak,
-            largest[part],
-        )  # fmt: skip
-    return count.sum(), largest.max()
 
 
 def screen_targets(
@@ -436,6 +337,7 @@ def screen_targets(
     Residuals are over what they should be, the stations' factor (16, p) taken into account; readings with a redundancy
     below ``weak`` are not checked.
     """
-    work = _screen_shared if place.shape[1] > MANY else _screen_alone
-    count, square = work(reading, weight, station, dead_path, place, factor, weak)
-    return int(count), math.sqrt(square)
+    m = place.shape[1]
+    checked, largest = np.zeros(chunks(m), dtype=np.int64), np.zeros(chunks(m))
+    in_chunks(screen_four, m, reading, weight, station, dead_path, place, factor, weak, checked, largest)
+    return int(checked.sum()), math.sqrt(largest.max())
