@@ -152,7 +152,9 @@ def test_wrong_scans_are_refused_with_what_to_do(scanner, change, message):
 
 SAME_BITS = """
 import numpy as np
-from errormotion.methods.crossbeam_scan.identification.registration import kernels, prepare, register
+from errormotion import compiling
+from errormotion.methods.crossbeam_scan.identification.registration import comparison, prepare, register
+comparison.COMPILED_FROM = comparison.MANY = 0
 rng = np.random.default_rng(0)
 x, y = np.arange(800) * 12.5e-6, np.arange(300) * 70e-6
 X, Y = np.meshgrid(x, y)
@@ -162,7 +164,7 @@ warm[rng.random(z.shape) < 0.02] = np.nan
 cold[rng.random(z.shape) < 0.02] += 1e-4
 seen = set()
 for threads in (1, 2):
-    kernels.threads = lambda: threads
+    compiling.threads = lambda: threads
     found = register(prepare(cold, x, y), prepare(warm, x, y))
     seen.add(found.pose.as_matrix().tobytes() + found.covariance.tobytes() + found.residual.tobytes())
 print(len(seen))

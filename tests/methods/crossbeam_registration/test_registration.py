@@ -8,9 +8,10 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import RigidTransform
 
+from errormotion import compiling
 from errormotion.errors import MethodError
 from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.identification.registration import kernels, prepare, register
+from errormotion.methods.crossbeam_scan.identification.registration import comparison, prepare, register
 from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem, State
 
@@ -315,9 +316,14 @@ def test_what_an_artefact_tells_is_the_sum_over_its_blocks(scanner):
 def test_one_thread_and_several_add_up_the_same(scanner, motion, monkeypatch):
     rng = np.random.default_rng(14)
     problem = Problem.of(prepare(*scanner.scan(rng)), prepare(*scanner.scan(rng, motion)))
+    plain = problem.evaluate(State.of(motion))  # by array operations
+    monkeypatch.setattr(comparison, "COMPILED_FROM", 0)
     alone = problem.evaluate(State.of(motion))
-    monkeypatch.setattr(kernels, "MANY", 0)
-    monkeypatch.setattr(kernels, "threads", lambda: 3)
+    np.testing.assert_allclose(plain.residual, alone.residual, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(plain.weight, alone.weight, rtol=1e-9)
+    np.testing.assert_allclose(plain.A.sum(axis=0), alone.A.sum(axis=0), rtol=1e-9)
+    monkeypatch.setattr(comparison, "MANY", 0)
+    monkeypatch.setattr(compiling, "threads", lambda: 3)
     shared = problem.evaluate(State.of(motion))
     np.testing.assert_array_equal(shared.residual, alone.residual)
     np.testing.assert_allclose(shared.A, alone.A, rtol=1e-12)

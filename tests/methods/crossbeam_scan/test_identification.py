@@ -9,12 +9,12 @@ import xarray as xr
 from scipy import stats
 from scipy.spatial.transform import RigidTransform
 
-from errormotion import datasets
+from errormotion import compiling, datasets
 from errormotion.datasets import provenance
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
-from errormotion.methods.crossbeam_scan.identification.registration import kernels
+from errormotion.methods.crossbeam_scan.identification.registration import comparison
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.montecarlo.trials import redrawing_of
 from errormotion.twin import VirtualMachine
@@ -316,8 +316,10 @@ def test_twice_is_the_same_to_the_bit(campaigns, found):
 
 def test_one_thread_and_two_give_the_same_bits(campaigns, monkeypatch):
     runs = []
+    monkeypatch.setattr(comparison, "COMPILED_FROM", 0)
+    monkeypatch.setattr(comparison, "MANY", 0)
     for threads in (1, 2):
-        monkeypatch.setattr(kernels, "threads", lambda threads=threads: threads)
+        monkeypatch.setattr(compiling, "threads", lambda threads=threads: threads)
         runs.append(identify(campaigns[2]))
     assert_same(*runs)
 
