@@ -1,7 +1,7 @@
 # Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo compiled test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance following programs lowest lock
+.PHONY: help setup demo compiled test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance following programs pictures lowest lock
 
 BIN := .venv/bin
 ARGS ?=
@@ -65,6 +65,9 @@ following: .venv/.dev  ## compensate the real LinuxCNC with a fault every 30 s, 
 
 programs: .venv/.dev  ## read 1e6 random NC programs by LinuxCNC's interpreter (ARGS="--programs 2e4"), and write docs/reliability.md
 	$(BIN)/python tools/programs.py $(ARGS)
+
+pictures: compiled  ## draw docs/figures/dashboard_*.png anew, by the browser tests of the dashboard (needs chromium)
+	$(BIN)/python -m pytest -n 0 tests/dashboard/test_pictures.py --pictures docs/figures
 
 lowest: .venv/.dev  ## run tests with the lowest versions of packages that pyproject.toml allows, in .venv-lowest
 	$(BIN)/python tools/lowest.py $(ARGS)

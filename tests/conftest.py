@@ -30,6 +30,11 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("errormotion")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the folder of pictures."""
+    parser.addoption("--pictures", metavar="FOLDER", help="write the pictures of the documentation that tests make")
+
+
 def pytest_xdist_auto_num_workers() -> int:
     """Use two workers for each processor: many tests wait for a device that is late, silent or slow on purpose."""
     return 2 * (os.cpu_count() or 1)

@@ -5,40 +5,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from short_demonstration import measure
 from typer.testing import Result
 
-from errormotion.campaign.files import load_campaign
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.demo import spindle as demonstration
-
-SHORTER = {
-    "steps = 41": "steps = 21",
-    'procedure = "beam_detection"': 'procedure = "beam_detection"\nscan_length = "1.6 mm"',
-    '"61.4 min"': '"132 s"',
-    '{ at = "121 min"': '{ at = "61 min"',
-    '{ at = "121.2 min"': '{ at = "61.6 min"',
-    '{ at = "61 min", compensation = { Z = false } },\n    { at = "61.2 min"': (
-        '{ at = "1 min", compensation = { Z = false } },\n    { at = "1.6 min"'
-    ),
-    'running_end = "61 min"': 'running_end = "1 min"',
-    'at = "54 min"': 'at = "57.8 min"',
-    'duration = "65 min"': 'duration = "3.7 min"',
-    'interval = "5 min"': 'interval = "72 s"',
-}
 
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[RunFolder]]:
     """Run the short campaign once; return the campaign and its run folders."""
-    folder = tmp_path_factory.mktemp("demo")
-    text = demonstration.CAMPAIGN.read_text()
-    for long, short in SHORTER.items():
-        assert long in text
-        text = text.replace(long, short)
-    (folder / "campaign.toml").write_text(text)
-    (folder / "bench.toml").write_text((demonstration.CAMPAIGN.parent / "bench.toml").read_text())
-    campaign = folder / "campaign.toml"
-    return campaign, demonstration.work(load_campaign(campaign), runs=folder / "runs", quiet=True)
+    return measure(tmp_path_factory.mktemp("demo"))
 
 
 @pytest.fixture

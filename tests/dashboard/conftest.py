@@ -60,6 +60,27 @@ def markup() -> str:
     return MARKUP
 
 
+@pytest.fixture(scope="session")
+def pictures(pytestconfig: pytest.Config) -> Path | None:
+    """Return the folder for pictures of the documentation; None: none are made."""
+    folder = pytestconfig.getoption("--pictures")
+    return Path(folder).resolve() if folder else None
+
+
+@pytest.fixture
+def picture(pictures: Path | None) -> Callable[..., None]:
+    """Return a function that writes a page as a picture, after some seconds; without a folder it does nothing."""
+
+    def take(page: Any, name: str, height: int, seconds: float = 0.5) -> None:
+        if pictures is not None:
+            page.wait_for_timeout(1000 * seconds)
+            page.mouse.move(0, 0)
+            clip = {"x": 0, "y": 0, "width": 1280, "height": height}
+            page.screenshot(path=pictures / f"dashboard_{name}.png", clip=clip, full_page=True)
+
+    return take
+
+
 def finished(root: Path, number: str, bias: float = 0.0, points: int = 5000) -> RunFolder:
     """Write a finished run whose names hold markup: an hour of drift, in the end too large by ``bias`` along Z, m."""
     base = {"bench": {"machine": f"Mill {MARKUP}"}, "method": {"id": "spindle_drift"}, "steps": []}

@@ -90,7 +90,7 @@ def test_values_live_and_a_sensor_that_is_unplugged(
     sync_api.expect(page.locator("#temperatures")).to_contain_text("spindle front<script>")
     page.wait_for_selector("#map svg >> nth=1")
     assert page.locator("#map svg").count() == 2
-    assert page.locator("#map .head + text").all_text_contents() == ["head: Z"] * 2
+    assert page.locator("#map .head-name").all_text_contents() == ["head: Z"] * 2
     sync_api.expect(page.locator(".tiles .rate").first).to_contain_text("readings/s")
     _shows_the_same(page, served.address)
     before = page.inner_text("#clock")

@@ -83,6 +83,60 @@ function bodies([h, v], position) { // bed, table, frame and head in one view, m
   ];
 }
 
+// Where texts of a drawing go: boxes [left, top, right, bottom] in its units. A text takes one of the first of its places,
+// and rather one that covers no edge; a place over a text or a circle is none.
+const INK = document.createElement("canvas").getContext("2d");
+const UP = 11, DOWN = 4; // of a line of text, from its base
+
+class Room {
+  constructor(width, height, edges) {
+    Object.assign(this, { border: [4, 4, width - 4, height - 4], edges, taken: [] });
+  }
+
+  take(...box) {
+    this.taken.push(box);
+  }
+
+  cost(box) {
+    const apart = (other) => box[2] <= other[0] || other[2] <= box[0] || box[3] <= other[1] || other[3] <= box[1];
+    const inside = (other) => other[0] <= box[0] && other[1] <= box[1] && box[2] <= other[2] && box[3] <= other[3];
+    if (!inside(this.border) || !this.taken.every(apart)) return Infinity;
+    return this.edges.filter((edge) => !apart(edge) && !inside(edge)).length;
+  }
+
+  place(text, starts) { // starts of the base line, the best first; null where none is free
+    INK.font = getComputedStyle(byId("map")).font.replace(/[\d.]+px/, "12.5px");
+    const width = INK.measureText(text).width + 4, most = starts(width);
+    const boxes = most.map(([x, y]) => [x - 2, y - UP, x + width - 2, y + DOWN]), costs = boxes.map((box, k) => this.cost(box) + k / 10);
+    const best = costs.indexOf(Math.min(...costs));
+    if (costs[best] === Infinity) return null;
+    this.take(...boxes[best]);
+    return most[best];
+  }
+}
+
+function inBody([left, top, right, bottom]) { // inside from the top down, then beside it
+  return (width) => {
+    const rows = [];
+    for (let y = top + UP + 3; y + DOWN < bottom; y += 12) rows.push(y);
+    const middle = (top + bottom) / 2 + DOWN;
+    return [
+      ...(left + width + 8 < right ? rows.flatMap((y) => [[left + 5, y], [right - width - 3, y]]) : []),
+      [right + 5, middle], [left - width - 5, middle], [left, top - 6], [left, bottom + UP + 5],
+    ];
+  };
+}
+
+function atSensor([x, y]) { // beside it, then below and above, then further away
+  return (width) => {
+    const sides = (by) => [[x + 13, y + DOWN + by], [x - 11 - width, y + DOWN + by]];
+    const further = Array.from({ length: 12 }, (_, k) => 8 * (k + 1)).flatMap((by) => [...sides(by), ...sides(-by)]);
+    return [...sides(0), [x - width / 2, y + 24], [x - width / 2, y - 14], ...further];
+  };
+}
+
+const short = (name) => (name.length > 24 ? `${name.slice(0, 23)}…` : name);
+
 function view(sensors, [h, v], low, high, position) { // one view of the machine, with the same scale along both axes
   const drawn = bodies([h, v], position);
   const span = (places, ends) => [Math.min(...places, ...ends), Math.max(...places, ...ends)];
@@ -93,23 +147,35 @@ function view(sensors, [h, v], low, high, position) { // one view of the machine
   const x = (mm) => 1.4 * MARGIN + ((WIDTH - 3.4 * MARGIN) - scale * (h1 - h0)) / 2 + scale * (mm - h0);
   const y = (mm) => tall - margin - ((tall - 2 * margin) - scale * (v1 - v0)) / 2 - scale * (mm - v0);
   const svg = shape("svg", { viewBox: `0 0 ${WIDTH} ${tall}` }), axes = "XYZ";
+  const outlines = drawn.map(({ box }) => [x(box[0]), y(box[1] + box[3]), x(box[0] + box[2]), y(box[1])]);
+  const room = new Room(WIDTH, tall, outlines);
   svg.append(shape("rect", { x: 1, y: 1, width: WIDTH - 2, height: tall - 2, rx: 4 }));
-  for (const { kind, name, box } of drawn) {
-    svg.append(shape("rect", { x: x(box[0]), y: y(box[1] + box[3]), width: scale * box[2], height: scale * box[3], rx: 2, class: `body ${kind}` }));
-    if (name) svg.append(shape("text", { x: x(box[0]) + 5, y: kind === "frame" || kind === "head" ? y(box[1] + box[3]) + 14 : y(box[1] + box[3] / 2) + 4, class: "axis" }, name));
-  }
+  drawn.forEach(({ kind }, k) => {
+    const [left, top, right, bottom] = outlines[k];
+    svg.append(shape("rect", { x: left, y: top, width: right - left, height: bottom - top, rx: 2, class: `body ${kind}` }));
+  });
   svg.append(shape("text", { x: WIDTH - 12, y: tall - 12, "text-anchor": "end", class: "axis" }, `${axes[h]} →`));
   svg.append(shape("text", { x: 12, y: 22, class: "axis" }, `↑ ${axes[v]}`));
-  const labels = [];
-  for (const each of sensors) {
-    const place = [x(1e3 * each.place[h]), y(1e3 * each.place[v])];
+  room.take(WIDTH - 40, tall - 26, WIDTH, tall);
+  room.take(0, 0, 40, 28);
+  const places = sensors.map((each) => [x(1e3 * each.place[h]), y(1e3 * each.place[v])]);
+  for (const [cx, cy] of places) room.take(cx - 9, cy - 9, cx + 9, cy + 9);
+  sensors.forEach((each, k) => {
+    const [cx, cy] = places[k], value = each.flag || number(each.value, 1), text = `${short(each.name)} ${value}`;
     const shade = each.value === null ? "#ffffff" : SHADES[Math.round((SHADES.length - 1) * (each.value - low) / Math.max(high - low, 0.5))];
-    let row = place[1] + 4;
-    while (labels.some(([px, py]) => Math.abs(px - place[0]) < 150 && Math.abs(py - row) < 15)) row += 15;
-    labels.push([place[0], row]);
-    svg.append(shape("circle", { cx: place[0], cy: place[1], r: 8, fill: shade }));
-    svg.append(shape("text", { x: place[0] + 13, y: row, class: "sensor" }, `${each.name.slice(0, 24)} ${each.flag || number(each.value, 1)}`));
-  }
+    const circle = shape("circle", { cx, cy, r: 8, fill: shade }), whole = room.place(text, atSensor(places[k]));
+    const start = whole ?? room.place(value, atSensor(places[k]));
+    circle.append(shape("title", {}, `${each.name} ${value}`));
+    if (start && Math.abs(start[1] - cy) > 30) { // a line to a label that is not at its circle
+      svg.append(shape("line", { x1: cx, y1: cy, x2: start[0] > cx ? start[0] - 3 : cx - 13, y2: start[1] - DOWN, class: "lead" }));
+    }
+    svg.append(circle);
+    if (start) svg.append(shape("text", { x: start[0], y: start[1], class: whole ? "sensor" : "value" }, whole ? text : value));
+  });
+  drawn.forEach(({ kind, name }, k) => {
+    const start = name && room.place(name, inBody(outlines[k]));
+    if (start) svg.append(shape("text", { x: start[0], y: start[1], class: `axis ${kind}-name` }, name));
+  });
   return svg;
 }
 
@@ -119,9 +185,12 @@ function map(temperatures, position) {
   if (byId("map-card").hidden) return;
   const known = sensors.map((each) => each.value).filter((value) => value !== null);
   const low = Math.min(...known), high = Math.max(...known);
-  byId("map").replaceChildren(view(sensors, [0, 2], low, high, position), view(sensors, [1, 2], low, high, position));
+  const views = [[0, 2], [1, 2]].map((axes) => view(sensors, axes, low, high, position));
+  byId("map").replaceChildren(...views);
+  const named = Math.min(...views.map((each) => each.querySelectorAll(".sensor").length));
   const scheme = MACHINE ? " A scheme of the machine: the dashed frame is the travel, the head is where the axes are." : "";
-  byId("map-note").textContent = (known.length ? `Dark is ${number(low, 1)} °C, bright ${number(Math.max(high, low + 0.5), 1)} °C; white is unknown.` : sensors.length ? "No temperature is known." : "No sensor has a place in the bench file.") + scheme;
+  const crowded = named < sensors.length ? " Not every sensor has room for its name: the pointer on a circle shows it." : "";
+  byId("map-note").textContent = (known.length ? `Dark is ${number(low, 1)} °C, bright ${number(Math.max(high, low + 0.5), 1)} °C; white is unknown.` : sensors.length ? "No temperature is known." : "No sensor has a place in the bench file.") + scheme + crowded;
 }
 
 async function values() {
