@@ -36,6 +36,7 @@ def test_the_verdict_is_that_of_the_function(served: Any, pair_of_runs: tuple[Pa
     assert escape(expected) in text
     assert "Most likely cause" in text
     assert "<script>window" not in text
+    assert all(f"drift {key[:16]} {key[-8:]}" in text for key in keys)  # tests of one name
     status, _, text = served.ask(f"/compare/figure.json?{_query(keys)}")
     assert (status, bool(json.loads(text)["item"]["doc"]["roots"])) == (200, True)
 

@@ -243,6 +243,7 @@ def test_results_of_the_demonstration(
     page.click("button:has-text('Compare')")
     page.wait_for_selector("#figure[data-drawn] canvas")
     sync_api.expect(page.locator("#verdict-title")).to_contain_text("The 2 datasets")
+    assert page.locator("th:text-is('balls - drift')").count() == 1
     picture(page, "compare", 1090)
 
 

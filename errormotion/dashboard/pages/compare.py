@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from errormotion.errors import DatasetError, ErrormotionError
 from errormotion.kinematics.iso import DOF
 from errormotion.record.history import history
 from errormotion.record.page import write as write_history
+from errormotion.record.runs.entry import Entry
 from errormotion.record.runs.listing import list_runs
 
 MOST_COMPARED = 20
@@ -138,7 +140,7 @@ class History(Guarded):
 
 
 def _compared(lab: Lab, question: Question) -> xr.Dataset:
-    files = {_name(lab, key): lab.file(key, "errors") for key in question.runs}
+    files = {name: lab.file(key, "errors") for key, name in _names(lab, question.runs).items()}
     asked = {name: value for name, value in asdict(question).items() if name != "runs"}
 
     def make() -> xr.Dataset:
@@ -158,10 +160,16 @@ def _minutes(text: str) -> float:
     return value
 
 
-def _name(lab: Lab, key: str) -> str:
-    """Return the name of a run in a comparison: its test, and the end of its folder, which is unique."""
-    entry = lab.entry(key)
-    return f"{entry.test or 'run'} {entry.folder[:16]} {entry.folder[-8:]}"
+def _names(lab: Lab, keys: Sequence[str]) -> dict[str, str]:
+    """Return the names of runs in a comparison: the test, with start and end of its folder where it is not unique."""
+    entries = {key: lab.entry(key) for key in keys}
+    tests = Counter(entry.test or "run" for entry in entries.values())
+
+    def name(entry: Entry) -> str:
+        test = entry.test or "run"
+        return test if tests[test] == 1 else f"{test} {entry.folder[:16]} {entry.folder[-8:]}"
+
+    return {key: name(entry) for key, entry in entries.items()}
 
 
 def _stated(ds: xr.Dataset) -> dict[str, Any]:
