@@ -166,7 +166,7 @@ def text(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.9g}"
+        return f"{value + 0.0:.9g}"  # no negative zero
     if isinstance(value, (list, tuple)):
         return ", ".join(text(entry) for entry in value)
     if isinstance(value, Mapping):

@@ -91,7 +91,7 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
         wires = {"control": "", "probe": "", "thermometer": ""} | faults
         active = driver == "controller_probe"
         wires |= {"driver": driver, "wire": "controller" if active else "printer"}
-        wires |= {"more": PROBE if active else 'timeout = "0.3 s"\nstart_timeout = "0.3 s"'}
+        wires |= {"more": PROBE if active else 'timeout = "1 s"\nstart_timeout = "1 s"'}
         (tmp_path / "bench.toml").write_text(BENCH.format(kind=kind, **wires))
         text = CAMPAIGN.format(balls=stated, minutes=minutes, axes=machine.tool_axes, settings=settings)
         (tmp_path / "campaign.toml").write_text(text)

@@ -90,11 +90,33 @@ def test_hostile_names_stay_text_in_every_language(german, make_drift):
 def test_a_plugin_brings_a_catalogue_of_its_own():
     t = Catalogue("de", [{"Gauge of {} at {}.": "Bei {2} Lehre von {1}.", "Summary": "Kurzfassung"}])
     assert t("Gauge of 2.5 µm at X <b>. Reported as unknown, not as zero.") == (
-        "Bei X <b> Lehre von 2.5 µm. Als unbekannt angegeben, nicht als Null."
+        "Bei X <b> Lehre von 2,5 µm. Als unbekannt angegeben, nicht als Null."
     )
     assert t("Summary") == "Zusammenfassung"  # the words of the page are the same in every report
     assert t("What nobody lists.") == "What nobody lists."
     assert list(t.missing) == ["What nobody lists."]
+
+
+@pytest.mark.parametrize(
+    ("text", "english", "german"),
+    [
+        ("28.09 um", "28.09 µm", "28,09 µm"),
+        ("EX / um", "EX / µm", "EX / µm"),
+        ("um", "µm", "µm"),
+        ("p = 0.91", "p = 0.91", "p = 0,91"),
+        ("-2 % to 10.5 %", "−2 % to 10.5 %", "−2 % bis 10,5 %"),
+        ("0.00 to -2.29", "0.00 to −2.29", "0,00 bis −2,29"),
+        ("20 degC", "20 °C", "20 °C"),
+        ("2026-11-24 04:01", "2026-11-24 04:01", "2026-11-24 04:01"),
+        ("0003.066.087", "0003.066.087", "0003.066.087"),
+        ("127.0.0.1", "127.0.0.1", "127.0.0.1"),
+        ("1e-07", "1e-07", "1e-07"),
+        ("drift - balls 2-3", "drift - balls 2-3", "drift - balls 2-3"),
+    ],
+)
+def test_signs_and_numbers_of_names_and_cells(text: str, english: str, german: str):
+    assert Catalogue("en").word(text) == english
+    assert Catalogue("de").word(text) == german
 
 
 def test_numbers_and_enumerations_follow_the_language():

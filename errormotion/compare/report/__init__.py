@@ -129,7 +129,7 @@ def _repeats(ds: xr.Dataset) -> list[Section]:
 
 
 def _ground(ds: xr.Dataset) -> str:
-    point = ", ".join(f"{1e3 * float(each):g}" for each in np.atleast_1d(ds.attrs["functional_point"]))
+    point = ", ".join(f"{1e3 * float(each) + 0.0:g}" for each in np.atleast_1d(ds.attrs["functional_point"]))
     text = (
         f"Machine {ds.attrs['machine']}, {ds.attrs['component']}, frame '{ds.attrs['frame']}', "
         f"functional point ({point}) mm."

@@ -116,7 +116,7 @@ def _figures(found: Effect) -> list[Section]:
 
 def _ground(found: Effect) -> str:
     ground = found.ground
-    point = ", ".join(f"{1e3 * float(each):g}" for each in np.atleast_1d(ground.point))
+    point = ", ".join(f"{1e3 * float(each) + 0.0:g}" for each in np.atleast_1d(ground.point))
     return f"Machine {ground.machine}, {ground.component}, frame '{ground.frame}', functional point ({point}) mm."
 
 

@@ -48,7 +48,8 @@ def values(sources: Sequence[Source]) -> list[Section]:
             [each.name, _number(each.value), _number(each.expanded_uncertainty), each.unit or "1"] for each in figures
         ]
         if rows:
-            caption = "Figures of merit as computed, in SI units; U: expanded uncertainty, k = 2."
+            of = f" of {source.errors.attrs['method']}" if len(sources) > 1 else ""
+            caption = f"Figures of merit{of} as computed, in SI units; U: expanded uncertainty, k = 2."
             blocks.append(Table(caption, ["figure", "value", "U", "unit"], rows))
     return [Section("values", "Values in SI units", blocks)] if blocks else []
 

@@ -22,11 +22,13 @@ from typing import Any, TypeVar
 
 from markupsafe import Markup
 
-from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Text
+from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Table, Text
 
 LANGUAGES = ("en", "de")
 COMMA = ("de",)
 """Languages with a decimal comma."""
+TO = {"de": " bis "}
+"""What stands between the ends of a range of numbers."""
 LONGEST = 4000
 """Characters of a text that is compared with the catalogue."""
 
@@ -36,6 +38,10 @@ _WORD = re.compile(r"[a-z]{3}")
 _LETTERS = re.compile(r"[a-z]{2}")
 _BEFORE_UNIT = re.compile(r"(?<![\w.])\d+\.\d+(?= (?:[uµ]?m|mm|[uµm]?rad|arcsec|%|K|min|s|±)(?!\w))")
 _MICRO = re.compile(r"(?<!\w)u(?=(?:m|rad)(?!\w))")
+_CELSIUS = re.compile(r"\bdegC\b")
+_MINUS = re.compile(r"(?<![\w)\]-])-(?=\d)")
+_NUMBER = re.compile(r"(?<![\w.])\d+\.\d+(?!\w|\.\d)")
+_RANGE = re.compile(r"(?<=[\d%∞]) to (?=[+−]?[\d∞])")
 _LIST = re.compile(r"(, | und )")
 _UNITS = re.compile(r"\b(?:arcsec|min|m?rad|days)\b")
 _SVG_TEXT = re.compile(r"(?<=>)([^<>]*[^<>\s][^<>]*)(?=</(?:text|span|label)>)")
@@ -85,7 +91,7 @@ class Catalogue:
         if not isinstance(text, str) or isinstance(text, Markup) or not text.strip():
             return text
         if self.language == "en":
-            return _MICRO.sub("µ", text)
+            return _signs(text)
         sentences = _SENTENCES.split(text)
         if len(sentences) > 1 and text not in self._exact:
             return " ".join(str(self(each)) for each in sentences)
@@ -99,7 +105,7 @@ class Catalogue:
         if not isinstance(text, str) or isinstance(text, Markup):
             return text
         if self.language == "en":
-            return _MICRO.sub("µ", text)
+            return _signs(text)
         found = self._found(text)
         if found is not None:
             return found
@@ -110,11 +116,12 @@ class Catalogue:
         pieces[::2] = [piece if each is None else each for piece, each in zip(pieces[::2], made, strict=True)]
         return "".join(pieces)
 
-    def _with_units(self, text: str) -> str:
-        """Return a text with the decimal sign of the language before units, and with micrometres as on all pages."""
+    def _with_units(self, text: str, decimals: re.Pattern[str] = _BEFORE_UNIT) -> str:
+        """Return a text with the decimal sign of the language where ``decimals`` are, and the signs of all pages."""
+        text = _signs(text)
         if self.language in COMMA:
-            text = _BEFORE_UNIT.sub(lambda found: found[0].replace(".", ","), text)
-        return _MICRO.sub("µ", text)
+            text = decimals.sub(lambda found: found[0].replace(".", ","), text)
+        return _RANGE.sub(TO.get(self.language, " to "), text)
 
     def _found(self, text: str) -> str | None:
         plain = " ".join(text.split()) if len(text) <= LONGEST else ""
@@ -123,13 +130,13 @@ class Catalogue:
         if plain in self._exact:
             return self._exact[plain]
         if not _LETTERS.search(_UNITS.sub("", plain)):
-            return text  # a symbol, a number, a unit
+            return self._with_units(text, _NUMBER)  # a symbol, numbers, a unit
         for pattern, made in self._patterns:
             match = pattern.fullmatch(plain)
             if match is not None:
                 return _filled(made, [str(self.word(each)) for each in match.groups()])
         if not _WORD.search(_UNITS.sub("", plain)):
-            return text
+            return self._with_units(text, _NUMBER)
         pieces = plain.split("; ")
         found = [self._found(each) for each in pieces] if len(pieces) > 1 else []
         if any(each is not None and each != piece for each, piece in zip(found, pieces, strict=False)):
@@ -164,10 +171,17 @@ class Catalogue:
                 caption=self(block.caption),
                 head=[self(name) for name in block.head],
                 groups=[(self(name), span) for name, span in block.groups],
-                rows=[[self.cell(cell) for cell in row] for row in block.rows] if rows else block.rows,
+                rows=[[self.cell(cell) for cell in row] for row in block.rows] if rows else self._reasons(block),
                 notes=[self(note) for note in block.notes],
             )
         return made  # type: ignore[return-value]
+
+    def _reasons(self, table: Table) -> list[list[Cell | str]]:
+        """Return the rows of a table with only the reasons of what is unknown in the language."""
+        return [
+            [Cell(cell.text, cell.uncertainty, self(cell.reason)) if isinstance(cell, Cell) else cell for cell in row]
+            for row in table.rows
+        ]
 
     def section(self, section: Section, *, rows: bool = True) -> Section:
         """Return a section in the language."""
@@ -176,8 +190,6 @@ class Catalogue:
 
     def part(self, part: Part) -> Part:
         """Return a chapter in the language."""
-        if self.language == "en":
-            return part
         return replace(
             part,
             title=self(part.title),
@@ -190,6 +202,11 @@ class Catalogue:
             sections=[self.section(section) for section in part.sections],
             overview=self.block(part.overview) if part.overview is not None else None,
         )
+
+
+def _signs(text: str) -> str:
+    """Return a text with the signs of micro, minus and degrees Celsius."""
+    return _CELSIUS.sub("°C", _MINUS.sub("−", _MICRO.sub("µ", text)))
 
 
 def _pattern(key: str) -> re.Pattern[str]:

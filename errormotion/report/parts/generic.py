@@ -159,7 +159,7 @@ def _curves(source: Source, key: str) -> list[Block]:
         for axes in panels[-1]:
             axes.set_xlabel(label)
 
-    shown = f" {len(picks)} of {flat.sizes['other_']} curves over {listed(others)} are shown." if others else ""
+    shown = f" Shown: {len(picks)} of {flat.sizes['other_']} curves over {listed(others)}." if others else ""
     caption = f"Error motions over {along}, actual minus commanded. Bands: expanded uncertainty, k = 2.{shown}"
     spans = "; ".join(f"{names[name]} {_span(errors, name, i)}" for i, name in enumerate(errors.em.names))
     height = 2.3 if single else 4.6

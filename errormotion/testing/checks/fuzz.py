@@ -34,7 +34,9 @@ BUDGET = 6.0
 LIMIT = 90.0
 """Time limit of the check within the budget, s; a longer one has a limit for each mutant only."""
 MOST_TIME = 0.05
-"""Processor time of a session with a mutated frame beyond that of the recorded one, s."""
+"""Processor time of a session with a mutated frame beyond twice that of the recorded one, s.
+
+A driver that opens its device anew after an error does its work twice, and all work takes longer on a busy computer."""
 REPEATS = 4
 """A session above a limit is repeated so many times: what else the process does is no work of the driver."""
 MOST_MEMORY, MEMORY_PER_BYTE = 4 << 20, 64
@@ -118,13 +120,14 @@ class Trial:
         require(typed, f"{what}: expected an InstrumentError, found {found.error!r}")
         most = self._subject.time_limit
         require(found.seconds < most, f"{what} took {found.seconds:.1f} s, limit {most:g} s")
-        for _ in range(REPEATS if found.work > self._sound_work + MOST_TIME else 0):
+        for _ in range(REPEATS if found.work > 2.0 * self._sound_work + MOST_TIME else 0):
             found.work = min(found.work, self._replayed().work)
         more = max(found.work - self._sound_work, 0.0)
+        limit = self._sound_work + MOST_TIME
         require(
-            more <= MOST_TIME,
+            more <= limit,
             f"{what} took {1e3 * more:.0f} ms of processor time more than the recorded session, limit "
-            f"{1e3 * MOST_TIME:g} ms",
+            f"{1e3 * limit:.0f} ms",
         )
         memory = max(found.memory - self._sound_memory, 0.0)
         most_memory = MOST_MEMORY + MEMORY_PER_BYTE * size

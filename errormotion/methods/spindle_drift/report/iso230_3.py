@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from markupsafe import Markup
 
 from errormotion.report.document import Cell, Table, estimate
 from errormotion.report.drawings.series import QUANTITIES, Event, curves, end_of_running, minutes_of, unit_of
@@ -90,7 +89,7 @@ def tables(errors: xr.Dataset, done: Sequence[Event] = ()) -> list[Table]:
     time, stop = minutes_of(errors), end_of_running(errors)
     running = f"to the end of running ({fixed(time[stop], 1)} min)" if stop is not None else "to the end of running"
     whole = f"whole record ({fixed(time[-1], 1)} min)" if time.size else "whole record"
-    groups = [("", 2), (Markup("first 60 min, d(…)<sub>60</sub>"), 2), (running, 2), (whole, 2)]
+    groups = [("", 2), ("first 60 min, d(…)₆₀", 2), (running, 2), (whole, 2)]
     head = ["quantity", "unit"] + ["range", "difference"] * 3
     intervals = [f"{kind}_{span}" for span in ("60min", "running", "total") for kind in ("range", "difference")]
     first = Table(
