@@ -100,12 +100,15 @@ def test_values_live_and_a_sensor_that_is_unplugged(
     def unplugged(self: Any) -> Any:
         raise InstrumentTimeoutError("no answer within 0.5 s")
 
-    monkeypatch.setattr(DconTemperature, "read", unplugged)
-    start = time.monotonic()
-    page.wait_for_selector(".tiles li.silent:has-text('modules')")
-    assert time.monotonic() - start < 15.0
-    monkeypatch.undo()
-    page.wait_for_selector(".tiles li.answers:has-text('modules')", timeout=20_000)
+    delays: list[float] = []
+    while not delays or (min(delays) > 3.0 and len(delays) < 3):  # again where the computer was busy
+        with monkeypatch.context() as unplugging:
+            unplugging.setattr(DconTemperature, "read", unplugged)
+            start = time.monotonic()
+            page.wait_for_selector(".tiles li.silent:has-text('modules')")
+            delays.append(time.monotonic() - start)
+        page.wait_for_selector(".tiles li.answers:has-text('modules')", timeout=20_000)
+    assert min(delays) < 3.0, delays
     page.reload()
     page.wait_for_selector("#temperatures tr >> nth=2")
     assert page.evaluate("window.taken") is None
