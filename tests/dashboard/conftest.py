@@ -21,6 +21,8 @@ from errormotion.datasets import provenance
 from errormotion.datasets.results.build import build_errors
 
 AXE = Path(__file__).parents[1] / "peers" / "node_modules" / "axe-core" / "axe.min.js"
+SCREENS = ((768, 1024), (3840, 2160))
+"""A tablet and 4K, px; all pages are tested at 1280 x 800 as well."""
 MARKUP = "<script>window.taken='yes'</script>&amp;\"'"
 """What stands in each name that comes from a file."""
 
@@ -221,12 +223,17 @@ def page(browser: Any) -> Iterator[Any]:
 
 @pytest.fixture
 def accessible(page: Any) -> Callable[[], None]:
-    """Return a function that refuses what axe-core finds wrong on the page by WCAG 2.2 AA."""
+    """Return a function that refuses what axe-core finds wrong on the page by WCAG 2.2 AA, and what a screen cuts."""
 
     def check() -> None:
         page.evaluate(AXE.read_text())
         options = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]}
         found = page.evaluate("options => axe.run(document, options)", options)
         assert [(each["id"], each["nodes"][0]["html"]) for each in found["violations"]] == []
+        for wide, high in (*SCREENS, (1280, 800)):
+            page.set_viewport_size({"width": wide, "height": high})
+            page.wait_for_timeout(100)
+            beyond = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+            assert beyond <= 0, f"{page.url} is {beyond} px wider than a screen of {wide} x {high}"
 
     return check
