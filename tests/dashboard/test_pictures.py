@@ -230,7 +230,7 @@ def test_results_of_the_demonstration(
     address = serving(Path("runs")).address
     page.goto(address + "results")
     sync_api.expect(page.locator(".runs tbody tr:has(.good)")).to_have_count(3)
-    picture(page, "results", 800)
+    picture(page, "results", 460)
     page.click("tbody a:text-is('drift')")
     page.wait_for_selector("#figure[data-drawn] canvas")
     accessible()
