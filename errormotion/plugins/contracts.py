@@ -404,6 +404,9 @@ class Method(Protocol):
         Every step of the machine; checked against the limits of the bench before anything moves. A method that moves a
         machine, by a controller or by programs, must have it: without it nothing moves during its tests. Where a search
         decides, the steps go to the ends of the search. MethodError where the settings do not determine them.
+    ``planning_settings(settings, instruments)`` : settings
+        What ``plan`` gets for a test of a campaign: the settings, with what the instruments of the bench state where
+        the settings leave it to them, such as their noise.
     ``check(settings)`` : mapping of str to str
         What is wrong, by setting, as far as it can be seen before a measurement; used when a campaign is read.
 
@@ -426,7 +429,7 @@ class Method(Protocol):
         a function ``(log, map)`` of two paths that returns the raw dataset. A map whose key ``schema`` is a raw schema
         needs no function.
 
-    ``programs`` and ``motions`` get the settings of the bench's instruments by kind.
+    ``programs``, ``motions`` and ``planning_settings`` get the settings of the bench's instruments by kind.
     """
 
     info: ClassVar[MethodInfo]

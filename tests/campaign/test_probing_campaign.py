@@ -16,6 +16,7 @@ from errormotion.campaign import runner
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, list_runs
+from errormotion.campaign.planning.expected import expected, planned
 from errormotion.campaign.storage.store import committed_length
 from errormotion.errors import InstrumentTimeoutError, RunError
 from errormotion.instruments.controller.virtual import VirtualController
@@ -330,8 +331,8 @@ def test_an_interrupted_run_has_the_data_of_an_uninterrupted_one(
     (run,) = runner.resume(runs=runs)
     raw, uninterrupted = raw_of(run), raw_of(whole)
     assert set(raw.variables) == set(uninterrupted.variables)
-    for name, expected in uninterrupted.variables.items():
-        np.testing.assert_array_equal(raw[name].values, expected.values, err_msg=str(name))
+    for name, whole_values in uninterrupted.variables.items():
+        np.testing.assert_array_equal(raw[name].values, whole_values.values, err_msg=str(name))
 
 
 def test_a_killed_process_costs_the_cycle_that_it_was_in(lab: Lab, command: Callable[..., Any]) -> None:
@@ -399,7 +400,7 @@ def test_an_alarm_while_a_program_runs_ends_the_run_with_nothing_false(
 
 def test_a_printer_that_goes_silent_keeps_what_it_has_printed(lab: Lab) -> None:
     plan, runs = lab(driver="dprnt", probe="&fault=silence&fault_at=17")
-    with pytest.raises(RunError, match=r"Touch 6 of 12 \(item 1\): no line for 0.3 s"):
+    with pytest.raises(RunError, match=r"Touch 6 of 12 \(item 1\): no line for 1 s"):
         runner.run(plan, runs=runs)
     flags = raw_of(one_run(runs))["touch_flag"].values
     assert (flags.reshape(2, TOUCHES) == 0).sum(axis=1).tolist() == [12, 5]
@@ -446,3 +447,18 @@ def test_a_probe_that_has_the_machine_moved_is_refused_without_a_control(lab: La
     plan = without_control(plan)
     with pytest.raises(RunError, match=r"'controller_probe' moves the machine.*the bench has none"):
         runner.run(plan, runs=runs)
+
+
+def test_a_plan_takes_the_noise_of_a_touch_from_the_probe_of_the_bench(lab: Any) -> None:
+    def u(**stated: str) -> tuple[float, str]:
+        plan, _ = lab(**stated)
+        bench = plan.folder / "bench.toml"
+        bench.write_text(bench.read_text().replace('noise = "0.25 um"', 'noise = "0.5 um"'))
+        plan = load_campaign(plan.folder / "campaign.toml")
+        found = planned(plan, plan.tests[0])
+        return expected(found)[0]["expanded_uncertainty"], str(found.em.notes[0])
+
+    of_probe, note = u()
+    of_settings, _ = u(settings='touch_noise = "0.25 um"')
+    assert "a noise of 0.5 um" in note
+    assert of_probe == pytest.approx(2 * of_settings)

@@ -14,8 +14,11 @@ from errormotion.tolerances.conformity import FIELD_UNITS
 
 def planned(plan: CampaignPlan, test: TestPlan) -> xr.Dataset:
     """Return the error dataset that a method plans: its covariance is the one to expect."""
+    method, settings = test.method(), test.settings
     with looking_beside(plan.folder):
-        found: xr.Dataset = test.method().plan(test.settings)
+        if hasattr(method, "planning_settings"):
+            settings = method.planning_settings(settings, plan.bench.chosen(test.instruments).settings_by_kind)
+        found: xr.Dataset = method.plan(settings)
     return found
 
 

@@ -141,6 +141,14 @@ class NormalVector:
             raise MethodError(f"normal_vector reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
         return identify_motion(checked, settings, self.info.id, self.info.version)
 
+    def planning_settings(self, settings: BallSettings, instruments: Mapping[str, Any]) -> BallSettings:
+        """Return the settings with tip radius and noise of a touch of the probe on the bench, where they state none."""
+        probe = instruments.get("touch_probe")
+        stated = {"tip_radius": getattr(probe, "tip_radius", None), "touch_noise": getattr(probe, "noise", None)}
+        return settings.model_copy(
+            update={name: value for name, value in stated.items() if value and getattr(settings, name) is None}
+        )
+
     def plan(self, settings: BallSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros over the cycles with the expected covariance. See ``planning``."""
         from errormotion.methods.normal_vector.planning import plan

@@ -14,6 +14,7 @@ from errormotion.methods.normal_vector.report.drawings import balls
 from errormotion.methods.normal_vector.report.view import MISSING, MOVED, WRONG, probing
 from errormotion.report import write_report
 from errormotion.report.drawings.timeline import clock
+from errormotion.report.page.language import Catalogue
 from errormotion.report.text import fixed
 from errormotion.twin import Event, VirtualMachine
 
@@ -176,7 +177,7 @@ def test_remarks_of_the_method_and_flags_of_the_probe_are_reported(folder):
     errors, raw = troubled()
     html = words(page(troubled, folder))
     for note in errors.attrs["notes"]:
-        assert note in html
+        assert Catalogue("en").word(note) in html
     flagged = int((raw["touch_flag"] == 1).sum())
     assert f"Flagged by the probe: no trip: {flagged} (the first of " in html
     assert "The probe flagged no touch." in words(page(clean, folder))
