@@ -17,13 +17,13 @@ from errormotion.campaign.files import CampaignPlan, TestPlan
 from errormotion.campaign.folder import replace_text
 from errormotion.campaign.form.fields import Form, form_of, with_field, with_test, without_test
 from errormotion.campaign.planning.expected import expected, planned
-from errormotion.campaign.planning.motions import beside_limits, headline, motions, picture
+from errormotion.campaign.planning.motions import Motions, beside_limits, headline, motions, picture
 from errormotion.dashboard.lab import NotFoundError
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.datasets.files.tomlfile import Key, parse_toml, read_toml
 from errormotion.datasets.files.tomltext import LONGEST_TEXT, value
 from errormotion.errors import BenchError, ErrormotionError
-from errormotion.report.text import rounded
+from errormotion.report.text import rounded, signs
 
 MOST_FILES = 200
 """Campaign files that are offered."""
@@ -188,6 +188,10 @@ def _strings(content: Any) -> Iterator[str]:
             yield from _strings(each)
 
 
+def _limits(plan: CampaignPlan, asked: Motions) -> list[list[str]]:
+    return [[signs(text) for text in row] for row in beside_limits(asked.extent, plan.bench.limits)]
+
+
 def _planned(plan: CampaignPlan, test: TestPlan) -> dict[str, Any]:
     """Return the plan of a test; what a method cannot tell is stated in its place."""
     found: dict[str, Any] = {"test": test.name, "method": test.method.info.id, "notes": []}
@@ -196,7 +200,7 @@ def _planned(plan: CampaignPlan, test: TestPlan) -> dict[str, Any]:
         drawn = io.BytesIO()
         picture(plan, asked).savefig(drawn, format="png", dpi=DPI)
         image = base64.b64encode(drawn.getvalue()).decode()
-        found |= {"headline": headline(asked), "limits": beside_limits(asked.extent, plan.bench.limits)}
+        found |= {"headline": headline(asked), "limits": _limits(plan, asked)}
         found |= {"picture": f"data:image/png;base64,{image}"}
     except ErrormotionError as error:
         found |= {"headline": str(error), "limits": [], "picture": ""}
@@ -204,10 +208,8 @@ def _planned(plan: CampaignPlan, test: TestPlan) -> dict[str, Any]:
         errors = planned(plan, test)
         rows = expected(errors)
         texts = [rounded(row["expanded_uncertainty"], row["expanded_uncertainty"])[1] for row in rows]
-        found["expected"] = [
-            [row["name"], text, row["unit"].replace("um", "µm")] for row, text in zip(rows, texts, strict=True)
-        ]
-        found["notes"] = [str(note) for note in errors.em.notes]
+        found["expected"] = [[row["name"], text, signs(row["unit"])] for row, text in zip(rows, texts, strict=True)]
+        found["notes"] = [signs(str(note)) for note in errors.em.notes]
     except ErrormotionError as error:
         found |= {"expected": [], "notes": [f"The uncertainty to expect is not known: {error}"]}
     return found

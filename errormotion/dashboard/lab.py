@@ -14,7 +14,7 @@ from errormotion.plugins import FigureOfMerit
 from errormotion.record.runs.entry import Entry, read_entry
 from errormotion.record.runs.listing import DEEPEST, list_runs
 from errormotion.record.text import FIELD, LONG
-from errormotion.report.text import DASH, rounded
+from errormotion.report.text import DASH, rounded, signs
 
 LONGEST_KEY = 600
 """Characters of the key of a run."""
@@ -158,7 +158,7 @@ def figure_text(figure: FigureOfMerit) -> tuple[str, str, str]:
     if figure.unit == "m" and abs(figure.value) >= LONG:
         factor, unit = 1e3, "mm"
     value, expanded = rounded(factor * figure.value, factor * figure.expanded_uncertainty)
-    return value, expanded, unit.replace("um", "µm")
+    return value, expanded, signs(unit)
 
 
 def _row(key: str, entry: Entry) -> Row:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -19,6 +20,9 @@ MM = ("mm", 1e-3)
 SECOND_OF_ARC = ("arcsec", ARCSEC)
 MINUTE = ("min", 60.0)
 
+_MICRO = re.compile(r"(?<!\w)u(?=(?:m|rad)(?!\w))")
+_CELSIUS = re.compile(r"\bdegC\b")
+_MINUS = re.compile(r"(?<![\w)\]-])-(?=\d)")
 _AND = {"en": "and", "de": "und"}
 _LANGUAGE: ContextVar[str] = ContextVar("language", default="en")
 _WORDS: ContextVar[Callable[[str], str]] = ContextVar("words", default=str)
@@ -42,6 +46,11 @@ def written_in(language: str, words: Callable[[str], str] = str) -> Iterator[Non
 def laid_out(text: str) -> str:
     """Return a text of a legend in the language of the page, so that its width is known when it is placed."""
     return _WORDS.get()(text)
+
+
+def signs(text: str) -> str:
+    """Return a text of the terminal with the signs of a page: those of micro, minus and degrees Celsius."""
+    return _CELSIUS.sub("°C", _MINUS.sub("−", _MICRO.sub("µ", text)))
 
 
 def typographic(text: str) -> str:

@@ -12,6 +12,7 @@ pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
 
 from errormotion import datasets
 from errormotion.compensation.effect import effect, text
+from errormotion.report.text import signs
 
 
 def test_the_effect_is_that_of_the_function(serving: Callable[..., Any], pair_of_runs: tuple[Path, list[str]]) -> None:
@@ -20,9 +21,10 @@ def test_the_effect_is_that_of_the_function(serving: Callable[..., Any], pair_of
     query = urlencode({"before": more, "after": less})
     _, _, page = served.ask(f"/compensate/effect?{query}")
     found = effect(*(datasets.load(root / key / "errors.nc") for key in (more, less)))
-    assert escape(text.verdict(found)[0]) in page
+    assert escape(signs(text.verdict(found)[0])) in page
+    assert " um" not in page
     for row in text.rows(found):
-        assert all(escape(cell) in page for cell in row)
+        assert all(escape(signs(cell)) in page for cell in row)
     assert "<script>window" not in page
     _, headers, report = served.ask(f"/compensate/effect.html?{query}")
     assert headers["Content-Security-Policy"].startswith("sandbox")

@@ -311,7 +311,7 @@ def test_a_campaign_is_planned_and_measures(
         page.click("#plan")
         page.wait_for_selector(".planned img")
         if name == "balls":
-            sync_api.expect(page.locator(".planned")).to_contain_text("-263.5 to 263.5")
+            sync_api.expect(page.locator(".planned")).to_contain_text("−263.5 to 263.5")
             accessible()
             picture(page, "measure", 1500)
     page.click("#start")

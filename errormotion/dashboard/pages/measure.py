@@ -22,6 +22,7 @@ from errormotion.dashboard.kept import Lately
 from errormotion.dashboard.pages.page import Guarded
 from errormotion.datasets.files.reading import parse_json
 from errormotion.errors import ErrormotionError, RunError
+from errormotion.report.text import signs
 
 SHOWN = 8
 """Processes that have ended and are shown."""
@@ -216,7 +217,7 @@ def _process(runs: Path, each: Background, busy: set[str]) -> dict[str, Any]:
     resumable = not each.alive and bool(open_) and not busy & set(each.tests.values())
     known = {key: None if isinstance(value, float) and not math.isfinite(value) else value
              for key, value in asdict(each).items()}  # fmt: skip
-    return {**known, "tests": tests, "resume": open_[-1] if resumable else ""}
+    return {**known, "note": signs(each.note), "tests": tests, "resume": open_[-1] if resumable else ""}
 
 
 def _status(path: Path) -> str:

@@ -18,6 +18,7 @@ from errormotion.dashboard.access import Access
 from errormotion.dashboard.lab import Lab, NotFoundError
 from errormotion.dashboard.watch import Watch
 from errormotion.errors import ErrormotionError
+from errormotion.report.text import signs
 
 T = TypeVar("T")
 
@@ -32,6 +33,18 @@ LONGEST_MESSAGE = 2000
 """Characters of a message on a page."""
 
 log = logging.getLogger(__name__)
+
+
+def _environment() -> Environment:
+    made = Environment(
+        loader=PackageLoader("errormotion.dashboard"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters["signs"] = signs
+    return made
 
 
 @dataclass(frozen=True)
@@ -52,15 +65,7 @@ class Context:
     """Whether pages may start and stop what moves or changes a machine."""
     campaigns: Path = Path()
     """Folder of the campaign files."""
-    environment: Environment = field(
-        default_factory=lambda: Environment(
-            loader=PackageLoader("errormotion.dashboard"),
-            autoescape=True,
-            undefined=StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-        )
-    )
+    environment: Environment = field(default_factory=_environment)
 
     @property
     def cookie(self) -> str:

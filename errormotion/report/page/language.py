@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 from markupsafe import Markup
 
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Table, Text
+from errormotion.report.text import signs
 
 LANGUAGES = ("en", "de")
 COMMA = ("de",)
@@ -37,9 +38,6 @@ _DECIMAL = re.compile(r"[+−-]?\d+\.\d+")
 _WORD = re.compile(r"[a-z]{3}")
 _LETTERS = re.compile(r"[a-z]{2}")
 _BEFORE_UNIT = re.compile(r"(?<![\w.])\d+\.\d+(?= (?:[uµ]?m|mm|[uµm]?rad|arcsec|%|K|min|s|±)(?!\w))")
-_MICRO = re.compile(r"(?<!\w)u(?=(?:m|rad)(?!\w))")
-_CELSIUS = re.compile(r"\bdegC\b")
-_MINUS = re.compile(r"(?<![\w)\]-])-(?=\d)")
 _NUMBER = re.compile(r"(?<![\w.])\d+\.\d+(?!\w|\.\d)")
 _RANGE = re.compile(r"(?<=[\d%∞]) to (?=[+−]?[\d∞])")
 _LIST = re.compile(r"(, | und )")
@@ -91,7 +89,7 @@ class Catalogue:
         if not isinstance(text, str) or isinstance(text, Markup) or not text.strip():
             return text
         if self.language == "en":
-            return _signs(text)
+            return signs(text)
         sentences = _SENTENCES.split(text)
         if len(sentences) > 1 and text not in self._exact:
             return " ".join(str(self(each)) for each in sentences)
@@ -105,7 +103,7 @@ class Catalogue:
         if not isinstance(text, str) or isinstance(text, Markup):
             return text
         if self.language == "en":
-            return _signs(text)
+            return signs(text)
         found = self._found(text)
         if found is not None:
             return found
@@ -118,7 +116,7 @@ class Catalogue:
 
     def _with_units(self, text: str, decimals: re.Pattern[str] = _BEFORE_UNIT) -> str:
         """Return a text with the decimal sign of the language where ``decimals`` are, and the signs of all pages."""
-        text = _signs(text)
+        text = signs(text)
         if self.language in COMMA:
             text = decimals.sub(lambda found: found[0].replace(".", ","), text)
         return _RANGE.sub(TO.get(self.language, " to "), text)
@@ -202,11 +200,6 @@ class Catalogue:
             sections=[self.section(section) for section in part.sections],
             overview=self.block(part.overview) if part.overview is not None else None,
         )
-
-
-def _signs(text: str) -> str:
-    """Return a text with the signs of micro, minus and degrees Celsius."""
-    return _CELSIUS.sub("°C", _MINUS.sub("−", _MICRO.sub("µ", text)))
 
 
 def _pattern(key: str) -> re.Pattern[str]:
