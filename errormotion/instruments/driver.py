@@ -99,7 +99,8 @@ class Driver:
 
         Unread bytes are discarded ahead of the request. If the previous exchange ended with an error, its answer may
         still arrive, or its rest: `resynchronise` is called first. An answer is therefore checked and decoded within
-        the block, so that a wrong one is known as an error of this exchange.
+        the block, so that a wrong one is known as an error of this exchange. A refusal is an answer as well: its error
+        is raised after the block, and the next request need not wait.
 
         Raises
         ------

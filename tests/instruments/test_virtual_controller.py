@@ -28,9 +28,9 @@ def test_a_request_is_a_line_of_json() -> None:
 
 
 def test_an_answer_is_checked_against_its_request() -> None:
-    assert decode_answer(b'{"id": 7, "ok": true, "result": [1]}\n', 7) == [1]
+    assert decode_answer(b'{"id": 7, "ok": true, "result": [1]}\n', 7).result == [1]
     with pytest.raises(InstrumentError, match="refuses: no such tool"):
-        decode_answer(b'{"id": 7, "ok": false, "error": "no such tool"}\n', 7)
+        decode_answer(b'{"id": 7, "ok": false, "error": "no such tool"}\n', 7).result  # noqa: B018
     for line in (b'{"id": 8, "ok": true, "result": 1}', b"hello", b"[]", b'{"id": 7, "ok": true}', b"\xff"):
         with pytest.raises(ProtocolError, match="request 7"):
             decode_answer(line, 7)

@@ -256,6 +256,15 @@ def test_stepping_is_stopped_where_it_is() -> None:
         assert not controller.state()["stepping"]
 
 
+def test_after_a_refusal_the_next_request_is_sent_at_once(
+    controller: VirtualController, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(InstrumentError, match="controller refuses"):
+        controller.mount("nothing like it")
+    monkeypatch.setattr(controller, "resynchronise", lambda: pytest.fail("a refusal is an answer: nothing is late"))
+    assert controller.state()["alarms"] == []
+
+
 MOVES: dict[str, Callable[[VirtualController], object]] = {
     "move_to": lambda c: c.move_to((1.0, 0.0, 0.0)),
     "probe": lambda c: c.probe((1.0, 0.0, 0.0), SLOW),

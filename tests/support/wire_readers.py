@@ -426,7 +426,7 @@ def linuxcnc_line(data: bytes) -> None:
 
 
 def virtual_line(data: bytes) -> None:
-    virtual.decode_answer(data, 1)
+    virtual.decode_answer(data, 1).result  # noqa: B018 - a refusal raises
 
 
 def opcua_lines(data: bytes) -> None:

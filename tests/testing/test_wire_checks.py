@@ -221,7 +221,7 @@ class TakesAnyNumber(VirtualController):
     def _call(self, op: str, **arguments: object) -> object:
         self.transport.write(encode_request(1, op, arguments))
         answer = self.transport.read_until(b"\n", limit=1 << 16)
-        return decode_answer(answer, 1)
+        return decode_answer(answer, 1).result
 
 
 class TakesAnyRegisters(ModbusTemperature):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from pydantic import Field
 
@@ -35,27 +35,31 @@ def encode_request(number: int, op: str, arguments: Mapping[str, Any]) -> bytes:
     return json.dumps({"id": number, "op": op, **arguments}, allow_nan=False).encode() + LINE_END
 
 
-def decode_answer(line: bytes, number: int) -> Any:
-    """Return the result in an answer.
+class Answer(NamedTuple):
+    """The answer to a request: whether it was accepted, and its result or the reason for the refusal."""
 
-    Raises
-    ------
-    ProtocolError
-        Not an answer, or that of another request.
-    InstrumentError
-        The controller refuses.
-    """
+    ok: bool
+    content: Any
+
+    @property
+    def result(self) -> Any:
+        """The result; InstrumentError where the controller refuses."""
+        if not self.ok:
+            raise InstrumentError(f"The controller refuses: {self.content}")
+        return self.content
+
+
+def decode_answer(line: bytes, number: int) -> Answer:
+    """Return the answer to a request; ProtocolError where the line is no answer, or that to another request."""
     try:
         answer = json.loads(line, parse_int=_whole)
-        matches, ok = answer["id"] == number, answer["ok"]
+        matches, ok = answer["id"] == number, bool(answer["ok"])
         content = answer["result"] if ok else answer["error"]
     except (ValueError, KeyError, TypeError, RecursionError):
         raise ProtocolError(f"Expected an answer in JSON to request {number}; found {line[:200]!r}") from None
     if not matches:
         raise ProtocolError(f"Expected the answer to request {number}; found {line[:200]!r}")
-    if not ok:
-        raise InstrumentError(f"The controller refuses: {content}")
-    return content
+    return Answer(ok, content)
 
 
 def _whole(text: str) -> int:
@@ -405,7 +409,8 @@ class VirtualController(Driver):
         with self.exchange() as line:
             self._number += 1
             line.write(encode_request(self._number, op, arguments))
-            return decode_answer(line.read_until(LINE_END, limit=LONGEST_LINE), self._number)
+            answer = decode_answer(line.read_until(LINE_END, limit=LONGEST_LINE), self._number)
+        return answer.result  # a refusal is an answer as well: the next request need not wait
 
     def _connect(self) -> Transport:
         self._number = 0
