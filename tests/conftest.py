@@ -41,11 +41,11 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 class _ByFile(LoadFileScheduling):  # type: ignore[misc]
-    """Gives whole files to the workers, all those of LinuxCNC to one: a computer runs one at a time."""
+    """Gives whole files to the workers, and all tests that start LinuxCNC to one: a computer runs one at a time."""
 
     def _split_scope(self, nodeid: str) -> str:
         file: str = super()._split_scope(nodeid)
-        return "linuxcnc" if "linuxcnc" in file else file
+        return "linuxcnc" if "linuxcnc" in file or "[linuxcnc" in nodeid else file
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
