@@ -181,7 +181,7 @@ def test_a_full_disk_leaves_nothing_behind_and_the_old_file_as_it_was(
 
     monkeypatch.setattr(os, "fsync", full)
     for target in (path, tmp_path / f"new{suffix}"):
-        with pytest.raises(DatasetError, match=r"(full|quota).*Nothing was left behind"):
+        with pytest.raises(DatasetError, match=r"(full|quota).*Nothing was written"):
             save(errors(seed=2), target, overwrite=True)
     monkeypatch.undo()
     assert names(tmp_path) == [path.name]
@@ -225,7 +225,7 @@ def test_a_limit_of_the_system_ends_in_a_message(errors, tmp_path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
     try:
         for name in ("errors.nc", "errors.zarr"):
-            with pytest.raises(DatasetError, match=r"larger than allowed\. Nothing was left behind"):
+            with pytest.raises(DatasetError, match=r"larger than allowed\. Nothing was written"):
                 save(big, tmp_path / name)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
