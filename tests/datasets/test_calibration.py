@@ -110,7 +110,7 @@ def test_between_settings_is_supported(good: InclinationCalibration) -> None:
 
 def test_beyond_the_steepest_setting_is_refused_by_name(good: InclinationCalibration) -> None:
     with pytest.raises(
-        MethodError, match=r"inclination 50\.0 deg at rotation 30\.0 deg lies beyond the steepest"
+        MethodError, match=r"inclination 50\.0 deg at rotation 30\.0 deg is beyond the steepest"
     ) as reported:
         good.compensate(1e-3, tilt_vector(np.radians(50.0), np.radians(30.0)))
     assert "nearest calibrated: inclination 40.0 deg at rotation 30.0 deg" in str(reported.value)
@@ -120,7 +120,7 @@ def test_a_hole_is_refused_where_it_is_used(holed: InclinationCalibration) -> No
     q = tilt_vector(np.radians([30.0, 30.0]), np.radians([5.0, 45.0]))
     assert holed.supported(q).tolist() == [True, False]
     with pytest.raises(
-        MethodError, match=r"rotation 45\.0 deg lies in a hole between the calibrated settings \(1 of 2"
+        MethodError, match=r"rotation 45\.0 deg is in a hole between the calibrated settings \(1 of 2"
     ):
         holed.compensate([1e-3, 1e-3], q)
     assert holed.compensate([1e-3, 1e-3], q, extrapolate=True).uncertainty[1] > 0
