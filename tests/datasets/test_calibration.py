@@ -119,9 +119,7 @@ def test_beyond_the_steepest_setting_is_refused_by_name(good: InclinationCalibra
 def test_a_hole_is_refused_where_it_is_used(holed: InclinationCalibration) -> None:
     q = tilt_vector(np.radians([30.0, 30.0]), np.radians([5.0, 45.0]))
     assert holed.supported(q).tolist() == [True, False]
-    with pytest.raises(
-        MethodError, match=r"rotation 45\.0 deg is in a hole between the calibrated settings \(1 of 2"
-    ):
+    with pytest.raises(MethodError, match=r"rotation 45\.0 deg is in a hole between the calibrated settings \(1 of 2"):
         holed.compensate([1e-3, 1e-3], q)
     assert holed.compensate([1e-3, 1e-3], q, extrapolate=True).uncertainty[1] > 0
 

@@ -1,4 +1,4 @@
-"""Errors that are seen along one known direction, over dimensions that the method declares."""
+"""Errors along one known direction, over dimensions that the method declares."""
 
 from typing import Any
 
@@ -129,7 +129,7 @@ def test_a_known_freedom_beside_a_deviation_is_refused() -> None:
     ds = radial()
     ds["EX"][:] = 1e-6
     ds["covariance"].values[..., 0, 0] = 1e-14
-    assert "EX: expected NaN beside deviation, which is their combination" in datasets.violations(ds)
+    assert "EX: expected NaN in a dataset with deviation, their combination" in datasets.violations(ds)
 
 
 @pytest.mark.parametrize("name", ["sensitivity", "deviation_variance", "deviation"])

@@ -51,7 +51,7 @@ def test_a_value_may_be_unknown_at_single_times(errors) -> None:
 def test_extra_results_ride_along_but_may_not_take_a_name(errors) -> None:
     ds = errors(extras={"bar_radius": xr.DataArray(0.005, attrs={"units": "m"})})
     assert ds["bar_radius"].attrs["units"] == "m"
-    with pytest.raises(DatasetError, match="taken already: EX"):
+    with pytest.raises(DatasetError, match="not used by the schema; found EX"):
         errors(extras={"EX": xr.DataArray(0.0)})
 
 
@@ -133,7 +133,7 @@ def test_influence_is_not_larger_than_the_covariance(errors) -> None:
 def test_the_rest_beside_the_influences_is_a_covariance(errors) -> None:
     F = np.zeros((1, 7, 6))
     F[0, :, 0] = F[0, :, 1] = 0.9e-6
-    message = "expected the covariance less the influences to be a covariance"
+    message = "expected the covariance minus the influences to be a covariance"
     with pytest.raises(DatasetError, match=message):
         # each variance holds its influence, but the two freedoms are not correlated as the common source makes them
         errors(covariance=np.tile(np.eye(6) * 1e-12, (7, 1, 1)), influence=F, sources=["a"], source_groups=["a"])

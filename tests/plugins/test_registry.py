@@ -74,7 +74,7 @@ def test_a_foreign_plugin_stands_beside_them_with_its_distribution(install):
         ("raise SystemExit(3)", "SystemExit: 3"),
         ("class Good: pass", "expected a class with an `info` of type InstrumentInfo, found None"),
         ("Worse = 1", "AttributeError"),
-        (GOOD.format(id="better"), "the entry point is called 'broken' but the class calls itself 'better'"),
+        (GOOD.format(id="better"), "the entry point is called 'broken', but the id of the class is 'better'"),
         (GOOD.format(id="broken").replace("def read", "def reed"), "class Good lacks read"),
         ("def", "SyntaxError"),
     ],
@@ -110,7 +110,7 @@ def test_two_distributions_that_claim_one_id_are_both_named(install):
     rivals = [plugin for plugin in plugins.available("instruments") if plugin.id == "good"]
     assert len(rivals) == 2
     assert all("one 1.2" in plugin.error and "two 1.2" in plugin.error for plugin in rivals)
-    with pytest.raises(PluginError, match="Several distributions claim the instrument 'good'"):
+    with pytest.raises(PluginError, match="Several distributions provide the instrument 'good'"):
         plugins.get("instruments", "good")
 
 

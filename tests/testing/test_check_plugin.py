@@ -13,7 +13,7 @@ from errormotion.testing.run import subjects_of
 
 @pytest.fixture
 def registered(monkeypatch):
-    """Put a class into the registry, under the id that it calls itself."""
+    """Put a class into the registry, under its id."""
 
     def register(**attributes):
         cls = type("Foreign", (), attributes)

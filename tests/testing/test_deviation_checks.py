@@ -147,7 +147,7 @@ def test_the_report_of_any_method_shows_a_deviation(tmp_path):
     errors = Sound().identify(make(0)[0], None)
     page = write_report(errors, tmp_path / "report.html").read_text(encoding="utf-8")
     assert "Observed: deviation, at 12 (time)." in page
-    assert "seen along one known direction only" in page
+    assert "measured along one known direction only" in page
     assert "standard uncertainty (k = 1) of the deviation, by group of sources" in page
     assert page.count("<svg") == 1
     alone = write_report(errors.isel(time=3), tmp_path / "one.html").read_text(encoding="utf-8")

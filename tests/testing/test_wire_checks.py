@@ -244,8 +244,8 @@ class TakesAnyRegisters(ModbusTemperature):
     ids=lambda each: getattr(each, "__name__", "sound"),
 )
 def test_a_late_answer_that_is_taken_is_seen_in_readings_that_differ(sound: InstrumentSubject, broken: type) -> None:
-    assert wire_checks.late_answers(sound).count("right readings") == 2
-    with pytest.raises(CheckFailedError, match="was taken for that to the next request"):
+    assert wire_checks.late_answers(sound).count("correct readings") == 2
+    with pytest.raises(CheckFailedError, match="was used for the next request"):
         wire_checks.late_answers(replace(sound, plugin=broken))
 
 
@@ -257,12 +257,12 @@ def test_equal_readings_can_be_made_to_differ() -> None:
             return round(super().read(), 4)
 
     subject = InstrumentSubject(Still, ADDRESS)
-    assert wire_checks.late_answers(subject).count("equal ones, whose order is not seen: state 'vary'") == 2
-    assert wire_checks.late_answers(replace(subject, repeats=True)).count("gives a lost one again") == 2
+    assert wire_checks.late_answers(subject).count("equal readings, so that their order is unknown: state 'vary'") == 2
+    assert wire_checks.late_answers(replace(subject, repeats=True)).count("repeats lost readings") == 2
 
     moved: list[int] = []
     found = wire_checks.late_answers(replace(subject, plugin=Dial, vary=moved.append))
-    assert found.count("right readings") == 2
+    assert found.count("correct readings") == 2
     assert moved[: wire_checks.READINGS] == list(range(wire_checks.READINGS))
 
 
