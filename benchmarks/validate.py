@@ -33,9 +33,9 @@ A section with the arguments ``workers`` and ``cache`` runs in several processes
 INTRODUCTION = """\
 # Validation
 
-Every figure on this page comes from a run of `make validate`; none is typed in. The truth is that of the
-[virtual machine](explanation/virtual-machine.md); bounds are Cramer-Rao bounds of the estimators' models.
-A ratio of 1 means that no unbiased estimator can do better.
+All figures on this page are results of `make validate`. The truth is that of the
+[virtual machine](explanation/virtual-machine.md); bounds are Cramer-Rao bounds of the models of the estimators.
+A ratio of 1 is the optimum of unbiased estimators.
 """
 
 

@@ -58,16 +58,16 @@ def section(seeds: int, cache: Path | None = None) -> Iterator[str]:
     folder = cache or Path(tempfile.mkdtemp(prefix="closed-loop-"))
     yield (
         f"{seeds} virtual C-frame machines, varied as above (up to {VARIATION:.0%}), under the real LinuxCNC on "
-        "simulated joints. Each touch is a motion of LinuxCNC in real time; between two cycles "
-        f"{INTERVAL / 60:g} simulated minutes pass at once, and the slew limit is therefore 20 um/s. A first warm-up "
-        f"of {CYCLES['training']} cycles at 15000, then 5000 /min is probed (3 balls, 4 touches each) and a model "
-        "fitted to it: present temperatures, of at most 2 sensors. In the second and the third warm-up, each from "
-        f"the cold state, with random speeds and {CYCLES['compensated']} cycles, the code of `errormotion compensate "
-        "run` reads the thermometers in Modbus and writes to LinuxCNC: in the feedback path, or as external offsets. "
+        f"simulated joints. Each touch is a motion of LinuxCNC in real time; between two cycles {INTERVAL / 60:g} "
+        "simulated minutes are skipped, and the slew limit is therefore 20 um/s. A first warm-up of "
+        f"{CYCLES['training']} cycles at 15000, then 5000 /min is probed (3 balls, 4 touches each), and a model is "
+        "fitted to it: present temperatures of at most 2 sensors. In the second and the third warm-up, each from the "
+        f"cold state, with random speeds and {CYCLES['compensated']} cycles, the code of `errormotion compensate run` "
+        "reads the thermometers by Modbus and writes to LinuxCNC: in the feedback path, or as external offsets. "
         "`without`: root mean square of the true displacement (EX, EY, EZ together) of that warm-up, without "
-        "compensation, at the times of the cycles after the cold one; `with`: the same as LinuxCNC probed it with the "
-        "compensation, the scatter of the probe (0.4 um a touch) included. `following`: share of the decisions that "
-        "move the offset; it is held while the machine probes, and here probing takes most of the real time."
+        "compensation, at the times of the cycles after the cold one; `with`: the same as probed by LinuxCNC with "
+        "the compensation, including the scatter of the probe (0.4 um in each touch). `following`: share of the "
+        "decisions that change the offset; it is held while the machine probes, which takes most of the real time here."
     )
     yield from ("", "| machine | route | sensors | warm-up | without/um | with/um | remaining | following |")
     yield "|---|---|---|---|---|---|---|---|"

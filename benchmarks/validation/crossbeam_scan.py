@@ -52,13 +52,13 @@ def section(seeds: int) -> Iterator[str]:
     """Yield the lines of the section."""
     campaigns = gathered(campaign, seeds)
     yield from (
-        f"{seeds} virtual gantries. Each has its profiler's pose found from two simulated scans of a pocket, a lever "
-        f"drawn {LEVER_SIGMA * 1e3:g} mm (k = 1) off the stated one, and {PLACES.size} artefacts scanned cold and "
-        f"{TIMES.size - 1} times warm, {POINTS} points {PITCH * 1e6:g} um apart by {LINES} lines {FEED * 1e6:g} um "
-        "apart, with all that is wrong with the virtual profiler: noise, jitter of the lines along both directions, "
-        "speckle, stray light, outliers and gaps. The carriage turns along each scan as its axis does. "
-        "The results of one gantry share pose, lever and cold scans, so every interval behind a coverage (+-, 95 %) "
-        "is that of the mean over gantries.",
+        f"{seeds} virtual gantries. For each, the pose of the profiler is found from two simulated scans of a pocket, "
+        f"the lever is drawn with {LEVER_SIGMA * 1e3:g} mm (k = 1) about the stated one, and {PLACES.size} artefacts "
+        f"are scanned cold and {TIMES.size - 1} times warm, {POINTS} points {PITCH * 1e6:g} um apart by {LINES} lines "
+        f"{FEED * 1e6:g} um apart, with all disturbances of the virtual profiler: noise, jitter of the lines along "
+        "both directions, speckle, stray light, outliers and gaps. The carriage rotates along each scan with the "
+        "errors of its axis. The results of one gantry share pose, lever and cold scans, so that each interval after "
+        "a coverage (+-, 95 %) is that of the mean over gantries.",
         "",
     )
     for strain in STRAINS:
@@ -165,13 +165,13 @@ def errors_table(found: Seed, strain: str) -> Iterable[str]:
     yield ""
     yield (
         f"All six together, NEES/6: {mean_of(nees(found[strain], found[f'{strain}_covariance']))} (1 is right). "
-        f"Scans without a result, or left out because the artefact was held to have moved: {lost:.2%}."
+        f"Scans without a result, or omitted because a motion of the artefact was assumed: {lost:.2%}."
     )
 
 
 def curves_table(found: Seed) -> Iterable[str]:
     """Return the coverage of the smooth curves, point by point."""
-    yield "Point by point along the curves; a curve over position knows of the error only where the artefacts stand."
+    yield "Point by point along the curves; data for a curve over position exist only at the artefacts."
     yield ""
     yield "| error | over position, free | guided | over time, free | guided |"
     yield "|---|---|---|---|---|"
@@ -190,8 +190,8 @@ def pose_table(found: Seed) -> Iterable[str]:
     bounds = np.sqrt(np.diagonal(expected["covariance"].values[0]))[[3, 4, 5, 0, 1, 2]]
     error, u = found["pose"], np.sqrt(np.diagonal(found["pose_covariance"], axis1=-2, axis2=-1))
     yield (
-        "Two scans of a circular pocket, 16 mm apart in height. The bound is that of a plan: an edge that scatters by "
-        f"{Layout().edge * 1e6:g} um in each line."
+        "Two scans of a circular pocket, 16 mm apart in height. The bound is that of the plan, with a scatter of the "
+        f"edge of {Layout().edge * 1e6:g} um in each line."
     )
     yield ""
     yield "| parameter | coverage of 95 % intervals | spread/stated | bias/stated | stated (k = 1) | spread/bound |"
@@ -210,8 +210,8 @@ def registration_table(found: Seed) -> Iterable[str]:
     """Return efficiency and coverage of the registration by itself."""
     yield (
         f"{len(found[REGISTRATIONS[0][0]])} pairs of scans of {FINE_POINTS} points {FINE_PITCH * 1e6:g} um apart by "
-        f"{LINES} lines, moved by 20 um and 20 urad (k = 1). The bound is that of white noise in every point of both "
-        "scans. Line jitter is beyond it."
+        f"{LINES} lines, moved by 20 um and 20 urad (k = 1). The bound is that of white noise in all points of both "
+        "scans, without line jitter."
     )
     for name, wrong, drift in REGISTRATIONS:
         n = 9 if drift else 6

@@ -74,12 +74,12 @@ def honesty(seeds: int) -> list[str]:
     held = [np.mean(np.abs(part)[np.isfinite(part)] <= Z95) for part in (z, station_z)]
     least_u = np.sqrt(np.mean(np.einsum("tii->ti", least.target_covariance), axis=0)) * 1e6
     return [
-        f"{seeds} virtual machines, each with its own errors and tracker: {np.prod(COUNT)} targets, four places of "
-        f"one tracker in turn, {NOISE * 1e6:.2g} um noise of a reading, dead paths free, lengths wrong by "
-        f"{SCALE * 1e6:.1g} um/m (one sigma). The bound of a target's coordinates is "
-        f"{least_u[0]:.2f}, {least_u[1]:.2f} and {least_u[2]:.2f} um in the mean over the grid (noise alone). "
-        f"Mean squared error of a target over its stated covariance: {np.mean(chi2):.3f} per freedom. "
-        f"{lost} of {seeds * np.prod(COUNT)} targets were given up: a good reading looked wrong.",
+        f"{seeds} virtual machines, each with its own errors and tracker: {np.prod(COUNT)} targets, four successive "
+        f"positions of one tracker, {NOISE * 1e6:.2g} um noise of a reading, free dead paths, an error of lengths of "
+        f"{SCALE * 1e6:.1g} um/m (one sigma). The bound of a target's coordinates is {least_u[0]:.2f}, "
+        f"{least_u[1]:.2f} and {least_u[2]:.2f} um in the mean over the grid (noise alone). Mean squared error of a "
+        f"target over its stated covariance: {np.mean(chi2):.3f} per freedom. {lost} of {seeds * np.prod(COUNT)} "
+        "targets were excluded because a correct reading was rejected.",
         "",
         "| | spread/bound | coverage of 95 % intervals |",
         "|---|---|---|",
@@ -118,9 +118,9 @@ def axes(seeds: int) -> list[str]:
             f"{np.mean(inside):.1%} | {size[0]:.2f} um | {size[1]:.2f} um |"
         )
     return [
-        f"{seeds} machines each. Curves are compared with the truth less its mean, and straightness less its slope, at "
-        "41 positions; the volume at 150 places between the targets. The prior of the curves is their own, found from "
-        "the data; the machine's waves are not drawn from it, so that intervals need not hold exactly 95 %.",
+        f"{seeds} machines each. Curves are compared with the truth minus its mean, and straightness minus its slope, "
+        "at 41 positions; the volume at 150 positions between the targets. The prior of the curves is estimated from "
+        "the data; the waves of the machine are not drawn from it, so that the coverage need not be exactly 95 %.",
         "",
         *rows,
     ]

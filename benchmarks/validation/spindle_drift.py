@@ -58,10 +58,11 @@ def drift(seeds: int) -> list[str]:
             f"{np.mean(sigma, axis=(0, 1))[k] * scale:.1f} {unit} |"
         )
     return [
-        f"{seeds} virtual machines, {TIMES.size - 1} instants of a warm-up each; every machine with its own beam "
-        "detection, and with a frame whose true expansion differs from its drawing. The instants of one machine share "
-        f"their reference state, beams and frame, so that the coverage has a standard deviation of up to {chance:.1%}. "
-        "The sensors have been on for four hours: 0.5 nm of their warm-up is left, which no uncertainty holds.",
+        f"{seeds} virtual machines, {TIMES.size - 1} instants of a warm-up each; each machine with its own beam "
+        "detection, and with a frame whose true expansion differs from nominal. The instants of one machine share "
+        "their reference state, beams and frame, so that the coverage has a standard deviation of up to "
+        f"{chance:.1%}. The sensors have been on for four hours: 0.5 nm of their warm-up remains, which is not part "
+        "of the uncertainty.",
         "",
         *rows,
     ]
@@ -102,13 +103,13 @@ def beams(seeds: int) -> list[str]:
     for k in (0, 1, 2, 4, 5):
         unit, scale = units[k]
         rows.append(
-            f"| {names[k]} | {np.mean(bounds, axis=0)[k] * scale:.3f} {unit} | "
-            f"{ratio[k]:.3f} | {construction[k]:.3f} | "
-            f"{np.mean(np.abs(stated) <= Z95, axis=0)[k]:.1%} |"
+            f"| {names[k]} | {np.mean(bounds, axis=0)[k] * scale:.3f} {unit} | {ratio[k]:.3f} | {construction[k]:.3f} "
+            f"| {np.mean(np.abs(stated) <= Z95, axis=0)[k]:.1%} |"
         )
     return [
-        f"{seeds} seeds; six scans of 101 steps over a sphere of 5 mm radius, {noise * 1e6:g} um noise a step, beams "
-        f"0.1 mm and 5 mrad off. The ratio of spreads has a standard deviation of {1 / np.sqrt(2 * seeds):.1%}.",
+        f"{seeds} seeds; six scans of 101 steps over a sphere of 5 mm radius, {noise * 1e6:g} um noise of a step, and "
+        "beams with deviations of 0.1 mm and 5 mrad. The ratio of spreads has a standard deviation of "
+        f"{1 / np.sqrt(2 * seeds):.1%}.",
         "",
         *rows,
     ]

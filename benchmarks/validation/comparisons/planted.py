@@ -191,23 +191,23 @@ def section(seeds: int, pool: Pool) -> list[str]:
         "their own covariance about the true errors: A every minute, with the radius of a bar as a source of all "
         "values; B every 4 minutes, with an expansion; 0.1 um and 0.5 urad of noise. B has one mistake. The joint "
         f"chi-square has {degrees} degrees of freedom. With the effect d of the mistake and the covariance V its "
-        f"non-centrality is d' V^-1 d; {needed(degrees):.1f} is detected with a probability of "
-        f"{POWER:.0%} at the level {LEVEL:g}. Sizes are those of this power on the first machine; where a mistake has "
-        "no size, all uncertainties are multiplied by the factor instead. `margin`: by how much the score of the "
-        "planted cause (twice the logarithm of the likelihood ratio, less the penalties) exceeds that of the next one "
-        f"without noise; below {CLOSE:g} the two cannot be told apart at this size. `right first`: among those "
-        "detected, the planted cause has the first rank; `or alike`: it has, or the first one is said to be "
-        "indistinguishable from it.",
+        f"non-centrality is d' V^-1 d; {needed(degrees):.1f} is detected with a probability of {POWER:.0%} at the "
+        f"level {LEVEL:g}. Sizes are those of this power on the first machine; for a mistake without size, all "
+        "uncertainties are multiplied by the factor instead. `margin`: difference of the scores (twice the logarithm "
+        "of the likelihood ratio, minus the penalties) of the planted cause and of the next one, without noise; "
+        f"below {CLOSE:g} the two cannot be distinguished at this size. `right first`: of the detected mistakes, the "
+        "planted cause has the first rank; `or alike`: it has, or the first one is reported as indistinguishable "
+        "from it.",
         "",
-        "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike "
-        "| first instead | named as alike |",
+        "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike | first "
+        "instead | named as alike |",
         "|---|---|---|---|---|---|---|---|---|---|",
         *rows,
         "",
         f"Without a mistake {np.mean(alarms < LEVEL):.2%} of {alarms.size} comparisons ({DRAWS} draws of each of "
         f"{2 * seeds} machines) are alarms at the level {LEVEL:g} (standard deviation {spread:.2%}); p is uniform "
-        f"(Kolmogorov-Smirnov {kstest(alarms, 'uniform').pvalue:.2g}). The test is exact for datasets whose covariance "
-        "is right: its rate is the level, by construction.",
+        f"(Kolmogorov-Smirnov {kstest(alarms, 'uniform').pvalue:.2g}). The test is exact for datasets with a correct "
+        "covariance: its rate is the level, by construction.",
     ]
 
 

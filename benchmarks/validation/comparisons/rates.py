@@ -159,16 +159,15 @@ def section(seeds: int, pool: Pool) -> list[str]:
             rows += [row("", "left out", [run["apart"] for run in runs])]
     return [
         f"{seeds} virtual machines each. The first four cases are results of methods on simulated raw data of one "
-        "machine that warms up for two hours, a C-frame or a gantry: a bar before five sensors (every "
-        f"{STEP:g} s) and four balls probed every {INTERVAL / 60:g} minutes; displacements at the origin. The rotation "
-        f"about the spindle axis, which the bar does not show, is stated as {UNSEEN * 1e6:g} urad, its size on a "
-        "C-frame; the default of 20 urad makes intervals wider. The last two cases are drawn from their own covariance "
-        "about the true errors of a gantry: six freedoms, a bar whose radius scales the displacements by 5 % (k = 1), "
-        "and a thermometer. "
-        "`correlation`: whether sources with the same identity are one draw (as stated) or counted as two (left out). "
-        "Of datasets that agree 95.4 % of the |En| are below 1 (k = 2), p is "
-        "uniform, and 95 % intervals of the consensus hold the true errors in 95 %. Behind ± the standard error of "
-        "the mean over machines, since the instants of one machine share their sources.",
+        f"machine that warms up for two hours, a C-frame or a gantry: a bar before five sensors (every {STEP:g} s) "
+        f"and four balls probed every {INTERVAL / 60:g} minutes; displacements at the origin. The rotation about the "
+        f"spindle axis, which is not measured with the bar, is stated as {UNSEEN * 1e6:g} urad, its size on a "
+        "C-frame; with the default of 20 urad, intervals are wider. The last two cases are drawn from their own "
+        "covariance about the true errors of a gantry: six freedoms, a bar whose radius scales the displacements by "
+        "5 % (k = 1), and a thermometer. `correlation`: sources with the same identity are one draw (as stated) or "
+        "independent (left out). Of datasets that agree 95.4 % of the |En| are below 1 (k = 2), p is uniform, and 95 "
+        "% of the 95 % intervals of the consensus contain the true errors. After ±: standard error of the mean over "
+        "machines, because the instants of one machine share their sources.",
         "",
         "| datasets | correlation | abs(En) <= 1 | p uniform (Kolmogorov-Smirnov) | p < 0.05 | consensus: coverage |",
         "|---|---|---|---|---|---|",
