@@ -1,4 +1,4 @@
-"""Beam direction: spread against the bound, coverage, and what the inclination compensation is worth."""
+"""Beam direction: spread against the bound, coverage, and benefit of the inclination compensation."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from errormotion.methods.beam_direction.identification.propagation import expect
 from errormotion.twin import VirtualMachine
 
 TITLE = "Beam direction"
-#: the standard error of a ratio of spreads is 1 / sqrt(2 SEEDS), 1.1 %: a fifth of the 5 % that are to be seen. Over
-#: 500 it is 3.2 %, and a freedom in ten is off by more than 5 % by chance alone.
+#: the standard error of a ratio of spreads is 1 / sqrt(2 SEEDS), 1.1 %: a fifth of the 5 % that must be detected. With
+#: 500 seeds it is 3.2 %, and a freedom in ten deviates by more than 5 % by chance.
 SEEDS = 4000
 FREEDOMS = ("EX", "EY", "EZ", "EA", "EB", "EC")
 Z95 = 1.959964
 INCLINATION = np.radians(20.0)
 #: rotations of the turntable for the pairs of planes in table 1 of Lu et al., deg, and the angles found there, deg
 PAIRS = {(0, 20): 20.0823, (20, 40): 19.9316, (40, 60): 20.0489, (60, 80): 20.0990, (80, 90): 19.9820, (0, 90): 19.9148}
-#: machines whose sensor is calibrated as well: a second each
+#: machines with a calibration of the sensor, which takes a second each
 CALIBRATED = 60
 EVEN, TENS = np.arange(0, 45.1, 5.0), np.arange(0, 360, 10.0)
-#: inclinations and rotations of the settings of a calibration, deg, and what they are called
+#: inclinations and rotations of the settings of a calibration, deg, and their names
 DESIGNS = (
     (EVEN, TENS, ("0 to 45 every 5", "every 10")),
     (np.arange(0, 45.1, 7.5), np.arange(0, 360, 30.0), ("0 to 45 every 7.5", "every 30")),
@@ -110,7 +110,7 @@ def honesty(seeds: int, rotations: tuple[int, ...]) -> list[str]:
 
 
 def compensation(seeds: int) -> list[str]:
-    """The published pairs of planes, with the twin's inclination error, before and after compensation."""
+    """The published pairs of planes with inclination error, before and after compensation."""
     method = BeamDirection()
     lean, turn, stated = ({pair: [] for pair in PAIRS} for _ in range(3))
     refused = dict.fromkeys(PAIRS, 0)
@@ -180,7 +180,7 @@ def _spread(ratio: np.ndarray) -> str:
 
 
 def holes(seeds: int) -> list[str]:
-    """Coverage of calibrations over the disc of tilts, where they are used and where they are refused."""
+    """Coverage of calibrations over the disc of tilts, where they are supported and where they are refused."""
     rows = [
         "| inclinations of the settings / deg | rotations / deg | where supported | where refused | share refused |",
         "|---|---|---|---|---|",

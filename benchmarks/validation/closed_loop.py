@@ -15,9 +15,9 @@ from errormotion.twin import VirtualMachine
 TITLE = "Closed loop"
 SEEDS = 10
 VARIATION = 0.2
-"""By which each constant of a machine differs from that of the table at most."""
+"""Largest relative difference of a constant of a machine from that of the table."""
 TRAINING: Speeds = ((0.0, 15000.0), (6600.0, 4000.0), (8400.0, 10000.0), (9600.0, 0.0))
-"""Of the warm-up that the model is fitted to: as hot as the machine becomes, then cooler."""
+"""Of the warm-up to which the model is fitted: the highest temperature of the machine, then cooler."""
 SHORTEST, LONGEST = 1200.0, 3600.0
 """Of one speed in a compensated warm-up, s."""
 

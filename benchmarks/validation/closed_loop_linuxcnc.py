@@ -1,7 +1,7 @@
-"""The closed loop with the real LinuxCNC: it probes a warm-up and, with offsets in its servo thread, two others.
+"""The closed loop with the real LinuxCNC: it probes a warm-up, and two others with offsets in its servo thread.
 
-``python benchmarks/validate.py closed_loop_linuxcnc --cache FOLDER``; of a single machine (several at a time need a
-network and IPC namespace each): ``PYTHONPATH=benchmarks python -m validation.closed_loop_linuxcnc SEED FOLDER``.
+``python benchmarks/validate.py closed_loop_linuxcnc --cache FOLDER``; for a single machine (several at a time need
+separate network and IPC namespaces): ``PYTHONPATH=benchmarks python -m validation.closed_loop_linuxcnc SEED FOLDER``.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from validation.closed_loop import VARIATION, individual
 TITLE = "Closed loop on LinuxCNC"
 SEEDS = 10
 DEFAULT = False
-"""Takes hours of real time, and needs LinuxCNC: only where it is named."""
+"""It takes hours of real time and needs LinuxCNC, so that it runs only if it is named."""
 FIRST = 100
 """Seed of the first machine."""
 INTERVAL = 600.0
 """From one cycle to the next, simulated s."""
 CYCLES = {"training": 16, "compensated": 13}
 WARM_UPS = (2, 3)
-"""Those that are compensated."""
+"""Those with compensation."""
 MODEL = Settings(variant="lagged", lags=(), most_sensors=2)
-"""Present temperatures alone: simulated minutes pass at once, and the compensation would take them for seconds."""
+"""Only present temperatures: simulated minutes are skipped, and the compensation would assume seconds."""
 BALLS = (0, 2, 3)
 ROUTES = {"feedback": "linuxcnc_feedback", "external": "linuxcnc_offset"}
 
 
 class Keeper:
-    """Keeps the world of a machine between two runs."""
+    """Reference to the world of a machine between two runs."""
 
     def close(self) -> None:
         """Do nothing."""

@@ -14,7 +14,7 @@ SEEDS = 1000
 
 
 class Case(NamedTuple):
-    """What is measured, um: errors before, share that remains, and the standard uncertainties."""
+    """A case, um: errors before, remaining share, and the standard uncertainties."""
 
     points: int
     freedoms: int

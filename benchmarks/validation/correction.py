@@ -1,4 +1,4 @@
-"""Corrections of commands from noisy measurements of virtual machines, against the errors that truly remain."""
+"""Corrections of commands from noisy measurements of virtual machines, compared with the true remaining errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NOISE = 0.5e-6
 TURN_NOISE = 1e-6
 PLACES = 40
 TOOL = np.array([0.03, -0.02, -0.15])
-"""Functional point, m: another one than that of the measurement."""
+"""Functional point, m, which differs from that of the measurement."""
 
 
 def section(seeds: int) -> Iterator[str]:

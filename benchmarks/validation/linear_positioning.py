@@ -65,7 +65,7 @@ def table(seeds: int, behaviour: Behaviour) -> list[str]:
 
 
 def bound(behaviour: Behaviour, P: np.ndarray) -> np.ndarray:
-    """Return the Cramer-Rao bound of a mean bidirectional deviation, instrument and expansion included, m^2."""
+    """Return the Cramer-Rao bound of a mean bidirectional deviation, including instrument and expansion, m^2."""
     z = (P - P.mean()) / (np.ptp(P) / 2.0)
     runs, lever = SETTINGS.runs, P - P[0]
     of_runs = (behaviour.noise**2 / 2.0 + behaviour.offset**2 + (behaviour.slope * z) ** 2) / runs

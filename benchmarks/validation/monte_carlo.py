@@ -1,4 +1,4 @@
-"""Linear uncertainties of all methods beside the Monte Carlo method, JCGM 101."""
+"""Linear uncertainties of all methods compared with the Monte Carlo method, JCGM 101."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from errormotion.testing.run import subjects_of
 TITLE = "Linear uncertainties and Monte Carlo"
 SEEDS = 2000
 LARGE = 10**6
-"""Bytes of raw data above which an identification takes so long that a fifth of the trials are made."""
+"""Bytes of raw data above which only a fifth of the trials are run, because an identification takes long."""
 
 
 def section(seeds: int, workers: int = 1) -> Iterator[str]:

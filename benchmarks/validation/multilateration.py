@@ -33,7 +33,7 @@ def section(seeds: int) -> Iterator[str]:
 
 
 def of_the_datum(place: np.ndarray, error: np.ndarray, everywhere: np.ndarray) -> np.ndarray:
-    """Return the motion of the whole that fits errors (m, 3) best, at other places (k, 3)."""
+    """Return the rigid motion that fits errors (m, 3) best, at other positions (k, 3)."""
     centre = place.mean(axis=0)
     motion = np.linalg.lstsq(motions(place, centre).reshape(-1, 6), error.ravel())[0]
     return motions(everywhere, centre) @ motion
@@ -62,7 +62,7 @@ def honesty(seeds: int) -> list[str]:
         station = simulation.stations(machine)
         true_station = station - of_the_datum(place, place - q - REFERENCE, station)
         least = bound(place, station, noise=NOISE)
-        # The scale is no noise: the bound has it beside, one draw for all.
+        # The scale is one draw for all, added to the bound of the noise.
         stretch = SCALE * (place - place.mean(axis=0))
         spread.append(left / np.sqrt(np.einsum("tii->ti", least.target_covariance) + stretch**2))
         off = errors["station_place"].values - true_station
@@ -127,7 +127,7 @@ def axes(seeds: int) -> list[str]:
 
 
 def curves(machine: VirtualMachine, errors) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield name, value, standard uncertainty and truth of every error motion that is seen."""
+    """Yield name, value, standard uncertainty and truth of every measured error motion."""
     x, w = leggauss(40)
     for axis in "XYZ":
         q = errors[f"{axis}_position"].values
@@ -144,6 +144,6 @@ def curves(machine: VirtualMachine, errors) -> Iterator[tuple[str, np.ndarray, n
 
 
 def as_seen(machine: VirtualMachine, name: str, k: int, axis: str, at: np.ndarray) -> np.ndarray:
-    """Return an error motion as one reflector sees it: that of a table whose rotation it does not tell holds that."""
+    """Return an error motion as measured with one reflector, including unmeasured rotations of a table."""
     twist = move(machine.geometry.motions[axis](at), REFERENCE)
     return twist[:, k] - (at * twist[:, 5] if name == "EXY" and "-Y-bed" in machine.chain else 0.0)

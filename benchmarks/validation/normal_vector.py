@@ -1,4 +1,4 @@
-"""Balls touched by the machine itself: spread against the bound, coverage, what the normals of planes lose."""
+"""Balls touched by the machine: spread against the bound, coverage, loss of the normals of planes."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def honesty(kind: str, seeds: int) -> tuple[list[str], str]:
 
 
 def wrong(seeds: int) -> list[str]:
-    """What a rigid motion of the balls makes of a machine whose table moves."""
+    """Result of the assumption of a rigid motion of the balls on a machine whose table moves."""
     ratio, off_by, named = [], [], 0
     for seed in range(seeds):
         machine, raw = probed("cframe", seed)

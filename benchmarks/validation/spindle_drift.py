@@ -1,4 +1,4 @@
-"""Spindle drift: coverage of the drift's intervals, and the beam detection against its bound."""
+"""Spindle drift: coverage of the intervals of the drift, and the beam detection against its bound."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def section(seeds: int) -> Iterator[str]:
 
 
 def drift(seeds: int) -> list[str]:
-    """Coverage of the drift's intervals, each seed with a beam detection of its own."""
+    """Coverage of the intervals of the drift, with another beam detection for each seed."""
     method = SpindleDrift()
     miss, sigma = [], []
     for seed in range(seeds):
@@ -69,7 +69,7 @@ def drift(seeds: int) -> list[str]:
 
 
 def beams(seeds: int) -> list[str]:
-    """Spread of the beam detection against the Cramer-Rao bound, the paper's construction beside it."""
+    """Spread of the beam detection and of the construction of the paper, against the Cramer-Rao bound."""
     rng = np.random.default_rng(0)
     radius, noise = 5e-3, 0.5e-6
     u0, p0 = np.array([-1.0, 0, 0]), np.array([6e-3, 0, 0.01])

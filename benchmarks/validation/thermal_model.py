@@ -17,7 +17,7 @@ TITLE = "Thermal model"
 SEEDS = 12
 #: three hours, a probing cycle every ten minutes, s
 BEGINS, CYCLE = 600.0 * np.arange(19), 120.0
-#: spindle speeds (1/min) from times on (min): two warm-ups to learn from, one to be judged by
+#: spindle speeds (1/min) from times on (min): two warm-ups for the fit, one for the assessment
 PROFILES = (
     ((2, 6000), (60, 12000), (120, 0)),
     ((2, 15000), (40, 3000), (100, 9000)),
@@ -55,7 +55,7 @@ def section(seeds: int) -> Iterator[str]:
 
 
 def judged(kind: str, seeds: int) -> tuple[list[str], str]:
-    """Return the rows of one kind of machine, and what the models were made of."""
+    """Return the rows of one kind of machine, and the sensors of the models."""
     method = NormalVector()
     sizes: dict[str, list] = {"displacement": [], "turn": []}
     sensors, variants = Counter(), Counter()
@@ -96,7 +96,7 @@ def judged(kind: str, seeds: int) -> tuple[list[str], str]:
     return rows, f"Sensors in the models of the {kind} (number of models of {seeds}): {chosen}. Variants: {made}."
 
 
-#: where the errors are stated, m: in the middle of the balls
+#: functional point, m: the centre of the balls
 POINTS = {
     kind: tuple(np.round(VirtualMachine(kind).balls.nominal[:4].mean(axis=0), 4)) for kind in ("gantry", "cframe")
 }

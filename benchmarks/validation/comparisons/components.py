@@ -1,4 +1,4 @@
-"""Repeats: do the intervals of repeatability, between groups, and of reproducibility hold the truth."""
+"""Repeats: coverage of the intervals of repeatability, between groups, and of reproducibility."""
 
 from __future__ import annotations
 

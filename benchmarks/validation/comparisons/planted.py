@@ -1,4 +1,4 @@
-"""Planted mistakes: whether a comparison detects them as often as predicted, and names the right one."""
+"""Planted mistakes: rate of detection compared with the prediction, and rate of the correct cause."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ARCSEC = np.pi / 180 / 3600
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake in the second dataset: what it does for a size, and the cause that should be named.
+    """A mistake in the second dataset: its effect by size, and the cause that should be reported.
 
     ``fixed`` mistakes have one size; the uncertainties of both datasets are scaled instead.
     """
@@ -115,7 +115,7 @@ def power(squares: float, degrees: int) -> float:
 
 
 def needed(degrees: int) -> float:
-    """Return the non-centrality at which a joint chi-square detects with the power that is asked for."""
+    """Return the non-centrality at which a joint chi-square has the required power."""
     low, high = 0.0, 1e4
     for _ in range(60):
         middle = (low + high) / 2
@@ -135,7 +135,7 @@ def planned(mistake: Mistake) -> tuple[float, float]:
 
 
 def margin(mistake: Mistake, size: float, factor: float) -> float:
-    """Return by how much the score of the planted cause exceeds that of the next one without noise."""
+    """Return the difference of the scores of the planted cause and of the next one, without noise."""
     a, b = (replace(each, factor=factor) for each in pair(0))
     sets = {"A": a.dataset(None), "B": mistake.apply(b, size).dataset(None)}
     ground = common_ground(sets)
@@ -145,7 +145,7 @@ def margin(mistake: Mistake, size: float, factor: float) -> float:
 
 
 def one(task: tuple[int, int, float, float]) -> dict:
-    """Return what a comparison says of one machine with one mistake."""
+    """Return the result of a comparison for one machine with one mistake."""
     seed, number, size, factor = task
     a, b = (replace(each, factor=factor) for each in pair(seed))
     b = MISTAKES[number].apply(b, size)
@@ -227,7 +227,7 @@ def _row(mistake: Mistake, size: float, factor: float, ahead: float, runs: list[
 
 
 def _same(found: str, planted: str) -> bool:
-    """Whether a cause is the planted one; a step may be one instant of the grid off."""
+    """Whether a cause is the planted one; a step may differ by one instant of the grid."""
     steps = [re.match(r"step at (\d+) s", name) for name in (found, planted)]
     if all(steps):
         return abs(int(steps[0][1]) - int(steps[1][1])) <= 240  # type: ignore[index]

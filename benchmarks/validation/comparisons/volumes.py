@@ -18,13 +18,13 @@ SCALE = 0.3e-6
 U_AXIS = np.array([2e-7] * 3 + [5e-7] * 3)
 """Standard uncertainty of the axis, m, rad."""
 ELSEWHERE = np.array([[0.1, -0.2, 0.0], [-0.2, 0.1, 0.15], [0.15, 0.1, -0.1], [0.0, -0.15, 0.2]])
-"""By how much the second tracker stands away from the places of the first, m."""
+"""Displacement of the second tracker from the positions of the first, m."""
 SHORT = 60
-"""Most machines of the comparison through the chain, which takes seconds."""
+"""Largest number of machines of the comparison through the chain, which takes seconds."""
 
 
 def tracked(machine: VirtualMachine, q: np.ndarray, seed: int, station: np.ndarray | None = None):
-    """Return the errors of targets by a tracker of its own."""
+    """Return the errors of targets by one tracker."""
     scale = SCALE * np.random.default_rng([seed, 1]).normal()
     raw = simulation.raw(machine, q, station, seed=seed, scale=scale)
     return Multilateration().identify(raw, Settings(noise="stated", scale_uncertainty=SCALE, parametric=False))
