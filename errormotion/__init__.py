@@ -14,7 +14,7 @@ The packages from the lowest layer to the highest; a package imports only lower 
 ``montecarlo``    uncertainty by the Monte Carlo method, compared with the linear one
 ``testing``       the conformance kit for plugins
 ``compare``       several results of one machine: agreement, consensus, diagnosis
-``compensation``  thermal models
+``compensation``  thermal models, corrections, tables of controls, NC programs, online compensation
 ``campaign``      bench and campaign files, the runner, run folders
 ``record``        all runs of a machine: list, history, notes
 ``cli``           the command ``errormotion``
