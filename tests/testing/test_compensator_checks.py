@@ -1,4 +1,4 @@
-"""A compensator that does one thing wrong fails the check that claims it."""
+"""A compensator with one fault fails the check for it."""
 
 import json
 import re
