@@ -1,34 +1,34 @@
-# Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
-# demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
+# Each target installs its requirements into .venv if it is missing or a lock file has changed.
+# demo needs only the dependencies of errormotion; the other targets need the development packages.
 .DEFAULT_GOAL := help
 .PHONY: help setup demo compiled test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance following programs pictures lowest lock
 
 BIN := .venv/bin
 ARGS ?=
-# Compiled modules are kept: many tests start processes, and would compile everything anew in each.
+# Compiled modules are stored, because many tests start processes, each of which would compile them again.
 unexport PYTHONDONTWRITEBYTECODE
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):[^#]*## /  \1\t/' | expand -t 14
 
-setup: .venv/.dev  ## install everything into .venv (uv where it is, else pip)
+setup: .venv/.dev  ## install all requirements into .venv (with uv if it is installed, else pip)
 
 demo: .venv/.core  ## measure a virtual machine: beam detection, spindle drift, report
 	@$(BIN)/errormotion demo $(ARGS)
 
-test: .venv/.compiled  ## run the tests without the slow ones (ARGS="-n 0 tests/kinematics -k fit" runs some, one after another)
+test: .venv/.compiled  ## run the tests except slow ones (ARGS="-n 0 tests/kinematics -k fit" selects tests, without workers)
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow" $(ARGS)
 
 test-all: compiled  ## run all tests
 	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
 
-lint: .venv/.dev  ## style, types, and which package imports which
+lint: .venv/.dev  ## check style, types and import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-docs: .venv/.dev  ## build docs/_build/html; a warning is an error
+docs: .venv/.dev  ## build docs/_build/html; warnings are errors
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html
 	@echo "docs/_build/html/index.html"
 
@@ -48,16 +48,16 @@ closed-loop: .venv/.dev  ## compensate 10 virtual machines in a closed loop, and
 fuzz: .venv/.dev  ## try 1e6 damaged frames of every codec (ARGS="--frames 1e5") and write docs/reliability.md
 	$(BIN)/python tools/fuzz.py $(ARGS)
 
-guided: .venv/.dev  ## search for inputs that reach new code in codecs and file readers (needs pip install atheris), docs/reliability.md
+guided: .venv/.dev  ## search for inputs that execute new code of codecs and file readers (needs pip install atheris), docs/reliability.md
 	$(BIN)/python tools/guided.py $(ARGS)
 
-wire: .venv/.dev  ## try every driver on a wire that disturbs it, and write docs/reliability.md
+wire: .venv/.dev  ## try all drivers with disturbed connections, and write docs/reliability.md
 	$(BIN)/python tools/wire.py $(ARGS)
 
-faults: .venv/.dev  ## kill runs, take their disks, set their clocks, and resume them, 10 minutes, and write docs/reliability.md
+faults: .venv/.dev  ## kill runs, let disks fail, set clocks, and resume the runs, 10 minutes, and write docs/reliability.md
 	$(BIN)/python tools/faults.py $(ARGS)
 
-endurance: .venv/.dev  ## watch a machine for 24 simulated hours with a fault a minute, and write docs/reliability.md
+endurance: .venv/.dev  ## monitor a machine for 24 simulated hours with a fault every minute, and write docs/reliability.md
 	$(BIN)/python tools/endurance.py $(ARGS)
 
 following: .venv/.dev  ## compensate the real LinuxCNC with a fault every 30 s, 72 minutes, and write docs/reliability.md
@@ -66,7 +66,7 @@ following: .venv/.dev  ## compensate the real LinuxCNC with a fault every 30 s, 
 programs: .venv/.dev  ## read 1e6 random NC programs by LinuxCNC's interpreter (ARGS="--programs 2e4"), and write docs/reliability.md
 	$(BIN)/python tools/programs.py $(ARGS)
 
-pictures: compiled  ## draw docs/figures/dashboard_*.png anew, by the browser tests of the dashboard (needs chromium)
+pictures: compiled  ## update docs/figures/dashboard_*.png by the browser tests of the dashboard (needs chromium)
 	$(BIN)/python -m pytest -n 0 tests/dashboard/test_pictures.py --pictures docs/figures
 
 lowest: .venv/.dev  ## run tests with the lowest versions of packages that pyproject.toml allows, in .venv-lowest
@@ -74,7 +74,7 @@ lowest: .venv/.dev  ## run tests with the lowest versions of packages that pypro
 mutations: .venv/.dev  ## read 2000 altered files by commands, about 15 minutes, and write docs/reliability.md
 	$(BIN)/python tools/mutations.py $(ARGS)
 
-lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)
+lock:  ## resolve the requirements in pyproject.toml into the two lock files (needs uv)
 	uv pip compile -q --universal --python-version 3.11 pyproject.toml --all-extras --group build --group dev \
 		--upgrade --generate-hashes --no-emit-index-url --no-header -o requirements.lock
 	uv pip compile -q --universal --python-version 3.11 pyproject.toml --group build -c requirements.lock \
@@ -86,7 +86,7 @@ lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)
 .venv/.dev: requirements.lock requirements-core.lock pyproject.toml
 	@tools/setup dev
 
-# What is compiled at first use, tests included, is compiled once, before the workers of the tests start.
+# Functions that are compiled at first use are compiled once, before the workers of the tests start.
 compiled: .venv/.compiled .venv/.compiled-large
 
 COMPILED := $(shell grep -rlsE 'njit|@compiled' --include='*.py' errormotion)

@@ -1,4 +1,4 @@
-"""Time of comparisons: two long datasets, and many short ones, with their rates beside it."""
+"""Time of comparisons of two long datasets and of many short ones, and their rates of agreement."""
 
 import time
 import tracemalloc

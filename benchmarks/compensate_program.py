@@ -1,4 +1,4 @@
-"""NC programs: time and memory of a correction beside LinuxCNC's own reading."""
+"""NC programs: time and memory of a correction, compared with the interpreter of LinuxCNC."""
 
 import math
 import os
@@ -20,7 +20,7 @@ BLOCKS = 200_000
 
 
 def contour() -> list[str]:
-    """Return the finish of a free-form surface: blocks of some 0.8 mm."""
+    """Return the finishing program of a free-form surface: blocks of about 0.8 mm."""
     lines = ["G21 G90 G17 G94 G54", "G0 X90 Y0 Z5", "F1500"]
     for k in range(BLOCKS):
         a = 0.01 * k
@@ -40,7 +40,7 @@ def speed(folder: Path) -> None:
     part, out = folder / "part.ngc", folder / "new.ngc"
     part.write_text("\n".join(contour()) + "\n")
     correcting, offsets = volume(), Offsets().with_system("G54", (0.0, 0.0, 0.2))
-    list(Rewriting(Reader(offsets), correcting).lines(["G0 X0 Y0 Z0", "G1 X100 F100", "M2"]))  # compiled before
+    list(Rewriting(Reader(offsets), correcting).lines(["G0 X0 Y0 Z0", "G1 X100 F100", "M2"]))  # for the compilation
     start, cpu = time.perf_counter(), time.process_time()
     found = compensate(part, out, correcting, offsets, Settings())
     wall, used = time.perf_counter() - start, time.process_time() - cpu

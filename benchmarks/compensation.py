@@ -1,10 +1,10 @@
 """Online compensation: time of a prediction and of a cycle of reading and writing, for each output.
 
-Beside it, what a bare client of the same protocol takes for the same reads and writes. The machines are simulated, in
-this process; a line or a control adds its own time.
+For comparison, the time of a plain client of the same protocol for the same reads and writes. The machines are
+simulated in this process; a connection or a control adds its own time.
 
-``python benchmarks/compensation.py [HOURS [SEED]]``: also so many simulated hours of following with a simulated PLC,
-with a fault every 10 minutes.
+``python benchmarks/compensation.py [HOURS [SEED]]``: also this number of simulated hours of compensation with a
+simulated PLC and a fault every 10 minutes.
 """
 
 import asyncio
@@ -67,7 +67,7 @@ def prediction() -> Callable[[int], object]:
 
 
 def outputs(predict: Callable[[int], object]) -> None:
-    """Print the cycle of every compensator that has a simulated machine in this process."""
+    """Print the time of a cycle of each compensator with a simulated machine in this process."""
     for plugin in plugins.available("compensators"):
         cls = plugin.cls
         if cls is None or not cls.info.simulator:
@@ -94,7 +94,7 @@ def outputs(predict: Callable[[int], object]) -> None:
 
 
 def modbus_client() -> None:
-    """Print the same requests by the client of pymodbus."""
+    """Print the time of the same requests by the client of pymodbus."""
     address = parse_address("sim://cframe/plc?slew=1e-3")
     simulator = "errormotion.instruments.simulators.compensator.plc:SimulatedPlc"
     with (
@@ -113,7 +113,7 @@ def modbus_client() -> None:
 
 
 def opcua_client() -> None:
-    """Print the same requests by the client of asyncua, without threads."""
+    """Print the time of the same requests by the client of asyncua, without threads."""
     from asyncua import Client, ua
 
     address = parse_address("sim://cframe/nodes?slew=1e-3")
@@ -135,7 +135,7 @@ def opcua_client() -> None:
 
 
 def bare_file() -> None:
-    """Print one replaced file."""
+    """Print the time of the replacement of a file."""
     with tempfile.TemporaryDirectory() as folder:
         new, target = Path(folder) / "new", Path(folder) / "offset.json"
 

@@ -1,8 +1,8 @@
 """A crossbeam campaign of 1.6 GB identified out of core: time, memory, and the errors against the truth.
 
 ``python -m benchmarks.crossbeam_campaign [--quick]``: 8 artefacts x 20 scans x 3200 x 800 points as float32;
-``--quick`` takes 4 scans of each. One artefact's true scans are made once; every artefact has them with noise of its
-own, so that all eight see the errors that the axis has at the place of that one.
+``--quick`` uses 4 scans of each. The true scans of one artefact are computed once and used for all artefacts with
+independent noise, so that all eight have the errors of the axis at the position of this one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FOLDER_ROOM = 1.2
 
 
 class Campaign:
-    """True scans of one artefact, and all that a raw dataset says beside the heights."""
+    """True scans of one artefact, and the other data of a raw dataset."""
 
     def __init__(self, cycles: int) -> None:
         from errormotion.twin import VirtualMachine
@@ -46,7 +46,7 @@ class Campaign:
         middle = float(PLACES[0])
         self.truth = beam.twist(self.time, middle)
         rng = np.random.default_rng(0)
-        # Lines stand at whole counts of the encoder, so that both variants say the same.
+        # Lines are at integer counts of the encoder, so that both variants are equal.
         self.y = (np.arange(LINES) - (LINES - 1) / 2) * FEED + rng.integers(-30, 31, (cycles, 1)) * COUNT
         self.scans = np.empty((cycles, LINES, POINTS), dtype=np.float32)
         stands = beam.artefact_pose(3, middle)
@@ -69,7 +69,7 @@ class Campaign:
         )
 
     def noisy(self) -> Iterator[tuple[int, int, np.ndarray]]:
-        """Yield cycle, artefact and heights (line, point) of all scans, the same ones every time."""
+        """Yield cycle, artefact and heights (line, point) of all scans, always the same."""
         rng = np.random.default_rng(1)
         for cycle in range(self.cycles):
             for artefact in range(ARTEFACTS):
@@ -112,13 +112,13 @@ class Campaign:
 
 
 def peak_memory() -> int:
-    """Return the most memory that this process has held, bytes (Linux)."""
+    """Return the largest memory of this process, bytes (Linux)."""
     line = next(row for row in Path("/proc/self/status").read_text().splitlines() if row.startswith("VmHWM"))
     return int(line.split()[1]) * 1024
 
 
 def identify(path: str, strain: str) -> None:
-    """Identify a campaign and print what it took as JSON; runs in a process of its own."""
+    """Identify a campaign and print time and memory as JSON; runs in a separate process."""
     from errormotion.datasets import load, provenance
     from errormotion.methods.crossbeam_scan import CrossbeamScan
     from errormotion.methods.crossbeam_scan.settings import Settings
@@ -147,7 +147,7 @@ def identify(path: str, strain: str) -> None:
 
 
 def plain_read(raw: xr.Dataset) -> float:
-    """Read every height once, chunk by chunk, and do nothing with them but add them up."""
+    """Read all heights once, chunk by chunk, and add them up."""
     heights = raw["height"] if "height" in raw else raw["record"]
     total = 0.0
     if "height" in raw:
@@ -195,7 +195,7 @@ def main() -> None:
     print(f"{ARTEFACTS} artefacts x {cycles} scans x {POINTS} x {LINES} points, {size:.2f} GB as float32, uncompressed")
     with tempfile.TemporaryDirectory() as folder:
         if shutil.disk_usage(folder).free < size * 1e9 * FOLDER_ROOM:
-            print(f"  left out: {folder} has not the {size:.1f} GB that it needs")
+            print(f"  skipped: {folder} has less than the required {size:.1f} GB")
             return
         start = time.perf_counter()
         campaign = Campaign(cycles)

@@ -1,10 +1,10 @@
-"""The dashboard: 100 sensors, 8 hours of history, 20 clients that ask ten times a second, one client that hangs.
+"""The dashboard: 100 sensors, 8 hours of history, 20 clients with ten requests a second, one client that hangs.
 
-The server is a process of its own with the real monitor, rows of a second, and thermometers without a line. Beside
-it, a bare tornado server that sends a text of the same length to the same clients. Accuracy: the peak of one row in
-every reduced curve.
+The server is a separate process with the real monitor, rows of a second, and thermometers without communication. It is
+compared with a plain tornado server that sends a text of the same length to the same clients. Accuracy: the peak of
+one row in each reduced curve.
 
-The page Compensate is asked by as many clients: a compensation of 8 hours with a period of a second, which goes on.
+The same number of clients requests the page Compensate of a running compensation of 8 hours with a period of a second.
 
 ``python benchmarks/dashboard.py [SECONDS]``
 """
@@ -51,13 +51,13 @@ WHOLE = f"span={int(SPAN)}"
 MODULES, CHANNELS = 20, 5
 CURVES = 8
 CORES, MEMORY, UPDATE = 1.0, 1 << 30, 0.2
-"""What is allowed: processors, bytes, and time of an answer, s."""
+"""Limits: processors, bytes, and time of an answer, s."""
 PEAK = 99.0
 """degC, of one value in the history"""
 
 
 class Thermometer:
-    """Five sensors that change a little."""
+    """Five sensors with small changes."""
 
     info = InstrumentInfo("thermometer", "thermometer", "for the benchmark", "simulated_only")
     Settings = PluginSettings
@@ -72,7 +72,7 @@ class Thermometer:
     close = open
 
     def identify(self) -> Identity:
-        """Return what it is."""
+        """Return the identity."""
         return Identity("benchmark", "thermometer", "1", simulated=True)
 
     def read(self) -> dict[str, float]:
@@ -88,7 +88,7 @@ def plan() -> BenchPlan:
 
 
 class Filled(Watch):
-    """A watch that has read for 8 hours."""
+    """A watch with a history of 8 hours."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -100,7 +100,7 @@ class Filled(Watch):
 
 
 def compensate(runs: Path) -> None:
-    """Write the log of a compensation of 8 hours, then go on with it in a thread, once a second."""
+    """Write the log of a compensation of 8 hours, and continue it in a thread, once a second."""
     folder = RunFolder.create(runs, "compensation", "00000001", {"status": "running", "bench": {"machine": "Mill"}})
     rest: dict[str, Any] = {"machine": "Mill", "bench": "bench.toml", "compensator": "none", "armed": False}
     rest |= {"limits": Limits(), "stopping": False, "missing": (), "outside": (), "limited": (), "estop": False}
@@ -158,10 +158,10 @@ def serve_bare(length: int) -> None:
 
 @dataclass
 class Taken:
-    """What the clients saw."""
+    """Measurements of the clients."""
 
     values: list[float] = field(default_factory=list)
-    """Times of the answers with values now, s."""
+    """Times of the answers with present values, s."""
     curves: list[float] = field(default_factory=list)
     highest: list[float] = field(default_factory=list)
     length: int = 0
@@ -180,7 +180,7 @@ def ask(connection: http.client.HTTPConnection, path: str) -> tuple[bytes, float
 
 
 def client(port: int, seconds: float, taken: Taken, lock: threading.Lock, page: str) -> None:
-    """Ask for values ten times a second, and once for curves of 8 hours."""
+    """Request values ten times a second, and once curves of 8 hours."""
     connection, names = http.client.HTTPConnection("127.0.0.1", port), "&".join(f"name=T0.{k}" for k in range(CHANNELS))
     names += "&" + "&".join(f"name=T1.{k}" for k in range(CURVES - CHANNELS))
     curves_of = {NOW: f"/now/history.json?span={int(SPAN)}&{names}", COMPENSATE: f"/compensate/curves.json?{WHOLE}"}
@@ -190,7 +190,7 @@ def client(port: int, seconds: float, taken: Taken, lock: threading.Lock, page: 
     text, needed = ask(connection, curves_of[page])
     with lock:
         taken.curves.append(needed)
-        if page == NOW and b'"x"' in text:  # not of the bare server
+        if page == NOW and b'"x"' in text:  # not with the plain server
             curves = [curve["y"] for curve in json.loads(text).values()]
             taken.highest += [max(each for each in curve if each is not None) for curve in curves]
     until = time.perf_counter() + seconds
@@ -210,7 +210,7 @@ def used(process: int) -> tuple[float, int]:
 
 
 def measured(arguments: list[str], seconds: float, page: str = NOW) -> Taken:
-    """Return what 20 clients see of a page of a server, started with arguments of this program."""
+    """Return the measurements of 20 clients for a page of a server, started with arguments of this program."""
     process = subprocess.Popen([sys.executable, __file__, *arguments], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
@@ -238,7 +238,7 @@ def verdict(within: bool) -> str:
 
 
 def main(seconds: float) -> None:
-    """Print what the server needs."""
+    """Print processor time, memory and times of answers."""
     with tempfile.TemporaryDirectory() as folder:
         ours = measured(["--serve", folder], seconds)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,9 +1,9 @@
-"""How fast five channels stream, over real sockets, from the simulated sensors to the caller.
+"""Rate of a stream of five channels over real sockets, from the simulated sensors to the caller.
 
     python benchmarks/instruments_stream.py [SECONDS]
 
-Twice: at the pace of real sensors at their highest rate, where nothing may be lost, and as fast as this machine can.
-Simulation, encoding, sockets and decoding all run in this one process.
+Two runs: at the highest rate of real sensors, without loss, and as fast as this computer can. Simulation, encoding,
+sockets and decoding all run in this process.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def main() -> int:
         )
     Console().print(table)
     if failed:
-        print("Samples were lost: this machine does not sustain that rate now.")
+        print("Samples were lost: this computer is too slow for this rate at present.")
     return int(failed)
 
 

@@ -1,7 +1,7 @@
-"""Time from an e-stop to its answer by LinuxCNC's bridge, while other clients send requests as fast as they can.
+"""Time from an e-stop to its answer by the bridge of LinuxCNC, while other clients send requests as fast as possible.
 
-Starts the real LinuxCNC on simulated joints. Each stop is requested over a connection of its own; the flooding clients
-are in another process. The bridge's own part is the time beyond that of LinuxCNC without a flood.
+It starts the real LinuxCNC on simulated joints. Each stop is requested over a separate connection; the flooding clients
+are in another process. The effect of the bridge is the difference from the time without a flood.
 """
 
 from __future__ import annotations

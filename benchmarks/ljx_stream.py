@@ -1,11 +1,11 @@
-"""How many profiles a second the LJ-X8000A driver takes in on one core, over real sockets.
+"""Profiles a second that the LJ-X8000A driver receives on one core, over real sockets.
 
     python benchmarks/ljx_stream.py [SECONDS]
 
-A device of its own process sends profiles that were made before, over loopback. The driver's process, reader thread
-and caller together, is held to one core, the device to another where there is one. Once as fast as the driver takes
-them, and once at 16 000 profiles a second: there the device waits for nobody, but throws away what has waited for more
-than half a second, as its memory is finite.
+A device in a separate process sends profiles that were computed before, over loopback. The process of the driver, with
+reader thread and caller, is limited to one core, the device to another one if possible. One run is as fast as the
+driver receives profiles, and one at 16 000 profiles a second: there the device does not wait, but discards profiles
+that are older than half a second, because its memory is finite.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ MEMORY = 0.5  # s
 
 
 def pin(core: int) -> None:
-    """Hold this process to one of the cores that it may use."""
+    """Limit this process to one of its available cores."""
     if hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[core % len(cores)]})
 
 
 def play(ports: Connection, layout: StreamLayout, rate: float) -> None:
-    """Be the device: answer requests, send profiles at a rate; 0: as fast as they are taken."""
+    """Simulate the device: answer requests, send profiles at a rate; 0: as fast as they are received."""
     pin(1)
     doors = [socket.create_server(("127.0.0.1", 0)) for _ in range(2)]
     ports.send([door.getsockname()[1] for door in doors])
@@ -66,7 +66,7 @@ def play(ports: Connection, layout: StreamLayout, rate: float) -> None:
 
 
 def answer(commands: socket.socket, layout: StreamLayout) -> int | None:
-    """Answer the next request and return its opcode; None where none has come, or the driver has closed."""
+    """Answer the next request and return its opcode; None without request, or after the driver has closed."""
     try:
         frame = commands.recv(64)
     except BlockingIOError:
@@ -142,7 +142,7 @@ def main() -> int:
     gigabit = 1e9 * 1448 / 1538 / bits  # data in an Ethernet frame with TCP time stamps, of the bytes on the wire
     print(f"A gigabit line carries {gigabit / 1e3:.1f} kHz of these profiles at most.")
     if failed:
-        print("Profiles were lost: this machine does not sustain that rate now.")
+        print("Profiles were lost: this computer is too slow for this rate at present.")
     return int(failed)
 
 

@@ -1,15 +1,14 @@
-"""Multilateration: the solver against general ones and the published scheme, what it states, and what layouts do.
+"""Multilateration: the solver compared with general solvers and the published scheme, coverage, and effect of layouts.
 
 ``python -m benchmarks.multilateration [--only compare coverage layout] [--targets 100 1000 ... 1000000]
 [--limit 600] [--stations near wide]``
 
-``compare`` gives every way the same readings and the same start, each in a process of its own: wall and processor time
-of one solution when everything is compiled and warm (the least of as many as fit into three seconds), the most memory
-that the process held, iterations, and how far its targets are off the truth and off those of a peer that has converged
-tightly (all as free networks on the nominal targets). A way that takes longer than the limit, or more than 16 GiB, is
-said to, and is left out where there are more targets. General solvers return targets and stations; so does
-``errormotion, solution``. What it tells besides has rows of its own.
-``coverage`` draws noise again and again. ``layout`` is the table of what places of the stations do.
+``compare`` applies each solver to the same readings with the same start, in separate processes: wall and processor time
+of one solution after compilation (the shortest within three seconds), largest memory of the process, iterations, and
+deviation of its targets from the truth and from those of a tightly converged solver (all as free networks on the
+nominal targets). A solver that exceeds the time limit or 16 GiB is reported, and skipped for more targets. General
+solvers return targets and stations, as does ``errormotion, solution``; further results have separate rows.
+``coverage`` uses many draws of noise. ``layout`` is the table of the effect of the positions of the stations.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from errormotion.methods.multilateration.planning.bound import bound, relative_b
 PARTS = ("compare", "coverage", "layout")
 NOISE = 1e-6
 EDGE = 0.1
-# Spread wide about the cube: at distances like its size, where everything is linear, and where trackers have room.
+# Distributed around the cube at distances similar to its size, in the linear range, and with space for trackers.
 STATION = np.array([[-0.15, -0.15, -0.1], [0.16, -0.13, 0.02], [0.0, 0.17, -0.05], [0.02, 0.01, 0.2]])
 LAYOUTS = {
     "near": STATION,
@@ -67,7 +66,7 @@ def on_nominal(target, station, nominal):
     return moved, stations.place
 
 
-# The ways. Each takes nominal targets, readings and rough stations; returns targets, stations, iterations, converged.
+# Solvers: from nominal targets, readings and rough stations to targets, stations, iterations, converged.
 
 
 def ours(u, d, station):
@@ -96,7 +95,7 @@ def unpacked(x, m):
 def general(u, d, station):
     """Residuals, sparse Jacobian and start for a general solver: the same model, the same start.
 
-    Where the Jacobian has values is found once.
+    The sparsity pattern of the Jacobian is computed once.
     """
     m = len(u)
     L = np.median(np.linalg.norm(u - station[:, None], axis=-1) - d, axis=1)
@@ -112,7 +111,7 @@ def general(u, d, station):
 
 
 TIGHT = {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15, "max_nfev": 100}
-"""Tolerances at rounding. Without the inner solver's, too, it never arrives."""
+"""Tolerances at rounding; required also for the inner solver to converge."""
 
 
 def least_squares_with(**options):
@@ -139,7 +138,7 @@ def sparse_newton(u, d, station):
     while size > 1e-12 and done < 30:
         J = slope(x)[:, keep]
         g, A = J.T @ off(x), (J.T @ J).tocsc()
-        # The order in which a target's unknowns are eliminated first leaves no more than need be.
+        # Elimination of the unknowns of the targets first results in the least fill-in.
         step = -spl.splu(A, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve(g)
         x[keep] += step
         done, size = done + 1, np.abs(step).max()
@@ -170,14 +169,14 @@ PEERS = {
 }
 WAYS = OURS | PEERS
 MOST = {"trf, exact (dense)": 100}
-"""Targets above which a way is not tried: dense matrices."""
+"""Targets above which a solver with dense matrices is not tried."""
 SAME = 1e-11
-"""A peer has the answer when its targets are this close to the reference, m."""
+"""A solver has the solution if its targets agree with the reference within this distance, m."""
 REPEATED, SECONDS, MEMORY = 50, 3.0, 16 * 2**30
 
 
 def one(way: str, m: int, places, out: str) -> None:
-    """Solve once to warm up, on few targets, then as often as fits for the figures."""
+    """Solve once with few targets for the compilation, then repeatedly for the figures."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     for some in (50, 30_000) if way in OURS else (50,):
         u, _, d, station = data(some)
@@ -201,9 +200,9 @@ def one(way: str, m: int, places, out: str) -> None:
 
 
 def measured(way: str, m: int, layout: str, out: str, limit: float):
-    """Return figures and targets of a way; or what became of it, and None."""
+    """Return figures and targets of a solver, or the reason of its failure and None."""
     command = [sys.executable, "-m", "benchmarks.multilateration", "--one", way, str(m), layout, out]
-    # More threads than one make the peers' linear algebra slower, several times so on a busy machine.
+    # Several threads make the linear algebra of the other solvers slower, particularly on a busy computer.
     threads = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "MKL")}
     try:
         done = subprocess.run(
@@ -220,9 +219,9 @@ def measured(way: str, m: int, layout: str, out: str, limit: float):
 def compare(layout: str, counts: list[int], limit: float) -> None:
     far = np.linalg.norm(LAYOUTS[layout], axis=1).mean()
     print(f"\nThe same readings for all, four stations {far * 1e3:.0f} mm from the cube's middle, 1 um of noise;")
-    print("error: rms of the targets against the truth; off: the furthest target from the reference.")
-    print("peak: of the process; rows of errormotion hold compiled code and a warm-up with 30 000 targets, too.")
-    print(f"Load when this began: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; linear algebra with one thread.")
+    print("error: rms of the targets against the truth; off: largest distance of a target from the reference.")
+    print("peak: of the process; with errormotion including compiled code and a first run with 30 000 targets.")
+    print(f"Load at the start: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; linear algebra with one thread.")
     print(
         f"{'targets':>9} {'way':>27} {'wall':>12} {'cpu':>11} {'times ours':>10} {'peak':>10} {'its':>5} {'done':>4} "
         f"{'error':>9} {'off':>9}"
@@ -256,12 +255,12 @@ def summary(m: int, found) -> None:
             f"{'yes' if f['converged'] else 'no':>4} {f['error'] * 1e6:>6.3f} um {off:>7.0e} m",
             flush=True,
         )
-    # On a busy machine processor time tells more: each by its best peer.
+    # On a busy computer the processor time is more meaningful; each with its best other solver.
     for kind, name, own in (("wall", "wall", wall), ("processor", "cpu", processor)) if same else ():
         best = min(same, key=lambda way: same[way][kind])
         full = found["and all covariances"][0][kind]
         print(
-            f"{'':>9} best peer with the answer, by {name}: {best.strip()}, {same[best][kind] / own:.0f} times ours, "
+            f"{'':>9} best other solver, by {name}: {best.strip()}, {same[best][kind] / own:.0f} times ours, "
             f"{same[best][kind] / full:.0f} times ours with all covariances",
             flush=True,
         )
@@ -317,8 +316,8 @@ def sigma(covariance):
     return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
-# Places after the description of the paper's figure 11, whose coordinates are not given: A B C close together in front
-# of the cube and below it, D E F the same places lifted in Z alone, G and H to both sides of it and above; m.
+# Positions by the description of figure 11 of the paper, which states no coordinates: A B C close together in front of
+# the cube and below it, D E F the same positions raised in Z, G and H on both sides of it and above; m.
 PLACES = {
     "A": (-0.12, -0.40, -0.15), "B": (0.10, -0.42, -0.15), "C": (0.0, -0.38, -0.20), "D": (-0.12, -0.40, 0.15),
     "E": (0.10, -0.42, 0.15), "F": (0.0, -0.38, 0.20), "G": (0.30, 0.05, 0.30), "H": (-0.30, 0.10, 0.20),
@@ -337,7 +336,7 @@ FOUR = {
 
 
 def trilaterated(d, u, U):
-    """Targets from displacements relative to the first one, the stations known (the paper's simplified simulation)."""
+    """Targets from displacements relative to the first one with known stations (simplified simulation of the paper)."""
     reach, found = d - d[:, :1] + np.linalg.norm(u[0] - U, axis=1)[:, None], u.copy()
     for _ in range(8):
         v = found - U[:, None]
@@ -348,10 +347,10 @@ def trilaterated(d, u, U):
 
 
 def layout(draws: int = 200) -> None:
-    """What places of the stations do, as in the paper's table 2 and with everything unknown."""
+    """Effect of the positions of the stations, as in table 2 of the paper and with all quantities unknown."""
     u, rng = nominal_targets(40), np.random.default_rng(11)
     print("Three stations known, as in table 2 of the paper: mean and standard deviation of the targets' errors, um.")
-    print("Places are chosen to follow its description; its own are not published as figures.")
+    print("Positions are chosen by its description; they are not published as numbers.")
     print(f"{'':>4} {'stations':>9} {'random 1 um':>16} {'published':>14} {'linear 3 um / 100 mm':>22}")
     for k, (name, published_error) in enumerate(zip(CONDITIONS, PUBLISHED, strict=True)):
         U = np.array([PLACES[place] for place in name])
@@ -386,7 +385,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--targets", nargs="+", type=int, default=[100, 1000, 10_000, 100_000, 1_000_000])
-    parser.add_argument("--limit", type=float, default=600.0, help="seconds that a way may take")
+    parser.add_argument("--limit", type=float, default=600.0, help="time limit of a solver, s")
     parser.add_argument("--stations", nargs="+", choices=tuple(LAYOUTS), default=tuple(LAYOUTS), help="for compare")
     parser.add_argument("--one", nargs=4, metavar=("WAY", "M", "LAYOUT", "OUT"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()

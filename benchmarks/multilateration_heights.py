@@ -1,10 +1,10 @@
-"""Moving stations in Z alone and spreading them across X and Y: what each does, by what is taken as known.
+"""Effect of moving stations only in Z and of distributing them in X and Y, for different known quantities.
 
 ``python -m benchmarks.multilateration_heights``
 
 40 targets in a cube of 100 mm, noise 1 um; standard uncertainty of a target, three coordinates together, mean over the
-targets, um, and how many times smaller it is than with the stations close together. Three stations stand close together
-in front of the cube, or are moved; where four are needed, a fourth hangs over it in every case.
+targets, um, and the factor by which it is smaller than with the stations close together. Three stations are close
+together in front of the cube, or are moved; if four are needed, a fourth is above it in all cases.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from errormotion.methods.multilateration.planning.bound import bound
 
 NOISE = 1e-6
 OVERHEAD = (0.05, 0.05, 0.45)
-# As the paper describes its own: A B C close together in front of the cube, D E F the same in other heights, G and H to
-# both sides of the cube. a b c stand closer, and each goes its own way up or down.
+# By the description of the paper: A B C close together in front of the cube, D E F the same at other heights, G and H
+# on both sides of the cube. a b c are closer together, and move up or down independently.
 PLACES = {
     "A": (-0.12, -0.40, -0.15), "B": (0.10, -0.42, -0.15), "C": (0.0, -0.38, -0.20), "D": (-0.12, -0.40, 0.15),
     "E": (0.10, -0.42, 0.15), "F": (0.0, -0.38, 0.20), "G": (0.30, 0.05, 0.30), "H": (-0.30, 0.10, 0.20),
@@ -38,7 +38,7 @@ def targets() -> np.ndarray:
 def known(u: np.ndarray, U: np.ndarray) -> np.ndarray:
     """Return the uncertainty (m,) of targets, m, from known stations, when displacements count from the first target.
 
-    Its place is known, and its noise is in all readings of a station.
+    Its position is known, and its noise is in all readings of a station.
     """
     n = len(U)
     e = directions(u, Stations(U, np.zeros(n), np.zeros(0))).transpose(1, 0, 2)
@@ -47,7 +47,7 @@ def known(u: np.ndarray, U: np.ndarray) -> np.ndarray:
 
 
 def free(u: np.ndarray, U: np.ndarray) -> np.ndarray:
-    """Return the uncertainty (m,) of targets, m, with places and dead paths of the stations unknown."""
+    """Return the uncertainty (m,) of targets, m, with unknown positions and dead paths of the stations."""
     return bound(u, U, noise=NOISE).uncertainty
 
 

@@ -1,10 +1,10 @@
-"""Identification of a multilateration from end to end, at very many targets: time, memory, and whether it is right.
+"""Complete identification of a multilateration with very many targets: time, memory and correctness.
 
 ``python -m benchmarks.multilateration_identify [--most 1000000] [--plain]``
 
-A virtual C-frame and four stations, noise 0.5 um. Data are made and stored by one process and identified by another,
-which reads them, solves, fits the errors of the axes (not with ``--plain``), and builds and checks the whole dataset.
-The most memory is that of the identifying process with all that it imports. Linear algebra has one thread.
+A virtual C-frame and four stations, noise 0.5 um. One process computes and stores the data, and another identifies
+them: it reads them, solves, fits the errors of the axes (not with ``--plain``), and builds and checks the dataset. The
+largest memory is that of this process including imports. Linear algebra has one thread.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SMALL = (5, 5, 4)
 
 
 def make(size: int, folder: Path) -> None:
-    """Store the readings of about so many targets, and their true errors."""
+    """Store the readings of about this number of targets, and their true errors."""
     from errormotion import datasets
     from errormotion.twin import VirtualMachine
 
@@ -41,7 +41,7 @@ def make(size: int, folder: Path) -> None:
 
 
 def identify(folder: Path, *, plain: bool) -> dict[str, float]:
-    """Identify what is stored; return time, memory and how many errors lie within their interval of 95 %."""
+    """Identify the stored data; return time, memory and the share of errors within their 95 % intervals."""
     from errormotion import datasets
     from errormotion.methods.multilateration import Multilateration, Settings, simulation
     from errormotion.twin import VirtualMachine

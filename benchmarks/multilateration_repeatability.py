@@ -1,9 +1,9 @@
-"""Repeatability of the machine: whether returns find it, and whether intervals hold with it.
+"""Repeatability of the machine: its estimation from returns, and the coverage of intervals.
 
 ``python -m benchmarks.multilateration_repeatability [--machines 100]``
 
-Virtual C-frames with 48 targets, four stations in turn, a tracker of 0.5 um: the repeatability found, its scatter over
-the machines and the mean of its stated uncertainty, um; and the share of true errors within intervals of 95 %.
+Virtual C-frames with 48 targets, four successive stations, 0.5 um noise of a length: the repeatability found, its
+scatter over the machines, its mean stated uncertainty, um, and the share of true errors within 95 % intervals.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CASES = (
 
 
 def one(seed: int, true: float, returns: int, settings: Settings) -> tuple[float, float, float]:
-    """Return the share within 95 % of one machine, the repeatability found and its uncertainty, m."""
+    """Return the share within 95 % of one machine, the estimated repeatability and its uncertainty, m."""
     machine = VirtualMachine("cframe", seed=seed)
     q = simulation.target_grid(machine, (4, 4, 3))
     if returns:

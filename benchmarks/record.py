@@ -17,11 +17,11 @@ from errormotion.record.steps import model_of
 
 RUNS = 10_000
 LONG_AGO = 1_700_000_000
-"""Time of change of files that have settled, s."""
+"""Modification time of files that no longer change, s."""
 
 
 def made(root: Path, count: int) -> None:
-    """Write run folders with the content of real ones: texts of campaign and bench, 12 figures, 1 note in 100 runs."""
+    """Write run folders with typical contents: texts of campaign and bench, 12 figures, 1 note in 100 runs."""
     figures = [{"name": f"EZ {k}", "value": k * 1e-6, "expanded_uncertainty": 4e-7, "unit": "m"} for k in range(12)]
     for number in range(count):
         folder = root / f"20260101T000000Z-drift-{number:08x}"
@@ -45,7 +45,7 @@ def made(root: Path, count: int) -> None:
 
 
 def timed(call: object) -> str:
-    """Return the duration of a call, and the time of the processor, that of a process it starts included."""
+    """Return the duration of a call, and its processor time including that of child processes."""
     begin, used = time.perf_counter(), sum(os.times()[:4])
     call()
     return f"{time.perf_counter() - begin:.2f} s (processor {sum(os.times()[:4]) - used:.2f} s)"

@@ -1,8 +1,8 @@
-"""Registration of two noisy height maps: ours against Open3D, small_gicp and the published chain, one data set for all.
+"""Registration of two noisy height maps, compared with Open3D, small_gicp and the published chain on the same data.
 
-``python -m benchmarks.registration [--quick] [--only compare warm ...]``; ``--quick`` takes 1600 x 400 points, not
-3200 x 800, and fewer seeds. What is not installed is left out, with the reason. small_gicp may be named by its folder:
-``SMALL_GICP=/path/to/site-packages``.
+``python -m benchmarks.registration [--quick] [--only compare warm ...]``; ``--quick`` uses 1600 x 400 points, not
+3200 x 800, and fewer seeds. Packages that are not installed are skipped with the reason. The folder of small_gicp may
+be stated: ``SMALL_GICP=/path/to/site-packages``.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Artefact:
         self.warm = self.moved(TWIST)
 
     def moved(self, twist):
-        """Heights seen by a profiler that has moved."""
+        """Heights measured by a profiler that has moved."""
         X, Y = np.meshgrid(self.x, self.y)
         M = poses.displaced(twist).as_matrix()
         z = self.cold.copy()
@@ -70,9 +70,9 @@ class Artefact:
         return z
 
     def scans(self, seed: int, jitter: float = 0.0, along: float = 0.0, speckle: float = 0.0):
-        """Return both scans with noise from point to point, and from line to line along z and y where asked for.
+        """Return both scans with noise of points, and optionally with noise of lines along z and y.
 
-        ``speckle`` (points): neighbours on a profile share their noise over this distance.
+        ``speckle`` (points): correlation length of the noise along a profile.
         """
         rng = np.random.default_rng([3, seed])
         noisy = []
@@ -101,7 +101,7 @@ def found_by(cold, warm):
 
 @numba.njit(parallel=True, fastmath=True)
 def plain_read(z):
-    """Add up an array: the least that a reader can do."""
+    """Add up an array: the minimum work of a reader."""
     total = np.float32(0.0)
     for i in numba.prange(z.size):
         total += z[i]
@@ -109,7 +109,7 @@ def plain_read(z):
 
 
 def times(work: Callable[[], object], repeats: int) -> tuple[float, float]:
-    """Return the shortest and the median of several times, s; the first call, which compiles, does not count."""
+    """Return the shortest and the median of several times, s, without the first call, which compiles."""
     work()
     found = []
     for _ in range(repeats):
@@ -120,7 +120,7 @@ def times(work: Callable[[], object], repeats: int) -> tuple[float, float]:
 
 
 def memory() -> float:
-    """Return the most memory that this process has held, MiB."""
+    """Return the largest memory of this process, MiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -138,12 +138,10 @@ def row(name: str, seconds: float, pose: Pose | None, artefact: Artefact, ours: 
 
 
 def compare(artefact: Artefact) -> None:
-    """Every way on the same two scans."""
+    """All algorithms on the same two scans."""
     cold, warm = artefact.scans(0)
     print(f"One pair of scans, {cold[0].shape[1]} x {cold[0].shape[0]} points each; error against the truth; error in")
-    print(
-        "units of the Cramer-Rao bound (root of the mean over six freedoms: 1 is the bound); rms as the way states it"
-    )
+    print("units of the Cramer-Rao bound (root of the mean over six freedoms: 1 is the bound); rms as stated")
     print(
         f"{'':>28} {'time':>12} {'':>9} {'shift error':>13} {'turn error':>14} {'/ bound':>9} {'rms':>11} {'peak':>11}"
     )
@@ -153,12 +151,12 @@ def compare(artefact: Artefact) -> None:
     try:
         against_open3d(artefact, cold, warm, ours)
     except MethodError as error:
-        print(f"  left out: Open3D ({error})")
+        print(f"  skipped: Open3D ({error})")
     against_small_gicp(artefact, cold, warm, ours)
 
 
 def warm_scan(artefact: Artefact) -> None:
-    """Time of a warm scan on a prepared cold one, against reading its numbers once; its memory."""
+    """Time of a warm scan on a prepared cold one, compared with reading its numbers once; its memory."""
     cold, warm = artefact.scans(0)
     reference, copies, turn = prepare(*cold), [warm[0].copy() for _ in range(24)], itertools.count()
 
@@ -177,7 +175,7 @@ def warm_scan(artefact: Artefact) -> None:
     register(reference, prepare(*warm))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    print(f"{'memory':>28}: {peak / 2**20:.1f} MiB beside the scan's own {warm[0].nbytes / 2**20:.1f} MiB")
+    print(f"{'memory':>28}: {peak / 2**20:.1f} MiB in addition to {warm[0].nbytes / 2**20:.1f} MiB of the scan")
 
 
 def against_open3d(artefact: Artefact, cold, warm, ours: float) -> None:
@@ -192,7 +190,7 @@ def against_open3d(artefact: Artefact, cold, warm, ours: float) -> None:
 
     def generalised(a, b):
         target, source = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(clouds.points_of(s))) for s in (a, b))
-        for cloud in (target, source):  # its own choice, 20 neighbours, would all lie on one profile
+        for cloud in (target, source):  # with its default of 20 neighbours, all would be on one profile
             cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamHybrid(0.25e-3, 60))
         criteria = fine.ICPConvergenceCriteria(1e-10, 1e-12, 30)
         method = fine.TransformationEstimationForGeneralizedICP()
@@ -207,7 +205,7 @@ def against_open3d(artefact: Artefact, cold, warm, ours: float) -> None:
         start = time.perf_counter()
         found = work(cold, warm)
         if found is None:
-            print(f"  left out: {label} (this Open3D, {o3d.__version__}, has none)")
+            print(f"  skipped: {label} (not in Open3D {o3d.__version__})")
             continue
         row(label, time.perf_counter() - start, found.transformation, artefact, ours, found.inlier_rmse)
 
@@ -218,12 +216,12 @@ def against_small_gicp(artefact: Artefact, cold, warm, ours: float) -> None:
     try:
         import small_gicp
     except ImportError as error:
-        print(f"  left out: small_gicp ({error}; it is no dependency of this project: pip install small_gicp)")
+        print(f"  skipped: small_gicp ({error}; it is not a dependency: pip install small_gicp)")
         return
     for kind in ("PLANE_ICP", "GICP"):
         start = time.perf_counter()
-        # In millimetres, its tolerances are made for such numbers; thinned to 0.1 mm, for its normals come from a fixed
-        # number of neighbours, which would all lie on one profile.
+        # In millimetres, as its tolerances require; thinned to 0.1 mm, because its normals are computed from a fixed
+        # number of neighbours, which would all be on one profile.
         target, source = (clouds.points_of(s) * 1e3 for s in (cold, warm))
         found = small_gicp.align(
             target, source, np.eye(4), kind, downsampling_resolution=0.1, max_correspondence_distance=0.3,
@@ -235,7 +233,7 @@ def against_small_gicp(artefact: Artefact, cold, warm, ours: float) -> None:
 
 
 def coverage(artefact: Artefact, seeds: int) -> None:
-    """Mean squared errors in units of the bound and of the stated covariance, with white noise and real one."""
+    """Mean squared errors in units of the bound and of the stated covariance, with white and realistic noise."""
     print(f"\n{seeds} pairs; mean squared error per freedom (NEES/6: 1 is right, +- {(1 / 3 / seeds) ** 0.5:.2f})")
     kinds = {
         "white noise": {},
@@ -259,7 +257,7 @@ def coverage(artefact: Artefact, seeds: int) -> None:
 
 
 def phases(artefact: Artefact) -> None:
-    """Bias at eight places between the blocks along x and along y: noise and its opposite, so that it cancels."""
+    """Bias at eight positions between the blocks along x and y, with noise and its opposite, which cancel."""
     print("\nBias in standard deviations of the bound, at eight shifts of an eighth of a block")
     for axis, block in ((0, 16 * PITCH_X), (1, 4 * PITCH_Y)):
         worst = []
@@ -280,7 +278,7 @@ def phases(artefact: Artefact) -> None:
 
 
 def yaw_of_jittering_lines(artefact: Artefact, seeds: int) -> None:
-    """Yaw of scans whose lines jitter along z, here and by point-to-plane ICP."""
+    """Yaw of scans with jitter of the lines along z, also by point-to-plane ICP."""
     print(f"\nLines jitter by 0.5 um along z: yaw error, {seeds} pairs")
     ours, theirs = [], []
     for seed in range(seeds):
@@ -289,7 +287,7 @@ def yaw_of_jittering_lines(artefact: Artefact, seeds: int) -> None:
         try:
             theirs.append(poses.displacement(clouds.BACKENDS["open3d_plane"](cold, warm)[0])[5] - TWIST[5])
         except MethodError as error:
-            print(f"  left out: Open3D ({error})")
+            print(f"  skipped: Open3D ({error})")
             return
     ours, theirs = (float(np.sqrt(np.mean(np.square(e)))) * 1e6 for e in (ours, theirs))
     print(f"{'rms':>28}: {ours:.4f} urad, Open3D point-to-plane {theirs:.4f} urad: {theirs / ours:.1f} times")
@@ -342,7 +340,7 @@ def dirt(artefact: Artefact, seeds: int) -> None:
 
 
 def extra(artefact: Artefact, seeds: int) -> None:
-    """What free drifts of the feed cost, and whether their covariance is right."""
+    """Cost of free drifts of the feed, and check of their covariance."""
     names = ("feed_x", "feed_y", "feed_z")
     joint, own = [], []
     for seed in range(seeds):

@@ -1,6 +1,6 @@
-"""Spindle drift: averages against a plain read, the bar fit against scipy, a four-hour record in constant memory.
+"""Spindle drift: averages compared with a plain read, the bar fit with scipy, a four-hour record in constant memory.
 
-``python -m benchmarks.spindle_drift [--quick] [--hours 4]``; ``--quick`` leaves the long record (6 GB on disk) out.
+``python -m benchmarks.spindle_drift [--quick] [--hours 4]``; ``--quick`` skips the long record (6 GB on disk).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RATE = 20_000
 
 @numba.njit(parallel=True, fastmath=True)
 def plain_read(x):
-    """Add up an array: the least that a reader can do."""
+    """Add up an array: the minimum work of a reader."""
     total = 0.0
     for i in numba.prange(x.size):
         total += x[i]
@@ -38,7 +38,7 @@ def plain_read(x):
 
 
 def best(work: Callable[[], object], times: int = 7) -> float:
-    """Return the shortest of several times, s; the first call, which compiles, does not count."""
+    """Return the shortest of several times, s, without the first call, which compiles."""
     work()
     found = []
     for _ in range(times):
@@ -131,18 +131,18 @@ def write_record(path: Path, hours: float) -> None:
     )  # fmt: skip
     block = machine.distances(0, piece, RATE).astype(np.float32)
     for begin in range(0, samples, piece):
-        # The same half minute over and over, shifted by 1 nm each, so that no two windows are alike.
+        # The same half minute repeated, displaced by 1 nm each, so that all windows differ.
         array[:, begin : begin + piece] = (block + np.float32(1e-9 * (begin // piece)))[:, : samples - begin]
 
 
 def peak_memory() -> int:
-    """Return the most memory that this process has held, bytes (Linux)."""
+    """Return the largest memory of this process, bytes (Linux)."""
     line = next(row for row in Path("/proc/self/status").read_text().splitlines() if row.startswith("VmHWM"))
     return int(line.split()[1]) * 1024
 
 
 def identify_record(path: str) -> None:
-    """Identify a record and print time, peak memory and the last errors as JSON; runs in a process of its own."""
+    """Identify a record and print time, peak memory and the last errors as JSON; runs in a separate process."""
     from errormotion.datasets import hash_dataset, load
     from errormotion.methods.spindle_drift import SpindleDrift
 
@@ -178,7 +178,7 @@ def record(hours: float) -> None:
     with tempfile.TemporaryDirectory() as folder:
         samples = round(hours * 3600 * RATE) * 5
         if shutil.disk_usage(folder).free < samples * 4 * 1.2:
-            print(f"  left out: {folder} has not the {samples * 4 / 1e9:.0f} GB that it needs")
+            print(f"  skipped: {folder} has less than the required {samples * 4 / 1e9:.0f} GB")
             return
         path = Path(folder) / "raw.zarr"
         write_record(path, hours)

@@ -1,9 +1,9 @@
 """Monte Carlo validation: coverage of the stated intervals, and efficiency compared with the Cramer-Rao bound.
 
 ``make validate`` runs it and writes ``docs/validation.md``; ``make validate ARGS="crossbeam_scan --seeds 50"`` runs one
-part and keeps the sections of the others. Truth comes from the virtual machine; the bound is the
-Cramer-Rao bound of each estimator's own model. Coverage over S seeds is itself a draw: its standard deviation is
-sqrt(0.05 * 0.95 / S) where nothing is shared, stated beside it.
+part and does not change the other sections. The truth is that of the virtual machine; the bound is the Cramer-Rao bound
+of the model of each estimator. The coverage over S independent seeds has a standard deviation of
+sqrt(0.05 * 0.95 / S), which is stated.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ PARTS = {
     for module in pkgutil.iter_modules(validation.__path__)
     if not module.ispkg
 }
-"""The modules of the folder beside this file, each with ``TITLE``, ``SEEDS`` and ``section(seeds)``.
+"""The modules of the folder ``validation``, each with ``TITLE``, ``SEEDS`` and ``section(seeds)``.
 
-A section with the arguments ``workers`` and ``cache`` runs in several processes, and keeps what it has.
+A section with the arguments ``workers`` and ``cache`` runs in several processes and stores results.
 """
 INTRODUCTION = """\
 # Validation
 
-Every figure on this page comes from a run of `make validate`; none is typed in. The truth is that of the
-[virtual machine](explanation/virtual-machine.md); bounds are Cramer-Rao bounds of the estimators' models.
-A ratio of 1 means that no unbiased estimator can do better.
+All figures on this page are results of `make validate`. The truth is that of the
+[virtual machine](explanation/virtual-machine.md); bounds are Cramer-Rao bounds of the models of the estimators.
+A ratio of 1 is the optimum of unbiased estimators.
 """
 
 
 def sections(page: Path) -> dict[str, str]:
-    """Return the sections of a page as it stands, by title."""
+    """Return the sections of the page by title."""
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     found = re.split(r"^## (.+)\n", text, flags=re.MULTILINE)[1:]
     return {title: body.strip("\n") for title, body in zip(found[::2], found[1::2], strict=True)}
@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", metavar="part", help=f"{', '.join(PARTS)}; default: all")
     parser.add_argument("--seeds", type=int, help="number of virtual machines; each part has its own default")
     parser.add_argument("--workers", type=int, default=1, help="processes, for the parts that can use several")
-    parser.add_argument("--cache", type=Path, help="folder of results of single machines, to go on with a run")
+    parser.add_argument("--cache", type=Path, help="folder of results of single machines, to continue a run")
     parser.add_argument("--out", type=Path, default=PAGE)
     options = parser.parse_args()
     if unknown := set(options.parts) - set(PARTS):

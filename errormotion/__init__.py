@@ -1,20 +1,20 @@
-"""Measure the error motions of machine tools: many sensors, many methods, one kind of result.
+"""Measurement of the error motions of machine tools: many sensors and methods, one kind of result.
 
-The packages, from the bottom up (imports run one way, enforced by a contract):
+The packages from the lowest layer to the highest; a package imports only lower ones (checked by a contract):
 
-``errors``        every exception that a user may meet, from one root
-``kinematics``    poses, twists, ISO 230-1 axes, machine chains, geometric fits; arrays in and out
+``errors``        the exceptions of the package, with a common root
+``kinematics``    poses, twists, ISO 230-1 axes, machine chains, geometric fits, for arrays
 ``plugins``       contracts of instruments, methods and kinds of dataset; the registry
 ``datasets``      raw and error datasets: schemas, units, provenance, reading and writing
 ``twin``          virtual machines with known errors
 ``tolerances``    limits of results, and decisions on them
-``report``        what chapters are made of
+``report``        elements of reports, the page, exports
 ``instruments``   transports, codecs, drivers and their simulators
 ``methods``       from raw datasets to error datasets
-``montecarlo``    uncertainty by trials, beside the linear one
-``testing``       the conformance kit that every plugin passes
+``montecarlo``    uncertainty by the Monte Carlo method, compared with the linear one
+``testing``       the conformance kit for plugins
 ``compare``       several results of one machine: agreement, consensus, diagnosis
-``compensation``  thermal models
+``compensation``  thermal models, corrections, tables of controls, NC programs, online compensation
 ``campaign``      bench and campaign files, the runner, run folders
 ``record``        all runs of a machine: list, history, notes
 ``cli``           the command ``errormotion``
@@ -25,8 +25,8 @@ import os
 
 __version__ = "0.1.0"
 
-# Without a handler, Python prints the warnings of a library whose user has configured no logging.
+# Without a handler, Python would print the warnings of the library if the user configured no logging.
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 
-# Numba would take the TBB that another package has brought into the process, and warn where it is too old.
+# Numba would use TBB if another package has loaded it, and warn if it is too old.
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")

@@ -1,4 +1,4 @@
-"""The type of the arrays that the package computes with."""
+"""The type of arrays, and small functions on arrays."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-"""Array of float64; its shape and unit stand in the docstring of the function that takes it."""
+"""Array of float64; its shape and unit are stated in the docstrings of functions."""
 
 NORMAL_MAD = 1.4826
 """Standard deviation of normally distributed values over the median of their absolute deviations: 1 / ndtri(0.75).
 
-`scipy.stats.median_abs_deviation` does not work in compiled loops, and takes 0.3 s to import.
+`scipy.stats.median_abs_deviation` cannot be compiled, and its import takes 0.3 s.
 """
 
 

@@ -1,4 +1,4 @@
-"""Functions that numba compiles when they are first called, and a line on the terminal while that takes time.
+"""Functions that numba compiles at their first call, with a message on the terminal during the compilation.
 
 A module declares its functions with a `Compiler`:
 
@@ -7,11 +7,11 @@ A module declares its functions with a `Compiler`:
     @compiled(fastmath=True)
     def add(x, y): ...
 
-Nothing is compiled and numba is not imported before the first call. Compiled functions may call one another; one that
-only they call is declared with ``@compiled(inner=True)``, which leaves out its entry from Python: an eighth of the
-code. One that is called in one place only is declared with ``@compiled(inline="always")``: it becomes part of its
-caller, with the caller's options, and is not compiled and optimised by itself before. What is compiled is kept in
-numba's cache on disk, so that it is compiled once for each installation.
+Nothing is compiled and numba is not imported before the first call. Compiled functions may call one another. A function
+that is called only by compiled ones is declared with ``@compiled(inner=True)``, which omits its entry from Python, an
+eighth of the code. A function with only one caller is declared with ``@compiled(inline="always")``: it becomes part of
+its caller, with the options of the caller, and is not compiled separately. The cache of numba on disk stores compiled
+functions, so that they are compiled once for each installation.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class Compiler:
     Parameters
     ----------
     what : str
-        The group, as the terminal shows it while it is compiled: ``the loops for large networks``.
+        The group for the message on the terminal: ``the loops for large networks``.
     seconds : float
-        Typical time that this takes, s.
+        Typical time of the compilation, s.
     **options
         Of ``numba.njit`` for all functions of the group, such as ``error_model="numpy"``.
     """
@@ -58,7 +58,7 @@ class Compiler:
         return declare
 
     def report(self) -> None:
-        """Write on the terminal that the group is compiled, once a process; nothing where stderr is no terminal."""
+        """Write on the terminal that the group is compiled, once for each process; only if stderr is a terminal."""
         if not self._reported and sys.stderr.isatty():
             print(f"Compiling {self.what}, once: about {self.seconds:g} s", file=sys.stderr, flush=True)
         self._reported = True
@@ -73,7 +73,7 @@ class _Compiled:
 
     @cached_property
     def dispatcher(self) -> Any:
-        """The function as numba sees it."""
+        """The function as numba's dispatcher."""
         import numba
 
         made = numba.njit(cache=True, nogil=True, **self._options)(self._function)
@@ -82,17 +82,17 @@ class _Compiled:
 
     @property
     def targetoptions(self) -> Any:
-        """Its options, where numba makes it part of another function."""
+        """Its options, for inlining by numba."""
         return self.dispatcher.targetoptions
 
     @property
     def py_func(self) -> Callable[..., Any]:
-        """The function in Python, likewise."""
+        """The function in Python, for inlining by numba."""
         return self._function
 
     @property
     def _numba_type_(self) -> Any:
-        """Its type where another compiled function calls it."""
+        """Its type, for calls from other compiled functions."""
         return self.dispatcher._numba_type_
 
     def __call__(self, *args: Any) -> Any:
@@ -104,18 +104,19 @@ class _Compiled:
 
 
 def in_threads(work: Callable[..., Any], items: int, several: bool, *given: Any) -> None:
-    """Call ``work(*given, first, last)`` for ranges of items that together are all of them.
+    """Call ``work(*given, first, last)`` for ranges that together contain all items.
 
-    The threads are Python's and not numba's: code for these takes two to four times as long to compile.
+    Threads of Python are used instead of those of numba, because code for the latter takes two to four times as long to
+    compile.
 
     Parameters
     ----------
     work : callable
-        Computes the items from ``first`` to before ``last``, each by itself, without the interpreter's lock.
+        Computes the items from ``first`` to before ``last`` independently, without the lock of the interpreter.
     items : int
-        How many there are.
+        Number of items.
     several : bool
-        Whether several threads share them; else this thread computes all.
+        Whether to use several threads; else this thread computes all.
     given : tuple
         Further arguments.
     """
@@ -124,7 +125,7 @@ def in_threads(work: Callable[..., Any], items: int, several: bool, *given: Any)
         return
     count = min(threads(), items)
     own, *others = pairwise([items * k // count for k in range(count + 1)])
-    with ThreadPoolExecutor(max(len(others), 1)) as pool:  # starts no thread before there is work for it
+    with ThreadPoolExecutor(max(len(others), 1)) as pool:  # starts threads only for submitted work
         running = [pool.submit(work, *given, *part) for part in others]
         work(*given, *own)
         for each in running:
@@ -132,7 +133,7 @@ def in_threads(work: Callable[..., Any], items: int, several: bool, *given: Any)
 
 
 def threads() -> int:
-    """Return how many threads share the items: as many as numba uses (``NUMBA_NUM_THREADS``)."""
+    """Return the number of threads, as used by numba (``NUMBA_NUM_THREADS``)."""
     import numba
 
     return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined, unused-ignore]
@@ -141,11 +142,11 @@ def threads() -> int:
 _REPORTERS: dict[Any, Compiler] = {}
 _COUNTING = Lock()
 _RARELY = (100_000, 50, 50)
-"""Thresholds of the garbage collector while something is compiled: else it takes a tenth of the time."""
+"""Thresholds of the garbage collector during a compilation, of which it otherwise takes a tenth of the time."""
 
 
 def _reporters() -> dict[Any, Compiler]:
-    """Return the group of each function that numba knows; numba reports to them before it compiles one."""
+    """Return the group of each function known to numba, and register the groups for its reports on compilations."""
     if not _REPORTERS:
         from numba.core import event
 

@@ -1,7 +1,7 @@
 """The engine ``errormotion`` of xarray, for ``xr.open_dataset(file, engine="errormotion")`` and ``xr.open_datatree``.
 
-xarray imports the engines of all packages when it opens the first file, so that datasets have the accessor ``ds.em``
-from then on, whatever the engine, without an import of this package.
+xarray imports the engines of all packages when it opens the first file. From then on, datasets have the accessor
+``ds.em`` with any engine, without an import of this package.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _ = accessor  # registers ds.em
 
 
 class ErrormotionEngine(BackendEntrypoint):
-    """Error datasets, raw datasets and readings, as `errormotion.datasets.load` opens them; runs as a tree of these."""
+    """Engine for error datasets, raw datasets and readings, see `errormotion.datasets.load`, and for runs as a tree."""
 
     description: ClassVar[str] = "Open error datasets, raw datasets and run folders of errormotion"
     supports_groups: ClassVar[bool] = True
@@ -60,12 +60,12 @@ class ErrormotionEngine(BackendEntrypoint):
     def open_groups_as_dict(
         self, filename_or_obj: Any, *, drop_variables: str | Iterable[str] | None = None, **unknown: Any
     ) -> dict[str, xr.Dataset]:
-        """Return the datasets of a run folder by their places in the tree; see `open_datatree`."""
+        """Return the datasets of a run folder by their paths in the tree; see `open_datatree`."""
         tree = self.open_datatree(filename_or_obj, drop_variables=drop_variables, **unknown)
         return {node.path: node.to_dataset() for node in tree.subtree}
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
-        """Return False: files are opened by this engine where it is named only."""
+        """Return False: this engine is only used if it is stated."""
         del filename_or_obj
         return False
 

@@ -1,11 +1,11 @@
-"""Every exception that a user may meet, from one root.
+"""The exceptions of the package, with a common root.
 
-A message states what was expected, what was found, and what to do. A traceback belongs in the log.
+A message states the expected and the found value, and a remedy. Tracebacks are written to the log.
 """
 
 
 class ErrormotionError(Exception):
-    """Root of all errors that a person can act on."""
+    """Root of all errors with a remedy for the user."""
 
 
 class InstrumentError(ErrormotionError):
@@ -13,24 +13,24 @@ class InstrumentError(ErrormotionError):
 
 
 class InstrumentTimeoutError(InstrumentError):
-    """An instrument stayed silent for longer than its time limit."""
+    """An instrument did not answer within its time limit."""
 
 
 class ProtocolError(InstrumentError):
-    """Bytes came that the protocol does not allow."""
+    """Received bytes do not conform to the protocol."""
 
 
 class ReplayError(InstrumentError):
-    """A replayed session and its recording part ways."""
+    """A replayed session differs from its recording."""
 
 
 class DatasetError(ErrormotionError):
-    """A dataset does not follow its schema, or a file cannot be read.
+    """A dataset does not conform to its schema, or a file cannot be read.
 
     Parameters
     ----------
     message : str
-        What is wrong, and where.
+        Description of the error, and its location.
     violations : sequence of str, optional
         All violations found, one sentence each.
     """
@@ -41,15 +41,15 @@ class DatasetError(ErrormotionError):
 
 
 class FitError(ErrormotionError):
-    """Geometry that does not determine the result."""
+    """The geometry does not determine the result."""
 
 
 class MethodError(ErrormotionError):
-    """A method cannot answer from what it was given."""
+    """A method has no result for its input."""
 
 
 class BenchError(ErrormotionError):
-    """A bench or campaign file is wrong, or the bench does not offer what a method needs."""
+    """A bench or campaign file is wrong, or the bench lacks a requirement of a method."""
 
 
 class RunError(ErrormotionError):
@@ -57,7 +57,7 @@ class RunError(ErrormotionError):
 
 
 class CompensationError(ErrormotionError):
-    """A correction cannot be made, or must not be written to a machine."""
+    """A correction cannot be computed, or must not be written to a machine."""
 
 
 class PluginError(ErrormotionError):
@@ -65,8 +65,8 @@ class PluginError(ErrormotionError):
 
 
 class PluginWarning(UserWarning):
-    """A part of a plugin does not load and is ignored."""
+    """A part of a plugin cannot be loaded and is ignored."""
 
 
 class ProgramError(ErrormotionError):
-    """An NC program cannot be read, or what it does is not determined."""
+    """An NC program cannot be read, or its motions are not determined."""

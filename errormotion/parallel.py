@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 SCHEDULERS = ("threads", "processes", "sync")
 CPU_COUNT = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 CLUSTER_TIMEOUT = 15.0
-"""Time within which a cluster must answer and have a worker, s."""
+"""Time limit for the connection to a cluster and its first worker, s."""
 
 Done = Callable[[int, Any], None]
 Lost = Callable[[int, str], None]
@@ -159,7 +159,7 @@ class Workers:
             if future.status == "finished":
                 answer = future.result()
                 done(answer.number, answer.value)
-            else:  # the task did not reach its own error handling: a worker died, or lacks errormotion
+            else:  # the error handling of the task was not reached: a worker ended, or lacks errormotion
                 lost(number_of[future], f"the cluster did not execute it: {future.exception() or future.status}")
 
 
@@ -171,7 +171,7 @@ def _start_process(threads: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent was killed: the other workers keep open the queue that it waits at."""
+    """End this process if its parent was killed; the queue does not close, because the other workers keep it open."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

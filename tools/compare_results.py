@@ -1,28 +1,28 @@
-"""Compare the results of two versions of errormotion: no error dataset may change when the code is rearranged.
+"""Compare the results of two versions of errormotion, to prove that a change of the code does not change results.
 
     python tools/compare_results.py make OUT                      simulate and measure every example, identify all of it
     python tools/compare_results.py make OUT --raw OLD            identify the raw data stored in OLD again
     python tools/compare_results.py make OUT --raw OLD --generate --measure
-                                                                  the same, and simulate and measure anew besides
-    python tools/compare_results.py compare OLD NEW               equal to the last bit?
-    python tools/compare_results.py compare OLD NEW --within 1e-9 equal within this fraction of a standard uncertainty?
+                                                                  the same, and also simulate and measure again
+    python tools/compare_results.py compare OLD NEW               compare bit for bit
+    python tools/compare_results.py compare OLD NEW --within 1e-9 compare within this fraction of a standard uncertainty
 
-``make`` runs with the errormotion of the interpreter that it is started with. It writes:
+``make`` uses the errormotion of the Python interpreter that runs it. It writes:
 
 ``raw/``        inputs, and ``raw/index.json``: method and settings of each
 ``generated/``  raw data and true errors of the kit's subjects, seeds 0 to 2 (without --raw, or with --generate)
 ``errors/``     the error dataset of each input, the plans, and the thermal model of the probing campaigns
-``digests.json``  SHA-256 of each variable and attribute of each raw dataset as loaded, how an item failed, and the
-                digests of the campaigns measured over the wire (without --raw, or with --measure)
+``digests.json``  SHA-256 of each variable and attribute of each raw dataset as loaded, the errors of failed items, and
+                the digests of the campaigns measured with simulated devices (without --raw, or with --measure)
 
 ``compare`` needs no errormotion. Names, dims, dtypes, values (NaN equal to NaN) and attributes of variables and
-coordinates are compared, JSON in attributes key by key. Left out are the attributes of ``LEFT_OUT`` and those given by
-``--ignore``; each one is counted. ``--wording`` accepts another wording of the attributes of ``PROSE``, if the numbers
-in the text are the same. The exit code is 1 if anything differs, or if an item is in one folder only.
+coordinates are compared, JSON in attributes key by key. The attributes of ``LEFT_OUT`` and of ``--ignore`` are omitted
+and counted. ``--wording`` accepts another wording of the attributes of ``PROSE``, if the numbers in the text are the
+same. The exit code is 1 if anything differs, or if an item is in only one folder.
 
 With ``--within``, a difference is divided by the standard uncertainty: from ``covariance`` (EX to EC, ``covariance``,
-``influence``), from ``NAME_uncertainty`` or ``NAME_covariance`` (other variables), or, where none is stated, by the
-largest absolute value of the variable. Integers, truth values, texts and the pattern of NaN must be equal in any case.
+``influence``), from ``NAME_uncertainty`` or ``NAME_covariance`` (other variables), or, without a stated one, by the
+largest absolute value of the variable. Integers, truth values, texts and the pattern of NaN must always be equal.
 """
 
 from __future__ import annotations
@@ -75,11 +75,11 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
         {"registration": "open3d_plane"},
     ],
 }
-"""Further settings under which an input is identified, so that more of each method is compared."""
+"""Further settings for the identification of an input, to compare more of each method."""
 
 LEFT_OUT = {
     "provenance.software.*": "versions of Python and of packages; the version of errormotion changes",
-    "@start": "time stamp of a campaign over the wire",
+    "@start": "time stamp of a campaign with simulated devices",
     "provenance.steps.*.campaigns.*": "hash of an error dataset, versions included; the dataset itself is compared",
     "provenance.steps.*.model": "hash of a thermal model, versions included; the model itself is compared",
 }
@@ -87,9 +87,8 @@ NOT_REPRODUCIBLE = {
     "errors/crossbeam_scan-scan-0-variant2.nc": 1e-6,
     "errors/crossbeam_scan-scan-0-variant3.nc": 1e-6,
 }
-"""Datasets that one version does not reproduce to the last bit, and within which fraction of a standard uncertainty
-they are compared instead: Open3D registers with several threads and adds in another order each time. Two runs differ by
-up to 2e-8; one that is not within this fraction is different."""
+"""Datasets that one version does not reproduce bit for bit, and the fraction of a standard uncertainty for their
+comparison: Open3D registers with several threads, and the order of its sums varies. Two runs differ by up to 2e-8."""
 PROSE = (
     *("notes", "notes.*", "reference", "comment", "description", "title"),
     *("*.long_name", "*.description", "*.comment", "provenance.steps.*"),
@@ -103,7 +102,7 @@ DOF = ("EX", "EY", "EZ", "EA", "EB", "EC")
 def simulated() -> Iterator[tuple[str, str, dict[str, Any], Any]]:
     """Yield name, method, settings and ``make(seed) -> (raw, truth)`` of each conformance subject of a built-in method.
 
-    This is the only function that depends on where the tree keeps its simulated raw data.
+    Only this function depends on the modules with the simulated raw data.
     """
     from errormotion import plugins
     from errormotion.testing.run import subjects_of
@@ -114,7 +113,7 @@ def simulated() -> Iterator[tuple[str, str, dict[str, Any], Any]]:
 
 
 def make(out: Path, raw: Path | None, generate: bool, measure_anew: bool) -> None:
-    """Fill a folder with results; see the top of this file."""
+    """Write the results into a folder; see the docstring of this file."""
     import errormotion
     from errormotion import datasets
 
@@ -147,7 +146,7 @@ def make(out: Path, raw: Path | None, generate: bool, measure_anew: bool) -> Non
 
 
 def simulate(folder: Path) -> None:
-    """Store raw data and truth of each conformance subject, and what to identify them with."""
+    """Store raw data and truth of each conformance subject, with method and settings of their identification."""
     from errormotion import datasets
 
     index = {}
@@ -163,7 +162,7 @@ def simulate(folder: Path) -> None:
 
 
 def collect(out: Path) -> None:
-    """Bring all inputs together in ``out/raw``: simulated raw data, the CSV files, and campaigns made over the wire."""
+    """Collect all inputs in ``out/raw``: simulated raw data, the CSV files, and campaigns with simulated devices."""
     import errormotion
 
     examples = Path(errormotion.__file__).parents[1] / "examples"
@@ -185,7 +184,7 @@ def collect(out: Path) -> None:
 
 
 def measure(folder: Path) -> dict[str, Any]:
-    """Run the demo and all campaigns over the wire in a folder; return what to identify their raw data with."""
+    """Run the demo and all campaigns in a folder; return method and settings for their raw data."""
     import errormotion
 
     examples = Path(errormotion.__file__).parents[1] / "examples"
@@ -194,7 +193,7 @@ def measure(folder: Path) -> dict[str, Any]:
     for name, command in ({"demo": ["demo"]} | commands).items():
         began, runs = time.time(), folder / name.replace("/", "-")
         errormotion_command(*command, "--runs", str(runs))
-        print(f"{time.time() - began:6.0f} s for {name} over the wire", flush=True)
+        print(f"{time.time() - began:6.0f} s for the campaign {name}", flush=True)
         for run in sorted(path.parent for path in runs.glob("*/run.json")):
             data = json.loads((run / "run.json").read_text())
             index[f"{runs.name}-{data['test']}"] = {
@@ -207,7 +206,7 @@ def measure(folder: Path) -> dict[str, Any]:
 
 
 def identify(out: Path, raw: Path, name: str, item: dict[str, Any]) -> dict[str, Any]:
-    """Store the errors of one input, and its plan where one is wanted; return the digests, and what failed."""
+    """Store the errors of one input, and its plan if stated; return the digests and failures."""
     from errormotion import datasets, plugins
     from errormotion.errors import ErrormotionError
 
@@ -232,7 +231,7 @@ def identify(out: Path, raw: Path, name: str, item: dict[str, Any]) -> dict[str,
 
 
 def thermal_model(errors: Path) -> None:
-    """Store a thermal model of two probing campaigns, and what it predicts for the third."""
+    """Store a thermal model of two probing campaigns, and its prediction for the third."""
     monday, tuesday, friday = (errors / f"virtual_probing-{day}-{day}.nc" for day in ("monday", "tuesday", "friday"))
     model = errors / "model" / "model.nc"
     errormotion_command("model", "fit", str(monday), str(tuesday), "-o", str(model))
@@ -241,13 +240,13 @@ def thermal_model(errors: Path) -> None:
 
 def errormotion_command(*arguments: str) -> None:
     """Run the command line of the errormotion under test."""
-    # -P: the working folder may hold another errormotion
+    # -P: the working folder may contain another errormotion
     command = [sys.executable, "-P", "-m", "errormotion", *arguments]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=CAMPAIGN_TIMEOUT)
 
 
 def jsonable(value: Any) -> Any:
-    """Return settings as JSON knows them."""
+    """Return settings as values of JSON."""
     return json.loads(json.dumps(value, default=lambda item: item.tolist() if hasattr(item, "tolist") else dict(item)))
 
 
@@ -271,7 +270,7 @@ def digests_of(ds: xr.Dataset) -> dict[str, str]:
 
 
 class Difference:
-    """What differs between two datasets, what was left out, and the largest difference in standard uncertainties."""
+    """Differences of two datasets, omitted attributes, and the largest difference in standard uncertainties."""
 
     def __init__(self, within: float | None, ignore: tuple[str, ...], wording: bool) -> None:
         self.within, self.ignore, self.wording = within, ignore, wording
@@ -282,7 +281,7 @@ class Difference:
         self.compared = 0
 
     def reports(self, old: dict[str, Any], new: dict[str, Any]) -> Difference:
-        """Compare the digests of two raw datasets, and how their identification failed."""
+        """Compare the digests of two raw datasets, and the failures of their identification."""
         if old.get("failed") != new.get("failed"):
             self.found.append(f"{old.get('failed') or 'done'} became {new.get('failed') or 'done'}")
         a, b = old.get("digests", {}), new.get("digests", {})
@@ -321,7 +320,7 @@ class Difference:
         if not np.array_equal(unknown, np.isnan(y)):
             self.found.append(f"{name}: NaN in other positions")
             return
-        # -0.0 and 0.0 differ in a bit as well
+        # -0.0 and 0.0 are also different
         differ = ~unknown & ((x != y) | (np.signbit(x) != np.signbit(y)))
         if not differ.any():
             return
@@ -407,7 +406,7 @@ def numbers(value: Any) -> list[str]:
 
 
 def short(value: Any) -> str:
-    """Return a value as a text of bounded length."""
+    """Return a value as a text of limited length."""
     text = repr(value)
     return text if len(text) <= 100 else f"{text[:97]}..."
 
@@ -438,7 +437,7 @@ def compare(old: Path, new: Path, within: float | None, ignore: list[str], wordi
 
 
 def pairs(old: Path, new: Path, *difference: Any) -> Iterator[tuple[str, Difference]]:
-    """Yield the comparison of every dataset that is in one of two folders; generated data only where both have them."""
+    """Yield the comparison of every dataset in one of two folders; generated data only if both have them."""
     kind, *options = difference
     a, b = (json.loads((folder / "digests.json").read_text()) for folder in (old, new))
     for part in ["raw"] + ["measured"] * bool(a["measured"] and b["measured"]):
@@ -461,7 +460,7 @@ def pairs(old: Path, new: Path, *difference: Any) -> Iterator[tuple[str, Differe
 
 
 def opened(path: Path) -> xr.Dataset:
-    """Open a NetCDF file; numbers and times stay as they are stored."""
+    """Open a NetCDF file without decoding of numbers and times."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return xr.open_dataset(
@@ -481,13 +480,13 @@ def main() -> int:
     one = commands.add_parser("make", help="store the results of this version")
     one.add_argument("out", type=Path, help="a new folder")
     one.add_argument("--raw", type=Path, help="identify the raw data of this folder, made by an earlier 'make'")
-    one.add_argument("--generate", action="store_true", help="with --raw: also simulate the kit's raw data anew")
-    one.add_argument("--measure", action="store_true", help="with --raw: also run the campaigns over the wire anew")
+    one.add_argument("--generate", action="store_true", help="with --raw: also simulate the raw data of the kit again")
+    one.add_argument("--measure", action="store_true", help="with --raw: also run the campaigns again")
     two = commands.add_parser("compare", help="compare two folders")
     two.add_argument("old", type=Path)
     two.add_argument("new", type=Path)
     two.add_argument("--within", type=float, help="largest difference, as a fraction of the standard uncertainty")
-    two.add_argument("--ignore", action="append", default=[], metavar="PATH", help="attribute to leave out, as *.name")
+    two.add_argument("--ignore", action="append", default=[], metavar="PATH", help="attribute to omit, as *.name")
     two.add_argument("--wording", action="store_true", help="accept another wording of notes and descriptions")
     two.add_argument("--details", type=int, default=5, help="differences to print for one dataset")
     given = parser.parse_args()
@@ -497,7 +496,7 @@ def main() -> int:
         return 0
     for folder in (given.old, given.new):
         if not (folder / "digests.json").exists():
-            parser.error(f"{folder}: expected a folder that 'make' has finished; found no digests.json")
+            parser.error(f"{folder}: expected a complete folder of 'make'; found no digests.json")
     return compare(given.old, given.new, given.within, given.ignore, given.wording, given.details)
 
 

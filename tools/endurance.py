@@ -1,6 +1,6 @@
-"""Watch a machine for 24 simulated hours while something fails every minute: ``make endurance``.
+"""Monitor a machine for 24 simulated hours with a fault every minute: ``make endurance``.
 
-The trial is in ``tests/support/monitored_day.py``. The section of docs/reliability.md is written by this program.
+The trial is in ``tests/support/monitored_day.py``. This program writes its section of docs/reliability.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from monitored_day import Day  # noqa: E402
 
 TITLE = "A monitor over 24 hours"
 LARGEST_GROWTH = 0.05
-"""Of the memory, from the end of the first hour to the end."""
+"""Of the memory after the first hour."""
 NAMES = {
     "corrupt": "answers with a wrong bit",
     "disconnect": "connection broken",
@@ -35,7 +35,7 @@ NAMES = {
 
 
 def failures(day: Day) -> list[str]:
-    """Return what is wrong with a day."""
+    """Return the failures of a day."""
     found = list(day.errors)
     first, last = day.resources[0], day.resources[-1]
     if day.growth() > LARGEST_GROWTH:
@@ -69,13 +69,13 @@ def section(day: Day, seed: int) -> str:
         ("threads", _range([each.threads for each in day.resources])),
     ]
     lines = [
-        f"`errormotion monitor` watched two modules, a thermometer and a controller over TCP for "
-        f"{day.duration / 3600:.1f} simulated hours, in {day.seconds / 60:.0f} minutes, while something failed every "
-        "minute. The monitor's clock advances to the next deadline while all threads wait, and runs at "
-        f"{day.speed:g} times the computer's rate while an answer is awaited. The modules send the number of each "
-        "reading as its temperature: every value in the log was sent, shortly before its row, none came back after a "
-        "later one, and every row without a reading is marked, by instrument, and counted alike in the log, in "
-        "run.json and in the report. Resources were counted every hour while all instruments answered.",
+        "`errormotion monitor` watched two modules, a thermometer and a controller over TCP for "
+        f"{day.duration / 3600:.1f} simulated hours, in {day.seconds / 60:.0f} minutes, with a fault every minute. "
+        f"The clock of the monitor advances to the next deadline while all threads wait, and runs at {day.speed:g} "
+        "times the rate of real time while an answer is awaited. The modules send the number of each reading as its "
+        "temperature. The trial checks that each value in the log was sent shortly before its row and not after a "
+        "later one, and that each row without a reading is marked by instrument and counted in the log, in run.json "
+        "and in the report. Resources were counted every hour while all instruments answered.",
         "",
         "| fault | number |",
         "|---|---|",

@@ -1,10 +1,9 @@
 """Runs under faults: ``make faults`` ends and disturbs real processes, and writes a section of ``docs/reliability.md``.
 
 Each trial starts a short campaign on a virtual machine, an identification, a report, a batch, a monitor, a compensation
-or the fit of a model, and kills it at a random instant, takes the disk away at a random write, sets the clocks,
-suspends it, or starts it twice. Then it is continued or repeated, and the raw data are compared with those of an
-undisturbed run. ``ARGS="--kills 30 --seed 5"`` tries other numbers of trials and other instants; ``--only disk`` the
-kinds whose name has these letters.
+or the fit of a model, and kills it at a random instant, lets a random write fail, sets the clocks, suspends it, or
+starts it twice. Then it is continued or repeated, and the raw data are compared with those of an undisturbed run.
+``ARGS="--kills 30 --seed 5"`` changes the number of trials and the instants; ``--only disk`` selects kinds by name.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ SHARES = {
     "two_at_once": 0.05,
     "moved": 0.06,
 }
-"""Trials of each kind for one kill."""
+"""Trials of each kind, relative to kills."""
 FOLLOWING = "errormotion compensate run"
 SHIMMED = ("disk", "disk_command", "disk_monitor", "clock_running", "clock_between", "suspend", "suspend_monitor")
 """Kinds that need a C compiler."""
@@ -81,7 +80,7 @@ class Row:
 
 @dataclass
 class Programme:
-    """The trials so far."""
+    """The completed trials."""
 
     kinds: Kinds
     seed: int
@@ -90,7 +89,7 @@ class Programme:
     seconds: float = 0.0
     """Of the processors."""
     load: float = 0.0
-    """Largest number of processes that wanted a processor, for each processor."""
+    """Largest number of processes that required a processor, for each processor."""
 
     def one(self, kind: str, number: int) -> None:
         """Make a trial."""
@@ -117,7 +116,7 @@ class Programme:
         lines = [
             TEXT.format(total=total, kills=kills, inside=inside, following=following, load=self.load),
             "",
-            "| fault | what it meets | trials | survived | worst loss | identical raw data | ended with a sentence |",
+            "| fault | target | trials | passed | largest loss | identical raw data | ended with a message |",
             "|---|---|---|---|---|---|---|",
         ]
         for (fault, what), row in sorted(self.rows.items()):
@@ -132,32 +131,31 @@ class Programme:
             ["Failures:", "", *(f"* {text[:400]}" for text in self.failures)] if self.failures else ["No failure."]
         )
         lines += ["", *failures]
-        without = "" if self.kinds.shimmed else " Without a C compiler: the faults of disks and clocks were left out."
+        without = "" if self.kinds.shimmed else " Without a C compiler: the faults of disks and clocks were omitted."
         return "\n".join([*lines, "", f"`make faults`, seed {self.seed}, {self.seconds:.0f} s of processors.{without}"])
 
 
 TEXT = """\
-{total} trials with short campaigns on virtual machines, each in processes of its own; {kills} of them kills at random
+{total} trials with short campaigns on virtual machines, each in separate processes; {kills} of them are kills at random
 instants, {inside} in an acquisition, {following} in a compensation that writes to a simulated PLC over TCP. After the
-fault the run is continued, in every third trial of an acquisition by two processes at once, of which one must finish it
-and the other must be refused; a command is repeated. A trial is survived when
+fault the run is continued, in every third trial of an acquisition by two processes at once, of which one must complete
+it and the other must be refused; a command is repeated. A trial is passed if
 
-* nothing that was delivered to the recorder more than a second before a kill is lost (longer only where more processes
-  want a processor than the computer has; here {load:.1f} on each);
-* no result is half a file, no message is an internal error, and a command that fails names the cause;
-* the run is finished by the continuation, and all its raw values are those of an undisturbed run. (Attributes state the
-  clock of the computer, and differ.) Every method repeats its values on a virtual machine; what it cannot repeat is
-  stated in [Run and resume a campaign](how-to/run-and-resume.md#on-a-virtual-machine);
-* the interruptions that the raw data state (`joins`) agree with the clocks that were set: the duration is right where
-  the computer was not restarted, and unknown where the clocks contradict each other;
+* no data that were delivered to the recorder more than a second before a kill are lost (longer only if more processes
+  require a processor than the computer has; here {load:.1f} on each);
+* no result file is incomplete, no message is an internal error, and a command that fails states the cause;
+* the continuation completes the run, and all its raw values are those of an undisturbed run. (Attributes state the
+  clock of the computer, and differ.) Every method repeats its values on a virtual machine; exceptions are stated in
+  [Run and resume a campaign](how-to/run-and-resume.md#on-a-virtual-machine);
+* the interruptions stated in the raw data (`joins`) agree with the clocks that were set: the duration is correct if
+  the computer was not restarted, and unknown if the clocks contradict each other;
 * every offset that reached the PLC is in the audit log of the compensation, whose chain of hashes is valid up to its
-  last entry; without a sign of life the PLC's offset is zero; and the compensation that is started next goes on from
-  the offset that the PLC then has, within the slew limit.
+  last entry; without new offsets the offset in the PLC becomes zero; and the next compensation continues from the
+  offset that the PLC then has, within the slew limit.
 
-A method delivers what belongs together: samples of a drift, the scans of a beam detection and lines of a crossbeam at
-least every 0.4 s, a face of the gauge (`beam_direction`), a set-up of the tracker (`multilateration`), a cycle of
-touches (`normal_vector`) when it is complete. What was measured of an incomplete one is not part of the loss below; it
-is measured again."""
+A method delivers complete units: samples of a drift, the scans of a beam detection and lines of a crossbeam at least
+every 0.4 s, a face of the gauge (`beam_direction`), a set-up of the tracker (`multilateration`), a cycle of touches
+(`normal_vector`). Data of an incomplete unit are not part of the loss below; they are measured again."""
 
 
 def can_mount() -> bool:
@@ -171,14 +169,14 @@ def can_mount() -> bool:
 
 
 def main() -> None:
-    """Try the faults until the trials are done or the time is over, print each, and write the page."""
+    """Try the faults up to the number of trials or the time limit, print each, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=100, help="number of kills; other faults in proportion")
     parser.add_argument("--minutes", type=float, default=9.0, help="no trial starts later")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="kinds whose name this regular expression finds")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--folder", type=Path, default=None, help="keep the trials that failed here")
+    parser.add_argument("--folder", type=Path, default=None, help="folder for the trials that failed")
     parser.add_argument("--out", type=Path, default=PAGE)
     options = parser.parse_args()
     start = time.monotonic()

@@ -1,7 +1,7 @@
-"""Compensate the real LinuxCNC while something fails at every interval: ``make following``.
+"""Compensate the real LinuxCNC with a fault at every interval: ``make following``.
 
-The servo thread records the offset and its change, cycle by cycle. The section of docs/reliability.md is written by
-this program.
+The servo thread records the offset and its change, cycle by cycle. This program writes its section of
+docs/reliability.md.
 """
 
 from __future__ import annotations
@@ -51,15 +51,15 @@ NAMES = {
 
 @dataclass
 class Course:
-    """What one route showed.
+    """Results of one route.
 
     Attributes
     ----------
     records : list of Record
-        Of the servo thread, one after the other, without a gap but around an emergency stop, where LinuxCNC sets an
-        external offset to zero at once.
+        Of the servo thread, without gaps except at an emergency stop, at which LinuxCNC sets an external offset to
+        zero at once.
     fastest_in_estop : float
-        There: fastest change of the motor's command, um/s.
+        Fastest change of the command of a motor in an emergency stop, um/s.
     """
 
     route: str
@@ -96,18 +96,18 @@ class Following:
         until(self.alive, START_TIMEOUT)
 
     def alive(self) -> bool:
-        """Whether signs of life arrive."""
+        """Whether new offsets arrive."""
         return bool(self.machine.pins("errormotion-alive.out")[0])
 
     def end(self) -> None:
-        """Kill the program, as nobody asks it to end."""
+        """Kill the program."""
         if self.program is not None:
             self.program.kill()
             self.program.wait()
             self.program = None
 
     def zero(self) -> None:
-        """Wait until the offset is zero; note how long it took after the last sign of life could have come."""
+        """Wait until the offset is zero; record the time since the last possible write."""
         start = time.monotonic()
         until(lambda: self.machine.offset() == 0, 60.0)
         self.course.slowest_zero = max(self.course.slowest_zero, time.monotonic() - start)
@@ -115,13 +115,13 @@ class Following:
     # ------------------------------------------------------------------ faults
 
     def kill_program(self) -> None:
-        """Kill it; a person starts it again."""
+        """Kill it and start it again."""
         self.end()
         self.zero()
         self.start()
 
     def suspend_program(self) -> None:
-        """Stop it for longer than the watchdog waits."""
+        """Stop it for longer than the time of the watchdog."""
         assert self.program is not None
         self.program.send_signal(signal.SIGSTOP)
         self.zero()
@@ -130,13 +130,13 @@ class Following:
         self._again()
 
     def kill_bridge(self) -> None:
-        """Kill it; it is started again, and the program connects again."""
+        """Kill it and start it again; the program reconnects."""
         self.machine.kill_bridge()
-        self.machine.control.state()  # connects again
+        self.machine.control.state()  # reconnects
         self._again()
 
     def estop(self) -> None:
-        """Stop the machine; a person switches it on, and starts the compensation again."""
+        """Stop the machine, switch it on, and start the compensation again."""
         self.course.records.append(self.machine.record())
         self.machine.watch()
         self.machine.control.estop()
@@ -148,7 +148,7 @@ class Following:
         self.start()
 
     def hold(self) -> None:
-        """Have a program hold the offset."""
+        """Hold the offset by an NC program."""
         self._program("M64 P0\nG4 P2\nM65 P0\n")
 
     def probe(self) -> None:
@@ -156,7 +156,7 @@ class Following:
         self._program("G38.3 Z-2 F80\nG53 G0 Z0\n")
 
     def second(self) -> None:
-        """Try to write beside the program."""
+        """Try to write with a second compensator."""
         with self.machine.compensator() as other:
             try:
                 other.arm(LIMITS.limit)
@@ -165,7 +165,7 @@ class Following:
         self.course.errors.append("a second compensator got the right to write")
 
     def raw(self) -> None:
-        """Ask the servo thread for 1 m, beside the bridge."""
+        """Set an offset of 1 m in the servo thread, without the bridge."""
         for value in (1e3, -1e3, 0.0):
             self.machine.hal(f"setp errormotion-source-x.in1 {value}")
             time.sleep(0.3)
@@ -175,7 +175,7 @@ class Following:
         self.machine.control.finish()
 
     def _again(self) -> None:
-        """Wait until the program goes on by itself, or start it again as a person would after a fault."""
+        """Wait until the program continues, or start it again as an operator would after a fault."""
         end = time.monotonic() + SLACK
         while time.monotonic() < end:
             if self.alive():
@@ -188,7 +188,7 @@ class Following:
     # ------------------------------------------------------------------ the course
 
     def run(self, seconds: float, interval: float) -> Course:
-        """Follow for a time, with a fault at each interval; each kind in turn, in random order."""
+        """Follow for a time, with a fault at each interval; all kinds in random order."""
         order: list[str] = []
         with self.machine.control:
             self.machine.rest()
@@ -217,7 +217,7 @@ class Following:
 
 
 def failures(course: Course) -> list[str]:
-    """Return what is wrong with a course."""
+    """Return the failures of a course."""
     found = list(course.errors)
     limit, slew = 1e6 * LIMITS.limit * (1 + EXACT), 1e6 * LIMITS.slew * (1 + EXACT)
     for record in course.records:
@@ -237,13 +237,12 @@ def section(courses: list[Course], interval: float, seed: int) -> str:
     hours = SPEEDUP * sum(course.seconds for course in courses) / 3600
     slowest = 1e6 * LIMITS.slew
     lines = [
-        "The code of `errormotion compensate run` followed a thermometer that drifts, jumps and falls silent, and "
-        "wrote to the real LinuxCNC on simulated joints. All times are "
-        f"{SPEEDUP:g} times shorter than by default, and the slew limit is as much higher ({slowest:g} um/s; watchdog "
-        f"{WATCHDOG:g} s, interval of offsets {LIMITS.period:g} s): {hours:.1f} hours at that scale, with a fault "
-        f"every {SPEEDUP * interval / 60:.2g} minutes. "
-        "The servo thread ran at its real rate, and recorded the extremes of the offset and of its change of all its "
-        "cycles. After a fault that needs a person, the program was started again.",
+        "The code of `errormotion compensate run` followed a thermometer with drift, jumps and missing answers, and "
+        f"wrote to the real LinuxCNC on simulated joints. All times are {SPEEDUP:g} times shorter than by default, "
+        f"and the slew limit is as much higher ({slowest:g} um/s; watchdog {WATCHDOG:g} s, interval of offsets "
+        f"{LIMITS.period:g} s): {hours:.1f} hours at that scale, with a fault every {SPEEDUP * interval / 60:.2g} "
+        "minutes. The servo thread ran at its real rate, and recorded the extremes of the offset and of its change "
+        "of all its cycles. After a fault that requires an operator, the program was started again.",
         "",
         "| fault | number |",
         "|---|---|",

@@ -1,10 +1,10 @@
 """Damaged frames of every codec: ``make fuzz`` tries them, and writes a section of ``docs/reliability.md``.
 
-``make fuzz ARGS="--frames 1e5 --only shdr"`` tries other numbers of frames, or some codecs, and leaves the rows of the
-others. A row is written when its codec is done. One that is there already, with as many frames of the same code and
-without failures, is kept (``--again`` tries it once more), so that a run that was ended goes on where it was. Codecs
-and good frames are those of ``tests/support/wire_codecs.py``; a failure is repeated with the seed and the number of
-its mutant.
+``make fuzz ARGS="--frames 1e5 --only shdr"`` changes the number of frames, or selects codecs; other rows are not
+changed. A row is written when its codec is complete. A row with the same number of frames and the same code, without
+failures, is not computed again (except with ``--again``), so that an interrupted run can be continued. Codecs and
+valid frames are those of ``tests/support/wire_codecs.py``; a failure is reproduced with the seed and the number of its
+mutant.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ PART = 25_000
 HEADING = """\
 # Reliability
 
-Every figure on this page comes from a run; none is typed in.
+All figures on this page are results of runs.
 """
 TABLE = (
     "| codec | frames | slowest frame | slowest piece | largest memory | longest frame | errors | code |",
@@ -47,7 +47,7 @@ TABLE = (
 INSTRUMENTS = "errormotion/instruments"
 OF_PROGRAMME = tuple(f"tests/support/{name}.py" for name in ("fuzzing", "mutants"))
 SAME_FOR_ALL = (f"{INSTRUMENTS}/transports/**/*.py", f"{INSTRUMENTS}/*.py", *OF_PROGRAMME)
-"""Files that every row depends on."""
+"""Files on which all rows depend."""
 
 
 def tasks(codecs: Sequence[int], frames: int) -> Iterator[tuple[int, int, int]]:
@@ -65,7 +65,7 @@ def work(task: tuple[int, int, int]) -> tuple[int, fuzzing.Found]:
 
 @cache
 def code_of(codec: fuzzing.Codec) -> str:
-    """Return a checksum of what a row depends on: the code of all instruments of the kind, its reader, good frames."""
+    """Return a checksum of the files of a row: the code of all instruments of the kind, its reader, valid frames."""
     device = codec.device.partition(" ")[0]
     patterns = [*SAME_FOR_ALL, f"tests/data/vectors/{device}.toml"]
     for plugin in plugins.available("instruments"):
@@ -104,45 +104,42 @@ def section(rows: Mapping[str, str], failures: Sequence[str]) -> str:
     frames = sum(int(text.split("|")[2]) for text in rows.values())
     lines = [
         f"{frames} damaged frames of {len(rows)} codecs: bits and bytes changed, stretches cut, repeated, exchanged "
-        "and inserted, numbers replaced by unusual ones, lengths and counts that are not true. Every one must be "
-        f"read, or refused with an error of the project, within {1e3 * fuzzing.SLOWEST:.0f} ms of processor time and "
-        f"within {fuzzing.OWN_MEMORY >> 10} KiB of memory and {fuzzing.MEMORY_PER_BYTE} bytes for each byte of the "
-        f"longest frame that was tried{_exceptions()}. One in {fuzzing.LENGTHENED} was lengthened to the longest "
-        "frame, or to 64 KiB with up to some thousand frames; it comes in pieces of up to "
-        f"{PIECE >> 10} KiB, as a connection delivers it, "
-        "and the same limit holds for each piece. Memory was measured with one in "
-        f"{fuzzing.SAMPLED}. Good frames are the golden vectors, frames of the codecs themselves and of the "
-        "simulators.",
+        "and inserted, numbers replaced by unusual ones, wrong lengths and counts. Each frame must be read, or "
+        f"refused with an error of the package, within {1e3 * fuzzing.SLOWEST:.0f} ms of processor time and within "
+        f"{fuzzing.OWN_MEMORY >> 10} KiB of memory and {fuzzing.MEMORY_PER_BYTE} bytes for each byte of the longest "
+        f"tried frame{_exceptions()}. One in {fuzzing.LENGTHENED} was lengthened to the longest frame, or to 64 KiB "
+        f"with up to several thousand frames; it is received in pieces of up to {PIECE >> 10} KiB, as from a "
+        f"connection, and the same limit applies to each piece. Memory was measured with one in {fuzzing.SAMPLED}. "
+        "Good frames are the golden vectors, frames of the codecs themselves and of the simulators.",
         "",
         *TABLE,
         *rows.values(),
         "",
-        "A document or file may be longer than a piece, up to the length in the table. It is read when it is complete, "
-        "so that its time grows with its length; it was tried up to "
+        "A document or file may be longer than a piece, up to the length in the table. It is read when it is "
+        "complete, so that the time increases with its length; it was tried up to "
         f"{', '.join(f'{each.tried >> 10} KiB ({each.name})' for each in CODECS if each.tried < each.longest)}. "
-        "`InstrumentTimeoutError`: the frame was cut off, and the rest of it did not arrive. The code is a checksum of "
-        "the files that the row depends on.",
+        "`InstrumentTimeoutError`: the frame was incomplete. The code is a checksum of the files on which the row "
+        "depends.",
         "",
         *(["Failures:", "", *failures] if failures else ["No failure."]),
         "",
         f"`make fuzz`, seed 1, {platform.machine()}, Python {platform.python_version()}.",
         "",
-        "Whole drivers are tried by the conformance kit: it records a session with the simulated device and replays it "
-        "with damaged frames ([Check a plugin](how-to/check-a-plugin.md)). Files that are imported have tests of the "
-        "same kind.",
+        "The conformance kit tries complete drivers: it records a session with the simulated device and replays it "
+        "with damaged frames ([Check a plugin](how-to/check-a-plugin.md)). Imported files have similar tests.",
     ]
     return "\n".join(lines)
 
 
 def sections(page: Path) -> tuple[str, dict[str, str]]:
-    """Return the start of the page and its sections by title."""
+    """Return the introduction of the page and its sections by title."""
     text = page.read_text(encoding="utf-8") if page.exists() else HEADING
     head, *parts = re.split(r"^## (.+)\n", text, flags=re.MULTILINE)
     return head, {name: part.strip("\n") for name, part in zip(parts[::2], parts[1::2], strict=True)}
 
 
 def write_section(page: Path, title: str, body: str) -> None:
-    """Replace one section of the page; the others stay."""
+    """Replace one section of the page."""
     head, found = sections(page)
     found[title] = body
     text = "".join(f"\n## {name}\n\n{part}\n" for name, part in found.items())
@@ -150,7 +147,7 @@ def write_section(page: Path, title: str, body: str) -> None:
 
 
 def updated(body: str, results: Sequence[tuple[fuzzing.Codec, fuzzing.Found]]) -> str:
-    """Return the section with the rows and failures of these codecs; those of other codecs stay."""
+    """Return the section with the rows and failures of these codecs; others are not changed."""
     names = [codec.name for codec in CODECS]
     before = {line[2:].partition(" |")[0]: line for line in body.splitlines() if line.startswith("| ")}
     rows = before | {codec.name: row(codec, found) for codec, found in results}
@@ -163,7 +160,7 @@ def updated(body: str, results: Sequence[tuple[fuzzing.Codec, fuzzing.Found]]) -
 
 
 def is_done(body: str, codec: fuzzing.Codec, frames: int) -> bool:
-    """Whether the section has a row of as many frames of the present code, without failures."""
+    """Whether the section has a row with this number of frames of the present code, without failures."""
     for line in body.splitlines():
         cells = [each.strip() for each in line.strip("| ").split("|")]
         if cells[0] == codec.name and len(cells) == TABLE[1].count("---"):
@@ -199,7 +196,7 @@ def main() -> None:
             found[number] += part
             if found[number].frames < options.frames:
                 continue
-            write(options.out, TITLE, [(CODECS[number], found[number])])  # what is ready is kept, whatever ends the run
+            write(options.out, TITLE, [(CODECS[number], found[number])])  # so that an interrupted run has this row
             failed = failed or bool(found[number].failures)
             print(row(CODECS[number], found[number]), f"{time.monotonic() - start:.0f} s", flush=True)
             for text in found[number].failures:

@@ -1,12 +1,12 @@
-"""Guided search: ``make guided`` looks for inputs that reach new code in every codec and reader, and judges them.
+"""Guided search: ``make guided`` finds inputs that execute new code in every codec and reader, and checks them.
 
-The search is that of atheris (libFuzzer), which sees the branches of the package that an input takes, and changes
-those inputs further that take new ones. It needs ``pip install atheris``, which is not among the dependencies. What is
-compiled is interpreted meanwhile, so that its branches are seen too. Where atheris breaks the code that it changes, a
-search of our own takes its place, which sees the steps from line to line. What the search keeps is then read as usual,
-with compiled functions, and judged: only errors of the project, bounded time and memory. The inputs that add coverage
-to the good frames are the corpus in ``tests/data/corpus``, which ``make test`` reads. ``ARGS="--seconds 60 --only
-shdr"`` searches longer, or some targets; rows of the others stay in ``docs/reliability.md``.
+The search is that of atheris (libFuzzer), which records the branches of the package that an input executes, and mutates
+inputs with new branches further. It needs ``pip install atheris``, which is not a dependency. Compiled functions are
+interpreted during the search, so that their branches are recorded. If atheris fails to instrument the code, a search in
+this module replaces it, which records the steps from line to line. The found inputs are then read with compiled
+functions and checked: only errors of the package, limits of time and memory. The inputs that add coverage to the valid
+frames are the corpus in ``tests/data/corpus``, which ``make test`` reads. ``ARGS="--seconds 60 --only shdr"`` searches
+longer, or selects targets; other rows of ``docs/reliability.md`` are not changed.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ MOST_SAVED = 50
 """Failures, and slow inputs, of one search."""
 SHOWN = 5
 MANY = (100, 1000, 5000)
-"""Repetitions of a sign."""
+"""Repetitions of a character."""
 MEMORY = 2000
 """Of the process of a search, MB."""
 
 
-# ---------------------------------------------------------------------- in processes of their own
+# ---------------------------------------------------------------------- in separate processes
 
 
 def good(name: str, folder: Path) -> None:
-    """Leave the good inputs in a folder: some come from sessions with simulators, which take their time elsewhere."""
+    """Write the valid inputs into a folder, because some come from sessions with simulators, which take long."""
     import corpus
 
     (folder / "good").mkdir(exist_ok=True)
@@ -59,12 +59,12 @@ def good(name: str, folder: Path) -> None:
 
 
 def good_ones(folder: Path) -> list[bytes]:
-    """Return the good inputs."""
+    """Return the valid inputs."""
     return [path.read_bytes() for path in sorted((folder / "good").iterdir())]
 
 
 def search(name: str, folder: Path, seconds: float) -> None:
-    """Search from the good inputs and the corpus; what reaches new branches, fails or is slow is left in a folder."""
+    """Search from the valid inputs and the corpus; write new, failing and slow inputs to a folder."""
     import atheris
 
     with atheris.instrument_imports(include=["errormotion"]):
@@ -74,7 +74,7 @@ def search(name: str, folder: Path, seconds: float) -> None:
     from errormotion.errors import ErrormotionError
 
     target = corpus.TARGETS[name]
-    limit = 10 * getattr(target, "limit", corpus.fuzzing.SLOWEST)  # of code with counters, and interpreted
+    limit = 10 * getattr(target, "limit", corpus.fuzzing.SLOWEST)  # for interpreted code with counters
     found, places = folder / "found", Counter[str]()
     found.mkdir()
     for number, data in enumerate([*good_ones(folder), *corpus.load(target)]):
@@ -112,7 +112,7 @@ def search(name: str, folder: Path, seconds: float) -> None:
 
 
 def walk(name: str, folder: Path, seconds: float) -> None:
-    """Search without atheris: change an input that is known, and keep what takes new steps, or fails."""
+    """Search without atheris: mutate known inputs, and keep those with new steps or failures."""
     import corpus
     import mutants
 
@@ -144,7 +144,7 @@ def walk(name: str, folder: Path, seconds: float) -> None:
 
 
 def measure(name: str, folder: Path) -> None:
-    """Choose the corpus among what was found, by the steps that each input takes in the package."""
+    """Select the corpus from the found inputs, by their steps in the package."""
     import corpus
 
     target = corpus.TARGETS[name]
@@ -157,12 +157,12 @@ def measure(name: str, folder: Path) -> None:
 
 
 def judge(name: str, folder: Path) -> None:
-    """Read all that was found within the limits."""
+    """Read the found inputs within the limits."""
     import corpus
 
     target = corpus.TARGETS[name]
     for data in good_ones(folder):
-        corpus.judge(target, data, memory=False)  # compiles what is compiled at its first use
+        corpus.judge(target, data, memory=False)  # includes compilations at first use
     errors, faults, slowest, memory = Counter[str](), list[str](), 0.0, 0
     for path in sorted((folder / "found").iterdir()):
         data = path.read_bytes()
@@ -182,7 +182,7 @@ def judge(name: str, folder: Path) -> None:
 
 
 def run(stage: str, name: str, folder: Path, seconds: float = 0.0) -> str:
-    """Run a stage in a process of its own; return what it printed."""
+    """Run a stage in a separate process; return its output."""
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "0" if stage in ("good", "judge") else "1"}
     words = [sys.executable, __file__, "--stage", stage, "--only", name, "--folder", folder, "--seconds", str(seconds)]
     ended = subprocess.run(
@@ -206,14 +206,14 @@ def row(name: str, tried: int, figures: dict[str, Any]) -> str:
 
 
 def guided(name: str, seconds: float, keep: Path | None) -> tuple[str, list[str]]:
-    """Search one target; return its row and what is not allowed."""
+    """Search one target; return its row and the failures."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if keep is None else keep / re.sub(r"\W+", "_", name)
         folder.mkdir(parents=True, exist_ok=True)
         run("good", name, folder)
         try:
             said = run("search", name, folder, seconds)
-        except RuntimeError as ended:  # of Python 3.11, atheris breaks a few functions
+        except RuntimeError as ended:  # with Python 3.11, atheris cannot instrument a few functions
             said = run("walk", name, folder, seconds)
             print(f"{name}: without atheris, which failed: {str(ended)[-300:]}", file=sys.stderr)
         tried = re.search(r"^Done (\d+) runs", said, re.MULTILINE)
@@ -232,13 +232,13 @@ def section(rows: dict[str, str], failures: list[str], seconds: float, version: 
 
     tried = sum(int(text.split("|")[2]) for text in rows.values())
     lines = [
-        f"{tried} inputs of {len(rows)} codecs and readers of files, chosen by a search that sees which branches of "
-        f"the package each of them takes (atheris {version}, up to {LONGEST} bytes). Each input that took a new "
-        "branch, failed, or was slow was then read again and measured: "
-        f"only errors of the project, {1e3 * SLOWEST:.0f} ms of processor time and the memory stated above for a "
-        f"frame, {1e3 * LIMIT:.0f} ms (a log: 200 ms) and {OF_FILES >> 20} MiB for a file. A step leads from one line "
-        "of the package to the next that is executed; the corpus holds the inputs that take steps that no good input "
-        "takes. It lies in `tests/data/corpus`, and `make test` reads it.",
+        f"{tried} inputs of {len(rows)} codecs and readers of files, chosen by a search that records the branches of "
+        f"the package that each of them executes (atheris {version}, up to {LONGEST} bytes). Each input that executed "
+        "a new branch, failed, or was slow was then read again and measured: only errors of the package, "
+        f"{1e3 * SLOWEST:.0f} ms of processor time and the memory stated above for a frame, {1e3 * LIMIT:.0f} ms (a "
+        f"log: 200 ms) and {OF_FILES >> 20} MiB for a file. A step is a pair of successively executed lines of the "
+        "package; the corpus in `tests/data/corpus` contains the inputs with steps of no valid input, and `make "
+        "test` reads it.",
         "",
         *TABLE,
         *rows.values(),
@@ -251,7 +251,7 @@ def section(rows: dict[str, str], failures: list[str], seconds: float, version: 
 
 
 def write(page: Path, names: list[str], new: dict[str, str], faults: dict[str, list[str]], seconds: float) -> None:
-    """Replace the rows of the targets that were searched; the others, and other sections, stay."""
+    """Replace the rows of the searched targets; others are not changed."""
     from fuzz import sections, write_section
 
     body = sections(page)[1].get(TITLE, "").splitlines()

@@ -1,8 +1,8 @@
 """Run tests with the lowest versions of packages that pyproject.toml allows: python tools/lowest.py [words of pytest].
 
-The environment (--venv) is made with uv where it is installed, else with pip. Packages that pyproject.toml names have
-exactly their lower bounds; what they need in turn is the newest version that fits, and the tools of the tests are those
-of requirements.lock. A lower bound must therefore be a version that exists.
+The environment (--venv) is made with uv if it is installed, else with pip. Packages in pyproject.toml have exactly
+their lower bounds, which must be existing versions; their dependencies have the newest allowed versions, and the test
+tools the versions of requirements.lock.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CORE = (
     *("report/test_exports.py", "report/test_canvas.py", "dashboard/test_server.py"),
     *("cli/test_commands.py", "cli/test_progress.py"),
 )
-"""Tests that use every package: files, instruments, fits, compiled loops, pages, the command line."""
+"""Tests that use all packages: files, instruments, fits, compiled loops, pages, the command line."""
 TITLE = "Lowest versions"
 
 _REQUIREMENT = re.compile(r"([A-Za-z0-9._-]+)>=([0-9][0-9.]*)(\s*;.+)?")
@@ -68,13 +68,13 @@ def locked(names: Iterable[str], lock: str) -> list[str]:
     for name in names:
         match = re.search(rf"^{re.escape(name)}==([^\s;]+)", lock, re.MULTILINE)
         if match is None:
-            raise ValueError(f"requirements.lock: expected {name}; it is not there")
+            raise ValueError(f"requirements.lock: expected {name}; found none")
         found.append(f"{name}=={match[1]}")
     return found
 
 
 def pins() -> list[str]:
-    """Return what the environment contains of the project's own choice."""
+    """Return the pinned packages of the environment."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = [text for texts in project["optional-dependencies"].values() for text in texts]
     lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
@@ -101,7 +101,7 @@ def section(result: str) -> str:
     own = pins()[: -len(TOOLS + PEERS)]
     return "\n".join(
         [
-            "Tests with packages at the lowest versions that `pyproject.toml` allows, all at once: "
+            "Tests with all packages at the lowest versions that `pyproject.toml` allows: "
             + ", ".join(pin.partition(";")[0].replace("==", " ").strip() for pin in own) + ".",
             "",
             f"{result}.",
@@ -114,7 +114,7 @@ def section(result: str) -> str:
 def main() -> None:
     """Make the environment and run the tests there."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--venv", type=Path, default=ROOT / ".venv-lowest", help="made anew each time")
+    parser.add_argument("--venv", type=Path, default=ROOT / ".venv-lowest", help="environment, replaced each time")
     parser.add_argument("--python", default=sys.executable, help="of the environment; the lowest is 3.11")
     options, words = parser.parse_known_args()
     python = install(options.venv, options.python)

@@ -2,8 +2,8 @@
 
 Every command must read the file or refuse it with one message that names it: no internal error (exit code 70), no
 crash, no warning of Python, no markup of the file in a page, within limits of time and memory.
-``ARGS="--mutations 500 --seed 5 --only bench"`` tries other numbers, other mutations, or some kinds of files. A failure
-is repeated with ``--only KIND --number NUMBER``.
+``ARGS="--mutations 500 --seed 5 --only bench"`` changes the number and the mutations, or selects kinds of files. A
+failure is reproduced with ``--only KIND --number NUMBER``.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ class Row:
 
 
 def libraries(folder: Path) -> dict[str, Kind]:
-    """Make the good files, and return the kinds by name."""
+    """Make the valid files, and return the kinds by name."""
     library = Library(folder)
     return {kind.name: kind for make in file_kinds.MAKERS for kind in make(library)}
 
 
 def tasks(kinds: dict[str, Kind], mutations: int) -> Iterator[tuple[Kind, range]]:
-    """Yield parts of the mutations, those of all kinds in turn."""
+    """Yield parts of the mutations, alternating between the kinds."""
     each = -(-mutations // len(kinds))
     for start in range(0, each, PART):
         for kind in kinds.values():
@@ -79,7 +79,7 @@ _place: list[Path] = []
 
 
 def prepare(kinds: list[Kind], folder: str) -> None:
-    """Import in a process of the pool what the commands import."""
+    """Import the modules of the commands in a process of the pool."""
     _place.append(Path(tempfile.mkdtemp(dir=folder)))
     for kind in kinds:
         source, _, commands = kind.cases[0]
@@ -124,7 +124,7 @@ def section(rows: dict[str, Row], seed: int) -> str:
 
 
 def main() -> None:
-    """Try the mutations until they are done or the time is over, print failures, and write the page."""
+    """Try the mutations up to their number or the time limit, print failures, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mutations", type=int, default=2000)
     parser.add_argument("--minutes", type=float, default=20.0, help="no mutation starts later")

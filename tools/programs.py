@@ -1,8 +1,8 @@
-"""Read random NC programs by LinuxCNC's own interpreter and by the plain reader: ``make programs``.
+"""Read random NC programs by the interpreter of LinuxCNC and by the reader of this package: ``make programs``.
 
-Both must move along one path. Many programs are read in one run of the interpreter, which would otherwise start longer
-than it reads. The section of docs/reliability.md is written by this program; a signal to end (SIGTERM, Ctrl-C) or
-``--minutes`` ends it early, and the section states what was done.
+Both must have the same path. One run of the interpreter reads many programs, because its start takes longer than
+reading one. This program writes its section of docs/reliability.md, also if it is ended early by SIGTERM, Ctrl-C or
+``--minutes``.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ STEPS = (5, 20)
 """Fewest and most steps of a program; one in `LONG` has `LONG_STEPS`."""
 LONG, LONG_STEPS = 50, 100
 GROUP = 250
-"""Programs that one run of the interpreter reads."""
+"""Programs in one run of the interpreter."""
 CLEARED = [f"G10 L2 P{n} X{n} Y{-n} Z0 R0" for n in range(1, 10)]
 KINDS = {
     "rapid moves": r"G0?0(?!\d|\.)",
@@ -56,13 +56,13 @@ KINDS = {
     "probing (G38)": r"G38",
     "machine coordinates (G53)": r"G53",
 }
-"""What a program may use."""
+"""Features of a program, by name."""
 _USED = {name: re.compile(pattern, re.IGNORECASE) for name, pattern in KINDS.items()}
 
 
 @dataclass
 class Found:
-    """What was done: numbers, and the seeds of programs that are read differently, with the reason."""
+    """Counts, and the seeds of programs that are read differently, with the reason."""
 
     programs: int = 0
     blocks: int = 0
@@ -80,19 +80,19 @@ class Found:
 
 
 def program(seed: int) -> list[str]:
-    """Return a program, without its end, that leaves the work offsets as they were."""
+    """Return a program without its end that does not change the work offsets."""
     steps = LONG_STEPS if seed % LONG == 0 else Random(~seed).randint(*STEPS)
     made = [*Programs(Random(seed)).lines(steps)[:-1], "G80"]
     return [*made, *CLEARED] if any(line.startswith("G10 ") for line in made) else made
 
 
 def read(seeds: Sequence[int]) -> Found:
-    """Read programs in one run of the interpreter; if the paths differ, each by itself."""
+    """Read programs in one run of the interpreter; if the paths differ, each separately."""
     found = Found(len(seeds))
     lines: list[str] = []
     for seed in seeds:
         made = program(seed)
-        own = "\n".join(made[1 : made.index("G80")])  # after what sets every mode
+        own = "\n".join(made[1 : made.index("G80")])  # after the block that sets all modes
         found.using.update(name for name, pattern in _USED.items() if pattern.search(own))
         lines += made
     found.blocks = len(lines)
@@ -116,7 +116,7 @@ def groups(programs: int, seed: int) -> Iterator[range]:
 
 
 def in_processes(parts: Iterable[range], jobs: int) -> Iterator[Found]:
-    """Yield results, with at most a few parts waiting."""
+    """Yield results, with only a few parts in the queue."""
     ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
     with ProcessPoolExecutor(jobs, mp_context=get_context("fork"), initializer=ignore) as pool:
         iterator = iter(parts)
@@ -127,11 +127,11 @@ def in_processes(parts: Iterable[range], jobs: int) -> Iterator[Found]:
 def section(found: Found, seed: int, seconds: float, cpu: float) -> str:
     """Return the section of the page."""
     lines = [
-        f"{found.programs} random programs of {STEPS[0]} to {STEPS[1]} steps, one in {LONG} of {LONG_STEPS}, were read "
-        "by LinuxCNC's own interpreter (`rs274`) and by the plain reader of `errormotion compensate program`. A step "
-        "is a move, a mode, an offset, a probing, or a word that does not move. Every move must have the same line, "
-        "kind, end, centre and number of turns, within the four digits that the interpreter prints. "
-        f"One run of the interpreter reads {GROUP} programs, and each leaves the work offsets as it found them.",
+        f"{found.programs} random programs of {STEPS[0]} to {STEPS[1]} steps, one in {LONG} of {LONG_STEPS}, were "
+        "read by the interpreter of LinuxCNC (`rs274`) and by the reader of `errormotion compensate program`. A step "
+        "is a move, a mode, an offset, a probing, or a word without motion. Each move must have the same line, "
+        "kind, end, centre and number of turns, within the four digits that the interpreter prints. One run of the "
+        f"interpreter reads {GROUP} programs, and no program changes the work offsets.",
         "",
         "| | number |",
         "|---|---|",

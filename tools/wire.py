@@ -1,8 +1,8 @@
-"""Disturbed wires: ``make wire`` tries every driver on them, and writes a section of ``docs/reliability.md``.
+"""Disturbed connections: ``make wire`` tries all drivers, and writes a section of ``docs/reliability.md``.
 
 A proxy between a driver and its simulated device disturbs one piece of each session (``tests/support/wire_proxy.py``).
-``ARGS="--number 10 --seed 5 --only keyence"`` tries other numbers of sessions, other places, or some instruments; the
-rows of the others stay.
+``ARGS="--number 10 --seed 5 --only keyence"`` changes the number of sessions and the disturbances, or selects
+instruments; other rows are not changed.
 """
 
 from __future__ import annotations
@@ -82,20 +82,20 @@ def section(rows: Mapping[str, str], failures: Sequence[str], seed: int) -> str:
     without = "; ".join(f"{name}: {why}" for name, why in trials.WITHOUT_WIRE.items())
     lines = [
         f"{total} sessions of drivers with their simulated devices, on TCP and on pseudo terminals, each disturbed "
-        f"once in one direction: a piece came 0.1 s later, or {LATE:g} s later, in two parts, byte by byte, twice, "
-        "after the next one, with its halves exchanged, with one byte changed, or not at all; or the wire went silent, "
-        "or was cut. A session must end with right readings and samples, with NaN that are counted, or with one typed "
-        "error; then the driver must close, open again and read right values. A piece that is late within the time "
-        "limit, or comes in parts, may not cost anything. The readings are compared with those of the same session "
-        "without a disturbance; where a device measures ahead of its reader, within twice their range.",
+        f"once in one direction: a piece was received 0.1 s later, or {LATE:g} s later, in two parts, byte by byte, "
+        "twice, after the next one, with its halves exchanged, with one byte changed, or not at all; or the transfer "
+        "stopped, or the connection was closed. A session must end with correct readings and samples, with counted "
+        "NaN, or with one typed error; then the driver must close, open again and read correct values. A piece that "
+        "is late within the time limit, or divided, must have no effect. The readings are compared with those of the "
+        "same session without a disturbance; if a device measures ahead of its reader, within twice their range.",
         "",
         *TABLE,
         *rows.values(),
         "",
-        "Wrong by changed bytes: sessions in which a changed byte, or exchanged halves, made another value that the "
-        "protocol cannot tell from a right one, because it has no checksum. The pages of the "
-        "[devices](reference/devices/index.md) state it. No other disturbance made a wrong value. Without a wire, or "
-        f"tried elsewhere: {without}.",
+        "Wrong by changed bytes: sessions in which a changed byte, or exchanged halves, resulted in another value "
+        "that cannot be detected, because the protocol has no checksum; see the pages of the "
+        "[devices](reference/devices/index.md). No other disturbance resulted in a wrong value. Not tried here: "
+        f"{without}.",
         "",
         *(["Failures:", "", *failures] if failures else ["No failure."]),
         "",
@@ -105,7 +105,7 @@ def section(rows: Mapping[str, str], failures: Sequence[str], seed: int) -> str:
 
 
 def write(page: Path, names: Sequence[str], new: Mapping[str, Row], seed: int) -> None:
-    """Replace rows and failures of the instruments that were tried; the others, and other sections, stay."""
+    """Replace rows and failures of the tried instruments; others are not changed."""
     body = sections(page)[1].get(TITLE, "").splitlines()
     rows = {line[2:].partition(" |")[0]: line for line in body if line.startswith("| ")}
     rows |= {name: text_of(name, row) for name, row in new.items()}

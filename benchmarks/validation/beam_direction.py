@@ -1,4 +1,4 @@
-"""Beam direction: spread against the bound, coverage, and what the inclination compensation is worth."""
+"""Beam direction: spread against the bound, coverage, and benefit of the inclination compensation."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from errormotion.methods.beam_direction.identification.propagation import expect
 from errormotion.twin import VirtualMachine
 
 TITLE = "Beam direction"
-#: the standard error of a ratio of spreads is 1 / sqrt(2 SEEDS), 1.1 %: a fifth of the 5 % that are to be seen. Over
-#: 500 it is 3.2 %, and a freedom in ten is off by more than 5 % by chance alone.
+#: the standard error of a ratio of spreads is 1 / sqrt(2 SEEDS), 1.1 %: a fifth of the 5 % that must be detected. With
+#: 500 seeds it is 3.2 %, and a freedom in ten deviates by more than 5 % by chance.
 SEEDS = 4000
 FREEDOMS = ("EX", "EY", "EZ", "EA", "EB", "EC")
 Z95 = 1.959964
 INCLINATION = np.radians(20.0)
 #: rotations of the turntable for the pairs of planes in table 1 of Lu et al., deg, and the angles found there, deg
 PAIRS = {(0, 20): 20.0823, (20, 40): 19.9316, (40, 60): 20.0489, (60, 80): 20.0990, (80, 90): 19.9820, (0, 90): 19.9148}
-#: machines whose sensor is calibrated as well: a second each
+#: machines with a calibration of the sensor, which takes a second each
 CALIBRATED = 60
 EVEN, TENS = np.arange(0, 45.1, 5.0), np.arange(0, 360, 10.0)
-#: inclinations and rotations of the settings of a calibration, deg, and what they are called
+#: inclinations and rotations of the settings of a calibration, deg, and their names
 DESIGNS = (
     (EVEN, TENS, ("0 to 45 every 5", "every 10")),
     (np.arange(0, 45.1, 7.5), np.arange(0, 360, 30.0), ("0 to 45 every 7.5", "every 30")),
@@ -93,26 +93,24 @@ def honesty(seeds: int, rotations: tuple[int, ...]) -> list[str]:
         unit, scale = ("um", 1e6) if k < 3 else ("urad", 1e6)
         ratio = error[:, k] / least[:, k]
         rows.append(
-            f"| {name} | {least[:, k].mean() * scale:.3g} {unit} | {_spread(ratio)} | "
-            f"{ratio.mean():+.3f} | {np.mean(u[:, k] / least[:, k]):.3f} | "
-            f"{np.mean(np.abs(error[:, k]) <= Z95 * u[:, k]):.1%} |"
+            f"| {name} | {least[:, k].mean() * scale:.3g} {unit} | {_spread(ratio)} | {ratio.mean():+.3f} | "
+            f"{np.mean(u[:, k] / least[:, k]):.3f} | {np.mean(np.abs(error[:, k]) <= Z95 * u[:, k]):.1%} |"
         )
     return [
-        f"{seeds} virtual machines, each with its own beam (0.3 deg and 0.1 mm off its drawing); {len(rotations)} "
-        f"planes of a sine gauge at 20 deg, turned to {', '.join(map(str, rotations))} deg, 60 readings on each "
-        "with 0.1 um noise and 0.3 um speckle that correlates over 50 um. "
-        "Behind ± the standard error of the ratio, by the squares of the single machines; that of a coverage is "
-        f"{np.sqrt(0.05 * 0.95 / seeds):.1%}. EA and EC are one freedom here, since the nominal beam lies in the plane "
-        "of X and Z. All freedoms together: mean squared error over the stated covariance "
-        f"{np.mean(chi2):.3f} per freedom "
-        f"(standard deviation {np.sqrt(2 / seeds / (known.sum() - 1)):.3f}).",
+        f"{seeds} virtual machines, each with its own beam (with deviations of 0.3 deg and 0.1 mm from nominal); "
+        f"{len(rotations)} planes of a sine gauge at 20 deg, rotated to {', '.join(map(str, rotations))} deg, 60 "
+        "readings on each with 0.1 um noise and 0.3 um speckle that correlates over 50 um. After ±: standard error "
+        "of the ratio, from the squares of the single machines; that of a coverage is "
+        f"{np.sqrt(0.05 * 0.95 / seeds):.1%}. EA and EC are one freedom here, because the nominal beam is in the "
+        f"plane of X and Z. All freedoms together: mean squared error over the stated covariance {np.mean(chi2):.3f} "
+        f"per freedom (standard deviation {np.sqrt(2 / seeds / (known.sum() - 1)):.3f}).",
         "",
         *rows,
     ]
 
 
 def compensation(seeds: int) -> list[str]:
-    """The published pairs of planes, with the twin's inclination error, before and after compensation."""
+    """The published pairs of planes with inclination error, before and after compensation."""
     method = BeamDirection()
     lean, turn, stated = ({pair: [] for pair in PAIRS} for _ in range(3))
     refused = dict.fromkeys(PAIRS, 0)
@@ -158,8 +156,8 @@ def compensation(seeds: int) -> list[str]:
         f"{seeds} virtual machines, each with its own beam, inclination error and calibration (inclinations -45 to 45 "
         "deg every 5, rotations 0 to 170 deg every 10, depths -10 to 10 mm every 1); beam about 20 deg from the "
         "vertical, pairs of planes at 20 deg as in table 1 of Lu et al., 60 readings on each with noise and speckle, "
-        "strokes of four fifths of the range. Mean absolute errors, deg: of the angle to the vertical, which is what "
-        "the paper states, and of the direction in space.",
+        "strokes of four fifths of the range. Mean absolute errors, deg: of the angle to the vertical, as stated in "
+        "the paper, and of the direction in space.",
         "",
         *rows,
         "",
@@ -182,7 +180,7 @@ def _spread(ratio: np.ndarray) -> str:
 
 
 def holes(seeds: int) -> list[str]:
-    """Coverage of calibrations over the disc of tilts, where they are used and where they are refused."""
+    """Coverage of calibrations over the disc of tilts, where they are supported and where they are refused."""
     rows = [
         "| inclinations of the settings / deg | rotations / deg | where supported | where refused | share refused |",
         "|---|---|---|---|---|",
@@ -208,8 +206,8 @@ def holes(seeds: int) -> list[str]:
         rows.append(f"| {names[0]} | {names[1]} | {_mean(used)} | {_mean(refused)} | {np.mean(share):.0%} |")
     return [
         f"{seeds} virtual sensors; 95 % intervals of the slope k at 400 random tilts each, none of them calibrated; "
-        "depths -10 to 10 mm every 4. The standard error behind ± is that of the mean over sensors. A ring of settings "
-        "left out makes no hole: that is what leaving a setting out vouches for.",
+        "depths -10 to 10 mm every 4. After ±: standard error of the mean over sensors. An omitted ring of settings "
+        "is not a hole, because leave-one-out validation covers it.",
         "",
         *rows,
     ]

@@ -15,9 +15,9 @@ from errormotion.twin import VirtualMachine
 TITLE = "Closed loop"
 SEEDS = 10
 VARIATION = 0.2
-"""By which each constant of a machine differs from that of the table at most."""
+"""Largest relative difference of a constant of a machine from that of the table."""
 TRAINING: Speeds = ((0.0, 15000.0), (6600.0, 4000.0), (8400.0, 10000.0), (9600.0, 0.0))
-"""Of the warm-up that the model is fitted to: as hot as the machine becomes, then cooler."""
+"""Of the warm-up to which the model is fitted: the highest temperature of the machine, then cooler."""
 SHORTEST, LONGEST = 1200.0, 3600.0
 """Of one speed in a compensated warm-up, s."""
 
@@ -26,18 +26,18 @@ def section(seeds: int) -> Iterator[str]:
     """Yield the lines of the section."""
     duty = Duty()
     yield (
-        f"{seeds} virtual machines, C-frames and gantries in turn. Heat capacities, heat flows, and the growth of each "
-        f"body differ from the tables by up to {VARIATION:.0%}, each constant by itself. A machine warms up for three "
-        "hours while four balls are probed every ten minutes; a thermal model is fitted to the result (responses to "
-        "temperatures and spindle speed, sensors that warmed by 1 K or more). Two further warm-ups from the cold state "
-        "with random speeds (0 to 15000 /min, 20 to 60 min each) follow, each without and with compensation: every "
-        "second the model predicts from noisy readings (0.02 K), the state machine of `errormotion compensate run` "
-        f"decides, and its offset acts on the tool; limits {1e6 * duty.limits.limit:g} um and "
-        f"{1e6 * duty.limits.slew:g} um/s, held while the machine probes. `true`: root mean square of the true "
-        "displacement (EX, EY, EZ together) at the functional point over the warm-up, with compensation over without; "
-        "`least gain`: the same of the one displacement that gains least. `measured`: 1 less the reduction of "
-        "`errormotion compensate effect`, with its 95 % interval, of the changes since the first cycle. All in "
-        "simulated time, without wire and controller."
+        f"{seeds} virtual machines, alternately C-frames and gantries. Heat capacities, heat flows, and the growth of "
+        f"each body differ from the tables by up to {VARIATION:.0%}, independently of each other. A machine warms up "
+        "for three hours while four balls are probed every ten minutes; a thermal model is fitted to the result "
+        "(responses to temperatures and spindle speed, sensors that warmed by 1 K or more). Two further warm-ups "
+        "from the cold state with random speeds (0 to 15000 /min, 20 to 60 min each) follow, each without and with "
+        "compensation: every second the model predicts from noisy readings (0.02 K), the state machine of "
+        f"`errormotion compensate run` decides, and its offset acts on the tool; limits {1e6 * duty.limits.limit:g} "
+        f"um and {1e6 * duty.limits.slew:g} um/s, held while the machine probes. `true`: root mean square of the true "
+        "displacement (EX, EY, EZ together) at the functional point over the warm-up, with compensation over "
+        "without; `least gain`: the same for the displacement with the smallest improvement. `measured`: 1 minus the "
+        "reduction of `errormotion compensate effect`, with its 95 % interval, of the changes since the first cycle. "
+        "All in simulated time, without communication and controller."
     )
     for title, first, model in (
         ("At most 2 sensors and 2 time constants", seeds, duty.model),
@@ -47,11 +47,11 @@ def section(seeds: int) -> Iterator[str]:
         yield from _table(range(first, first + seeds), replace(duty, model=model))
     yield from (
         "",
-        "The machines of both tables are different ones. One warm-up determines few coefficients, and left-out blocks "
-        "of it have its speeds: they do not show what the coefficients are worth at others. The selection therefore "
-        "adds the variance of the prediction with sources of heat that act each by itself, and takes one sensor at "
-        "least. Without both, models were chosen that are not followed (limit of U: 20 um), or that knew the speed "
-        "alone.",
+        "The machines of both tables are different. One warm-up determines few coefficients, and its omitted blocks "
+        "have the same speeds: they do not show the validity of the coefficients at other speeds. The selection "
+        "therefore adds the variance of the prediction with heat sources that act independently, and requires at "
+        "least one sensor. Without both, models were selected that are not followed (limit of U: 20 um), or that "
+        "depend only on the speed.",
     )
 
 

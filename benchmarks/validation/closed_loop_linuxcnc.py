@@ -1,7 +1,7 @@
-"""The closed loop with the real LinuxCNC: it probes a warm-up and, with offsets in its servo thread, two others.
+"""The closed loop with the real LinuxCNC: it probes a warm-up, and two others with offsets in its servo thread.
 
-``python benchmarks/validate.py closed_loop_linuxcnc --cache FOLDER``; of a single machine (several at a time need a
-network and IPC namespace each): ``PYTHONPATH=benchmarks python -m validation.closed_loop_linuxcnc SEED FOLDER``.
+``python benchmarks/validate.py closed_loop_linuxcnc --cache FOLDER``; for a single machine (several at a time need
+separate network and IPC namespaces): ``PYTHONPATH=benchmarks python -m validation.closed_loop_linuxcnc SEED FOLDER``.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from validation.closed_loop import VARIATION, individual
 TITLE = "Closed loop on LinuxCNC"
 SEEDS = 10
 DEFAULT = False
-"""Takes hours of real time, and needs LinuxCNC: only where it is named."""
+"""It takes hours of real time and needs LinuxCNC, so that it runs only if it is named."""
 FIRST = 100
 """Seed of the first machine."""
 INTERVAL = 600.0
 """From one cycle to the next, simulated s."""
 CYCLES = {"training": 16, "compensated": 13}
 WARM_UPS = (2, 3)
-"""Those that are compensated."""
+"""Those with compensation."""
 MODEL = Settings(variant="lagged", lags=(), most_sensors=2)
-"""Present temperatures alone: simulated minutes pass at once, and the compensation would take them for seconds."""
+"""Only present temperatures: simulated minutes are skipped, and the compensation would assume seconds."""
 BALLS = (0, 2, 3)
 ROUTES = {"feedback": "linuxcnc_feedback", "external": "linuxcnc_offset"}
 
 
 class Keeper:
-    """Keeps the world of a machine between two runs."""
+    """Reference to the world of a machine between two runs."""
 
     def close(self) -> None:
         """Do nothing."""
@@ -58,16 +58,16 @@ def section(seeds: int, cache: Path | None = None) -> Iterator[str]:
     folder = cache or Path(tempfile.mkdtemp(prefix="closed-loop-"))
     yield (
         f"{seeds} virtual C-frame machines, varied as above (up to {VARIATION:.0%}), under the real LinuxCNC on "
-        "simulated joints. Each touch is a motion of LinuxCNC in real time; between two cycles "
-        f"{INTERVAL / 60:g} simulated minutes pass at once, and the slew limit is therefore 20 um/s. A first warm-up "
-        f"of {CYCLES['training']} cycles at 15000, then 5000 /min is probed (3 balls, 4 touches each) and a model "
-        "fitted to it: present temperatures, of at most 2 sensors. In the second and the third warm-up, each from "
-        f"the cold state, with random speeds and {CYCLES['compensated']} cycles, the code of `errormotion compensate "
-        "run` reads the thermometers in Modbus and writes to LinuxCNC: in the feedback path, or as external offsets. "
+        f"simulated joints. Each touch is a motion of LinuxCNC in real time; between two cycles {INTERVAL / 60:g} "
+        "simulated minutes are skipped, and the slew limit is therefore 20 um/s. A first warm-up of "
+        f"{CYCLES['training']} cycles at 15000, then 5000 /min is probed (3 balls, 4 touches each), and a model is "
+        "fitted to it: present temperatures of at most 2 sensors. In the second and the third warm-up, each from the "
+        f"cold state, with random speeds and {CYCLES['compensated']} cycles, the code of `errormotion compensate run` "
+        "reads the thermometers by Modbus and writes to LinuxCNC: in the feedback path, or as external offsets. "
         "`without`: root mean square of the true displacement (EX, EY, EZ together) of that warm-up, without "
-        "compensation, at the times of the cycles after the cold one; `with`: the same as LinuxCNC probed it with the "
-        "compensation, the scatter of the probe (0.4 um a touch) included. `following`: share of the decisions that "
-        "move the offset; it is held while the machine probes, and here probing takes most of the real time."
+        "compensation, at the times of the cycles after the cold one; `with`: the same as probed by LinuxCNC with "
+        "the compensation, including the scatter of the probe (0.4 um in each touch). `following`: share of the "
+        "decisions that change the offset; it is held while the machine probes, which takes most of the real time here."
     )
     yield from ("", "| machine | route | sensors | warm-up | without/um | with/um | remaining | following |")
     yield "|---|---|---|---|---|---|---|---|"

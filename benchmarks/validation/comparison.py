@@ -19,4 +19,4 @@ def section(seeds: int, workers: int = 1, cache: Path | None = None) -> Iterator
     yield from ("### Volumes and axes that agree", "", *volumes.section(seeds, pool), "")
     yield from ("### Repeats", "", *components.section(seeds, pool), "")
     yield from ("### Planted mistakes", "", *planted.section(max(seeds // 2, 1), pool), "")
-    yield from ("### Instants that were left out", "", *left_out.section(max(seeds // 4, 1), pool))
+    yield from ("### Omitted instants", "", *left_out.section(max(seeds // 4, 1), pool))

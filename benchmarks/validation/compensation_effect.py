@@ -14,7 +14,7 @@ SEEDS = 1000
 
 
 class Case(NamedTuple):
-    """What is measured, um: errors before, share that remains, and the standard uncertainties."""
+    """A case, um: errors before, remaining share, and the standard uncertainties."""
 
     points: int
     freedoms: int
@@ -41,12 +41,13 @@ def section(seeds: int) -> Iterator[str]:
     """Yield the lines of the section."""
     yield (
         f"{seeds} pairs of records of one known truth each: a warm-up, and a residual of another shape, `left` as a "
-        "share of its size. Both have white noise, a drift of the instrument of their own that grows linearly, a "
-        "reference state that is as noisy as every value, and a scale and a thermometer that both share (`shared`, as "
-        "a share of the error). Share of the 95 % intervals of the ratio that hold the true one, of those too high and "
-        "too low, and of the intervals of the magnitude after; the median width of the former. The standard error of a "
-        f"share of 95 % is {100 * np.sqrt(0.05 * 0.95 / seeds):.1f}%. Where nothing is left the lower end is 0, and "
-        "97.5 % are to be expected; intervals are wide by intention where a drift could have hidden a residual."
+        "share of its size. Both have white noise, an independent linear drift of the instrument, a reference state "
+        "with the same noise as each value, and a common scale and thermometer (`shared`, as a share of the error). "
+        "Share of the 95 % intervals of the ratio that contain the true ratio (`held`), that are too high and too "
+        "low, and the same for the intervals of the magnitude after compensation; the median width of the intervals "
+        f"of the ratio. The standard error of a share of 95 % is {100 * np.sqrt(0.05 * 0.95 / seeds):.1f}%. Without a "
+        "residual the lower end is 0, and 97.5 % are expected; intervals are intentionally wide if a drift could "
+        "have hidden a residual."
     )
     yield from (
         "",

@@ -1,4 +1,4 @@
-"""Corrections of commands from noisy measurements of virtual machines, against the errors that truly remain."""
+"""Corrections of commands from noisy measurements of virtual machines, compared with the true remaining errors."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ NOISE = 0.5e-6
 TURN_NOISE = 1e-6
 PLACES = 40
 TOOL = np.array([0.03, -0.02, -0.15])
-"""Functional point, m: another one than that of the measurement."""
+"""Functional point, m, which differs from that of the measurement."""
 
 
 def section(seeds: int) -> Iterator[str]:
     """Yield the lines of the section."""
     yield (
         f"{seeds} virtual machines of each kind, each measured once with {1e6 * NOISE:g} um and {1e6 * TURN_NOISE:g} "
-        f"urad of noise: the volume on a grid of 7 x 7 x 7 places, and at 400 places anywhere. The correction of "
-        f"{PLACES} commands inside is applied for a tool that is 0.15 m longer, and the true displacement of the tool "
-        "is computed by multiplied poses. `remaining`: RMS of its components; `stated`: RMS of their standard "
-        "uncertainties; `held`: share of components within their 95 % interval; `chi2`: mean of the squared remaining "
-        "displacement over its covariance, 3 where the covariance is right and less where it is too large. What the "
-        "interpolation of a grid adds is that of a Wiener process, up to twice the variance that smooth errors need."
+        "urad of noise: the volume on a grid of 7 x 7 x 7 positions, and at 400 random positions. The correction of "
+        f"{PLACES} commands in the volume is applied for a tool that is 0.15 m longer, and the true displacement of "
+        "the tool is computed by multiplication of poses. `remaining`: RMS of its components; `stated`: RMS of their "
+        "standard uncertainties; `held`: share of components within their 95 % interval; `chi2`: mean of the squared "
+        "remaining displacement over its covariance, 3 for a correct covariance and less for one that is too large. "
+        "The interpolation of a grid adds the variance of a Wiener process, up to twice the variance needed for "
+        "smooth errors."
     )
     yield from (
         "",

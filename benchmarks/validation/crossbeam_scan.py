@@ -1,4 +1,4 @@
-"""Crossbeam scan: whole virtual campaigns, from the profiler's pose to the curves, each of a machine of its own."""
+"""Crossbeam scan: complete virtual campaigns with different machines, from the pose of the profiler to the curves."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from errormotion.twin.sensors.profiler import Disturbances, Profiler
 TITLE = "Crossbeam scan"
 SEEDS = 150
 REGISTRATION_SEEDS = 2
-"""Registrations by themselves for each campaign."""
+"""Single registrations for each campaign."""
 Z95 = 1.959964
 
 TIMES = np.array([0.0, 1800.0, 4200.0, 9000.0])
@@ -35,14 +35,14 @@ POINTS, PITCH, LINES, FEED = 800, 25e-6, 400, 70e-6
 FINE_POINTS, FINE_PITCH = 1600, 12.5e-6
 LEVER_SIGMA = 1e-3
 TOOL = np.add(LEVER, [0.0, 0.0, LIFT])
-"""Where a profiler hangs by its drawing, from the carriage, m."""
+"""Nominal position of the profiler relative to the carriage, m."""
 STRAINS = ("free", "guided")
 REGISTRATIONS = (
     ("White noise, six freedoms", Disturbances.white(), False),
     ("White noise, drift along the feed besides", Disturbances.white(), True),
     ("All disturbances, drift along the feed besides", Disturbances(), True),
 )
-"""Name, what is wrong with the profiler, and whether the drift along the feed is a parameter."""
+"""Name, disturbances of the profiler, and whether the drift along the feed is a parameter."""
 METHOD = CrossbeamScan()
 
 Seed = dict[str, np.ndarray]
@@ -52,13 +52,13 @@ def section(seeds: int) -> Iterator[str]:
     """Yield the lines of the section."""
     campaigns = gathered(campaign, seeds)
     yield from (
-        f"{seeds} virtual gantries. Each has its profiler's pose found from two simulated scans of a pocket, a lever "
-        f"drawn {LEVER_SIGMA * 1e3:g} mm (k = 1) off the stated one, and {PLACES.size} artefacts scanned cold and "
-        f"{TIMES.size - 1} times warm, {POINTS} points {PITCH * 1e6:g} um apart by {LINES} lines {FEED * 1e6:g} um "
-        "apart, with all that is wrong with the virtual profiler: noise, jitter of the lines along both directions, "
-        "speckle, stray light, outliers and gaps. The carriage turns along each scan as its axis does. "
-        "The results of one gantry share pose, lever and cold scans, so every interval behind a coverage (+-, 95 %) "
-        "is that of the mean over gantries.",
+        f"{seeds} virtual gantries. For each, the pose of the profiler is found from two simulated scans of a pocket, "
+        f"the lever is drawn with {LEVER_SIGMA * 1e3:g} mm (k = 1) about the stated one, and {PLACES.size} artefacts "
+        f"are scanned cold and {TIMES.size - 1} times warm, {POINTS} points {PITCH * 1e6:g} um apart by {LINES} lines "
+        f"{FEED * 1e6:g} um apart, with all disturbances of the virtual profiler: noise, jitter of the lines along "
+        "both directions, speckle, stray light, outliers and gaps. The carriage rotates along each scan with the "
+        "errors of its axis. The results of one gantry share pose, lever and cold scans, so that each interval after "
+        "a coverage (+-, 95 %) is that of the mean over gantries.",
         "",
     )
     for strain in STRAINS:
@@ -69,7 +69,7 @@ def section(seeds: int) -> Iterator[str]:
 
 
 def gathered(work: Callable[[int], Seed], seeds: int) -> Seed:
-    """Return the results of all seeds, stacked, computed in as many processes as there are processors."""
+    """Return the stacked results of all seeds, computed with one process for each processor."""
     os.environ |= dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
@@ -81,7 +81,7 @@ def gathered(work: Callable[[int], Seed], seeds: int) -> Seed:
 
 
 def campaign(seed: int) -> Seed:
-    """Return how far a campaign is off and what it says of that: pose, errors, errors at the tool, curves."""
+    """Return deviations of a campaign and their stated covariance: pose, errors, errors at the tool, curves."""
     machine = VirtualMachine("gantry", seed=seed)
     beam = machine.crossbeam
     posed = METHOD.identify(simulation.raw_pocket(machine, seed=10_000 + seed), Settings(procedure="profiler_pose"))
@@ -112,9 +112,9 @@ def campaign(seed: int) -> Seed:
 
 
 def registration(seed: int) -> Seed:
-    """Return errors of three registrations at the real pitch of the points, and what they and the bound say of them.
+    """Return errors of three registrations at the real pitch of the points, their stated covariance and the bound.
 
-    White noise and the six freedoms, white noise and the drift along the feed besides, all disturbances and both.
+    White noise with six freedoms, white noise with drift along the feed, and all disturbances with drift.
     """
     rng = np.random.default_rng([seed, 3])
     artefact, y = swept(), (np.arange(LINES) - (LINES - 1) / 2) * FEED
@@ -165,13 +165,13 @@ def errors_table(found: Seed, strain: str) -> Iterable[str]:
     yield ""
     yield (
         f"All six together, NEES/6: {mean_of(nees(found[strain], found[f'{strain}_covariance']))} (1 is right). "
-        f"Scans without a result, or left out because the artefact was held to have moved: {lost:.2%}."
+        f"Scans without a result, or omitted because a motion of the artefact was assumed: {lost:.2%}."
     )
 
 
 def curves_table(found: Seed) -> Iterable[str]:
     """Return the coverage of the smooth curves, point by point."""
-    yield "Point by point along the curves; a curve over position knows of the error only where the artefacts stand."
+    yield "Point by point along the curves; data for a curve over position exist only at the artefacts."
     yield ""
     yield "| error | over position, free | guided | over time, free | guided |"
     yield "|---|---|---|---|---|"
@@ -185,13 +185,13 @@ def curves_table(found: Seed) -> Iterable[str]:
 
 
 def pose_table(found: Seed) -> Iterable[str]:
-    """Return coverage and efficiency of the profiler's pose."""
+    """Return coverage and efficiency of the pose of the profiler."""
     expected = METHOD.plan(Settings(procedure="profiler_pose", profiler_pose=PoseSettings(dz=LIFT)))
     bounds = np.sqrt(np.diagonal(expected["covariance"].values[0]))[[3, 4, 5, 0, 1, 2]]
     error, u = found["pose"], np.sqrt(np.diagonal(found["pose_covariance"], axis1=-2, axis2=-1))
     yield (
-        "Two scans of a circular pocket, 16 mm apart in height. The bound is that of a plan: an edge that scatters by "
-        f"{Layout().edge * 1e6:g} um in each line."
+        "Two scans of a circular pocket, 16 mm apart in height. The bound is that of the plan, with a scatter of the "
+        f"edge of {Layout().edge * 1e6:g} um in each line."
     )
     yield ""
     yield "| parameter | coverage of 95 % intervals | spread/stated | bias/stated | stated (k = 1) | spread/bound |"
@@ -207,11 +207,11 @@ def pose_table(found: Seed) -> Iterable[str]:
 
 
 def registration_table(found: Seed) -> Iterable[str]:
-    """Return efficiency and coverage of the registration by itself."""
+    """Return efficiency and coverage of single registrations."""
     yield (
         f"{len(found[REGISTRATIONS[0][0]])} pairs of scans of {FINE_POINTS} points {FINE_PITCH * 1e6:g} um apart by "
-        f"{LINES} lines, moved by 20 um and 20 urad (k = 1). The bound is that of white noise in every point of both "
-        "scans. Line jitter is beyond it."
+        f"{LINES} lines, moved by 20 um and 20 urad (k = 1). The bound is that of white noise in all points of both "
+        "scans, without line jitter."
     )
     for name, wrong, drift in REGISTRATIONS:
         n = 9 if drift else 6

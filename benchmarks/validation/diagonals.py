@@ -20,12 +20,12 @@ def section(seeds: int) -> Iterator[str]:
     """Yield the lines of the section."""
     yield (
         f"{seeds} virtual machines in each row, each with the diagonals {', '.join(NAMES)}, 5 targets, runs in both "
-        "directions. `deviations`, `E`, `squareness`: share of the 95 % intervals that hold the truth of the twin: the "
-        "error of the position along the diagonal, the bidirectional error, and the angle of two axes from each pair "
-        "of face diagonals. `spread`: standard deviation of the error of squareness in its standard uncertainty, which "
-        "has a factor for few runs, so that the intervals hold with few as well; it is 1 with many. `mean`: of the "
-        "error of squareness in its standard uncertainty; its own standard deviation is `spread` divided by the "
-        "root of their number."
+        "directions. `deviations`, `E`, `squareness`: share of the 95 % intervals that contain the truth of the "
+        "virtual machine: the error of the position along the diagonal, the bidirectional error, and the angle of "
+        "two axes from each pair of face diagonals. `spread`: standard deviation of the error of squareness in its "
+        "standard uncertainty, which includes a factor for few runs, so that the coverage is also correct with few "
+        "runs; it is 1 with many. `mean`: of the error of squareness in its standard uncertainty; its own standard "
+        "deviation is `spread` divided by the root of their number."
     )
     yield from (
         "",

@@ -47,8 +47,8 @@ def table(seeds: int, behaviour: Behaviour) -> list[str]:
     coverage = 100.0 * np.mean(held)
     spread = np.sqrt(np.mean(ratio))
     lines = [
-        f"Error over the position: 95 % intervals hold the truth in {coverage:.1f}%; spread over the bound of a known "
-        f"model {spread:.3f}. Figures, each against that of an infinite number of runs:",
+        f"Error over the position: coverage of the 95 % intervals {coverage:.1f}%; spread over the bound of a known "
+        f"model {spread:.3f}. Figures, compared with those of an infinite number of runs:",
         "",
         "| figure | mean excess | mean excess stated | left, in u | within 2 u | within U as printed |",
         "|---|---|---|---|---|---|",
@@ -65,7 +65,7 @@ def table(seeds: int, behaviour: Behaviour) -> list[str]:
 
 
 def bound(behaviour: Behaviour, P: np.ndarray) -> np.ndarray:
-    """Return the Cramer-Rao bound of a mean bidirectional deviation, instrument and expansion included, m^2."""
+    """Return the Cramer-Rao bound of a mean bidirectional deviation, including instrument and expansion, m^2."""
     z = (P - P.mean()) / (np.ptp(P) / 2.0)
     runs, lever = SETTINGS.runs, P - P[0]
     of_runs = (behaviour.noise**2 / 2.0 + behaviour.offset**2 + (behaviour.slope * z) ** 2) / runs

@@ -1,4 +1,4 @@
-"""Linear uncertainties of all methods beside the Monte Carlo method, JCGM 101."""
+"""Linear uncertainties of all methods compared with the Monte Carlo method, JCGM 101."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from errormotion.testing.run import subjects_of
 TITLE = "Linear uncertainties and Monte Carlo"
 SEEDS = 2000
 LARGE = 10**6
-"""Bytes of raw data above which an identification takes so long that a fifth of the trials are made."""
+"""Bytes of raw data above which only a fifth of the trials are run, because an identification takes long."""
 
 
 def section(seeds: int, workers: int = 1) -> Iterator[str]:
@@ -25,13 +25,13 @@ def section(seeds: int, workers: int = 1) -> Iterator[str]:
     logging.getLogger("errormotion").setLevel(logging.ERROR)
     yield (
         f"Raw data of the conformance kit for each method, evaluated by {seeds} trials (of large data {seeds // 5}) "
-        "through the method's own identification with all sources drawn anew (JCGM 101); see "
-        "[Monte Carlo](explanation/monte-carlo.md). `u ratio`: standard uncertainty of the trials over the linear one, "
-        "root mean square over the places; with "
-        f"{seeds} trials each place varies by {1 / np.sqrt(2 * seeds):.1%}. `difference`: largest distance of "
-        "an end of the linear 95 % interval from that of the trials, in standard uncertainties; an end is known to "
-        f"about {2.67 / np.sqrt(seeds):.2f} of them. `verdict`: of clause 8 with one meaningful digit; the procedure "
-        "goes on until it is clear (`--monte-carlo auto`), which this table does not."
+        "through the identification of the method with random draws of all sources (JCGM 101); see [Monte "
+        "Carlo](explanation/monte-carlo.md). `u ratio`: standard uncertainty of the trials over the linear one, root "
+        f"mean square over the points; with {seeds} trials each point varies by {1 / np.sqrt(2 * seeds):.1%}. "
+        "`difference`: largest distance of an end of the linear 95 % interval from that of the trials, in standard "
+        f"uncertainties; an end is known to about {2.67 / np.sqrt(seeds):.2f} of them. `verdict`: of clause 8 with "
+        "one meaningful digit; the procedure continues until it is clear (`--monte-carlo auto`), in contrast to this "
+        "table."
     )
     yield from ("", "| method | trials | freedom | u ratio | difference | verdict |", "|---|---|---|---|---|---|")
     for plugin in plugins.available("methods"):

@@ -33,7 +33,7 @@ def section(seeds: int) -> Iterator[str]:
 
 
 def of_the_datum(place: np.ndarray, error: np.ndarray, everywhere: np.ndarray) -> np.ndarray:
-    """Return the motion of the whole that fits errors (m, 3) best, at other places (k, 3)."""
+    """Return the rigid motion that fits errors (m, 3) best, at other positions (k, 3)."""
     centre = place.mean(axis=0)
     motion = np.linalg.lstsq(motions(place, centre).reshape(-1, 6), error.ravel())[0]
     return motions(everywhere, centre) @ motion
@@ -62,7 +62,7 @@ def honesty(seeds: int) -> list[str]:
         station = simulation.stations(machine)
         true_station = station - of_the_datum(place, place - q - REFERENCE, station)
         least = bound(place, station, noise=NOISE)
-        # The scale is no noise: the bound has it beside, one draw for all.
+        # The scale is one draw for all, added to the bound of the noise.
         stretch = SCALE * (place - place.mean(axis=0))
         spread.append(left / np.sqrt(np.einsum("tii->ti", least.target_covariance) + stretch**2))
         off = errors["station_place"].values - true_station
@@ -74,12 +74,12 @@ def honesty(seeds: int) -> list[str]:
     held = [np.mean(np.abs(part)[np.isfinite(part)] <= Z95) for part in (z, station_z)]
     least_u = np.sqrt(np.mean(np.einsum("tii->ti", least.target_covariance), axis=0)) * 1e6
     return [
-        f"{seeds} virtual machines, each with its own errors and tracker: {np.prod(COUNT)} targets, four places of "
-        f"one tracker in turn, {NOISE * 1e6:.2g} um noise of a reading, dead paths free, lengths wrong by "
-        f"{SCALE * 1e6:.1g} um/m (one sigma). The bound of a target's coordinates is "
-        f"{least_u[0]:.2f}, {least_u[1]:.2f} and {least_u[2]:.2f} um in the mean over the grid (noise alone). "
-        f"Mean squared error of a target over its stated covariance: {np.mean(chi2):.3f} per freedom. "
-        f"{lost} of {seeds * np.prod(COUNT)} targets were given up: a good reading looked wrong.",
+        f"{seeds} virtual machines, each with its own errors and tracker: {np.prod(COUNT)} targets, four successive "
+        f"positions of one tracker, {NOISE * 1e6:.2g} um noise of a reading, free dead paths, an error of lengths of "
+        f"{SCALE * 1e6:.1g} um/m (one sigma). The bound of a target's coordinates is {least_u[0]:.2f}, "
+        f"{least_u[1]:.2f} and {least_u[2]:.2f} um in the mean over the grid (noise alone). Mean squared error of a "
+        f"target over its stated covariance: {np.mean(chi2):.3f} per freedom. {lost} of {seeds * np.prod(COUNT)} "
+        "targets were excluded because a correct reading was rejected.",
         "",
         "| | spread/bound | coverage of 95 % intervals |",
         "|---|---|---|",
@@ -118,16 +118,16 @@ def axes(seeds: int) -> list[str]:
             f"{np.mean(inside):.1%} | {size[0]:.2f} um | {size[1]:.2f} um |"
         )
     return [
-        f"{seeds} machines each. Curves are compared with the truth less its mean, and straightness less its slope, at "
-        "41 positions; the volume at 150 places between the targets. The prior of the curves is their own, found from "
-        "the data; the machine's waves are not drawn from it, so that intervals need not hold exactly 95 %.",
+        f"{seeds} machines each. Curves are compared with the truth minus its mean, and straightness minus its slope, "
+        "at 41 positions; the volume at 150 positions between the targets. The prior of the curves is estimated from "
+        "the data; the waves of the machine are not drawn from it, so that the coverage need not be exactly 95 %.",
         "",
         *rows,
     ]
 
 
 def curves(machine: VirtualMachine, errors) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield name, value, standard uncertainty and truth of every error motion that is seen."""
+    """Yield name, value, standard uncertainty and truth of every measured error motion."""
     x, w = leggauss(40)
     for axis in "XYZ":
         q = errors[f"{axis}_position"].values
@@ -144,6 +144,6 @@ def curves(machine: VirtualMachine, errors) -> Iterator[tuple[str, np.ndarray, n
 
 
 def as_seen(machine: VirtualMachine, name: str, k: int, axis: str, at: np.ndarray) -> np.ndarray:
-    """Return an error motion as one reflector sees it: that of a table whose rotation it does not tell holds that."""
+    """Return an error motion as measured with one reflector, including unmeasured rotations of a table."""
     twist = move(machine.geometry.motions[axis](at), REFERENCE)
     return twist[:, k] - (at * twist[:, 5] if name == "EXY" and "-Y-bed" in machine.chain else 0.0)

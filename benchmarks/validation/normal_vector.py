@@ -1,4 +1,4 @@
-"""Balls touched by the machine itself: spread against the bound, coverage, what the normals of planes lose."""
+"""Balls touched by the machine: spread against the bound, coverage, loss of the normals of planes."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ def section(seeds: int) -> Iterator[str]:
     yield (
         f"{seeds} virtual machines of each kind, {DRAWS} draws of the noise on each: {BALLS} balls, {TOUCHES} touches "
         f"of each with 0.25 um noise, in {len(BEGINS)} cycles of {CYCLE:g} s, one every {BEGINS[1] / 60:g} minutes; "
-        f"the spindle turns at {SPEED:g} /min from the end of the cold cycle on. Pre-travel with three lobes, form of "
-        "the balls and geometric errors of the machine are in the touches. Errors are relative to the cold cycle, at "
-        "the middle of the balls; their coverage is the mean over the cycles. The ratio of spread to bound has a "
-        f"standard deviation of about {deviation:.1%} (half of each variance is "
-        " the cold cycle's, one draw for all others)."
+        f"the spindle turns at {SPEED:g} /min from the end of the cold cycle on. The touches include pre-travel with "
+        "three lobes, the form of the balls and geometric errors of the machine. Errors are relative to the cold "
+        "cycle, at the centre of the balls; their coverage is the mean over the cycles. The ratio of spread to bound "
+        f"has a standard deviation of about {deviation:.1%} (half of each variance is that of the cold cycle, one "
+        "draw for all others)."
     )
     for kind, (rows, text) in found.items():
         yield from (
             "",
-            f"### {'A gantry: all axes carry the tool' if kind == 'gantry' else 'A C-frame: X and Y carry the table'}",
+            f"### {'A gantry: all axes move the tool' if kind == 'gantry' else 'A C-frame: X and Y move the table'}",
             "",
             text,
             "",
@@ -48,7 +48,7 @@ def section(seeds: int) -> Iterator[str]:
             "|---|---|---|---|---|---|---|",
             *rows,
         )
-    yield from ("", "### A C-frame, taken for a gantry", "", *wrong(min(seeds, 20)))
+    yield from ("", "### A C-frame, evaluated as a gantry", "", *wrong(min(seeds, 20)))
 
 
 def probed(kind: str, seed: int, draw: int = 0):
@@ -118,13 +118,13 @@ def honesty(kind: str, seeds: int) -> tuple[list[str], str]:
         )
     size = ", ".join(f"{name} {np.mean(largest, axis=0)[k] * scale[k]:.1f} {unit[k]}" for k, name in enumerate(DOF))
     return rows, (
-        f"Mean size of the true error at the end: {size}. In {alarms} of {seeds * DRAWS} records a touch that was "
-        "right was taken for a wrong one, or a ball for moved."
+        f"Mean size of the true error at the end: {size}. In {alarms} of {seeds * DRAWS} records a correct touch was "
+        "rejected, or a ball was reported as moved."
     )
 
 
 def wrong(seeds: int) -> list[str]:
-    """What a rigid motion of the balls makes of a machine whose table moves."""
+    """Result of the assumption of a rigid motion of the balls on a machine whose table moves."""
     ratio, off_by, named = [], [], 0
     for seed in range(seeds):
         machine, raw = probed("cframe", seed)
@@ -137,7 +137,7 @@ def wrong(seeds: int) -> list[str]:
     turn = np.degrees(size[3:]) * 3600
     return [
         f"The same touches, with `tool_axes` set to XYZ, on {seeds} machines: the touches then scatter "
-        f"{np.mean(ratio):.2f} times as much as stated in the mean, of which {named} of {seeds} results warn, and the "
-        f"errors at the end are off by (rms) {size[0] * 1e6:.2f}, {size[1] * 1e6:.2f} and {size[2] * 1e6:.2f} um, "
+        f"{np.mean(ratio):.2f} times as much as stated on average; {named} of {seeds} results contain a warning, and "
+        f"the errors at the end deviate by (rms) {size[0] * 1e6:.2f}, {size[1] * 1e6:.2f} and {size[2] * 1e6:.2f} um, "
         f"{turn[0]:.2f}, {turn[1]:.2f} and {turn[2]:.2f} arcsec.",
     ]

@@ -22,12 +22,12 @@ def section(seeds: int) -> Iterator[str]:
     yield (
         f"{seeds} virtual histories in each row: runs at random times in three years, a trend of {SLOPE * 1e6:g} um a "
         f"year, standard uncertainties of {U[0] * 1e6:g} um to {U[1] * 1e6:g} um from run to run, {BAR * 1e6:g} um of "
-        "a bar that all runs share, and a reproducibility of the machine that no run states. `false steps`, `false "
-        "departures`: share of histories in which one is found though there is none. `trend`: share of its 95 % "
-        "intervals that hold the true trend. `outside`: share of the values outside of their limits, without a trend; "
-        "0.27 % where the reproducibility is known. In as many histories more there is a step of "
+        "a bar that all runs share, and a reproducibility of the machine that is not stated in the runs. `false "
+        "steps`, `false departures`: share of histories in which one is found although there is none. `trend`: share "
+        "of its 95 % intervals that contain the true trend. `outside`: share of the values outside of their limits, "
+        "without a trend; 0.27 % with known reproducibility. The same number of further histories has a step of "
         f"{SIZE:g} standard deviations of a value, in the middle. `found`: share in which a step is found; `time`, "
-        "`size`: share of these whose 95 % intervals hold the true time and size."
+        "`size`: share of these whose 95 % intervals contain the true time and size."
     )
     yield from (
         "",

@@ -1,4 +1,4 @@
-"""Spindle drift: coverage of the drift's intervals, and the beam detection against its bound."""
+"""Spindle drift: coverage of the intervals of the drift, and the beam detection against its bound."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def section(seeds: int) -> Iterator[str]:
 
 
 def drift(seeds: int) -> list[str]:
-    """Coverage of the drift's intervals, each seed with a beam detection of its own."""
+    """Coverage of the intervals of the drift, with another beam detection for each seed."""
     method = SpindleDrift()
     miss, sigma = [], []
     for seed in range(seeds):
@@ -58,17 +58,18 @@ def drift(seeds: int) -> list[str]:
             f"{np.mean(sigma, axis=(0, 1))[k] * scale:.1f} {unit} |"
         )
     return [
-        f"{seeds} virtual machines, {TIMES.size - 1} instants of a warm-up each; every machine with its own beam "
-        "detection, and with a frame whose true expansion differs from its drawing. The instants of one machine share "
-        f"their reference state, beams and frame, so that the coverage has a standard deviation of up to {chance:.1%}. "
-        "The sensors have been on for four hours: 0.5 nm of their warm-up is left, which no uncertainty holds.",
+        f"{seeds} virtual machines, {TIMES.size - 1} instants of a warm-up each; each machine with its own beam "
+        "detection, and with a frame whose true expansion differs from nominal. The instants of one machine share "
+        "their reference state, beams and frame, so that the coverage has a standard deviation of up to "
+        f"{chance:.1%}. The sensors have been on for four hours: 0.5 nm of their warm-up remains, which is not part "
+        "of the uncertainty.",
         "",
         *rows,
     ]
 
 
 def beams(seeds: int) -> list[str]:
-    """Spread of the beam detection against the Cramer-Rao bound, the paper's construction beside it."""
+    """Spread of the beam detection and of the construction of the paper, against the Cramer-Rao bound."""
     rng = np.random.default_rng(0)
     radius, noise = 5e-3, 0.5e-6
     u0, p0 = np.array([-1.0, 0, 0]), np.array([6e-3, 0, 0.01])
@@ -102,13 +103,13 @@ def beams(seeds: int) -> list[str]:
     for k in (0, 1, 2, 4, 5):
         unit, scale = units[k]
         rows.append(
-            f"| {names[k]} | {np.mean(bounds, axis=0)[k] * scale:.3f} {unit} | "
-            f"{ratio[k]:.3f} | {construction[k]:.3f} | "
-            f"{np.mean(np.abs(stated) <= Z95, axis=0)[k]:.1%} |"
+            f"| {names[k]} | {np.mean(bounds, axis=0)[k] * scale:.3f} {unit} | {ratio[k]:.3f} | {construction[k]:.3f} "
+            f"| {np.mean(np.abs(stated) <= Z95, axis=0)[k]:.1%} |"
         )
     return [
-        f"{seeds} seeds; six scans of 101 steps over a sphere of 5 mm radius, {noise * 1e6:g} um noise a step, beams "
-        f"0.1 mm and 5 mrad off. The ratio of spreads has a standard deviation of {1 / np.sqrt(2 * seeds):.1%}.",
+        f"{seeds} seeds; six scans of 101 steps over a sphere of 5 mm radius, {noise * 1e6:g} um noise of a step, and "
+        "beams with deviations of 0.1 mm and 5 mrad. The ratio of spreads has a standard deviation of "
+        f"{1 / np.sqrt(2 * seeds):.1%}.",
         "",
         *rows,
     ]

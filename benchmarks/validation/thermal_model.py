@@ -17,7 +17,7 @@ TITLE = "Thermal model"
 SEEDS = 12
 #: three hours, a probing cycle every ten minutes, s
 BEGINS, CYCLE = 600.0 * np.arange(19), 120.0
-#: spindle speeds (1/min) from times on (min): two warm-ups to learn from, one to be judged by
+#: spindle speeds (1/min) from times on (min): two warm-ups for the fit, one for the assessment
 PROFILES = (
     ((2, 6000), (60, 12000), (120, 0)),
     ((2, 15000), (40, 3000), (100, 9000)),
@@ -31,14 +31,14 @@ def section(seeds: int) -> Iterator[str]:
     logging.getLogger("errormotion").setLevel(logging.ERROR)
     said = ", then ".join(", ".join(f"{speed} /min from {at} min" for at, speed in profile) for profile in PROFILES)
     yield (
-        f"{seeds} virtual machines of each kind warm up three times for {BEGINS[-1] / 3600:g} h, without the control's "
-        f"own compensation, and are probed every {BEGINS[1] / 60:g} minutes ({said}). A thermal model, all of its "
-        "choices left to cross-validation, learns from the first two and predicts the third, which it has not seen. "
-        "`removed`: share of the RMS that the prediction takes away, of the measured errors and of the true ones; "
-        "`held`: share of times at which measured minus predicted, or true minus predicted, lies inside its 95 % "
-        "interval. Of the displacement the RMS is that of its length at the middle of the balls. The misfit of a model "
-        "is one draw for a whole warm-up, so `held` varies from machine to machine; the lowest machine is given beside "
-        "the mean."
+        f"{seeds} virtual machines of each kind warm up three times for {BEGINS[-1] / 3600:g} h, without the "
+        f"compensation of the control, and are probed every {BEGINS[1] / 60:g} minutes ({said}). A thermal model, "
+        "selected by cross-validation, is fitted to the first two and predicts the third. `removed`: share of the "
+        "RMS that the prediction removes, of the measured errors and of the true ones; `held`: share of times at "
+        "which measured minus predicted, or true minus predicted, is within its 95 % interval. For the displacement, "
+        "the RMS is that of its length at the centre of the balls. The misfit of a model is one draw for a whole "
+        "warm-up, so that `held` varies from machine to machine; the lowest value of a machine is stated in addition "
+        "to the mean."
     )
     yield from (
         "",
@@ -55,7 +55,7 @@ def section(seeds: int) -> Iterator[str]:
 
 
 def judged(kind: str, seeds: int) -> tuple[list[str], str]:
-    """Return the rows of one kind of machine, and what the models were made of."""
+    """Return the rows of one kind of machine, and the sensors of the models."""
     method = NormalVector()
     sizes: dict[str, list] = {"displacement": [], "turn": []}
     sensors, variants = Counter(), Counter()
@@ -93,10 +93,10 @@ def judged(kind: str, seeds: int) -> tuple[list[str], str]:
         )
     chosen = ", ".join(f"{name} ({count})" for name, count in sensors.most_common())
     made = ", ".join(f"{name} {count}" for name, count in variants.most_common())
-    return rows, f"Sensors that the models of the {kind} chose (in how many of {seeds}): {chosen}. Variants: {made}."
+    return rows, f"Sensors in the models of the {kind} (number of models of {seeds}): {chosen}. Variants: {made}."
 
 
-#: where the errors are stated, m: in the middle of the balls
+#: functional point, m: the centre of the balls
 POINTS = {
     kind: tuple(np.round(VirtualMachine(kind).balls.nominal[:4].mean(axis=0), 4)) for kind in ("gantry", "cframe")
 }

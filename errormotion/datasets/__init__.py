@@ -1,6 +1,6 @@
-"""What flows between the parts: raw datasets and error datasets, their units and where they come from.
+"""Raw datasets and error datasets: schemas, units, provenance, reading and writing.
 
-Importing this package registers the accessor ``ds.em``.
+The import of this package registers the accessor ``ds.em``.
 """
 
 from errormotion.datasets.provenance import hash_dataset

@@ -1,4 +1,4 @@
-"""Certificates of artefacts and instruments: what makes a source of uncertainty the same draw in two measurements."""
+"""Certificates of artefacts and instruments, by which sources of uncertainty are the same draw in two measurements."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 from errormotion.errors import DatasetError
 
 ATTRIBUTE = "certificates"
-"""Attribute of raw data: JSON object of what was certified, and its certificate."""
+"""Attribute of raw data: JSON object of certified items and their certificates."""
 
 ITEMS = {
     "bar": "the bar in the spindle: radius, roundness",
     "check_bar": "the check bar of a beam",
-    "sphere": "the sphere that beams are detected with",
+    "sphere": "the sphere of a beam detection",
     "balls": "the balls on the table: positions, diameters",
     "frame": "the measuring frame: coefficient of expansion",
     "sensor": "the point sensor: gain",
@@ -26,18 +26,18 @@ ITEMS = {
     "barometer": "the barometer",
     "hygrometer": "the hygrometer",
 }
-"""What a certificate may be of."""
+"""Items that can have a certificate."""
 LONGEST = 200
-"""Characters of a certificate's number or hash."""
+"""Largest number of characters of the number or hash of a certificate."""
 
 
 def certificates_of(attrs: Mapping[Any, Any]) -> dict[str, str]:
-    """Return the certificates that the attributes of a dataset state, by item; empty where they state none.
+    """Return the certificates that the attributes of a dataset state, by item.
 
     Raises
     ------
     DatasetError
-        The attribute is no JSON object of known items and texts.
+        The attribute is not a JSON object of known items and texts.
     """
     stated = attrs.get(ATTRIBUTE)
     if stated is None:
@@ -55,7 +55,7 @@ def certificates_of(attrs: Mapping[Any, Any]) -> dict[str, str]:
 
 
 def wrong(certificates: Mapping[Any, Any]) -> list[str]:
-    """Return the keys of what is no item with a certificate."""
+    """Return the keys of entries that are not an item with a certificate."""
     return [
         str(item)
         for item, text in certificates.items()
@@ -64,19 +64,19 @@ def wrong(certificates: Mapping[Any, Any]) -> list[str]:
 
 
 def certified(attrs: Mapping[Any, Any], sources: Mapping[str, tuple[str, str]]) -> dict[str, str]:
-    """Return the identity of sources by their name, for ``source_ids`` of `errormotion.datasets.build_errors`.
+    """Return the identities of sources by name, for ``source_ids`` of `errormotion.datasets.build_errors`.
 
     Parameters
     ----------
     attrs : mapping
         Attributes of the raw dataset.
     sources : mapping of str to tuple of str
-        Name of a source to the item and the certified quantity, such as ``{"bar radius": ("bar", "radius")}``.
+        Item and certified quantity of each source, such as ``{"bar radius": ("bar", "radius")}``.
 
     Returns
     -------
     dict of str to str
-        Only of sources whose item has a certificate. Two measurements with one certificate share the draw.
+        Only of sources whose item has a certificate. Measurements with the same certificate share the draw.
     """
     stated = certificates_of(attrs)
     return {

@@ -1,6 +1,6 @@
-"""Checks that every schema shares: units, magnitudes, attributes, labels.
+"""Checks for all schemas: units, magnitudes, attributes, labels.
 
-Each returns sentences, none if all is well.
+Each returns one sentence for each violation.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ _MISTAKES = {
 }
 
 ROUNDING = 1e-8
-"""Rounding of a covariance relative to its diagonal, after moves over some metres and back."""
+"""Rounding of a covariance relative to its diagonal, after transformations over some metres and back."""
 
 
 def number(value: float) -> str:
-    """Return a number as a person writes it."""
+    """Return a number as text with six digits."""
     return f"{value:.6g}"
 
 
 def magnitude_violations(name: str, variable: xr.Variable, row: Row) -> list[str]:
-    """Return what is wrong with the type, unit and size of a variable's values; looks at a sample of a big one."""
+    """Return violations of type, unit and magnitude of the values of a variable, of a sample if it is large."""
     if variable.dtype.kind not in "fiu":
         return [f"{name}: expected numbers (float64); found {_dtype(variable)}"]
     found = unit_violations(name, variable.attrs, row.unit)
@@ -54,7 +54,7 @@ def _range(row: Row) -> str:
 
 def _guess(value: float, row: Row) -> str:
     mistakes = _MISTAKES.get(row.unit, ())
-    # Where a whole turn is plausible, the value is not in seconds of arc.
+    # If a whole turn is plausible, the value is not in seconds of arc.
     for factor, offset, unit in mistakes[::-1] if row.unit == "rad" and row.high > 1 else mistakes:
         if row.low <= value * factor + offset <= row.high:
             return f"; is it in {unit}?"
@@ -62,7 +62,7 @@ def _guess(value: float, row: Row) -> str:
 
 
 def unit_violations(name: str, attrs: Mapping[Any, Any], unit: str) -> list[str]:
-    """Return a sentence if the attribute ``units`` is there and is not the inside unit."""
+    """Return a sentence if the attribute ``units`` exists and is not the unit of the schema."""
     found = attrs.get("units")
     if found is None or not unit:
         return []
@@ -84,14 +84,14 @@ def unit_violations(name: str, attrs: Mapping[Any, Any], unit: str) -> list[str]
 
 
 def matrix_violations(name: str, matrices: np.ndarray, unknown: np.ndarray) -> list[str]:
-    """Return a sentence if covariances are none.
+    """Return a sentence if matrices are not covariances.
 
     Parameters
     ----------
     name : str
     matrices : ndarray (..., k, k)
     unknown : ndarray of bool (..., k)
-        Where the values are unknown: there, and only there, rows and columns are NaN.
+        Whether the values are unknown; rows and columns must be NaN exactly there.
     """
     if matrices.dtype.kind != "f" or matrices.shape != (*unknown.shape, unknown.shape[-1]):
         return [f"{name}: expected a square matrix of numbers for each place"]
@@ -116,7 +116,7 @@ def matrix_violations(name: str, matrices: np.ndarray, unknown: np.ndarray) -> l
 
 
 def label_violations(ds: xr.Dataset, dim: str, labels: tuple[str, ...], *, ordered: bool = True) -> list[str]:
-    """Return what is wrong with the labels of a dimension: missing, unknown, twice, or in another order."""
+    """Return violations of the labels of a dimension: missing, unknown, repeated, or in another order."""
     if dim not in ds.variables:
         return [f"{dim}: expected a coordinate with the labels {' '.join(labels)}; found none"]
     variable = ds.variables[dim]
@@ -129,7 +129,7 @@ def label_violations(ds: xr.Dataset, dim: str, labels: tuple[str, ...], *, order
     what = f"{dim}: expected {' '.join(labels)}; found {' '.join(found) or 'nothing'}"
     complaints = [
         f"{word} {' '.join(names)}"
-        for word, names in (("missing", missing), ("unknown", unknown), ("twice", twice))
+        for word, names in (("missing", missing), ("unknown", unknown), ("repeated", twice))
         if names
     ]
     if complaints:
@@ -157,7 +157,7 @@ def time_violations(name: str, variable: xr.Variable) -> list[str]:
 
 
 def storable_violations(ds: xr.Dataset) -> list[str]:
-    """Return what a NetCDF file cannot hold: attributes but text, numbers and flat arrays of them, text with NUL."""
+    """Return what a NetCDF file cannot store: attributes except text, numbers, flat arrays of them; text with NUL."""
     owners: list[tuple[str, Mapping[Any, Any]]] = [("", ds.attrs)]
     owners += [(f"{name}: ", variable.attrs) for name, variable in ds.variables.items()]
     found = [

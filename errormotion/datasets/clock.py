@@ -1,10 +1,10 @@
-"""Time across interruptions: how long a record has run, on monotonic clocks.
+"""Duration of records across interruptions, from monotonic clocks.
 
 The wall clock of a computer may be set, by a person or by a time server, while a record runs and while it is
-interrupted. The time since the computer started (suspension included) is not set by anybody, but ends with a restart.
-Every commit of a raw store keeps both, with the identity of the start of the computer (attribute ``clock``). A
-continuation compares them: the duration of the interruption is known where they agree or where the computer was not
-restarted, and unknown where they contradict each other. Every interruption is an entry of the attribute ``joins``.
+interrupted. The time since the start of the computer (including suspension) cannot be set, but ends with a restart.
+Every commit of a raw store stores both, with the identity of the start of the computer (attribute ``clock``). A
+continuation compares them: the duration of the interruption is known if they agree or if the computer was not
+restarted, and unknown if they contradict each other. Every interruption is an entry of the attribute ``joins``.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ ORIGIN = "clock_origin"
 """Attribute of raw data of a virtual machine: its clock at the start of the record, s."""
 
 TOLERANCE = 2.0
-"""Difference of two clocks that is no contradiction, s."""
+"""Largest accepted difference of two clocks, s."""
 DRIFT = 1e-3
-"""The same for each second between two readings."""
+"""The same in addition for each second between two readings, s/s."""
 LONGEST = 30 * 86400.0
-"""Longest interruption that is believed from the wall clock alone, s."""
+"""Longest interruption that is accepted from the wall clock alone, s."""
 
 
 def steady() -> float:
-    """Return a time that is never set, s: it runs through a suspension of the computer, and is never negative."""
+    """Return a time that cannot be set, s; it includes suspensions of the computer, and is never negative."""
     if hasattr(time, "CLOCK_BOOTTIME"):  # Linux
         return time.clock_gettime(time.CLOCK_BOOTTIME)
     return time.monotonic()
@@ -44,7 +44,7 @@ def steady() -> float:
 
 @cache
 def _boot() -> str:
-    """Return the identity of the start of the computer; empty where the system does not state it."""
+    """Return the identity of the start of the computer; empty if the system does not state it."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError):
@@ -66,7 +66,7 @@ class Reading:
     began : float
         Wall clock at the start of the record, s.
     elapsed : float
-        Duration of the record, interruptions of known duration included, s.
+        Duration of the record, including interruptions of known duration, s.
     """
 
     wall: float
@@ -77,15 +77,15 @@ class Reading:
 
 
 def read(began: float = math.nan, elapsed: float = 0.0) -> Reading:
-    """Return the present reading; by default that of a record that begins now."""
+    """Return the present reading; by default that of a record that starts now."""
     wall = time.time()
     return Reading(wall, steady(), _boot(), wall if math.isnan(began) else began, elapsed)
 
 
 def interval(first: Reading, last: Reading) -> tuple[float, str]:
-    """Return the time between two readings, s, and what is wrong with the clocks, if anything.
+    """Return the time between two readings, s, and a contradiction of the clocks, empty if there is none.
 
-    NaN where the clocks contradict each other and the computer was restarted between the readings.
+    NaN if the clocks contradict each other and the computer was restarted between the readings.
     """
     wall, run = last.wall - first.wall, last.steady - first.steady
     if first.boot and first.boot == last.boot and run >= 0:
@@ -104,7 +104,7 @@ def interval(first: Reading, last: Reading) -> tuple[float, str]:
     if wall > LONGEST:
         return math.nan, (
             f"the wall clock states {wall / 86400:.3g} days since the last data; beyond {LONGEST / 86400:.0f} days it "
-            "is taken as wrong, and the duration is unknown"
+            "is assumed to be wrong, and the duration is unknown"
         )
     return max(wall, 0.0), ""
 
@@ -120,9 +120,9 @@ class Join:
     seconds : float or None
         Duration; None if unknown.
     reason : str
-        What is wrong with the clocks; empty if nothing is.
+        The contradiction of the clocks; empty if there is none.
     time : float or None
-        Time of the last sample before it on the time axis of the record, s, where it has one.
+        Time of the last sample before it on the time axis of the record, s, if it has one.
     """
 
     index: int
@@ -181,7 +181,7 @@ def age(done: xr.Dataset) -> float:
 
 
 def restarted(done: xr.Dataset, now: float) -> bool:
-    """Return whether a virtual machine was started anew since an interrupted record was started, by its clock now, s.
+    """Return whether a virtual machine was restarted since the start of a record, from its present clock, s.
 
     True for a record that does not state its attribute ``clock_origin``.
     """
@@ -189,7 +189,7 @@ def restarted(done: xr.Dataset, now: float) -> bool:
 
 
 def _stored(attrs: Mapping[Any, Any]) -> Reading | None:
-    """Return the reading at the last commit; None where there is none, or a damaged one."""
+    """Return the reading at the last commit; None if it is missing or damaged."""
     try:
         found = json.loads(attrs[CLOCK])
         wall, since, began, elapsed = (float(found[name]) for name in ("wall", "steady", "began", "elapsed"))
@@ -202,7 +202,7 @@ def _stored(attrs: Mapping[Any, Any]) -> Reading | None:
 
 
 def joins(attrs: Mapping[Any, Any]) -> list[Join]:
-    """Return the interruptions that raw data state; none where the attribute is damaged."""
+    """Return the interruptions that raw data state; none if the attribute is damaged."""
     try:
         return [Join(**each) for each in json.loads(attrs.get(JOINS, "[]"))]
     except (TypeError, ValueError, RecursionError):
@@ -220,7 +220,7 @@ def notes(attrs: Mapping[Any, Any]) -> list[str]:
 
 
 def noted(errors: xr.Dataset, raw: xr.Dataset) -> xr.Dataset:
-    """Return errors whose notes state every interruption of unknown duration of their raw data, whatever the method."""
+    """Return errors whose notes state every interruption of unknown duration of their raw data."""
     stated = errors.attrs.get("notes", [])
     before = [note for note in ([stated] if isinstance(stated, str) else stated) if note]
     missing = [note for note in notes(raw.attrs) if note not in before]

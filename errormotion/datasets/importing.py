@@ -1,4 +1,4 @@
-"""Import of logs: text with columns becomes a stored raw dataset."""
+"""Import of logs: conversion of texts with columns to raw datasets."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ LogReader = Callable[[Path, Path], xr.Dataset]
 
 
 def import_log(log: str | Path, map_file: str | Path, out: str | Path, *, overwrite: bool = False) -> xr.Dataset:
-    """Turn a log into a raw dataset, and write it.
+    """Convert a log to a raw dataset, and write it.
 
     Parameters
     ----------
     log : str or Path
         Text with columns. Empty cells are NaN, and counted in the attribute ``missing_values`` (JSON).
     map_file : str or Path
-        TOML. Where its key ``schema`` is a raw schema, the map follows `errormotion.datasets.text.log_map.LogMap`;
-        otherwise it is the schema of a map that a method reads.
+        TOML. If its key ``schema`` is a raw schema, the map follows `errormotion.datasets.text.log_map.LogMap`;
+        otherwise it is the schema of a map of a method.
     out : str or Path
         ``.nc`` or ``.zarr``.
     overwrite : bool
@@ -36,7 +36,7 @@ def import_log(log: str | Path, map_file: str | Path, out: str | Path, *, overwr
     Raises
     ------
     DatasetError
-        The map or the log is wrong; all mistakes at once, each with its key or line. Nothing is written then.
+        The map or the log is wrong; all mistakes at once, each with its key or line. Nothing is written.
     """
     log, map_file = Path(log), Path(map_file)
     raw = _reader(map_file)(log, map_file).assign_attrs(log=log.name, map=map_file.name)

@@ -1,4 +1,4 @@
-"""Where a result comes from: settings, raw data, instruments, software."""
+"""Provenance of results: settings, raw data, instruments, software."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ def make(
     steps: Sequence[Any] = (),
     raw_hash: str | None = None,
 ) -> dict[str, Any]:
-    """Return the provenance of a result; the same inputs give the same provenance.
+    """Return the provenance of a result; it is deterministic.
 
     Parameters
     ----------
     settings : BaseModel or mapping
-        Effective settings, defaults included.
+        Effective settings, including defaults.
     raw : Dataset or None
-        What was identified; its hash goes in.
+        The raw data, whose hash is stored.
     instruments : sequence of mapping or None
-        Serial number, address and calibration of each; None takes the raw dataset's attribute ``instruments`` (JSON).
+        Serial number, address and calibration of each; default: the attribute ``instruments`` (JSON) of ``raw``.
     seed : int, optional
-        Of whatever was drawn.
+        Seed of random numbers.
     steps : sequence
-        What was done, in order.
+        Processing steps, in order.
     raw_hash : str, optional
-        The hash of ``raw`` if it is known already, from `errormotion.datasets.files.hashing.DatasetHasher`.
+        The hash of ``raw`` if it is known, from `errormotion.datasets.files.hashing.DatasetHasher`.
 
     Returns
     -------
     dict
-        Of JSON values.
+        Values are those of JSON.
     """
     if instruments is None and raw is not None and isinstance(raw.attrs.get("instruments"), str):
         instruments = json.loads(raw.attrs["instruments"])
@@ -74,12 +74,12 @@ def identity(*calibrated: ArrayLike | str, part: str, along: ArrayLike = ()) -> 
     Parameters
     ----------
     *calibrated : array_like or str
-        What was calibrated: values and covariance as the calibration states them, or its hash.
+        Values and covariance of the calibration, or its hash.
     part : str
-        Which of the independent parts of its uncertainty.
+        Name of one of the independent parts of its uncertainty.
     along : array_like, optional
-        Direction of this part among the calibrated parameters; it counts to 1e-6, with its sign, so that a part whose
-        direction is reversed is another source.
+        Direction of this part in the space of the calibrated parameters, rounded to 1e-6; the reversed direction is
+        another source.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def identity(*calibrated: ArrayLike | str, part: str, along: ArrayLike = ()) -> 
 
 
 def of(ds: xr.Dataset) -> dict[str, Any]:
-    """Return the provenance that a dataset carries."""
+    """Return the provenance of a dataset."""
     return cast(dict[str, Any], json.loads(ds.attrs["provenance"]))
 
 

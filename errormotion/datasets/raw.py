@@ -1,4 +1,4 @@
-"""Whether a raw dataset follows its schema."""
+"""Validation of raw datasets."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from errormotion.datasets.checks import (
 )
 from errormotion.datasets.schemas import RawSchema, Row, variants
 
-# A direction that is 1e-6 too long makes 1 nm on a reading of 1 mm.
+# A relative error of the length of a direction of 1e-6 causes 1 nm for a reading of 1 mm.
 _UNIT_NORM = 1e-6
 # Rounding of a 6x6 covariance, relative to its diagonal.
 _ROUNDING = 1e-8
 
 
 def variant_of(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> RawSchema | None:
-    """Return the raw schema that a dataset claims, the variant by its content; None if the id is unknown.
+    """Return the raw schema of a dataset: its id by the attribute, the variant by the content; None if unknown.
 
     ``tables`` are searched before the raw schemas of the installed plugins.
     """
@@ -39,7 +39,7 @@ def variant_of(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> RawSchema | 
 def raw_violations(ds: xr.Dataset, raw: RawSchema) -> list[str]:
     """Return every violation of a raw schema, one sentence each.
 
-    Big variables are looked at in samples spread over the record; nothing is loaded whole.
+    Large variables are checked in samples distributed over the record; they are never loaded completely.
     """
     found = storable_violations(ds)
     for dim, size in raw.sizes.items():
@@ -103,7 +103,7 @@ def _norm_violations(name: str, variable: xr.Variable) -> Iterator[str]:
 def _covariance_violations(variable: xr.Variable, row: Row) -> Iterator[str]:
     C = np.asarray(variable.values, dtype=float)
     if row.name == "beam_covariance" and np.isnan(C).any():
-        yield f"{row.name}: expected numbers; found NaN. Leave the variable out where it is not known"
+        yield f"{row.name}: expected numbers; found NaN. Omit the variable if it is unknown"
         return
     if C.shape[-1] != C.shape[-2]:
         yield f"{row.name}: expected square matrices; found {C.shape[-2]} x {C.shape[-1]}"

@@ -1,6 +1,6 @@
-"""Schemas as data: one row a variable. Validation, readers and the reference page follow these tables.
+"""Schemas as tables with one row for each variable, used by validation, readers and the reference page.
 
-The table of error datasets is here. The tables of raw datasets come with the plugins that own them.
+This module contains the table of error datasets. The tables of raw datasets are in the plugins of their methods.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ SCHEMA = plugins.ERRORS_SCHEMA
 """Schema of every error dataset."""
 
 SIGN = "actual minus commanded, tool side relative to workpiece side"
-"""The one sign convention, as it stands in the attribute ``sign``."""
+"""The sign convention of all errors, and value of the attribute ``sign``."""
 
 ERROR_DIMS = ("time", "position", "target", "beam")
-"""Dimensions that errors may have; others are declared by a coordinate of their own name."""
+"""Dimensions that errors may have; others are declared by a coordinate of the same name."""
 
 INDEX = "_index"
-"""Ending of the variables that number the values along each dimension, such as ``time_index``.
+"""Suffix of the variables that number the values along each dimension, such as ``time_index``.
 
-Selecting keeps them whole; an interpolation or a mean that knows nothing of the covariance does not, and shows.
+They are whole numbers after a selection, but not after an interpolation or a mean of plain xarray, which do not
+propagate the covariance. The validator uses them to detect this.
 """
 
 ERROR_UNITS = ("m", "m", "m", "rad", "rad", "rad")
@@ -43,15 +44,15 @@ class Row:
     dims : tuple of str
         ``...`` stands for the dimensions of the errors themselves.
     unit : str
-        Inside unit; "1" for a pure number, "" where elements differ in unit or the values are text.
+        Unit in datasets; "1" for a pure number, "" if the elements differ in unit or the values are text.
     low, high : float
-        Plausible range, both ends allowed; infinite where there is none.
+        Plausible range, both ends included; infinite for none.
     meaning : str
     required : bool
     missing : bool
-        Whether single values of a required variable may be NaN: what a sensor did not see.
+        Whether single values of a required variable may be NaN, for missing readings.
     units : tuple of str
-        Inside units of the elements, where they differ and a column of a text file holds elements of one of them.
+        Units of the elements, if they differ and a column of a text file contains elements of one unit.
     """
 
     name: str
@@ -67,23 +68,23 @@ class Row:
 
 @dataclass(frozen=True)
 class RawSchema:
-    """What the raw dataset of one method holds; a method with two procedures has two.
+    """The content of the raw dataset of one method; a method with two procedures has two.
 
     Attributes
     ----------
     id : str
         Value of the attribute ``schema``.
     variant : str
-        Which procedure; empty where there is only one.
+        Name of the procedure; empty if there is only one.
     marker : str
         Variable or dimension that only this variant has.
     rows : tuple of Row
     sizes : mapping of str to int
         Dimensions of fixed length.
     labels : mapping of str to tuple of str
-        Labels that a dimension must have, all of them and no other.
+        Labels that a dimension must have, all of them and no others.
     aliases : mapping of str to str
-        Short names of columns in text files, and the columns that they stand for.
+        Short names of columns in text files, and the full names.
     """
 
     id: str
@@ -96,13 +97,13 @@ class RawSchema:
 
     @property
     def title(self) -> str:
-        """Id and variant for people."""
+        """Id and variant as text."""
         return f"{self.id}, {self.variant}" if self.variant else self.id
 
 
 NO_LIMIT = float("inf")
 POSITION = (-20.0, 20.0)
-"""Plausible coordinates, m: the largest machine tools; a coordinate in mm shows."""
+"""Plausible coordinates of the largest machine tools, m; detects coordinates in mm."""
 READING = (-0.1, 0.1)
 """Plausible readings of point sensors, m."""
 RADIUS = (0.0005, 0.1)
@@ -131,7 +132,7 @@ ERROR_ROWS = (
         "",
         -NO_LIMIT,
         NO_LIMIT,
-        "total covariance of the six freedoms at one place, influences included; m^2, m rad, rad^2",
+        "total covariance of the six freedoms at one place, including influences; m^2, m rad, rad^2",
     ),
     Row(
         "influence",
@@ -148,7 +149,7 @@ ERROR_ROWS = (
         "m",
         -0.1,
         0.1,
-        "error along one known direction, where the method sees no freedom alone: `sensitivity` times the six freedoms",
+        "error along one known direction, if the method determines no single freedom: `sensitivity` times the freedoms",
         required=False,
     ),
     Row(
@@ -170,15 +171,15 @@ ERROR_ROWS = (
         "effect of one standard uncertainty of each source on `deviation`, as in `influence`",
         required=False,
     ),
-    Row("source_group", ("source",), "", -NO_LIMIT, NO_LIMIT, "what a source belongs to in the budget", required=False),
+    Row("source_group", ("source",), "", -NO_LIMIT, NO_LIMIT, "group of a source in the budget", required=False),
     Row(
         "source_id",
         ("source",),
         "",
         -NO_LIMIT,
         NO_LIMIT,
-        "what makes a source the same draw in another dataset: hash of a calibration, number of a certificate; "
-        "empty where it is shared with no other",
+        "identity of a source, equal in datasets that share the draw: hash of a calibration, number of a certificate; "
+        "empty if it is not shared",
         required=False,
     ),
     Row(
@@ -190,7 +191,7 @@ ERROR_ROWS = (
         "1 for the uncertainty of the reference state, else 0",
         required=False,
     ),
-    Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "since the reference state, increasing", required=False),
+    Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "time since the reference state, increasing", required=False),
     *(
         Row(name, ("position|target",), "m", *POSITION, f"commanded {name.upper()}", required=False)
         for name in ("x", "y", "z")
@@ -199,12 +200,12 @@ ERROR_ROWS = (
 
 ERROR_ATTRIBUTES = {
     "schema": f"`{SCHEMA}`",
-    "component": "what moves wrongly: an axis (X, Y, Z, A, B, C, U, V, W), `spindle`, `tool` (the volume) or `beam`; "
-    "another name with the attribute `component_description`",
-    "machine": "which machine",
+    "component": "the part with the errors: an axis (X, Y, Z, A, B, C, U, V, W), `spindle`, `tool` (the volume) or "
+    "`beam`; another name with the attribute `component_description`",
+    "machine": "name of the machine",
     "frame": "coordinate system of the components",
     "functional_point": "three coordinates in that frame, m",
-    "reference": "the state that the errors are relative to",
+    "reference": "the state to which the errors are relative",
     "method": "id of the method",
     "method_version": "its version",
     "sign": f"`{SIGN}`",
@@ -216,24 +217,24 @@ OPTIONAL_ATTRIBUTES = {
     "reference_interval": "first and last time of the reference state, s on `time`",
     "reference_position": "position whose errors are zero by definition",
     "notes": "list of sentences for the reader",
-    "component_description": "what a component is that the schema does not list",
+    "component_description": "description of a component that the schema does not list",
     "chain": "kinematic chain of the machine, such as `workpiece-X-Y-bed-Z-spindle-tool`",
-    "operator": "who measured",
+    "operator": "name of the operator",
     "certificates": "JSON object: certificates of artefacts and instruments, by item",
-    "frame_origin": "origin of `frame` in machine coordinates with all axes at zero, m, where its directions are those "
+    "frame_origin": "origin of `frame` in machine coordinates with all axes at zero, m, if its directions are those "
     "of the machine",
-    "lever_axes": "linear axes whose travel is a lever of the rotations, such as `Z`, where the errors are not those "
+    "lever_axes": "linear axes whose travel is a lever of the rotations, such as `Z`, if the errors are not those "
     "of one rigid motion: the displacement at another point is `E + R x r` along these directions only, and EA, EB "
     "and EC are rotations of the frame of the axes",
 }
 """Attributes that an error dataset may have."""
 
 CARRIED = ("chain", "operator", "certificates")
-"""Attributes of a raw dataset that its error dataset carries on."""
+"""Attributes of a raw dataset that are copied to its error dataset."""
 
 
 def variants(schema: str) -> tuple[RawSchema, ...]:
-    """Return the raw schemas of one id, from the plugin that brings them; none for an unknown id."""
+    """Return the raw schemas of one id, from the plugin that provides them; none for an unknown id."""
     owner = plugins.owner_of_schema(schema)
     return tuple(table for table in getattr(owner, "raw_schemas", ()) if table.id == schema)
 
@@ -245,7 +246,7 @@ def raw_schemas() -> tuple[RawSchema, ...]:
 
 
 def known_schemas() -> set[str]:
-    """Return the id of every schema that a dataset may claim."""
+    """Return the ids of all known schemas."""
     known = {SCHEMA} | {table.id for table in raw_schemas()}
     return known.union(*(getattr(cls.info, "schemas", ()) for cls in plugins.loaded("datasets")))
 

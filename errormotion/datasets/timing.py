@@ -10,12 +10,12 @@ from errormotion.errors import DatasetError
 
 
 def later(start: str, seconds: float) -> str:
-    """Return the instant some seconds after another one, in UTC to the microsecond; empty for an empty one.
+    """Return the instant some seconds after another one, in UTC to the microsecond; empty if ``start`` is empty.
 
     Raises
     ------
     DatasetError
-        No instant with an offset from UTC.
+        ``start`` is not an instant with an offset from UTC.
     """
     if not start:
         return ""
@@ -37,7 +37,7 @@ def between(start: str, end: str) -> float:
 def start_of(ds: xr.Dataset, seconds: float = 0.0) -> str:
     """Return the instant some seconds after the attribute ``start`` of a dataset, in UTC.
 
-    Empty where the dataset states no start, or one without an offset from UTC.
+    Empty if the dataset states no start, or one without an offset from UTC.
     """
     try:
         return later(str(ds.attrs.get("start", "")), seconds)

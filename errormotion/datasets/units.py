@@ -1,8 +1,8 @@
-"""Quantities with units: what a person writes at the edge, and the SI numbers inside.
+"""Quantities with units: conversion of texts such as ``"5 mm"`` to numbers in SI.
 
-``Length``, ``Angle``, ``Time`` and their sisters are types for pydantic models. The value is a float in SI (spindle
-speed in 1/min, temperature in degC). A string such as ``"5 mm"`` is read everywhere. A bare number is SI when it comes
-from Python, and refused when it comes from a file or a command line (validation context ``{"edge": True}``).
+``Length``, ``Angle``, ``Time`` and the others are types for pydantic models. The value is a float in SI (spindle
+speed in 1/min, temperature in degC). A string such as ``"5 mm"`` is accepted everywhere. A number without unit is SI
+in Python, and refused in a file or on the command line (validation context ``{"edge": True}``).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pint
 
 EDGE = {"edge": True}
-"""Validation context of everything that a person writes: units are compulsory."""
+"""Validation context of files and of the command line, where units are compulsory."""
 
 _USUAL = {
     "m": ("mm", "um", "nm", "m", "inch"),
@@ -38,7 +38,7 @@ _USUAL = {
     "m/s": ("mm/min", "m/min", "mm/s", "m/s"),
     "m/K": ("um/K", "nm/K", "mm/K", "m/K"),
 }
-"""Units that are suggested, by the inside unit."""
+"""Suggested units, by the SI unit."""
 
 ArrayLike = float | np.ndarray
 
@@ -46,7 +46,7 @@ LONGEST = 100
 """Longest text of a quantity or a unit, characters."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2}(?![0-9]))?")
-# A name and its exponent, as pint (m^2, m**2), CF and UDUNITS (m2, s-1) and people (m²) write it.
+# A name and its exponent in the forms of pint (m^2, m**2), CF and UDUNITS (m2, s-1), and with superscripts (m²).
 _TERM = re.compile(r"([^\W\d_]+(?:_[^\W\d_]+)*|°C?|%)(?:(?:\^|\*\*)?([+-]?[0-9]{1,2})(?![0-9]))?")
 _LEAD = re.compile(r"1?/\s*")
 _SEPARATOR = re.compile(r"\s*[*·⋅/.]\s*|\s+")
@@ -56,7 +56,7 @@ _CELSIUS = ("degree_C", "degrees_C", "degreesC", "degree_c", "degree_celsius", "
 _NAMES = {**dict.fromkeys((*_CELSIUS, "Celsius", "degree_Celsius"), "degC"), "arc_second": "arcsecond"}
 _NAMES |= {"arc_minute": "arcminute", "arc_degree": "degree"}
 
-# A turn is no angle here: pint's rpm carries a factor 2 pi, so spindle speeds have their own table, in 1/min.
+# pint's rpm contains a factor 2 pi; spindle speeds therefore have a separate table, in 1/min.
 _PER_MINUTE = {
     **dict.fromkeys(("/min", "1/min", "min^-1", "min-1", "rpm", "rev/min", "U/min"), Fraction(1)),
     **dict.fromkeys(("/s", "1/s", "s^-1", "s-1", "rps", "rev/s"), Fraction(60)),
@@ -70,11 +70,11 @@ class Quantity:
     Parameters
     ----------
     kind : str
-        What it is, with its article: "a length".
+        Name with its article: "a length".
     unit : str
         Unit of the value.
     example : str
-        How a person writes one.
+        An example as text.
     """
 
     kind: str
@@ -100,7 +100,7 @@ class Quantity:
             raise ValueError(f"{expected}: the number is too large") from None
 
     def _near(self, unit: str) -> str:
-        """Return a question for a unit that is not known or of another kind; empty where none is near."""
+        """Return a suggestion for a unit that is unknown or of another kind; empty if there is none."""
         usual = _USUAL.get(self.unit, ())
         plain = unit.replace(" ", "")
         found = [known for known in usual if known.lower() == plain.lower()] or get_close_matches(plain, usual, 3, 0.5)
@@ -153,7 +153,7 @@ Expansion = Annotated[float, EXPANSION]
 
 @cache
 def _registry() -> pint.UnitRegistry[Any]:
-    import pint  # 0.3 s to load: only when a text has to be read
+    import pint  # takes 0.3 s; only needed for texts
 
     return pint.UnitRegistry(non_int_type=Fraction)  # exact: 25 um is 2.5e-5 m to the last bit
 
@@ -165,18 +165,18 @@ def _unit(text: str) -> pint.Unit:
     expression = _expression(text)
     try:
         return _registry().parse_units(expression)
-    # pint's own errors, and those of Python's that it lets through for names such as 'nan'
+    # errors of pint, and those of Python that pint raises for names such as 'nan'
     except (pint.PintError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise DatasetError(f"'{text}' is not a known unit") from error
 
 
 def _expression(text: str) -> str:
-    """Return a unit as an expression of pint; factors count from left to right, as in UDUNITS.
+    """Return a unit as an expression of pint; factors are evaluated from left to right, as in UDUNITS.
 
     Raises
     ------
     DatasetError
-        Anything but names with whole exponents, and signs between them.
+        The text is not a sequence of names with whole exponents, and signs between them.
     """
     if len(text) > LONGEST:
         raise DatasetError(f"'{text[:LONGEST]}...' is not a known unit")
@@ -206,14 +206,14 @@ def _linear(source: str, target: str) -> tuple[Fraction, Fraction]:
         return _PER_MINUTE[source] / _PER_MINUTE[target], Fraction(0)
     registry = _registry()
     from_, to = _unit(source), _unit(target)
-    # Compared in base units, not in dimensions: a per cent is no angle.
+    # Compared in base units, not in dimensions, since a per cent is not an angle.
     if registry.get_base_units(from_)[1] != registry.get_base_units(to)[1]:
         raise DatasetError(f"'{source}' is not convertible to '{target}'")
     try:
         zero, one, two = (Fraction(registry.Quantity(Fraction(n), from_).to(to).magnitude) for n in (0, 1, 2))
         factor = one - zero
         float(factor), float(1 / factor), float(zero)
-    except (ArithmeticError, TypeError, ValueError) as error:  # logarithmic units, powers beyond all numbers
+    except (ArithmeticError, TypeError, ValueError) as error:  # logarithmic units, overflow
         raise DatasetError(f"'{source}' is not convertible to '{target}'") from error
     if two - one != factor:
         raise DatasetError(f"'{source}' is not convertible to '{target}' by a factor and an offset")
@@ -233,22 +233,22 @@ def convert(values: ArrayLike, source: str, target: str) -> ArrayLike:
     Returns
     -------
     float or ndarray
-        Numbers in ``target``; infinite where they are beyond all numbers.
+        Numbers in ``target``; infinite after an overflow.
 
     Raises
     ------
     DatasetError
-        A unit is unknown, or they are of different kinds.
+        A unit is unknown, or the units are of different kinds.
     """
     factor, offset = _linear(source, target)
-    # Divided where the factor is 1/n: 25 um is then 2.5e-5 m to the last bit.
+    # Divided if the factor is 1/n: 25 um is then 2.5e-5 m to the last bit.
     with np.errstate(over="ignore"):
         scaled = values / float(1 / factor) if factor.numerator == 1 else values * float(factor)
         return scaled + float(offset) if offset else scaled
 
 
 def si_unit(unit: str) -> str:
-    """Return the inside unit (m, rad, s, 1/min, degC, Hz, m/s, m/K) of the kind that ``unit`` belongs to."""
+    """Return the SI unit (m, rad, s, 1/min, degC, Hz, m/s, m/K) of the kind of ``unit``."""
     if unit in _PER_MINUTE:
         return SPEED.unit
     for kind in (kind for kind in KINDS if kind is not SPEED):
@@ -267,9 +267,9 @@ def format_quantity(value: float, unit: str, digits: int = 4) -> str:
     Parameters
     ----------
     value : float
-        In the inside unit: m, rad, s, 1/min, degC.
+        In m, rad, s, 1/min or degC.
     unit : str
-        Unit to write it in.
+        Unit of the text.
     digits : int
         Significant digits.
     """

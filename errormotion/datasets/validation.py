@@ -1,4 +1,4 @@
-"""The validator of all datasets, by the schema that they claim."""
+"""The validator of all datasets, according to their attribute ``schema``."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from errormotion.errors import DatasetError, ErrormotionError
 
 
 def violations(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> list[str]:
-    """Return every violation of the schema of a dataset, one sentence each; none if it follows its schema.
+    """Return every violation of the schema of a dataset, one sentence each.
 
     Parameters
     ----------
     ds : Dataset
-        With the attribute ``schema``. Large variables of a raw dataset are checked in samples, never loaded whole.
+        With the attribute ``schema``. Large variables of a raw dataset are checked in samples.
     tables : sequence of RawSchema, optional
-        Raw schemas to use before those of the installed plugins: for a plugin that is not installed.
+        Raw schemas that precede those of the installed plugins, for a plugin that is not installed.
     """
     schema = ds.attrs.get("schema")
     if schema == SCHEMA:
@@ -43,12 +43,12 @@ def violations(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> list[str]:
 
 @contextmanager
 def explained(path: str | Path, ds: xr.Dataset) -> Iterator[None]:
-    """Evaluate a dataset of a file; where that fails, and the dataset breaks its schema, the violations are the error.
+    """Report the violations of the schema of a file if its evaluation fails.
 
     Raises
     ------
     DatasetError
-        The evaluation ended with an error of Python, and the dataset breaks its schema; one sentence each.
+        The evaluation ended with an error of Python, and the dataset breaks its schema; a sentence for each violation.
     """
     try:
         yield
@@ -67,7 +67,7 @@ def validate(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> None:
     Raises
     ------
     DatasetError
-        Its ``violations`` hold one sentence for each violation.
+        Its attribute ``violations`` contains one sentence for each violation.
     """
     found = violations(ds, tables)
     if found:

@@ -1,8 +1,8 @@
-"""Plugins: what an instrument, a method, a kind of dataset and a compensator are, and the registry.
+"""Plugins: the contracts of instruments, methods, kinds of dataset and compensators, and the registry.
 
 A plugin is a plain class, named in the entry-point group ``errormotion.instruments``, ``errormotion.methods``,
-``errormotion.datasets`` or ``errormotion.compensators`` of any distribution. The built-in ones come
-through the same door.
+``errormotion.datasets`` or ``errormotion.compensators`` of any distribution. The built-in plugins are registered in
+the same way.
 """
 
 from errormotion.plugins.contracts import (

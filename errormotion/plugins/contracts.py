@@ -1,4 +1,4 @@
-"""What a plugin is: an instrument, a method, a kind of dataset; and the data that they exchange."""
+"""Contracts of plugins (instrument, method, kind of dataset, compensator), and the data that they exchange."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from errormotion.kinematics.description import MachineDescription
 
 Status = Literal["hardware_verified", "replay_verified", "peer_verified", "simulated_only"]
-"""How a plugin was verified, the strongest first.
+"""Verification of a plugin, the strongest first.
 
 ``hardware_verified``: with the real device. ``replay_verified``: with a recorded session of the real device.
-``peer_verified``: with an independent implementation of the protocol at the other end. ``simulated_only``: with the
-project's own simulator.
+``peer_verified``: with an independent implementation of the protocol as the device. ``simulated_only``: with the
+simulator of this project.
 """
 
 ERRORS_SCHEMA = "errormotion.errors/1"
-"""Schema of every error dataset, whichever method it comes from."""
+"""Schema of the error datasets of all methods."""
 
 
 class PluginSettings(BaseModel):
-    """Base of every plugin's settings: unknown keys are refused, values are fixed once made."""
+    """Base of the settings of plugins: unknown keys are refused, instances are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -37,7 +37,7 @@ class InstrumentInfo:
     """Description of an instrument.
 
     ``status`` states how it was verified; see `Status`.
-    ``simulator`` names the wire simulator behind ``sim://`` as ``module:Class``; None where there is none.
+    ``simulator`` is the wire simulator for ``sim://`` as ``module:Class``; None if there is none.
     """
 
     id: str
@@ -61,10 +61,10 @@ class MethodInfo:
 
 @dataclass(frozen=True)
 class DatasetInfo:
-    """Description of a kind of dataset that is neither raw data of a method nor its errors: a log, a model.
+    """Description of a kind of dataset that is neither raw data nor errors of a method: a log, a model.
 
-    ``schemas`` are the values of the attribute ``schema`` that its datasets have. ``methods`` are the values of the
-    attribute ``method`` of error datasets that it makes, such as the predictions of a model.
+    ``schemas`` are the values of the attribute ``schema`` of its datasets. ``methods`` are the values of the
+    attribute ``method`` of error datasets that it computes, such as the predictions of a model.
     """
 
     id: str
@@ -76,21 +76,21 @@ class DatasetInfo:
 
 @dataclass(frozen=True)
 class FigureOfMerit:
-    """One number of a result that a person looks at first: on the command line, in a summary, in a comparison.
+    """One of the main numbers of a result: on the command line, in a summary, in a comparison.
 
     Attributes
     ----------
     name : str
-        In the words of the standard that defines it, with its position or time where it has one.
+        As in the standard that defines it, with its position or time if it has one.
     value, expanded_uncertainty : float
-        SI; k = 2. NaN where unknown.
+        SI; k = 2. NaN if unknown.
     unit : str
         SI unit of both: ``m``, ``rad``, ``1``, ``degC``.
     limit : float, optional
-        Largest absolute value that is accepted, where one is known.
+        Largest accepted absolute value, if known.
     influence : mapping of str to float, optional
-        Effect of one standard uncertainty of each source of the dataset, by its name. Where it is left out, it is the
-        change of the figure when the errors change; so a figure that is computed from other variables states it.
+        Effect of one standard uncertainty of each source of the dataset, by the name of the source. By default it is
+        computed from the change of the figure with the errors; required for a figure computed from other variables.
     """
 
     name: str
@@ -103,18 +103,18 @@ class FigureOfMerit:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibration that a plugin makes from readings, for ``errormotion calibrate``.
+    """A calibration that a plugin computes from readings, for ``errormotion calibrate``.
 
     Attributes
     ----------
     Settings : type of pydantic.BaseModel
-        How the calibration is made.
+        Settings of the calibration.
     make : function
         ``make(raw, settings)`` returns the calibration dataset.
     figures : function
         ``figures(calibration)`` returns its figures as a mapping, for ``--json``.
     text : function
-        ``text(calibration)`` returns its figures as lines for the terminal.
+        ``text(calibration)`` returns its figures as lines of text.
     """
 
     Settings: type[BaseModel]
@@ -125,7 +125,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a method needs: instrument kinds to acquire, a raw schema to identify."""
+    """Requirements of a method: kinds of instrument for ``acquire``, a raw schema for ``identify``."""
 
     instruments: tuple[str, ...]
     raw_schema: str
@@ -133,7 +133,7 @@ class Needs:
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity of the device at an address; recorded in the provenance of everything that it measured."""
+    """Identity of the device at an address; part of the provenance of its data."""
 
     manufacturer: str
     model: str
@@ -145,22 +145,22 @@ class Identity:
 
 @dataclass(frozen=True)
 class Samples:
-    """A block of equally spaced samples of one or more channels, as delivered by an instrument.
+    """A block of equally spaced samples of one or more channels.
 
     Attributes
     ----------
     values : ndarray, float64, (channel, n)
-        SI units; NaN where the instrument gave no valid value.
+        SI units; NaN without valid value.
     first : int
-        Device counter of the first sample (samples since the start of the stream, lost ones included).
+        Counter of the device at the first sample: samples since the start of the stream, including lost ones.
     rate : float
         Samples per second.
     host_time : float
         ``time.monotonic()`` when the block was received, s.
     dropped : int
-        Samples that the device counter shows missing inside this block; they are NaN in ``values``.
+        Number of samples missing in this block by the counter of the device; they are NaN in ``values``.
     invalid : mapping of str to int
-        Why values are NaN: reason to count.
+        Number of NaN by their reason.
     """
 
     values: np.ndarray
@@ -173,14 +173,14 @@ class Samples:
 
 @dataclass(frozen=True)
 class Touch:
-    """One touch that a probe is to make: to the start, toward the target until it trips, and back to the start.
+    """One touch of a probe: to the start, towards the target until it triggers, and back to the start.
 
     Attributes
     ----------
     start, target : (3,) tuple of float
-        Commanded positions of the tip, X Y Z, m: before the touch, and where the probe stops if it does not trip.
+        Commanded positions of the tip, X Y Z, m: before the touch, and the end of the motion without trigger.
     item : int
-        What is touched (the number of a ball), for messages and for the dataset.
+        Number of the touched item, such as a ball, for messages and the dataset.
     """
 
     start: tuple[float, float, float]
@@ -195,11 +195,11 @@ class Contact:
     Attributes
     ----------
     position : (3,) tuple of float
-        Position of the tip by the machine when the probe tripped, m; NaN where it did not trip.
+        Position of the tip by the machine when the probe triggered, m; NaN if it did not.
     time : float
-        When it tripped, s on the clock of the machine (its ``state()["time"]``).
+        Time of the trigger by the clock of the machine (its ``state()["time"]``), s.
     flag : str
-        Empty for a good touch; else why there is none: ``no trip``, ``tripped at the start``, ``repeat differs``.
+        Empty for a valid touch, or the reason: ``no trip``, ``tripped at the start``, ``repeat differs``.
     """
 
     position: tuple[float, float, float]
@@ -209,18 +209,18 @@ class Contact:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of what a machine is to do: for its limits, and for a dry run.
+    """One step of the motions of a machine, for the check of its limits and for a dry run.
 
     Attributes
     ----------
     what : str
         ``move``, ``touch`` or ``rest``.
     place : (3,) tuple of float or None
-        Where it ends, X Y Z, m; NaN for an axis that stays; None where the machine stays.
+        End of the step, X Y Z, m; NaN for an axis that does not move; None if the machine does not move.
     feed : float
-        m/s; NaN at rest, and for a rapid move, which the driver holds to the limit of the bench.
+        m/s; NaN at rest, and for a rapid move, which the driver limits to the feed limit of the bench.
     seconds : float
-        How long it takes; NaN where unknown, as for a rapid move.
+        Its duration; NaN if unknown, as for a rapid move.
     spindle_speed : float
         1/min.
     """
@@ -234,7 +234,7 @@ class Step:
 
 @dataclass(frozen=True)
 class MachineLimits:
-    """Limits of every order to a machine; what is not stated is not limited.
+    """Limits of all commands to a machine; quantities that are not stated are not limited.
 
     Attributes
     ----------
@@ -245,7 +245,7 @@ class MachineLimits:
     spindle_speed : float, optional
         Highest, 1/min.
     forbidden : str
-        Why no order at all is allowed; empty where orders are allowed.
+        Reason why no command is allowed; empty if commands are allowed.
     """
 
     spans: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -256,7 +256,7 @@ class MachineLimits:
     def __str__(self) -> str:
         """Return the limits as a text."""
         if self.forbidden:
-            return f"nothing may move: {self.forbidden}"
+            return f"no motion is allowed: {self.forbidden}"
         texts = [f"{axis} {1e3 * low:.6g} to {1e3 * high:.6g} mm" for axis, (low, high) in self.spans.items()]
         texts += [] if self.feed is None else [f"feed up to {6e4 * self.feed:.6g} mm/min"]
         texts += [] if self.spindle_speed is None else [f"spindle up to {self.spindle_speed:.6g} /min"]
@@ -265,7 +265,7 @@ class MachineLimits:
 
 @runtime_checkable
 class Instrument(Protocol):
-    """A driver: one plain class. No communication before ``__enter__`` (or ``open``)."""
+    """A driver. It does not communicate before ``__enter__`` (or ``open``)."""
 
     info: ClassVar[InstrumentInfo]
     Settings: ClassVar[type[PluginSettings]]
@@ -276,7 +276,7 @@ class Instrument(Protocol):
         """Open the connection; idempotent."""
 
     def close(self) -> None:
-        """Close the connection and end every thread; idempotent."""
+        """Close the connection and end all threads; idempotent."""
 
     def __enter__(self) -> Self: ...
 
@@ -285,34 +285,34 @@ class Instrument(Protocol):
     ) -> None: ...
 
     def identify(self) -> Identity:
-        """Ask the device for its identity."""
+        """Return the identity of the device."""
 
     def read(self) -> Any:
-        """Return one reading now."""
+        """Return one reading."""
 
 
 @runtime_checkable
 class Bench(Protocol):
-    """A bench as a method sees it: opened instruments by kind, and the machine.
+    """A bench for a method: opened instruments by kind, and the machine.
 
     ``machine`` is the name of the machine tool; ``description`` is its chain, travel, spindle axis and rotary axes,
-    None where the bench file gives the name only.
+    None if the bench file states only the name.
     """
 
     machine: str
     description: MachineDescription | None
 
     def of_kind(self, kind: str) -> Any:
-        """Return the one instrument of this kind; BenchError names what is missing."""
+        """Return the only instrument of this kind; raises BenchError if there is none or there are several."""
 
     def all_of_kind(self, kind: str) -> Mapping[str, Any]:
-        """Return every instrument of this kind by its name on the bench; none where there is none."""
+        """Return the instruments of this kind by their names on the bench; may be empty."""
 
     def has_kind(self, kind: str) -> bool:
-        """Whether the bench offers an instrument of this kind."""
+        """Whether the bench has an instrument of this kind."""
 
     def ask(self, message: str) -> None:
-        """Request an action of the operator and wait for it; returns immediately on a virtual machine."""
+        """Request an action of the operator and wait for it; returns at once on a virtual machine."""
 
 
 @dataclass(frozen=True)
@@ -322,11 +322,11 @@ class Applied:
     Attributes
     ----------
     offset : tuple of float
-        Offset of X, Y, Z in effect, m; NaN where unknown.
+        Active offset of X, Y, Z, m; NaN if unknown.
     busy : str
-        Why the offset must not change now, such as a probing cycle or a thread; empty: it may.
+        Reason why the offset must not change now, such as a probing cycle or a thread; empty if it may.
     fault : str
-        Why the machine takes no offsets, such as an emergency stop; empty: it does.
+        Reason why the machine accepts no offsets, such as an emergency stop; empty if it does.
     """
 
     offset: tuple[float, float, float]
@@ -338,10 +338,10 @@ class Applied:
 class Compensator(Protocol):
     """Writes offsets into a machine for ``errormotion compensate run``; group ``errormotion.compensators``.
 
-    The machine's side keeps a slew limit of its own, and ramps to zero when `write` is not called for the time that
-    its watchdog allows. ``open`` and `read` change nothing. After a lost connection ``open`` connects again.
+    The machine limits the slew rate itself, and ramps to zero if `write` is not called within the time of its
+    watchdog. ``open`` and `read` change nothing. After a lost connection ``open`` connects again. ``conformance()``
 
-    ``conformance()`` (optional) returns the `CompensatorSubject` that the conformance kit examines.
+    (optional) returns the `CompensatorSubject` for the conformance kit.
     """
 
     info: ClassVar[InstrumentInfo]
@@ -350,86 +350,86 @@ class Compensator(Protocol):
     settings: Any
 
     def open(self) -> None:
-        """Connect; idempotent. InstrumentError where nothing answers."""
+        """Connect; idempotent. Raises InstrumentError without answer."""
 
     def close(self) -> None:
-        """Disconnect and disarm; idempotent. Offsets that were written ramp to zero by the machine's watchdog."""
+        """Disconnect and disarm; idempotent. The watchdog of the machine ramps written offsets to zero."""
 
     def identify(self) -> Identity:
-        """Return what answers at the address."""
+        """Return the identity of the machine at the address."""
 
     def arm(self, limit: float) -> None:
-        """Let `write` pass offsets up to a limit of each axis, m, until `close`; nothing is sent.
+        """Allow `write` to send offsets up to a limit of each axis, m, until `close`; nothing is sent.
 
-        InstrumentError where the machine cannot be given such offsets.
+        Raises InstrumentError if the machine cannot accept such offsets.
         """
 
     def read(self) -> Applied:
-        """Return the offsets in effect, and whether they may change."""
+        """Return the active offsets, and whether they may change."""
 
     def write(self, offset: Sequence[float]) -> None:
-        """Write the offset of X, Y, Z, m, and with it the sign of life that the machine's watchdog expects.
+        """Write the offset of X, Y, Z, m, and reset the watchdog of the machine.
 
-        InstrumentError, and nothing is sent, where it is not armed, or unless there are three finite numbers within
-        the limit.
+        Raises InstrumentError, and sends nothing, if it is not armed or the values are not three finite numbers
+        within the limit.
         """
 
 
 @runtime_checkable
 class Method(Protocol):
-    """What is measured and how it becomes an error dataset.
+    """A method: acquisition of raw data, and their identification as an error dataset.
 
-    Optional attributes. Where one is heavy to import, `lazy` loads it when it is first used.
+    Optional attributes; `lazy` loads one at its first use, if its import takes long.
 
     ``raw_schemas`` : tuple of `errormotion.datasets.schemas.RawSchema`
-        The tables that validation, CSV reading, import and the reference pages follow.
+        The tables for validation, CSV reading, import and the reference pages.
     ``texts(language)`` : mapping of str to str
-        Catalogue of the texts of its chapters, English to this language (``de``).
+        Catalogue of the texts of its chapters: English to this language (``de``).
     ``chapters(source)`` : list of `errormotion.report.document.Part`
-        The report of one of its error datasets; without it, the generic chapter.
+        The report of one of its error datasets; by default the generic chapter.
     ``figures(errors)`` : list of `FigureOfMerit`
-        The numbers that the command line and summaries show.
+        The numbers for the command line and summaries.
     ``simulate(settings, seed)`` : (raw, truth)
-        Raw data with a known truth: a raw dataset, and an error dataset relative to the same reference.
+        Raw data with known truth: a raw dataset, and an error dataset relative to the same reference.
     ``truth(machine, errors, clock)`` : Dataset
-        The true errors of a `VirtualMachine` where an error dataset states errors; its time 0 was at ``clock`` (s) of
-        the machine.
+        The true errors of a `VirtualMachine` at the positions and times of an error dataset, whose time 0 is at
+        ``clock`` (s) of the machine.
     ``conformance()`` : tuple of `MethodSubject`
-        What the conformance kit examines.
+        The subjects of the conformance kit.
     ``follow(settings)`` : function
-        Takes each acquired dataset and returns a line of text for the operator.
+        Called with each acquired dataset; returns a line of text for the operator.
     ``programs(settings, instruments)`` : mapping of str to str
-        The NC programs of the test, file name to text.
+        The NC programs of the test: file name to text.
     ``motions(settings, instruments)`` : list of `Step`
-        Every step of the machine; checked against the limits of the bench before anything moves. A method that moves a
-        machine, by a controller or by programs, must have it: without it nothing moves during its tests. Where a search
-        decides, the steps go to the ends of the search. MethodError where the settings do not determine them.
+        All steps of the machine; checked against the limits of the bench before the first motion. Required for a
+        method that moves a machine, by a controller or by programs: without it, no motion is allowed in its tests. The
+        steps include the ends of a search. Raises MethodError if the settings do not determine the steps.
     ``planning_settings(settings, instruments)`` : settings
-        What ``plan`` gets for a test of a campaign: the settings, with what the instruments of the bench state where
-        the settings leave it to them, such as their noise.
+        Settings of ``plan`` for a test of a campaign: the settings, completed with data of the instruments of the
+        bench, such as their noise.
     ``check(settings)`` : mapping of str to str
-        What is wrong, by setting, as far as it can be seen before a measurement; used when a campaign is read.
+        Mistakes that can be found before a measurement, by setting; called when a campaign is read.
 
     ``machine_defaults(machine)`` : mapping of str to value
-        Settings that follow from the machine of the bench (a `MachineDescription`), for a campaign that does not state
-        them.
+        Defaults of settings that follow from the machine of the bench (a `MachineDescription`).
     ``check_machine(settings, machine)`` : mapping of str to str
-        What contradicts the machine, by setting (an empty text for the whole), with what was expected and what was
-        found; used when a campaign is read.
+        Contradictions to the machine, by setting (an empty text for all settings), with the expected and the found
+        value; called when a campaign is read.
     ``redrawing(raw, settings, errors)`` : `Redrawing`
-        Every source of uncertainty of raw data, to be drawn anew, for ``identify --monte-carlo``; ``errors`` is what
-        ``identify`` made of them.
+        The sources of uncertainty of raw data, for ``identify --monte-carlo``; ``errors`` is the result of
+        ``identify``.
     ``doctor`` : mapping of str to function
-        Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Instruments too.
+        Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Also possible for
+        instruments.
 
     ``calibrations`` : mapping of str to `Calibration`
-        Raw schema of readings to the calibration that ``errormotion calibrate`` makes from them.
+        Raw schema of readings to the calibration that ``errormotion calibrate`` computes from them.
     ``log_readers`` : mapping of str to function
-        Formats of maps for ``errormotion import`` that are the method's own: value of the key ``schema`` of the map to
-        a function ``(log, map)`` of two paths that returns the raw dataset. A map whose key ``schema`` is a raw schema
-        needs no function.
+        Formats of maps of this method for ``errormotion import``: value of the key ``schema`` of the map to a function
+        ``(log, map)`` of two paths that returns the raw dataset. A map whose key ``schema`` is a raw schema needs no
+        function.
 
-    ``programs``, ``motions`` and ``planning_settings`` get the settings of the bench's instruments by kind.
+    The argument ``instruments`` contains the settings of the instruments of the bench by kind.
     """
 
     info: ClassVar[MethodInfo]
@@ -444,20 +444,20 @@ class Method(Protocol):
         inputs: Mapping[str, xr.Dataset],
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
-        """Measure; yield raw datasets to be joined along ``append_dim(settings)``.
+        """Measure; yield raw datasets, which are joined along ``append_dim(settings)``.
 
-        ``inputs`` are results of earlier tests by the name the campaign gives them. ``done`` is what an interrupted
-        run has already: continue after it.
+        ``inputs`` are results of earlier tests by their names in the campaign. ``done`` contains the data of an
+        interrupted run, which is continued.
         """
 
     def append_dim(self, settings: Any) -> str:
         """Return the dimension along which the yielded datasets are joined."""
 
     def progress(self, settings: Any) -> float:
-        """Return the expected total for the progress bar: seconds, where chunks state a ``sample_rate``; else items."""
+        """Return the expected total for the progress bar: seconds for chunks with ``sample_rate``, else items."""
 
     def identify(self, raw: xr.Dataset, settings: Any) -> xr.Dataset:
-        """Turn a raw dataset into an error dataset; leaves ``raw`` as it is."""
+        """Return the error dataset of a raw dataset, which is not changed."""
 
     def plan(self, settings: Any) -> xr.Dataset:
-        """Return an error dataset of zeros whose covariance is the one to expect."""
+        """Return an error dataset of zeros with the expected covariance."""

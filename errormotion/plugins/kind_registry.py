@@ -1,7 +1,7 @@
 """Registry of the kinds of instrument, and the comparison of a driver with the contract of its kind.
 
 A contract is a Protocol; see `errormotion.plugins.kinds`. Distributions register contracts in the entry-point group
-``errormotion.kinds``, the built-in ones included.
+``errormotion.kinds``; the built-in contracts are registered in the same way.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _NO_MEMBERS = (*_STATED, "changes_machine")
 def contract(
     *, plausible: tuple[float, float] | None = None, capabilities: tuple[type, ...] = ()
 ) -> Callable[[Contract], Contract]:
-    """Return a decorator that completes a Protocol to the contract of a kind; see the module's first lines."""
+    """Return a decorator that completes a Protocol to the contract of a kind."""
 
     def complete(cls: Contract) -> Contract:
         for name, value in zip(_STATED, (plausible, capabilities), strict=True):
@@ -41,8 +41,8 @@ def _points() -> Mapping[str, EntryPoint]:
 def changing(cls: Contract) -> Contract:
     """Mark a capability whose methods move or change a machine.
 
-    An instrument that has it needs the setting ``arm``, default false, without which it refuses these methods, and a
-    method ``bound(limits)``, after which each order is held to a `MachineLimits`.
+    An instrument with it needs the setting ``arm``, default false, without which it refuses these methods, and a
+    method ``bound(limits)``, after which each command is checked against a `MachineLimits`.
     """
     cls.changes_machine = True  # type: ignore[attr-defined]
     return cls
@@ -72,12 +72,12 @@ def kinds() -> tuple[str, ...]:
 
 
 def kind(name: str) -> Any:
-    """Return the contract of a kind, None where none is registered.
+    """Return the contract of a kind, None if there is none.
 
     Raises
     ------
     PluginError
-        The registered object does not load, or is not a Protocol.
+        The registered object cannot be loaded, or is not a Protocol.
     """
     point = _points().get(name)
     if point is None:
@@ -99,7 +99,7 @@ def refresh() -> None:
 
 
 def plausible(name: str) -> tuple[float, float] | None:
-    """Return the lowest and highest plausible reading of a kind in SI units, None where there are no bounds."""
+    """Return the lowest and highest plausible reading of a kind in SI units, None without bounds."""
     bounds: tuple[float, float] | None = getattr(kind(name), "plausible", None)
     return bounds
 
@@ -117,12 +117,12 @@ def members(protocol: type) -> dict[str, Any]:
 
 
 def deviations(driver: Any, protocol: type) -> list[str]:
-    """Return in one sentence each how an instrument deviates from a contract; nothing is called.
+    """Return the deviations of an instrument from a contract, one sentence each; nothing is called.
 
     Parameters
     ----------
     driver : Instrument
-        An object of the driver's class, not opened.
+        An instance that is not open.
     protocol : type
         The contract of its kind.
     """
@@ -161,7 +161,7 @@ def _lacking(driver: Any, protocol: type) -> list[str]:
             if inspect.isfunction(static):
                 found.append(f"'{name}' is a method, expected an attribute or property")
         elif not callable(static) and not isinstance(static, staticmethod | classmethod):
-            found.append(f"'{name}' is no method, expected {name}{_shown(method)}")
+            found.append(f"'{name}' is not a method, expected {name}{_shown(method)}")
         elif not _accepts(getattr(driver, name), method):
             found.append(f"expected {name}{_shown(method)}, found {name}{inspect.signature(getattr(driver, name))}")
     return found
@@ -173,7 +173,7 @@ def _shown(method: Any) -> str:
 
 
 def _accepts(found: Any, method: Any) -> bool:
-    """Whether a bound method takes every call that the contract's method allows."""
+    """Whether a bound method accepts all calls that the method of the contract allows."""
     expected = list(inspect.signature(method).parameters.values())[1:]
     required = [each for each in expected if each.default is each.empty]
     try:

@@ -2,12 +2,12 @@
 
 A contract has the members that every instrument of the kind must have. Its attribute ``capabilities`` lists further
 Protocols: an instrument that has the first method of a capability (without methods: its first attribute) must have all
-its members; methods look for it before they use it. Its attribute ``plausible`` holds the lowest and highest reading
-that a conformance check accepts, in SI units, or None. The decorator ``changing`` marks the capabilities by which an
+its members; methods test for it before they use it. The attribute ``plausible`` is the lowest and highest reading that
+a conformance check accepts, in SI units, or None. The decorator ``changing`` marks the capabilities by which an
 instrument moves or changes a machine.
 
-Kinds are open: a distribution registers a contract in the entry-point group ``errormotion.kinds``, under the name that
-its instruments give as ``info.kind``.
+A distribution can add a kind: it registers a contract in the entry-point group ``errormotion.kinds``, under the name
+that its instruments state as ``info.kind``.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ class Synchronised(Protocol):
     Attributes
     ----------
     name : str
-        Of the channel, for messages; set by whoever starts it.
+        Of the channel, for messages; set by the caller of `start`.
     reasons : tuple of str
-        Why a sample has no value, by the code that `fill` gives; code 0 stands for a value.
+        Reasons of missing values by the codes of `fill`; code 0 means a value.
     lost : tuple of int
-        Codes of samples that were lost on the way.
+        Codes of samples that were lost in transfer.
     """
 
     name: str
@@ -58,38 +58,38 @@ class Synchronised(Protocol):
         """Fill both arrays (n,) with the next samples, m, and the codes of their reasons, uint8."""
 
     def start(self, block: int, sync: Literal["NONE", "MASTER", "SLAVE"] = "NONE") -> None:
-        """Start sampling; a slave samples as soon as its master has started, and both from the same instant on."""
+        """Start sampling; a slave samples from the same instant on as its master."""
 
     @property
     def host_time(self) -> float:
-        """``time.monotonic()`` at the arrival of the last samples that `fill` gave, s."""
+        """``time.monotonic()`` at the arrival of the last samples of `fill`, s."""
 
     def drain(self) -> None:
-        """Discard samples from now on, so that the sensor is not held back until `stop`."""
+        """Discard samples until `stop`, so that the sensor is not blocked."""
 
     def stop(self, timeout: float | None = None) -> None:
         """Stop sampling; idempotent."""
 
 
 class StatesReason(Protocol):
-    """A sensor that states why a reading is NaN."""
+    """A sensor that states the reason of a NaN."""
 
     no_value: str
 
 
 class StatesOperatingTime(Protocol):
-    """A sensor that states how long it has been switched on."""
+    """A sensor that states the time since it was switched on."""
 
     def on_for(self) -> float:
-        """Return the time since it was switched on, s; 0 where unknown."""
+        """Return the time since it was switched on, s; 0 if unknown."""
 
 
 class Packed(Protocol):
-    """An instrument whose readings are integers on the wire."""
+    """An instrument that transmits readings as integers."""
 
     @property
     def encoding(self) -> dict[str, Any]:
-        """Encoding of a variable that stores them without loss; empty where there is none."""
+        """Encoding of a variable that stores them without loss; empty if there is none."""
 
 
 @contract(plausible=(-0.05, 0.5), capabilities=(Streaming, Synchronised, StatesReason, StatesOperatingTime, Packed))
@@ -102,10 +102,10 @@ class PointLDS(Instrument, Protocol):
 
     @property
     def mid_range(self) -> float:
-        """Reading in the middle of the range, m: there a tilt of the surface has no effect."""
+        """Reading in the middle of the range, m, at which a tilt of the surface has no effect."""
 
     def read(self) -> float:
-        """Return one reading, m along the beam, larger for a more distant surface; NaN where there is none."""
+        """Return one reading, m along the beam, larger for a more distant surface; NaN without value."""
 
 
 # ---------------------------------------------------------------------- line_profiler
@@ -123,7 +123,7 @@ class LineProfiler(Instrument, Protocol):
     """A sensor that measures heights along a line."""
 
     def read(self) -> Array:
-        """Return the heights of one profile, m, (point,); NaN where there is none."""
+        """Return the heights of one profile, m, (point,); NaN without value."""
 
     def stream(self, block: int | None = None) -> Iterator[Profiles]:
         """Yield blocks of profiles, ``values`` (point, block), until the caller stops."""
@@ -134,7 +134,7 @@ class LineProfiler(Instrument, Protocol):
 
 @contract(plausible=(-0.05, 0.5))
 class SpindleFrame(Instrument, Protocol):
-    """Distance sensors around a bar in the spindle (ISO 230-3), on one clock."""
+    """Distance sensors with a common clock around a bar in the spindle (ISO 230-3)."""
 
     geometry: FrameGeometry
 
@@ -144,14 +144,14 @@ class SpindleFrame(Instrument, Protocol):
 
     @property
     def encoding(self) -> dict[str, Any]:
-        """Encoding of a variable that stores the samples without loss; empty where there is none."""
+        """Encoding of a variable that stores the samples without loss; empty if there is none."""
 
     @property
     def warm(self) -> bool:
-        """Whether all sensors have been switched on long enough to be stable; False where unknown."""
+        """Whether all sensors have been switched on long enough to be stable; False if unknown."""
 
     def read(self) -> Array:
-        """Return one distance of each channel, m, (channel,); NaN where there is none."""
+        """Return one distance of each channel, m, (channel,); NaN without value."""
 
     def stream(self, channels: Sequence[str] | None = None, *, block: int | None = None) -> Iterator[Samples]:
         """Yield blocks of samples, ``values`` (channel, block); a column is one instant."""
@@ -164,7 +164,7 @@ class MeasuresTargets(Protocol):
     """A tracker that measures one target at a time."""
 
     def measure(self, target: tuple[float, float, float] | None = None) -> Measurement:
-        """Measure the reflector that the beam holds, or look for one at a position in the tracker's frame, m."""
+        """Measure the reflector in the beam, or search for one at a position in the frame of the tracker, m."""
 
 
 @contract(plausible=(-160.0, 160.0), capabilities=(MeasuresTargets,))
@@ -173,10 +173,10 @@ class LaserTracker(Instrument, Protocol):
 
     @property
     def distance_is_displacement(self) -> bool:
-        """Whether lengths count from an unknown dead path (interferometer) instead of from the tracker."""
+        """Whether lengths include an unknown dead path (interferometer) and are not distances from the tracker."""
 
     def read(self) -> Any:
-        """Return one length, m, or the array of all that a table holds; NaN where there is none."""
+        """Return one length, m, or the array of all lengths of a table; NaN without value."""
 
 
 # ---------------------------------------------------------------------- interferometer
@@ -194,7 +194,7 @@ class Interferometer(Instrument, Protocol):
         """Return displacement (m) or angle (rad) of each channel since `zero`; NaN from a broken beam until `zero`."""
 
     def zero(self) -> None:
-        """Count from the present position on; raises InstrumentError where a beam is broken."""
+        """Set the count to zero at the present position; raises InstrumentError if a beam is broken."""
 
 
 # ---------------------------------------------------------------------- touch_probe
@@ -202,11 +202,11 @@ class Interferometer(Instrument, Protocol):
 
 @changing
 class MovesMachine(Protocol):
-    """A probe that commands the machine; others read what the machine's program prints."""
+    """A probe that commands the machine; others read the output of an NC program."""
 
     @property
     def control(self) -> Any:
-        """The controller that it uses."""
+        """Its controller."""
 
 
 @contract(capabilities=(MovesMachine,))
@@ -219,10 +219,10 @@ class TouchProbe(Instrument, Protocol):
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a contact, m; NaN where unknown."""
+        """Standard deviation of a contact, m; NaN if unknown."""
 
     def configure(self, settings: Any) -> None:
-        """Use other settings from now on."""
+        """Replace the settings."""
 
     def measure(self, touches: Sequence[Touch]) -> Iterator[Contact]:
         """Yield one contact for each touch, in their order."""
@@ -232,17 +232,17 @@ class TouchProbe(Instrument, Protocol):
 
 
 class StatesFlags(Protocol):
-    """A thermometer that states why a temperature is unknown."""
+    """A thermometer that states the reason of a missing temperature."""
 
     flags: dict[str, str]
 
 
 class StatesPositions(Protocol):
-    """A thermometer that states where its sensors are."""
+    """A thermometer that states the positions of its sensors."""
 
     @property
     def places(self) -> Mapping[str, tuple[float, float, float] | None]:
-        """Position of each sensor on the machine, m; None where unknown."""
+        """Position of each sensor on the machine, m; None if unknown."""
 
 
 @contract(plausible=(-60.0, 400.0), capabilities=(StatesFlags, StatesPositions))
@@ -254,17 +254,17 @@ class Thermometer(Instrument, Protocol):
         """Names of the sensors, known before the thermometer is opened."""
 
     def read(self) -> Mapping[str, float]:
-        """Return the temperatures, degC by channel; NaN where unknown."""
+        """Return the temperatures, degC by channel; NaN if unknown."""
 
 
 # ---------------------------------------------------------------------- controller
 
 
 class State(TypedDict, total=False):
-    """State of a machine. What a controller does not report is absent, None or NaN.
+    """State of a machine. Values that a controller does not report are absent, None or NaN.
 
     ``time`` (s, on the machine's clock), ``position`` and ``commanded_position`` (X, Y, Z, m), ``spindle_speed``
-    (1/min), ``spindle_load`` (1 = rated), ``feed`` (m/s), ``running`` (a program waits or runs), ``homed``,
+    (1/min), ``spindle_load`` (1 = rated), ``feed`` (m/s), ``running`` (a program is ready or runs), ``homed``,
     ``enabled``, ``estop``, ``alarms`` (texts).
     """
 
@@ -286,10 +286,10 @@ class MovesAxes(Protocol):
     """A controller that moves the axes."""
 
     def move_to(self, position: Position, feed: float | None = None) -> Any:
-        """Move in a straight line to a position, m, with a feed, m/s; in rapid without one."""
+        """Move in a straight line to a position, m, with a feed, m/s; without one, in rapid."""
 
     def stop(self, *, spindle: bool = False) -> None:
-        """Abort all motion, with ``spindle`` that of the spindle as well; always allowed."""
+        """Abort all motion, with ``spindle`` including the spindle; always allowed."""
 
 
 @changing
@@ -302,33 +302,33 @@ class TurnsSpindle(Protocol):
 
 @changing
 class RunsPrograms(Protocol):
-    """A controller that takes NC programs."""
+    """A controller that executes NC programs."""
 
     def run_program(self, text: str) -> Mapping[str, Any]:
-        """Start a program (ISO 6983); return ``duration`` and ``longest_lead_in``, s, where known."""
+        """Start a program (ISO 6983); return ``duration`` and ``longest_lead_in``, s, if known."""
 
 
 @changing
 class Probes(Protocol):
-    """A controller that moves until a touch probe trips."""
+    """A controller that moves until a touch probe triggers."""
 
     def probe(self, target: Position, feed: float) -> dict[str, Any]:
-        """Move to a target, m, until the probe trips; return ``tripped``, ``position`` (m or None), ``time`` (s)."""
+        """Move to a target, m, until the probe triggers; return ``tripped``, ``position`` (m or None), ``time`` (s)."""
 
 
 class PassesTime(Protocol):
-    """A controller with a clock of its own."""
+    """A controller with its own clock."""
 
     def elapse(self, seconds: float) -> None:
-        """Let time pass on the machine's clock, s."""
+        """Advance the clock of the machine, s."""
 
 
 @changing
 class RunsSchedules(Protocol):
-    """A controller that mounts artefacts and turns the spindle by a schedule."""
+    """A controller that mounts artefacts and executes a schedule of spindle speeds."""
 
     def mount(self, tool: str) -> None:
-        """Put ``bar``, ``sphere`` or ``probe`` into the spindle."""
+        """Mount ``bar``, ``sphere`` or ``probe`` in the spindle."""
 
     def start(self, schedule: Sequence[Any]) -> None:
         """Start a schedule at time 0: events with ``time``, and optionally ``spindle_speed`` and ``compensation``."""
@@ -339,7 +339,7 @@ class StepsSphere(Protocol):
     """A controller that steps a mounted sphere along a line."""
 
     def run_steps(self, start: Position, direction: Position, step: float, count: int, dwell: float = 1.0) -> Any:
-        """Start a step program: first position, m, direction, step, m, their count, and the rest at each, s."""
+        """Start a step program: first position, m, direction, step, m, number of steps, and dwell at each, s."""
 
 
 @changing
@@ -347,15 +347,15 @@ class SetsTarget(Protocol):
     """A controller that turns a gauge in front of a point sensor."""
 
     def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
-        """Set a plane, a bar or nothing, with the inclination and rotation of a plane, rad."""
+        """Mount a plane, a bar or nothing; a plane with its inclination and rotation, rad."""
 
 
 @changing
 class CarriesTracker(Protocol):
-    """A controller that carries the laser tracker to a station."""
+    """A controller that moves the laser tracker to a station."""
 
     def set_station(self, position: Position) -> None:
-        """Carry the tracker to a position in machine coordinates, m."""
+        """Move the tracker to a position in machine coordinates, m."""
 
 
 @contract(
@@ -375,4 +375,4 @@ class Controller(Instrument, Protocol):
     """The control of a machine."""
 
     def state(self) -> Mapping[str, Any]:
-        """Return the state now; see `State`."""
+        """Return the present state; see `State`."""

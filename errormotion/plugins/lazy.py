@@ -1,4 +1,4 @@
-"""Attributes of a plugin class that are imported when they are first used."""
+"""Attributes of a plugin class that are imported at their first use."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from errormotion.errors import PluginError
 
 
 def load_object(path: str) -> Any:
-    """Return the object that ``module:name`` names.
+    """Return the object of a text ``module:name``.
 
     Raises
     ------
@@ -21,14 +21,14 @@ def load_object(path: str) -> Any:
         raise PluginError(f"expected 'module:name', found '{path}'")
     try:
         return getattr(import_module(module), name)
-    except Exception as error:  # whatever a foreign module raises while it is imported
+    except Exception as error:  # any exception of the import of a plugin
         raise PluginError(f"'{path}' does not load: {type(error).__name__}: {error}") from error
 
 
 class lazy:  # noqa: N801 - reads like `property` and `cached_property`
-    """A class attribute that is imported when it is first used: ``chapters = lazy("my_lab.report:chapters")``.
+    """A class attribute that is imported at its first use: ``chapters = lazy("my_lab.report:chapters")``.
 
-    A function is returned as it is, without an instance as its first argument.
+    A function is not bound to the instance.
     """
 
     def __init__(self, path: str) -> None:

@@ -1,6 +1,6 @@
-"""What instruments return to methods: profiles, height maps, tracker measurements, the geometry of a frame.
+"""Readings of instruments: profiles, height maps, tracker measurements, the geometry of a frame.
 
-`Samples`, `Touch`, `Contact` and `Identity` are beside them in `errormotion.plugins`. All values are in SI units.
+For `Samples`, `Touch`, `Contact` and `Identity` see `errormotion.plugins`. All values are in SI units.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class Profiles(Samples):
     x : ndarray, float64, (point,)
         Positions of the points on the line, m.
     trigger : ndarray, int64, (n,)
-        The device's count of triggers, those of lost profiles included.
+        Count of triggers by the device, including those of lost profiles.
     encoder : ndarray, float64, (n,)
-        The device's count of encoder pulses, its overflow undone; NaN where the profile was lost.
+        Count of encoder pulses by the device, corrected for overflow; NaN for a lost profile.
     intensity : ndarray, uint16, (n, point), or None
-        Brightness of the points, 0 to 1023, where the device sends it; 0 where the profile was lost.
+        Brightness of the points, 0 to 1023, if the device sends it; 0 for a lost profile.
     y : ndarray, float64, (n,), or None
-        Positions of the profiles along the feed, m, where known.
+        Positions of the profiles along the feed, m, if known.
     """
 
     x: Array
@@ -57,9 +57,9 @@ class Scan:
     Attributes
     ----------
     path : Path
-        File that held it.
+        Its file.
     heights : ndarray, float64, (n, point)
-        m; NaN where there is none.
+        m; NaN without value.
     x : ndarray, float64, (point,)
         Positions of the points on the line, m.
     y : ndarray, float64, (n,)
@@ -74,7 +74,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Environment:
-    """The air along a beam: temperature in degC, pressure in Pa, relative humidity in %; NaN where unknown."""
+    """The air along a beam: temperature in degC, pressure in Pa, relative humidity in %; NaN if unknown."""
 
     temperature: float = NAN
     pressure: float = NAN
@@ -88,22 +88,22 @@ class Measurement:
     Attributes
     ----------
     distance : float
-        From the tracker to the reflector, m, as the tracker states it: corrected with its own ``refraction_index``.
-        NaN where there is none.
+        From the tracker to the reflector, m, as stated by the tracker: corrected with its ``refraction_index``. NaN
+        without value.
     angles : (float, float)
         Azimuth, counterclockwise about the tracker's z, and zenith angle, rad.
     std : (float, float, float)
-        Standard deviations of distance (m), azimuth and zenith angle (rad), as the tracker states them.
+        Standard deviations of distance (m), azimuth and zenith angle (rad), as stated by the tracker.
     environment : Environment
-        With which the tracker measured.
+        The air as measured by the tracker.
     refraction_index : float
-        By which the tracker has divided the optical path. The optical path is ``distance * refraction_index``.
+        The optical path is ``distance * refraction_index``.
     valid : bool
-        Whether there is a distance.
+        Whether the distance is known.
     reason : str
-        Why there is none; empty where there is one.
+        Reason of a missing distance; empty if it is known.
     dead_path : int
-        Measurements of one number share one dead path. It increases whenever the distance was set again.
+        Number of the dead path, common to consecutive measurements; it increases when the distance is set again.
     """
 
     distance: float = NAN
@@ -125,7 +125,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class FrameGeometry:
-    """A frame of distance sensors around a bar as drawn, in machine coordinates.
+    """Nominal geometry of a frame of distance sensors around a bar, in machine coordinates.
 
     A reading d of a channel puts a point of the bar's surface at origin + d direction.
 
@@ -133,7 +133,7 @@ class FrameGeometry:
     ----------
     channels : tuple of str
     nominal_origin : ndarray, (channel, 3)
-        Position of the reading 0 of each beam, m.
+        Position of reading 0 of each beam, m.
     nominal_direction : ndarray, (channel, 3)
         Unit vectors from the sensor to the bar.
     bar_radius : float
@@ -145,9 +145,9 @@ class FrameGeometry:
     noise : ndarray, (channel,)
         Standard deviation of a single sample, m.
     expansion : ndarray, (channel, 3)
-        Displacement of the origins per kelvin of the frame, m/K: along the axis that the sensor measures.
+        Displacement of the origins per kelvin of the frame, m/K, along the measured axis.
     reference_temperature : float
-        At which the origins hold, degC.
+        Temperature for which the origins apply, degC.
     """
 
     channels: tuple[str, ...]
@@ -163,7 +163,7 @@ class FrameGeometry:
     def origins_at(self, temperature: float | Array) -> Array:
         """Return the origins with the frame at a temperature, m, (..., channel, 3).
 
-        The frame's expansion is part of what the sensors read; this is its compensation.
+        They compensate the effect of the expansion of the frame on the readings.
         """
         warming = np.asarray(temperature, dtype=float)[..., None, None] - self.reference_temperature
         return np.asarray(self.nominal_origin + warming * self.expansion)

@@ -1,4 +1,4 @@
-"""What a method brings so that its uncertainty can be evaluated by the Monte Carlo method: its sources, drawn anew."""
+"""Sources of uncertainty of a method for the evaluation by the Monte Carlo method."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import numpy as np
 import xarray as xr
 
 Draw = Callable[[xr.Dataset, Any, np.random.Generator], tuple[xr.Dataset, Any]]
-"""``draw(raw, settings, generator)`` returns raw data and settings with one source drawn anew; changes neither."""
+"""``draw(raw, settings, generator)`` returns new raw data and settings with one source drawn at random."""
 Act = Callable[[xr.Dataset, np.random.Generator], xr.Dataset]
-"""``act(errors, generator)`` returns an error dataset with a source that no raw data contain."""
+"""``act(errors, generator)`` returns an error dataset with a source that is not part of the raw data."""
 
 
 @dataclass(frozen=True)
 class Redraw:
-    """One source of uncertainty that can be drawn anew, independent of all others.
+    """One source of uncertainty, independent of all others.
 
     Attributes
     ----------
     draw : function, optional
         ``draw(raw, settings, generator)`` returns raw data and settings in which the source is drawn from its
-        distribution about what was measured or stated. It leaves its arguments as they are.
+        distribution about the measured or stated value. It does not change its arguments.
     groups : tuple of str
-        Values of ``source_group`` in the ``influence`` of the result that this source stands for.
+        Values of ``source_group`` in the ``influence`` of the result that this source represents.
     own : bool
-        Whether the part of the covariance that no influence names, independent from value to value, comes from it.
+        Whether it causes the part of the covariance without influence, independent from value to value.
     act : function, optional
-        ``act(errors, generator)`` returns an error dataset: for an assumption about the machine that no reading
-        contains, such as a rotation that the method does not see.
+        ``act(errors, generator)`` returns an error dataset: for an assumption about the machine without effect on the
+        readings, such as a rotation that the method does not measure.
     """
 
     draw: Draw | None = None
@@ -41,18 +41,18 @@ class Redraw:
 
 @dataclass(frozen=True)
 class Redrawing:
-    """Raw data to be drawn anew, and every source of their uncertainty.
+    """Raw data and all sources of their uncertainty.
 
     Attributes
     ----------
     raw : Dataset
-        What was measured, reduced as far as the method allows so that it can be identified often: means instead of
-        single samples, outliers that were found replaced by NaN. It is in memory.
+        The measured data in memory, reduced for many identifications: means instead of single samples, outliers
+        replaced by NaN.
     settings : PluginSettings
-        With which ``raw`` gives the values of the measured data: what the method chose by itself is stated, tests for
-        outliers are off, and results that no value depends on are left out.
+        Settings for the same result from ``raw`` as from the measured data: automatic choices of the method are
+        stated, tests for outliers are off, and results without effect on the values are omitted.
     sources : mapping of str to Redraw
-        By name, in the order in which they act.
+        By name, in their order of application.
     """
 
     raw: xr.Dataset

@@ -1,7 +1,7 @@
 """The registry: finds plugins through the entry points of all distributions.
 
-The built-in plugins come through the same door. The entry points are read once, a plugin is loaded when it is first
-used, and a broken plugin stays in the list together with its error.
+The built-in plugins are registered in the same way. The entry points are read once, a plugin is loaded at its first
+use, and a broken plugin is listed with its error.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ GROUPS: tuple[Group, ...] = ("instruments", "methods", "datasets", "compensators
 
 @dataclass(frozen=True)
 class Plugin:
-    """One entry of the registry: the class, or why it could not be loaded."""
+    """One entry of the registry: the class, or the error of loading it."""
 
     id: str
     group: Group
@@ -37,11 +37,11 @@ class Plugin:
 
     @property
     def distribution(self) -> str:
-        """Name and version of the distribution that brought the plugin."""
+        """Name and version of the distribution of the plugin."""
         return _name_and_version(self.entry_point.dist)
 
 
-#: What the registry requires of a class; the conformance kit checks the rest.
+#: Type of ``info`` that the registry requires; the conformance kit checks the rest.
 _REQUIRED: Mapping[Group, tuple[type[InstrumentInfo | MethodInfo | DatasetInfo], tuple[str, ...]]] = {
     "instruments": (InstrumentInfo, ("Settings", "open", "close", "identify", "read")),
     "methods": (MethodInfo, ("Settings", "needs", "acquire", "append_dim", "progress", "identify", "plan")),
@@ -58,9 +58,9 @@ def _name_and_version(dist: Distribution | None) -> str:
 
 
 def _with_plugins() -> Iterator[tuple[Distribution, str]]:
-    """Yield every distribution with entry points of ours, and the text that lists them.
+    """Yield every distribution with entry points of errormotion, and the text of its entry points.
 
-    The name of a distribution is parsed slowly, and is asked only of these.
+    Reading the name of a distribution is slow, and is done only for these.
     """
     seen: set[str] = set()
     for dist in distributions():
@@ -72,7 +72,7 @@ def _with_plugins() -> Iterator[tuple[Distribution, str]]:
             yield dist, text
         elif name not in seen:
             seen.add(name)
-            first = next(iter(distributions(name=name)), dist)  # of two copies the first on the path counts
+            first = next(iter(distributions(name=name)), dist)  # of two copies, the first on the path is used
             if first.read_text("entry_points.txt") == text:
                 yield dist, text
 
@@ -81,7 +81,7 @@ def _with_plugins() -> Iterator[tuple[Distribution, str]]:
 def _found() -> Mapping[Group, tuple[EntryPoint, ...]]:
     """Read the entry points of every distribution.
 
-    Where a distribution's list cannot be read, an entry point without a value replaces it.
+    An entry point without a value replaces an unreadable list of a distribution.
     """
     found: dict[Group, list[EntryPoint]] = {group: [] for group in GROUPS}
     for dist, text in _with_plugins():
@@ -108,7 +108,7 @@ def _loaded(group: Group, point: EntryPoint) -> Plugin:
         if missing := [name for name in required if not hasattr(cls, name)]:
             raise PluginError(f"class {cls.__name__} lacks {', '.join(missing)}")
         if info.id != point.name:
-            raise PluginError(f"the entry point is called '{point.name}' but the class calls itself '{info.id}'")
+            raise PluginError(f"the entry point is called '{point.name}', but the id of the class is '{info.id}'")
     except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin affects no other plugin
         return Plugin(
             point.name,
@@ -121,7 +121,7 @@ def _loaded(group: Group, point: EntryPoint) -> Plugin:
 
 
 def available(group: Group) -> list[Plugin]:
-    """Return every plugin of a group, broken ones and rival claims to one id included, sorted by id."""
+    """Return all plugins of a group sorted by id, including broken ones and those with the same id."""
     points = sorted(_found()[group], key=lambda point: point.name)
     claims = Counter(point.name for point in points)
     return [
@@ -134,17 +134,16 @@ def available(group: Group) -> list[Plugin]:
 
 def _rivals(group: Group, plugin_id: str) -> str:
     sources = ", ".join(_name_and_version(point.dist) for point in _found()[group] if point.name == plugin_id)
-    return f"Several distributions claim the {group.rstrip('s')} '{plugin_id}': {sources}. Remove all but one."
+    return f"Several distributions provide the {group.rstrip('s')} '{plugin_id}': {sources}. Remove all but one."
 
 
 def get(group: Group, plugin_id: str) -> Any:
-    """Return a plugin's class.
+    """Return the class of a plugin.
 
     Raises
     ------
     PluginError
-        Unknown id (the nearest known ones are named), two distributions claiming one id, or a plugin that does not
-        load.
+        The id is unknown, two distributions provide it, or the plugin cannot be loaded.
     """
     points = [point for point in _found()[group] if point.name == plugin_id]
     what = group.rstrip("s")
@@ -152,7 +151,7 @@ def get(group: Group, plugin_id: str) -> Any:
         names = sorted({point.name for point in _found()[group]})
         near = get_close_matches(plugin_id, names, n=1)
         hint = f" Did you mean '{near[0]}'?" if near else ""
-        raise PluginError(f"No {what} plugin '{plugin_id}'; there are: {', '.join(names) or 'none'}.{hint}")
+        raise PluginError(f"No {what} plugin '{plugin_id}'; available: {', '.join(names) or 'none'}.{hint}")
     if len(points) > 1:
         raise PluginError(_rivals(group, plugin_id))
     plugin = _loaded(group, points[0])
@@ -162,7 +161,7 @@ def get(group: Group, plugin_id: str) -> Any:
 
 
 def loaded(*groups: Group) -> Iterator[Any]:
-    """Yield the class of every plugin of some groups that loads."""
+    """Yield the classes of the plugins of some groups, without broken ones."""
     for group in groups:
         for plugin in available(group):
             if plugin.cls is not None:
@@ -170,9 +169,9 @@ def loaded(*groups: Group) -> Iterator[Any]:
 
 
 def brought(name: str, *groups: Group) -> Iterator[tuple[Any, Any]]:
-    """Yield each plugin class of some groups that has an attribute of this name, with the attribute.
+    """Yield each plugin class of some groups with an attribute of this name, and the attribute.
 
-    A plugin whose attribute cannot be loaded is left out with a warning, so that it affects no other plugin.
+    A plugin whose attribute cannot be loaded is omitted with a warning.
     """
     for cls in loaded(*groups):
         value = _attribute(cls, name)
@@ -181,7 +180,7 @@ def brought(name: str, *groups: Group) -> Iterator[tuple[Any, Any]]:
 
 
 def _attribute(cls: Any, name: str) -> Any:
-    """Return an attribute of a plugin class; None where it has none, or, with a warning, where it does not load."""
+    """Return an attribute of a plugin class; None if it has none or, with a warning, if it cannot be loaded."""
     try:
         return getattr(cls, name, None)
     except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin affects no other plugin
@@ -196,9 +195,9 @@ def _warn(message: str) -> None:
 
 
 def owner_of_schema(schema: str) -> Any:
-    """Return the plugin class whose datasets have this schema; None where no plugin claims it.
+    """Return the plugin class whose datasets have this schema; None if there is none.
 
-    A schema ``errormotion.raw.NAME/1`` is looked for in the plugin NAME first.
+    For a schema ``errormotion.raw.NAME/1``, the plugin NAME is tried first.
     """
     name = schema.removeprefix("errormotion.").removeprefix("raw.").partition("/")[0]
     for cls in _named_first(name, ("methods", "datasets")):
@@ -208,7 +207,7 @@ def owner_of_schema(schema: str) -> Any:
 
 
 def owner_of_method(method: str) -> Any:
-    """Return the plugin class that makes error datasets with this attribute ``method``; None where there is none."""
+    """Return the plugin class whose error datasets have this attribute ``method``; None if there is none."""
     for cls in _named_first(method, ("methods", "datasets")):
         if method == cls.info.id or method in getattr(cls.info, "methods", ()):
             return cls
@@ -216,7 +215,7 @@ def owner_of_method(method: str) -> Any:
 
 
 def _named_first(name: str, groups: tuple[Group, ...]) -> Iterator[Any]:
-    """Yield the plugins of one name, then all others; so that the usual case loads one plugin."""
+    """Yield the plugins of one name, then all others: usually only one plugin is loaded."""
     for group in groups:
         if sum(point.name == name for point in _found()[group]) == 1:
             plugin = _loaded(group, next(point for point in _found()[group] if point.name == name))
@@ -233,7 +232,7 @@ def _schemas_of(cls: Any) -> set[str]:
 
 
 def refresh() -> None:
-    """Forget what was found: entry points are read again at the next call."""
+    """Read the entry points again at the next call."""
     _found.cache_clear()
     _loaded.cache_clear()
     _warn.cache_clear()

@@ -1,4 +1,4 @@
-"""What the kit examines: a plugin, and the little that the kit cannot find out by itself."""
+"""Subjects of the conformance kit: a plugin, and data that the kit cannot derive from it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import xarray as xr
 from errormotion.plugins import kind_registry
 from errormotion.plugins.lazy import load_object
 
-#: How a variable of a raw dataset moves with the frame: see ``MethodSubject.raw_vectors``.
+#: Transformation of a variable of a raw dataset with the frame: see ``MethodSubject.raw_vectors``.
 Vector = Literal["pose", "point", "direction", "x", "y", "z", "covariance"]
 
 
@@ -28,13 +28,13 @@ def with_query(address: str, query: str) -> str:
 
 
 LONGEST_WARM_UP = 240.0
-"""For which the kit waits while a method compiles, s."""
+"""Time limit for the compilation of a method, s."""
 
 _WARM: set[type] = set()
 
 
 class _Simulated:
-    """What subjects of instruments and of compensators share: whether they are simulated, and with which faults."""
+    """Base of the subjects of instruments and compensators: simulation and faults."""
 
     plugin: Any
     address: str
@@ -42,7 +42,7 @@ class _Simulated:
 
     @property
     def menu(self) -> tuple[str, ...]:
-        """Names of the faults to try; a real device or machine is spared them."""
+        """Names of the tested faults; none for a real device or machine."""
         if not self.simulated:
             return ()
         if self.faults is not None:
@@ -52,13 +52,13 @@ class _Simulated:
 
     @property
     def simulated(self) -> bool:
-        """Whether a simulator answers, and not a device or a machine."""
+        """Whether it is a simulator, not a device or a machine."""
         return self.address.startswith("sim://")
 
 
 @dataclass(frozen=True)
 class InstrumentSubject(_Simulated):
-    """An instrument plugin and an address at which its simulator answers.
+    """An instrument plugin and the address of its simulator.
 
     Attributes
     ----------
@@ -67,35 +67,34 @@ class InstrumentSubject(_Simulated):
     address : str
         A ``sim://`` address without a fault; faults are added to its query as ``fault=NAME``.
     settings : mapping
-        What the driver's ``Settings`` are made from.
+        Contents of the ``Settings`` of the driver.
     name : str
         Distinguishes several subjects of one plugin.
     make : callable, optional
-        ``make(address, record)`` returns a driver, where ``plugin(address, Settings(**settings), record=record)``
-        would not do (a driver of several addresses). ``record`` is a path or None.
+        ``make(address, record)`` returns a driver, instead of ``plugin(address, Settings(**settings), record=record)``
+        (for a driver with several addresses). ``record`` is a path or None.
     faults : tuple of str, optional
-        Names of the faults to try; default: what the simulator's class offers in its ``faults``.
+        Names of the tested faults; default: ``faults`` of the class of the simulator.
     harmless : tuple of str
-        Faults that a driver must get over without loss.
+        Faults that a driver must handle without loss.
     drop_fault, split_fault : str
-        Fault that leaves samples out (requested with ``fault_at=10``, from the tenth on), and fault that cuts the
-        frames into pieces.
+        Fault that omits samples (requested with ``fault_at=10``, from the tenth on), and fault that splits the frames.
     plausible : (float, float), optional
         Lowest and highest plausible reading in SI units; default: those of its kind. None: no bounds.
     blocks : int
-        How many blocks of a stream the kit looks at.
+        Number of examined blocks of a stream.
     time_limit : float
-        A fault must have become an error, or a counted loss, by then, s.
+        Time within which a fault must cause an error or a counted loss, s.
     dead_address : str
-        An address at which nothing answers.
+        An address without a device.
     repeats : bool
-        Whether the device gives a reading that was lost once more: after a late answer, equal readings are right.
+        Whether the device repeats a lost reading: equal readings after a late answer are then correct.
     vary : callable, optional
-        ``vary(number)`` makes the next reading another one; it is called ahead of each reading whose order is examined.
-        Default: time passes in the simulated world.
+        ``vary(number)`` changes the next reading; called before each reading whose order is examined. Default: the
+        time of the simulation is advanced.
     mutants : int
-        How many times a recorded session is replayed with a changed frame; 0: never. Up to 300 within 6 s; of more than
-        300 all, however long it takes.
+        Number of replays of a recorded session with a changed frame; 0: none. Up to 300 are limited to 6 s; more than
+        300 are not limited in time.
     """
 
     plugin: Any
@@ -116,7 +115,7 @@ class InstrumentSubject(_Simulated):
     mutants: int = 300
 
     def build(self, *, address: str = "", fault: str = "", record: Path | None = None) -> Any:
-        """Return a new driver, not yet opened."""
+        """Return a new driver, not open."""
         where = address or self.address
         if fault:
             where = with_query(where, f"fault={fault}")
@@ -137,47 +136,47 @@ class InstrumentSubject(_Simulated):
 
 @dataclass(frozen=True)
 class CompensatorSubject(_Simulated):
-    """A compensator plugin, and a simulated machine that takes its offsets.
+    """A compensator plugin, and a simulated machine for its offsets.
 
-    A simulated machine is what ``start(address)`` returns: it has ``driver_url`` (or ``url``), where the compensator
-    finds it; ``driver_settings``, a mapping of the settings that it needs there (optional); ``close()``; and
-    ``machine``, the machine's part: ``offset`` (X, Y, Z in effect, m), ``orders`` (how many it got), ``slew`` (m/s),
-    ``watchdog`` (s), ``busy`` and ``fault`` (texts, to be set), and ``elapse(seconds)``, which lets time pass.
-    `errormotion.instruments.simulators.compensator.machine.MachinePart` is one.
+    ``start(address)`` returns a simulated machine with ``driver_url`` (or ``url``), the address for the compensator;
+    ``driver_settings``, a mapping of required settings (optional); ``close()``; and ``machine``, the part of the
+    machine: ``offset`` (active X, Y, Z, m), ``orders`` (number of received offsets), ``slew`` (m/s), ``watchdog`` (s),
+    ``busy`` and ``fault`` (texts, to be set), and ``elapse(seconds)``, which advances the time. An example is
+    `errormotion.instruments.simulators.compensator.machine.MachinePart`.
 
     Attributes
     ----------
     plugin : type
         The class.
     address : str
-        Parameters of the simulated machine, as a ``sim://`` address; another address is that of a real machine, to
+        Parameters of the simulated machine as a ``sim://`` address; other addresses are those of real machines, to
         which nothing is written.
     settings : mapping
-        What the ``Settings`` are made from.
+        Contents of the ``Settings``.
     name : str
         Distinguishes several subjects of one plugin.
     start : callable, optional
-        ``start(address)`` starts the simulated machine; default: the simulator that ``info`` names.
+        ``start(address)`` starts the simulated machine; default: the simulator in ``info``.
     offset : (3,) tuple of float
-        An offset that is written, m.
+        The written offset, m.
     limit : float
-        The limit for which it is armed, m.
+        The limit of ``arm``, m.
     resolution : float
-        Largest difference of the offset in effect from the one written, m.
+        Largest difference of the active offset from the written one, m.
     states : tuple of str
-        What the compensator can report of a machine: ``busy``, ``fault``.
+        States that the compensator can report: ``busy``, ``fault``.
     faults : tuple of str, optional
-        Names of the faults to try; default: what the simulator's class offers in its ``faults``.
+        Names of the tested faults; default: ``faults`` of the class of the simulator.
     harmless : tuple of str
-        Faults that it must get over without an error.
+        Faults that it must handle without an error.
     lost_fault : str
         Fault that breaks the connection.
     time_limit : float
-        An error must have come by then, s.
+        Time within which an error must be raised, s.
     dead_address : str
-        An address at which nothing answers.
+        An address without a device.
     mutants : int
-        As of `InstrumentSubject`, for a compensator whose class takes ``record``.
+        As in `InstrumentSubject`, for a compensator whose class has an argument ``record``.
     """
 
     plugin: Any
@@ -197,13 +196,13 @@ class CompensatorSubject(_Simulated):
     mutants: int = 100
 
     def build(self, address: str, settings: Mapping[str, Any] | None = None) -> Any:
-        """Return a new compensator, not yet opened; ``settings`` are those of a simulated machine."""
+        """Return a new compensator, not open; ``settings`` are those of a simulated machine."""
         return self.plugin(address, self.plugin.Settings(**{**(settings or {}), **self.settings}))
 
 
 @dataclass(frozen=True)
 class MethodSubject:
-    """A method plugin and a source of raw data whose truth is known.
+    """A method plugin and a source of raw data with known truth.
 
     Attributes
     ----------
@@ -211,30 +210,30 @@ class MethodSubject:
         The method class.
     make : callable
         ``make(seed)`` returns ``(raw, truth)``: a raw dataset and the true errors in the error schema, relative to the
-        same reference state. ``truth`` is interpolated along its numeric coordinate to the places of the result.
+        same reference state. ``truth`` is interpolated along its numeric coordinate to the points of the result.
     raw_vectors : mapping of str to str
-        How the variables of the raw dataset move with the frame: ``point`` and ``direction`` (last dimension x y z),
-        ``covariance`` (last two dimensions: point, then direction), ``pose`` (a matrix (4, 4) from a part's own frame
-        into one along the axes of this; its origin is a direction), ``x`` ``y`` ``z`` (that coordinate of a point;
-        ``motion`` must then keep this axis). All others are taken as numbers that no frame changes. Empty where the
-        raw data hold no vectors.
+        Transformation of the variables of the raw dataset with the frame: ``point`` and ``direction`` (last dimension
+        x y z), ``covariance`` (last two dimensions: point, then direction), ``pose`` (a matrix (4, 4) from the frame of
+        a part into one along the axes of this frame; its origin is a direction), ``x`` ``y`` ``z`` (that coordinate of
+        a point; ``motion`` must then not change this axis). All other variables are independent of the frame. Empty
+        without vectors in the raw data.
     settings : mapping
-        What the method's ``Settings`` are made from.
+        Contents of the ``Settings`` of the method.
     setting_vectors : mapping of str to str
-        Which of these settings are points and directions in the frame of the raw data.
+        Settings that are points or directions in the frame of the raw data.
     name : str
         Distinguishes several subjects of one plugin.
     optional : tuple of str
-        Variables of the raw dataset that the method can do without.
+        Variables of the raw dataset that the method does not require.
     measured : tuple of str
-        What the sensors read; may be stored as float32.
+        Readings of the sensors; may be stored as float32.
     motion : (tuple, tuple)
-        Rotation vector (rad) and shift (m) of the frame for the check of frame invariance.
+        Rotation vector (rad) and displacement (m) of the frame for the check of frame invariance.
     seeds : int, optional
-        How many seeds the checks of coverage take; default: 60, or as many as it takes to see a covariance that is
-        30 % off.
+        Number of seeds of the coverage checks; default: 60, or the number that detects a covariance 30 % too large or
+        too small.
     compiles : bool
-        Whether the method compiles parts of itself at first use: that is done before the first check.
+        Whether the method compiles functions at first use: this is done before the first check.
     """
 
     plugin: Any
@@ -253,22 +252,22 @@ class MethodSubject:
         return id(self)
 
     def effective_settings(self) -> Any:
-        """Return the method's settings."""
+        """Return the settings of the method."""
         return self.plugin.Settings(**self.settings)
 
     def identify(self, raw: xr.Dataset) -> xr.Dataset:
-        """Return what a new object of the method makes of a raw dataset."""
+        """Return the result of a new instance of the method."""
         errors: xr.Dataset = self.plugin().identify(raw, self.effective_settings())
         return errors
 
     def warm_up(self) -> None:
-        """Let the plugin compile what it compiles at first use: that is no part of a check's time. Once a process."""
+        """Compile the functions of the plugin, so that the time is not counted in a check; once for each process."""
         if not self.compiles or self.plugin in _WARM:
             return
         _WARM.add(self.plugin)
 
         def work() -> None:
-            with suppress(Exception):  # the checks report what is wrong
+            with suppress(Exception):  # errors are reported by the checks
                 self.identify(self.make(0)[0])
 
         worker = threading.Thread(target=work, name="warm-up", daemon=True)

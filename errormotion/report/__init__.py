@@ -1,4 +1,4 @@
-"""Reports: one HTML file that needs nothing else.
+"""Reports: self-contained HTML files.
 
 ``write_report`` writes a report from error datasets, ``write_run_report`` from a run folder, ``write_page`` from
 chapters. They are loaded at first use, because the drawing library takes time to import.

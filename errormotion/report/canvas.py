@@ -95,7 +95,7 @@ def _translate_legends(figure: Figure) -> None:
 
 
 def _spread_ticks(figure: Figure) -> None:
-    """Take fewer ticks where the numbers of an abscissa would touch."""
+    """Use fewer ticks if the numbers of an abscissa would overlap."""
     for axes in figure.axes:
         if not isinstance(axes.xaxis.get_major_locator(), MaxNLocator) or axes.get_xscale() != "linear":
             continue
@@ -149,7 +149,7 @@ def decimate(time: np.ndarray, values: np.ndarray, bins: int = 450) -> tuple[np.
 
 
 def _picks(values: np.ndarray, bins: int) -> np.ndarray | None:
-    """Return the indices that are drawn of a curve; None for all."""
+    """Return the indices of the points of a curve that are drawn; None for all."""
     if values.size <= 2 * bins:
         return None
     found = []
@@ -208,7 +208,7 @@ def limit_lines(axes: Axes, limits: Sequence[tuple[str, float, float]]) -> None:
     Parameters
     ----------
     limits : sequence of (name, lower, upper)
-        In the unit of the ordinate; infinite where there is none. Draw the curves first.
+        In the unit of the ordinate; infinite = no limit. Draw the curves first.
     """
     low, high = axes.get_ylim()
     span = high - low
@@ -305,7 +305,7 @@ def inline(svg: str, key: str, named: Marks | None = None) -> Markup:
 
 
 def _resolve(root: ElementTree.Element) -> None:
-    """Put areas, which matplotlib defines and then uses once at the left edge, in the place of their use."""
+    """Replace the use of an area, which matplotlib defines once and uses once, by its definition."""
     text = ElementTree.tostring(root, encoding="unicode")
     defined = {each.attrib["id"]: each for each in root.iter("path") if "id" in each.attrib}
     for parent in list(root.iter()):

@@ -1,4 +1,4 @@
-"""Contents of an error dataset as chapters need them: variables as floats, units of freedoms, notes as text."""
+"""Contents of an error dataset for chapters: variables as floats, units of freedoms, notes as text."""
 
 from __future__ import annotations
 

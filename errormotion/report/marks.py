@@ -1,4 +1,4 @@
-"""What a graph states for the script of the page: the range of each panel, and the curves with their uncertainty.
+"""Data of a graph for the script of the page: the range of each panel, and the curves with their uncertainty.
 
 The script reads values from the drawn curves and these attributes; no numbers are stored twice.
 """
@@ -94,7 +94,7 @@ def _curve(line: Line2D, unit: str) -> dict[str, str]:
 
 
 def _curves(axes: Axes) -> list[Line2D]:
-    """Return the lines in data coordinates; reference lines across the panel, and dots on a curve, are none."""
+    """Return the lines in data coordinates, without reference lines across the panel and dots on a curve."""
     return [
         line
         for line in axes.get_lines()
@@ -103,14 +103,14 @@ def _curves(axes: Axes) -> list[Line2D]:
 
 
 def _in_data(axes: Axes, text: Text) -> bool:
-    """Return whether a text stands at a value, and not at a place of the panel."""
+    """Return whether the position of a text is a value of the data, not a fraction of the panel."""
     if isinstance(text, Annotation):
         return text.xycoords != "axes fraction"
     return text.get_transform() == axes.transData
 
 
 def _across(axes: Axes) -> str:
-    """Return the label of the abscissa, which may stand at another panel."""
+    """Return the label of the abscissa, which may be that of another panel."""
     siblings = axes.get_shared_x_axes().get_siblings(axes)
     return next((label for each in (axes, *siblings) if (label := each.get_xlabel())), "")
 

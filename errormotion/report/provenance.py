@@ -140,7 +140,7 @@ def settings_rows(source: Source) -> list[list[Cell | str]]:
 
 
 def _brief(value: Any) -> Any:
-    """Return an entry of ``run.json`` without the full text of a file (its hash stands for it) and its folder."""
+    """Return an entry of ``run.json`` without the full text of a file (its hash identifies it) and its folder."""
     if not isinstance(value, Mapping):
         return value
     return {name: entry for name, entry in value.items() if name not in ("text", "folder")}

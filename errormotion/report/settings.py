@@ -1,4 +1,4 @@
-"""Settings of a method for a reader: as the campaign states them, else in field units, with the SI value beside."""
+"""Settings of a method for a reader: as in the campaign or in field units, and as SI values."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _units(
 
 
 def stated(run: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the settings of the test as its campaign file states them; empty where that is not known."""
+    """Return the settings of the test as in its campaign file; empty if unknown."""
     campaign = run.get("campaign")
     text = campaign.get("text") if isinstance(campaign, Mapping) else None
     if not isinstance(text, str):
@@ -67,7 +67,7 @@ def stated(run: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def unit_of(known: Mapping[tuple[str, ...], str], path: Sequence[str]) -> str:
-    """Return the unit of the setting at a path; empty where it has none."""
+    """Return the unit of the setting at a path; empty if it has none."""
     for pattern, unit in known.items():
         leaf = pattern[:-1] if len(pattern) == len(path) + 1 and pattern[-1] == "*" else pattern  # a list is one leaf
         if len(leaf) == len(path) and all(a in ("*", b) for a, b in zip(leaf, path, strict=True)):
@@ -76,7 +76,7 @@ def unit_of(known: Mapping[tuple[str, ...], str], path: Sequence[str]) -> str:
 
 
 def field(value: Any, unit: str) -> str:
-    """Return an SI number, or a list of some, in a field unit with its name."""
+    """Return an SI number, or a list of numbers, in a field unit with its name."""
     numbers = value if isinstance(value, (list, tuple)) else [value]
     known = [abs(each) for each in numbers if isinstance(each, (int, float)) and not isinstance(each, bool)]
     if len(known) != len(numbers) or not known:
@@ -87,5 +87,5 @@ def field(value: Any, unit: str) -> str:
 
 
 def settings_class(method: str) -> Any:
-    """Return the model of the settings of a method; None where its plugin is not installed."""
+    """Return the model of the settings of a method; None if its plugin is not installed."""
     return getattr(plugins.owner_of_method(method), "Settings", None)

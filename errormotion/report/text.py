@@ -32,7 +32,7 @@ _WORDS: ContextVar[Callable[[str], str]] = ContextVar("words", default=str)
 def written_in(language: str, words: Callable[[str], str] = str) -> Iterator[None]:
     """Write numbers and enumerations in this language inside of the block: in German with a decimal comma.
 
-    ``words`` translates what must be in the language before it is laid out: the legends of drawings.
+    ``words`` translates texts whose width must be known for the layout: the legends of drawings.
     """
     before = _LANGUAGE.set(language if language in _AND else "en")
     used = _WORDS.set(words)
@@ -67,7 +67,7 @@ def rounded(value: float, expanded: float, *, signed: bool = True, digits: int =
         In one unit. A value that is not finite gives two dashes; an uncertainty that is not finite or not positive
         gives a dash, and the value then has ``digits`` significant digits.
     signed : bool
-        Whether a positive value carries its plus.
+        Whether a positive value has a plus sign.
     """
     if not math.isfinite(value):
         return DASH, DASH

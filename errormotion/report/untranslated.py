@@ -1,4 +1,4 @@
-"""Texts of chapters that no catalogue has in a language."""
+"""Texts of chapters that are missing in the catalogues of a language."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from errormotion.report.write import chapters
 
 
 def untranslated(plugin: Any, dataset: xr.Dataset, raw: xr.Dataset | None = None, *, language: str) -> list[str]:
-    """Return the texts of a dataset's chapters that neither the page nor the plugin has in a language.
+    """Return the texts of a dataset's chapters that neither the page nor the plugin translates.
 
     Parameters
     ----------
     plugin : object
-        What made the dataset: its ``chapters`` and ``texts``, where it brings them.
+        The plugin that made the dataset, with its optional ``chapters`` and ``texts``.
     dataset : Dataset
         Such as an error dataset.
     raw : Dataset, optional
@@ -32,7 +32,7 @@ def untranslated(plugin: Any, dataset: xr.Dataset, raw: xr.Dataset | None = None
     Returns
     -------
     list of str
-        In their order, each once. Names and numbers in tables are not among them: they may be names of the data.
+        In their order, each once; without names and numbers in tables, which may be names of the data.
     """
     found = provenance.read(dataset) if "provenance" in dataset.attrs else {}
     source = Source(dataset, raw, {}, found)
@@ -46,7 +46,7 @@ def untranslated(plugin: Any, dataset: xr.Dataset, raw: xr.Dataset | None = None
 def missing_of(
     parts: Sequence[Part], more: Sequence[Section], language: str, catalogues: Sequence[Mapping[str, str]]
 ) -> list[str]:
-    """Return the texts of chapters and further sections that the page and these catalogues do not have."""
+    """Return the texts of chapters and further sections that the page and these catalogues do not translate."""
     t = Catalogue(language, catalogues)
     body, appended = annex.divided(parts)
     for part in body:

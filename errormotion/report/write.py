@@ -1,4 +1,4 @@
-"""Put a report together and write it: one file, no network, written beside and renamed."""
+"""Assemble a report and write it: one self-contained file, replaced in one step."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from errormotion.tolerances.table import Tolerances, from_run
 
 @dataclass(frozen=True)
 class Form:
-    """How a report is written.
+    """Form of a report.
 
-    ``language`` and ``paper`` replace those of the campaign; ``also`` names what is written beside the page: ``pdf``,
-    ``csv`` (a folder), ``xlsx``.
+    ``language`` and ``paper`` replace those of the campaign; ``also`` lists further forms: ``pdf``, ``csv`` (a
+    folder), ``xlsx``.
     """
 
     language: str = ""
@@ -48,7 +48,7 @@ class Form:
         return replace(head, language=self.language or head.language, paper=self.paper or head.paper)
 
     def beside(self, page: Path) -> list[Path]:
-        """Return the files and folders that are written beside a page."""
+        """Return the files and folders that are written in addition to a page."""
         return [
             page.with_name(f"{page.stem}-tables") if kind == "csv" else page.with_suffix(f".{kind}")
             for kind in self.also
@@ -56,12 +56,12 @@ class Form:
 
 
 PLAIN = Form()
-"""The page alone."""
+"""Only the page."""
 
-#: Chapters of components that several methods measure; used where the method brings no chapter of its own.
+#: Chapters of components that several methods measure, for methods without their own chapters.
 COMPONENTS = {"beam": beams.part}
 
-#: What a chapter raises where a dataset has not what the chapter shows.
+#: Exceptions of a chapter if a dataset lacks contents that the chapter shows.
 _DO_NOT_FIT = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 
 
@@ -79,17 +79,17 @@ def write_report(
     Parameters
     ----------
     errors : Dataset or sequence of Dataset
-        Error datasets, one chapter each; the log of a monitor is a chapter too.
+        Error datasets, one chapter each, or logs of a monitor.
     out : Path
         The file; an older one is replaced in one step.
     raw : Dataset, optional
-        The raw dataset that they come from: for counts of lost samples; its samples are not read.
+        The raw dataset that they come from, for the counts of lost samples; its samples are not read.
     title : str, optional
-        Title of the report; without it, made of the machine and what was tested.
+        Title of the report; by default made from the machine and the test.
     run : mapping, optional
-        What else is known of the measurement, such as the content of ``run.json``: machine, test, operator, start.
+        Further data of the measurement, such as the content of ``run.json``: machine, test, operator, start.
     form : Form, optional
-        Language, paper, and what is written beside the page.
+        Language, paper and further files.
 
     Returns
     -------
@@ -99,13 +99,13 @@ def write_report(
     Raises
     ------
     DatasetError
-        No dataset, or one that is no error dataset.
+        There is no dataset, or one is not an error dataset.
     RunError
-        The page was written, and a PDF of it could not be.
+        The page was written, but its PDF could not be.
     """
     datasets = [errors] if isinstance(errors, xr.Dataset) else list(errors)
     if not datasets:
-        raise DatasetError("A report needs at least one error dataset, and none was given.")
+        raise DatasetError("Expected at least one error dataset for a report; found none.")
     sources, tolerances = [], from_run(run or {})
     for i, dataset in enumerate(datasets):
         _check_reportable(dataset)
@@ -124,7 +124,7 @@ def write_report(
 
 
 def _finished(found: Page, out: Path, form: Form, head: Head) -> Path:
-    """Write a page and what belongs beside it."""
+    """Write a page and its further files."""
     target = _write(found.html, out)
     sheets = [sheet(table, k, section) for k, (section, table) in enumerate(found.tables, 1)]
     for path in form.beside(target):
@@ -138,7 +138,7 @@ def _finished(found: Page, out: Path, form: Form, head: Head) -> Path:
 
 
 def catalogue_of(source: Source, language: str) -> Mapping[str, str]:
-    """Return the catalogue of the plugin that made a dataset; empty where it brings none."""
+    """Return the catalogue of the plugin that made a dataset; empty if it has none."""
     owner = _owner(source.errors)
     return owner.texts(language) if language and hasattr(owner, "texts") else {}
 
@@ -154,7 +154,7 @@ def _judged(sources: Sequence[Source], tolerances: Tolerances) -> list[Conformit
 
 
 def _noted(part: Part, run: Mapping[str, Any]) -> Part:
-    """Return a chapter that ends with the notes on its run."""
+    """Return a chapter with the notes on its run as its last section."""
     notes, damaged = run.get("events") or ((), ())
     if not notes and not damaged:
         return part
@@ -179,8 +179,8 @@ def chapters(source: Source) -> list[Part]:
         by = f"method '{source.errors.attrs['method']}'" if "method" in source.errors.attrs else "the plugin"
         raise DatasetError(
             f"The chapter of {by} cannot be written from {file or 'this dataset'} ({type(error).__name__}: {error}). "
-            "Its schema is followed; what the plugin adds to it is missing or has another form. If nobody changed the "
-            "dataset, this is a defect of the plugin: the traceback is in the log."
+            "The dataset conforms to its schema, but contents that the plugin adds are missing or have another form. "
+            "If the dataset was not changed, this is a defect of the plugin: the traceback is in the log."
         ) from error
 
 
@@ -198,17 +198,17 @@ def write_page(
     Parameters
     ----------
     sources : sequence of Source
-        What the chapters were made from; the first one heads the page.
+        Sources of the chapters; the head of the page is that of the first one.
     make : callable
-        Returns the chapters; called once, with numbers written in the language of the page.
+        Returns the chapters; called once, while numbers are written in the language of the page.
     out : Path
         The file; an older one is replaced in one step.
     title : str, optional
-        Without it, made of the machine and the title of the first chapter.
+        By default made from the machine and the title of the first chapter.
     form : Form, optional
-        Language, paper, and what is written beside the page.
+        Language, paper and further files.
     texts : callable, optional
-        ``texts(language)``: the catalogue of the chapters, where the plugins that made the datasets do not bring it.
+        ``texts(language)``: a catalogue of the chapters in addition to those of the plugins of the datasets.
 
     Returns
     -------
@@ -218,7 +218,7 @@ def write_page(
     Raises
     ------
     RunError
-        The page was written, and a PDF of it could not be.
+        The page was written, but its PDF could not be.
     """
     head = form.of(Head())
     catalogues = [catalogue_of(source, head.language) for source in sources]
@@ -229,7 +229,7 @@ def write_page(
 
 
 def _owner(dataset: xr.Dataset) -> Any:
-    """Return the plugin that a dataset comes from; None where there is none."""
+    """Return the plugin that made a dataset; None if it is unknown."""
     schema = str(dataset.attrs.get("schema"))
     if schema == plugins.ERRORS_SCHEMA:
         return plugins.owner_of_method(str(dataset.attrs.get("method")))
@@ -237,19 +237,19 @@ def _owner(dataset: xr.Dataset) -> Any:
 
 
 def _is_log(dataset: xr.Dataset) -> bool:
-    """Return whether a dataset that is no error dataset has chapters of its own; raw data of a method have none."""
+    """Return whether a dataset without errors has its own chapters, such as a log; raw data of a method have none."""
     owner = _owner(dataset)
     return isinstance(getattr(owner, "info", None), plugins.DatasetInfo) and hasattr(owner, "chapters")
 
 
 def _kind_without_errors(dataset: xr.Dataset) -> str:
-    """Return what a stored dataset is that has no report, and the command that shows it; empty for others."""
+    """Return the kind of a dataset without report, and the command for it; empty for others."""
     owner = plugins.owner_of_schema(str(dataset.attrs.get("schema")))
     if not isinstance(getattr(owner, "info", None), plugins.DatasetInfo):
         return ""
     if hasattr(owner, "predictor"):
         return (
-            "a model, which states no errors. Compare it with a measured campaign: errormotion model check MODEL "
+            "a model, which contains no errors. Compare it with a measured campaign: errormotion model check MODEL "
             "ERRORS --report page.html; or predict errors and report these: errormotion model predict MODEL DATA"
         )
     if hasattr(owner, "chapters"):
@@ -269,7 +269,7 @@ def _check_reportable(dataset: xr.Dataset) -> None:
 
 
 def _write(text: str, out: Path) -> Path:
-    """Write a page beside its place, and rename it."""
+    """Write a page; an older one is replaced in one step."""
     with whole(out) as beside:
         beside.write_text(text, encoding="utf-8")
     return out
@@ -283,14 +283,14 @@ def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = 
     run_folder : Path
         Of a test, or of a monitor.
     out : Path, optional
-        The file; without it, ``report.html`` in the folder.
+        The file; by default ``report.html`` in the folder.
     form : Form, optional
-        Language, paper, and what is written beside the page.
+        Language, paper and further files.
 
     Raises
     ------
     RunError
-        The folder does not exist, or holds no ``errors/*/errors.nc``.
+        The folder does not exist, or contains no ``errors/*/errors.nc``.
     DatasetError
         A result cannot be read.
     """
@@ -300,14 +300,12 @@ def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = 
 
     folder = Path(run_folder)
     if not folder.is_dir():
-        raise RunError(f"Expected a run folder, and there is none at {folder}.")
+        raise RunError(f"Expected a run folder at {folder}; found none.")
     files = sorted(folder.glob("errors/*/errors.nc"))
     raw = load(folder / "raw.zarr") if (folder / "raw.zarr").exists() else None
     log = raw if raw is not None and not files and _is_log(raw) else None
     if not files and log is None:
-        raise RunError(
-            f"{folder} holds no errors/*/errors.nc: nothing was identified yet. Run 'errormotion identify' first."
-        )
+        raise RunError(f"{folder} contains no errors/*/errors.nc. Run 'errormotion identify' first.")
     run: dict[str, Any] = {}
     if os.path.lexists(folder / "run.json"):
         run = dict(read_run(folder))
@@ -324,7 +322,7 @@ def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = 
 
 
 def belonging(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
-    """Return the datasets beside a file of errors that state its hash (`errors_hash`), such as an evaluation of it."""
+    """Return the datasets in the folder of a file of errors with its hash (`errors_hash`), such as its evaluation."""
     from errormotion.datasets import hash_dataset, load
     from errormotion.datasets.storage.disk import reading
 
@@ -339,7 +337,7 @@ def belonging(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
 
 
 def _provenance(dataset: xr.Dataset, run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the provenance of a dataset; where it carries none, what its run says."""
+    """Return the provenance of a dataset; if it has none, that of its run."""
     if "provenance" not in dataset.attrs:
         return {name: run[name] for name in ("instruments", "settings", "software") if run.get(name)}
     return provenance.read(dataset)

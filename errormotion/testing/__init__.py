@@ -1,8 +1,8 @@
-"""The conformance kit: what every instrument, method and compensator plugin has to show, ours and others'.
+"""The conformance kit: checks for all instrument, method and compensator plugins.
 
 ``check_plugin(group, plugin_id)`` runs it on a plugin of the registry. In a plugin's own tests, subclass
 ``InstrumentConformance``, ``MethodConformance`` or ``CompensatorConformance`` and state the subject; pytest then
-collects one test a check.
+collects one test for each check.
 """
 
 from __future__ import annotations

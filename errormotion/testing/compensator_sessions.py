@@ -1,4 +1,4 @@
-"""A session with a compensator under test and the simulated machine that takes its offsets."""
+"""A session with a compensator under test and the simulated machine for its offsets."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from errormotion.plugins.subjects import with_query
 from errormotion.testing.kit import require
 
 ARRIVAL = 5.0
-"""Real time within which something written is seen at the other end, s."""
+"""Real time within which the machine receives written values, s."""
 POLL = 0.005
 """s"""
 STEPS = 20
-"""Instants at which a ramp is looked at."""
+"""Number of instants at which a ramp is examined."""
 
 
 @contextmanager
 def started(subject: CompensatorSubject, fault: str = "") -> Iterator[Any]:
-    """Start the simulated machine; without one, stand in for it with the address of the real one."""
+    """Start the simulated machine, or yield the address of the real one in the same form."""
     if not subject.simulated:
         yield None
         return
@@ -38,7 +38,7 @@ def started(subject: CompensatorSubject, fault: str = "") -> Iterator[Any]:
 
 
 def made(subject: CompensatorSubject, device: Any) -> Any:
-    """Return a new compensator for a machine, not yet opened."""
+    """Return a new compensator for a machine, not open."""
     if device is None:
         return subject.build(subject.address)
     where = getattr(device, "driver_url", None) or device.url
@@ -47,7 +47,7 @@ def made(subject: CompensatorSubject, device: Any) -> Any:
 
 @contextmanager
 def armed(subject: CompensatorSubject, device: Any) -> Iterator[Any]:
-    """Give an open and armed compensator."""
+    """Yield an open and armed compensator."""
     with closing(made(subject, device)) as compensator:
         compensator.open()
         compensator.arm(subject.limit)
@@ -55,7 +55,7 @@ def armed(subject: CompensatorSubject, device: Any) -> Iterator[Any]:
 
 
 def wait_for(condition: Callable[[], bool], message: str | Callable[[], str]) -> None:
-    """Wait until a condition holds; fail with a message where it does not."""
+    """Wait until a condition is true; fail with a message at the time limit."""
     end = time.monotonic() + ARRIVAL
     while not condition():
         if time.monotonic() >= end:
@@ -64,19 +64,19 @@ def wait_for(condition: Callable[[], bool], message: str | Callable[[], str]) ->
 
 
 def write(compensator: Any, device: Any, offset: tuple[float, float, float]) -> None:
-    """Write, and wait until the machine has it."""
+    """Write, and wait until the machine has received it."""
     before = device.machine.orders
     compensator.write(offset)
-    wait_for(lambda: device.machine.orders > before, f"the machine got nothing after write({offset})")
+    wait_for(lambda: device.machine.orders > before, f"the machine received nothing after write({offset})")
 
 
 def near(one: Any, other: Any, tolerance: float) -> bool:
-    """Return whether two offsets agree, m."""
+    """Return whether two offsets, m, agree."""
     return all(math.isfinite(a) and abs(a - b) <= tolerance for a, b in zip(one, other, strict=True))
 
 
 def require_offset(subject: CompensatorSubject, found: Any, expected: Any, what: str) -> None:
-    """Fail unless an offset is the expected one, to the resolution of the subject."""
+    """Fail if an offset differs from the expected one by more than the resolution of the subject."""
     require(near(found, expected, subject.resolution), f"{what}: expected {um(expected)}, found {um(found)}")
 
 
@@ -86,34 +86,34 @@ def um(offset: Any) -> str:
 
 
 def follow(subject: CompensatorSubject, compensator: Any, device: Any) -> None:
-    """Write the offset of the subject until it is in effect."""
+    """Write the offset of the subject until it is active."""
     machine = device.machine
     ramp = max(map(abs, subject.offset)) / machine.slew
     for _ in range(math.ceil(ramp / (0.4 * machine.watchdog)) + 1):
         write(compensator, device, subject.offset)
         machine.elapse(0.4 * machine.watchdog)
-    require_offset(subject, machine.offset, subject.offset, "the offset in effect after it was written")
+    require_offset(subject, machine.offset, subject.offset, "the active offset after it was written")
 
 
 def require_ramp(device: Any, what: str) -> None:
-    """Let the time of the watchdog and of a ramp pass; fail where the offset jumps or does not reach zero."""
+    """Advance by the time of the watchdog and of a ramp; fail if the offset jumps or does not reach zero."""
     machine = device.machine
     before = machine.offset
-    # until the watchdog ends it, the offset may still move towards the last order
+    # until the watchdog acts, the offset may still change towards the last command
     slowest = 2 * machine.watchdog + max(map(abs, before)) / machine.slew
     step = 1.05 * slowest / STEPS
     for _ in range(STEPS):
         machine.elapse(step)
         now = machine.offset
         change = max(abs(a - b) for a, b in zip(now, before, strict=True))
-        # a clock that runs by itself has moved on a little as well
+        # a clock in real time has advanced a little more
         require(change <= machine.slew * (step + 1.0), f"{what}: the offset jumped by {change * 1e6:.4f} um")
         before = now
     require(not any(before), f"{what}: expected a ramp to zero within {slowest:g} s, found {um(before)}")
 
 
 class Written:
-    """A compensator as an instrument: armed when it is opened, each of its readings is followed by a write.
+    """A compensator as an instrument: it is armed when opened, and each reading is followed by a write.
 
     Parameters
     ----------

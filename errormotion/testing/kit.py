@@ -1,4 +1,4 @@
-"""What a check is: a plain function that takes a subject, claims something in its docstring, and fails in words."""
+"""Checks: functions of a subject; the docstring states the requirement, an exception the failure."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ Subject = TypeVar("Subject")
 
 
 class CheckFailedError(AssertionError):
-    """A plugin does not do what the check claims."""
+    """A plugin does not meet the requirement of a check."""
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What came out of one check.
+    """Result of one check.
 
     Attributes
     ----------
     name : str
         Name of the check.
     ok : bool
-        Whether the plugin passed; True too where the check does not apply.
+        Whether the plugin passed; also True if the check does not apply.
     message : str
-        What was seen, or what was expected and what came instead.
+        The observation, or the expected and the found behaviour.
     seconds : float
-        How long it took.
+        Its duration.
     skipped : bool
-        The check does not apply to this plugin; ``message`` says why.
+        Whether the check does not apply to this plugin, for the reason in ``message``.
     trace : str
-        Traceback of an exception that no check expected.
+        Traceback of an unexpected exception.
     """
 
     name: str
@@ -46,16 +46,16 @@ class CheckResult:
 
 
 def applies_always(subject: object) -> str:  # noqa: ARG001 - one signature for all
-    """Return no reason against running a check."""
+    """Return an empty reason: the check applies."""
     return ""
 
 
 @dataclass(frozen=True)
 class Check(Generic[Subject]):
-    """A named claim about a plugin, and the function that tries it.
+    """A named requirement for plugins, and the function that checks it.
 
-    ``why_not(subject)`` is empty where the check applies, else the reason why it does not. ``limit`` is its time limit,
-    s, or a function that returns it; infinite where the check has limits of its own.
+    ``why_not(subject)`` is empty if the check applies, else the reason why it does not. ``limit`` is its time limit, s,
+    or a function that returns it; infinite for a check with its own limits.
     """
 
     name: str
@@ -65,17 +65,17 @@ class Check(Generic[Subject]):
 
     @property
     def claim(self) -> str:
-        """What the check claims, in one line."""
+        """The requirement of the check, in one line."""
         return (self.function.__doc__ or "").strip().splitlines()[0]
 
 
 class Checks(list[Check[Subject]]):
-    """Checks in the order in which they run."""
+    """Checks in their order."""
 
     def add(
         self, limit: float | Callable[[Subject], float] = 30.0, why_not: Callable[[Subject], str] = applies_always
     ) -> Callable[[Callable[[Subject], str]], Callable[[Subject], str]]:
-        """Return a decorator that appends a check named like its function."""
+        """Return a decorator that appends a check with the name of its function."""
 
         def register(function: Callable[[Subject], str]) -> Callable[[Subject], str]:
             self.append(Check(function.__name__, function, limit, why_not))
@@ -85,13 +85,13 @@ class Checks(list[Check[Subject]]):
 
 
 def require(condition: bool, message: str) -> None:
-    """Fail the running check with a message unless the condition holds."""
+    """Fail the running check with a message if the condition is false."""
     if not condition:
         raise CheckFailedError(message)
 
 
 def run_check(check: Check[Subject], subject: Subject) -> CheckResult:
-    """Run one check in a thread of its own and return its result; a check that hangs fails at its time limit."""
+    """Run one check in a separate thread and return its result; a check that hangs fails at its time limit."""
     box: list[CheckResult] = []
     getattr(subject, "warm_up", lambda: None)()
     start = time.perf_counter()

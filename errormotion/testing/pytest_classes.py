@@ -1,4 +1,4 @@
-"""The kit as test classes: one test a check. Plain classes: pytest collects their subclasses called ``Test...``."""
+"""The kit as test classes with one test for each check; pytest collects subclasses named ``Test...``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _give_tests(cls: type, subject: Any) -> None:
 
 
 class InstrumentConformance:
-    """One test for every check that applies to the instrument which a subclass states as its ``subject``."""
+    """One test for each check that applies to the instrument that a subclass states as ``subject``."""
 
     subject: ClassVar[InstrumentSubject]
 
@@ -39,7 +39,7 @@ class InstrumentConformance:
 
 
 class MethodConformance:
-    """One test for every check that applies to the method which a subclass states as its ``subject``."""
+    """One test for each check that applies to the method that a subclass states as ``subject``."""
 
     subject: ClassVar[MethodSubject]
 
@@ -49,7 +49,7 @@ class MethodConformance:
 
 
 class CompensatorConformance:
-    """One test for every check that applies to the compensator which a subclass states as its ``subject``."""
+    """One test for each check that applies to the compensator that a subclass states as ``subject``."""
 
     subject: ClassVar[CompensatorSubject]
 

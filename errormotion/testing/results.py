@@ -1,4 +1,4 @@
-"""An error dataset as plain arrays over its places, and the truth at those places."""
+"""An error dataset as arrays over its points (positions or times), and the truth at these points."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from errormotion.testing.kit import require
 
 
 def place_dims(errors: xr.Dataset) -> tuple[str, ...]:
-    """Return the dimensions over which the errors are given."""
+    """Return the dimensions of the errors."""
     return tuple(str(dim) for dim in errors["EX"].dims)
 
 
 def names(errors: xr.Dataset) -> tuple[str, ...]:
-    """Return the names of the estimates: the six freedoms, or ``deviation`` alone."""
+    """Return the names of the estimates: the six freedoms, or only ``deviation``."""
     return tuple(errors.em.names)
 
 
@@ -27,7 +27,7 @@ def values(errors: xr.Dataset) -> np.ndarray:
 
 
 def covariance(errors: xr.Dataset) -> np.ndarray:
-    """Return the covariance of the estimates at every place, (place, n, n), SI."""
+    """Return the covariance of the estimates at each point, (place, n, n), SI."""
     full = errors.em.covariance().transpose(*place_dims(errors), "dof", "dof_").values
     return np.reshape(full, (-1, *full.shape[-2:]))
 
@@ -39,7 +39,7 @@ def sigma(errors: xr.Dataset) -> np.ndarray:
 
 
 def influence(errors: xr.Dataset) -> np.ndarray:
-    """Return the effects of the shared sources, (place, source, n), SI; no source where none is stated."""
+    """Return the effects of the shared sources, (place, source, n), SI; may contain no source."""
     n = len(names(errors))
     name = "influence" if n > 1 else "deviation_influence"
     if name not in errors:
@@ -49,16 +49,16 @@ def influence(errors: xr.Dataset) -> np.ndarray:
 
 
 def functional_point(errors: xr.Dataset) -> np.ndarray:
-    """Return the point whose displacement the errors tell, (3,), m."""
+    """Return the point whose displacement the errors state, (3,), m."""
     return np.asarray(errors.attrs["functional_point"], dtype=float)
 
 
 def truth_at_places(errors: xr.Dataset, truth: xr.Dataset) -> np.ndarray:
-    """Return the true estimates, (place, n), at the places and at the functional point of a result."""
+    """Return the true values, (place, n), at the points and for the functional point of a result."""
     dims = place_dims(errors)
-    require(place_dims(truth) == dims, f"the truth is given over {place_dims(truth)}, the result over {dims}")
+    require(place_dims(truth) == dims, f"the truth has the dimensions {place_dims(truth)}, the result {dims}")
     seen = ("deviation",) if "deviation" in truth else DOF
-    require(seen == DOF or names(errors) == seen, "the truth is a deviation, and the result is none")
+    require(seen == DOF or names(errors) == seen, "the truth is a deviation, but the result is not")
     known = truth[list(seen)]
     for dim in dims:
         if errors[dim].dtype.kind in "fiu":
@@ -82,7 +82,7 @@ def truth_at_places(errors: xr.Dataset, truth: xr.Dataset) -> np.ndarray:
 
 
 def _interpolated(array: np.ndarray, axis: int, given: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return an array with the values at other places along an axis, linear between the given ones."""
+    """Return an array with values at other coordinates along an axis, by linear interpolation."""
     if np.array_equal(given, wanted):
         return array
     order = np.argsort(given)

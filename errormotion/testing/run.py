@@ -24,26 +24,26 @@ _EXPECTED = {
 def check_plugin(
     group: Group, plugin_id: str, *, address: str | None = None, mutants: int | None = None
 ) -> list[CheckResult]:
-    """Run every check on one plugin of the registry.
+    """Run all checks on one plugin of the registry.
 
     Parameters
     ----------
     group : "instruments", "methods" or "compensators"
     plugin_id : str
     address : str, optional
-        Where to find the instrument or the machine; default: its own simulator.
+        Address of the instrument or the machine; default: that of its simulator.
     mutants : int, optional
-        How many changed frames a driver has to stand; default: as its subject states.
+        Number of changed frames for a driver; default: as its subject states.
 
     Returns
     -------
     list of CheckResult
-        In the order in which the checks ran; where a plugin states several subjects, their name stands in brackets.
+        In the order of the checks; with several subjects, with the name of the subject in brackets.
 
     Raises
     ------
     PluginError
-        Unknown id, a plugin that does not load, or one that states no subject to check.
+        The id is unknown, or the plugin cannot be loaded or states no subject.
     """
     results = []
     for subject in subjects_of(group, plugin_id, address=address):
@@ -55,12 +55,12 @@ def check_plugin(
 
 
 def run_checks(subject: Subject) -> list[CheckResult]:
-    """Run every check of the kit on one subject."""
+    """Run all checks of the kit on one subject."""
     return [run_check(check, subject) for check in checks_for(subject)]
 
 
 def checks_for(subject: Subject) -> Sequence[Check[Any]]:
-    """Return the checks for a subject of this kind, in the order in which they run."""
+    """Return the checks for a subject of this kind, in their order."""
     if isinstance(subject, InstrumentSubject):
         from errormotion.testing.checks.instrument import INSTRUMENT_CHECKS
 
@@ -75,7 +75,7 @@ def checks_for(subject: Subject) -> Sequence[Check[Any]]:
 
 
 def subjects_of(group: Group, plugin_id: str, *, address: str | None = None) -> Sequence[Subject]:
-    """Return what the kit examines of one plugin.
+    """Return the subjects of one plugin.
 
     A plugin states its subjects by the attribute ``conformance``: a function that returns one subject or a tuple of
     them, or the text ``module:name`` of such subjects. An instrument or a compensator without it is examined at
@@ -84,7 +84,7 @@ def subjects_of(group: Group, plugin_id: str, *, address: str | None = None) -> 
     Raises
     ------
     PluginError
-        Nothing is stated and nothing can be guessed.
+        The plugin states no subject, and there is no default.
     """
     cls = plugins.get(group, plugin_id)
     subjects: tuple[Any, ...] = ()
@@ -92,11 +92,11 @@ def subjects_of(group: Group, plugin_id: str, *, address: str | None = None) -> 
         stated = load_object(cls.conformance) if isinstance(cls.conformance, str) else cls.conformance()
         subjects = stated if isinstance(stated, tuple) else (stated,)
         if not all(isinstance(subject, Subject) for subject in subjects):
-            raise PluginError(f"The attribute conformance of '{plugin_id}' gives no {_EXPECTED.get(group, 'subject')}")
+            raise PluginError(f"The attribute conformance of '{plugin_id}': expected {_EXPECTED.get(group, 'subject')}")
     if not subjects and group == "methods":
         raise PluginError(
-            f"The method '{plugin_id}' does not say how to check it; give its class an attribute "
-            "conformance = 'module:name' that names a MethodSubject."
+            f"The method '{plugin_id}' states no subject for the checks; expected an attribute conformance = "
+            "'module:name' of its class, with a MethodSubject."
         )
     if not subjects:
         if group == "datasets":

@@ -1,4 +1,4 @@
-"""One session with an instrument under test, and what it left behind."""
+"""One session with an instrument under test, and resources left open after it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from errormotion.testing.kit import require
 
 @dataclass
 class Session:
-    """What an instrument gave in one session: identify, read, stream."""
+    """Results of one session with an instrument: identity, readings, stream."""
 
     error: Exception | None = None
     seconds: float = 0.0
@@ -33,12 +33,12 @@ class Session:
 
     @property
     def unread(self) -> int:
-        """How many values of the readings are unknown."""
+        """Number of unknown values of the readings."""
         return int(np.isnan(self.read).sum())
 
     @property
     def summary(self) -> str:
-        """What came of it, in words."""
+        """The result in words."""
         if self.error is not None:
             return f"{type(self.error).__name__} after {self.seconds:.2f} s"
         if self.lost:
@@ -49,7 +49,7 @@ class Session:
 def run_session(
     subject: InstrumentSubject, *, address: str = "", fault: str = "", record: Path | None = None
 ) -> Session:
-    """Go through one session and keep what came, with the error that ended it."""
+    """Run one session; return its results, with the error that ended it."""
     session = Session()
     start = time.perf_counter()
     blocks: list[Samples] = []
@@ -82,7 +82,7 @@ def first_blocks(instrument: Any, n: int) -> list[Samples]:
 
 
 def numbers(reading: Any) -> list[float]:
-    """Return all numbers of a reading, in order; None counts as NaN, text beside them (states, names) not at all."""
+    """Return all numbers of a reading, in order; None counts as NaN, and texts (states, names) are ignored."""
     return [
         math.nan if leaf is None else float(leaf)
         for leaf in leaves(reading)
@@ -105,7 +105,7 @@ def leaves(reading: Any) -> Iterator[Any]:
 
 
 def require_same(one: np.ndarray, other: np.ndarray, message: str) -> None:
-    """Fail unless two arrays hold the same values; NaN equals NaN."""
+    """Fail unless two arrays contain the same values; NaN equals NaN."""
     require(one.shape == other.shape, f"{message}: {one.shape} values became {other.shape}")
     differ = ~((one == other) | (np.isnan(one) & np.isnan(other)))
     if differ.any():

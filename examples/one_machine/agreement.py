@@ -1,4 +1,4 @@
-"""Do the methods of this example agree, with each other and with the truth?  agreement.py [RUNS]."""
+"""Compare the methods of this example with each other and with the truth: agreement.py [RUNS]."""
 
 import argparse
 from collections.abc import Iterator
@@ -20,10 +20,10 @@ def newest(runs: Path) -> dict[str, RunFolder]:
 
 
 def questions(runs: dict[str, RunFolder]) -> Iterator[tuple[str, dict[str, xr.Dataset], tuple[str, ...]]]:
-    """Yield what is compared: a title, results by name, and the freedoms that they share (empty: all)."""
+    """Yield each comparison: a title, results by name, and the common freedoms (empty: all)."""
     errors = {name: datasets.load(folder.errors) for name, folder in runs.items() if folder.errors}
     truth = {name: truth_of(folder) for name, folder in runs.items() if errors[name].attrs["component"] != "beam"}
-    # The bar shows the tilt of the spindle, the balls the rotation of the axes: about Y and Z these differ.
+    # The bar determines the tilt of the spindle, the balls the rotation of the axes: about Y and Z these differ.
     displacements = ("EX", "EY", "EZ", "EA")
     yield "the tool", {"bar": errors["bar"], "balls": errors["balls"], "truth": truth["balls"]}, displacements
     for i, y in enumerate(errors["carriage"]["y"].values):
@@ -34,7 +34,7 @@ def questions(runs: dict[str, RunFolder]) -> Iterator[tuple[str, dict[str, xr.Da
 
 
 def main() -> None:
-    """Compare, and print what was found."""
+    """Compare, and print the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", nargs="?", type=Path, default=Path("runs"), help="folder with the runs of this example")
     for title, results, freedoms in questions(newest(parser.parse_args().runs)):
@@ -43,7 +43,7 @@ def main() -> None:
         print("\n".join(verdict(found)))
         for j, pair in enumerate(found["pair"].values):
             en = abs(found["en"].values[j])
-            share = (en[en == en] <= 1).mean()  # a value that is not known is not equal to itself
+            share = (en[en == en] <= 1).mean()  # without unknown values (NaN)
             print(f"  {pair}: |En| <= 1 at {100 * share:.0f} %, p = {probability(found['p'].values[j])}")
 
 

@@ -14,7 +14,7 @@ Build = Callable[..., xr.Dataset]
 
 
 def error_dataset(seed: int = 0, n: int = 7, unseen: tuple[int, ...] = (), **changes: Any) -> xr.Dataset:
-    """Return an error dataset over time with influences in two groups and an independent rest."""
+    """Return an error dataset over time with influences in two groups and independent noise."""
     rng = np.random.default_rng(seed)
     E = rng.normal(size=(n, 6)) * 1e-5
     F = rng.normal(size=(3, n, 6)) * 1e-6
@@ -45,7 +45,7 @@ def error_dataset(seed: int = 0, n: int = 7, unseen: tuple[int, ...] = (), **cha
 
 
 def drift_dataset(n: int = 50, **variables: Any) -> xr.Dataset:
-    """Return a raw dataset of a drift measurement that follows its schema."""
+    """Return a valid raw dataset of a drift measurement."""
     rng = np.random.default_rng(0)
     side = [[-1, 0, 0], [-1, 0, 0], [0, -1, 0], [0, -1, 0], [0, 0, 1]]
     origin = [[0.006, 0, 0.01], [0.006, 0, 0.05], [0, 0.006, 0.01], [0, 0.006, 0.05], [0, 0, -0.001]]
@@ -73,7 +73,7 @@ def drift_dataset(n: int = 50, **variables: Any) -> xr.Dataset:
 
 
 def beam_dataset() -> xr.Dataset:
-    """Return a raw dataset of a beam detection that follows its schema."""
+    """Return a valid raw dataset of a beam detection."""
     shape = (5, 6, 11)
     return xr.Dataset(
         {

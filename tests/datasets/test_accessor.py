@@ -21,7 +21,7 @@ poses = st.builds(
 
 
 def assert_same(back: xr.Dataset, ds: xr.Dataset) -> None:
-    """Equal up to some roundings of the largest number that occurred on the way."""
+    """Equal up to rounding of the largest intermediate number."""
     assert set(back.variables) == set(ds.variables)
     lever = 10.0  # m: points and shifts of at most 5 m in each coordinate
     scale = {"EX": 5e-5 * lever, "EA": 5e-5, "covariance": 1e-10 * lever**2, "influence": 5e-6 * lever}
@@ -67,7 +67,7 @@ def test_a_tilt_becomes_a_displacement_at_the_end_of_the_lever(errors) -> None:
     np.testing.assert_array_equal(ds["EX"], 0)
 
 
-def test_an_unseen_freedom_spoils_only_what_depends_on_it(errors) -> None:
+def test_an_undetermined_freedom_affects_only_dependent_values(errors) -> None:
     ds = errors(unseen=(5,), functional_point=(0, 0, 0))
     along = ds.em.at((0, 0, 0.1))
     assert np.isfinite(along.em.twist().sel(dof=list(DOF[:5]))).all()
@@ -78,7 +78,7 @@ def test_an_unseen_freedom_spoils_only_what_depends_on_it(errors) -> None:
         assert datasets.violations(moved) == []
 
 
-def test_a_frame_change_turns_both_parts_and_the_commanded_places(errors) -> None:
+def test_a_frame_change_rotates_both_parts_and_the_commanded_positions(errors) -> None:
     quarter = RigidTransform.from_components([0, 0, 1.0], Rotation.from_euler("z", 90, degrees=True))
     coords = {"position": np.arange(7.0), **{name: ("position", np.full(7, k / 10)) for k, name in enumerate("xyz")}}
     ds = errors(dims=("position",), coords=coords, component="X", functional_point=(1, 0, 0))
@@ -114,7 +114,7 @@ def test_a_common_source_cancels_in_a_difference(errors) -> None:
     np.testing.assert_allclose(ds.em.covariance_between(2, -5), C[2], rtol=1e-12)
 
 
-def test_a_place_with_weight_zero_does_not_matter_even_when_unknown(errors) -> None:
+def test_a_point_with_weight_zero_has_no_effect_even_if_unknown(errors) -> None:
     ds = errors()
     values = ds.em.twist().values.copy()
     values[0] = np.nan
@@ -149,7 +149,7 @@ def test_the_budget_adds_up_to_the_total(errors) -> None:
     assert list(alone["group"].values) == ["independent"]
 
 
-def test_combination_of_what_does_not_fit_is_refused(errors) -> None:
+def test_combination_of_inconsistent_datasets_is_refused(errors) -> None:
     ds = errors()
     with pytest.raises(DatasetError, match="one of the dims time; found 'position'"):
         ds.em.combine(np.ones(7), "position")
@@ -165,7 +165,7 @@ def test_names_follow_the_component(errors) -> None:
     assert errors().em.iso_names()["EZ"] == "EZC"
 
 
-def test_extras_stay_as_the_method_computed_them(errors) -> None:
+def test_extras_are_not_changed(errors) -> None:
     ds = errors(extras={"bar_axis_point": xr.DataArray([0.0, 0.0, 0.0], dims="direction")})
     xr.testing.assert_identical(ds.em.at((1, 2, 3))["bar_axis_point"], ds["bar_axis_point"])
 
@@ -198,6 +198,6 @@ def test_a_curve_is_drawn_in_um_over_minutes(errors) -> None:
     np.testing.assert_allclose(line.get_xdata(), np.arange(7), rtol=1e-12)
 
 
-def test_a_raw_dataset_has_no_errors_to_ask_for(drift) -> None:
+def test_a_raw_dataset_has_no_errors(drift) -> None:
     with pytest.raises(DatasetError, match="Identify a raw dataset first"):
         drift().em.twist()

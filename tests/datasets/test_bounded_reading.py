@@ -1,4 +1,4 @@
-"""Files are read with a bound on their size, and memory follows the size, not the bound."""
+"""Files are read with a limit of their size; the memory depends on the size, not on the limit."""
 
 import tracemalloc
 from pathlib import Path
@@ -10,7 +10,7 @@ from errormotion.datasets.files.runfile import SCHEMA, read_run
 from errormotion.errors import RunError
 
 
-def test_a_small_file_takes_little_memory_whatever_the_bound(tmp_path: Path) -> None:
+def test_a_small_file_takes_little_memory_with_any_limit(tmp_path: Path) -> None:
     path = tmp_path / "small"
     path.write_bytes(b"x" * 1000)
     tracemalloc.start()
@@ -21,7 +21,7 @@ def test_a_small_file_takes_little_memory_whatever_the_bound(tmp_path: Path) -> 
         tracemalloc.stop()
 
 
-def test_a_file_beyond_the_bound_is_refused(tmp_path: Path) -> None:
+def test_a_file_above_the_limit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "large"
     path.write_bytes(b"x" * 1001)
     with pytest.raises(OSError, match="expected at most 1000 bytes"):
@@ -29,7 +29,7 @@ def test_a_file_beyond_the_bound_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("start", "end"), [('{"a":', "}"), ("[", "]")])
-def test_json_is_read_to_a_depth_that_everything_can_walk(start: str, end: str) -> None:
+def test_json_is_read_up_to_a_limited_depth(start: str, end: str) -> None:
     parse_json(start * DEEPEST + "1" + end * DEEPEST)
     for levels in (DEEPEST + 1, 900, 100_000):
         with pytest.raises(ValueError, match="nested too deeply"):
@@ -37,7 +37,7 @@ def test_json_is_read_to_a_depth_that_everything_can_walk(start: str, end: str) 
 
 
 def test_a_nested_run_json_is_refused_with_its_name(tmp_path: Path) -> None:
-    """Python reads 900 levels, and ends in a RecursionError when they are walked."""
+    """Python reads 900 levels, but a recursion over them raises a RecursionError."""
     deep = '{"a":' * 900 + "1" + "}" * 900
     (tmp_path / "run.json").write_text(f'{{"schema": "{SCHEMA}", "x": {deep}}}')
     with pytest.raises(RunError, match=r"run\.json: is not valid JSON \(nested too deeply"):

@@ -1,4 +1,4 @@
-"""The calibration of an inclination error as a dataset: what it says, where it refuses, and how it is found."""
+"""The calibration of an inclination error as a dataset: values, refused tilts, and search by name."""
 
 from pathlib import Path
 
@@ -71,7 +71,7 @@ def holed() -> InclinationCalibration:
     beta=st.floats(0.0, 2 * np.pi),
     mid=st.sampled_from([0.0, 1e-3]),
 )
-def test_compensation_undoes_the_error(depth: float, alpha: float, beta: float, mid: float) -> None:
+def test_compensation_removes_the_error(depth: float, alpha: float, beta: float, mid: float) -> None:
     known = calibration()
     q = tilt_vector(alpha, beta)
     k, _ = known.slope(q)
@@ -79,7 +79,7 @@ def test_compensation_undoes_the_error(depth: float, alpha: float, beta: float, 
     assert found.value == pytest.approx(mid + depth, abs=1e-15)
 
 
-def test_the_raw_reading_stays_beside_the_compensated_one(good: InclinationCalibration) -> None:
+def test_the_raw_reading_is_stored_with_the_compensated_one(good: InclinationCalibration) -> None:
     reading = np.array([-4e-3, 0.0, 5e-3, np.nan])
     found = good.compensate(reading, tilt_vector(np.radians(20.0), 0.0))
     np.testing.assert_array_equal(found.raw, reading)
@@ -108,20 +108,18 @@ def test_between_settings_is_supported(good: InclinationCalibration) -> None:
     ).all()
 
 
-def test_beyond_the_steepest_setting_is_refused_by_name(good: InclinationCalibration) -> None:
+def test_a_tilt_beyond_the_steepest_setting_is_refused(good: InclinationCalibration) -> None:
     with pytest.raises(
-        MethodError, match=r"inclination 50\.0 deg at rotation 30\.0 deg lies beyond the steepest"
+        MethodError, match=r"inclination 50\.0 deg at rotation 30\.0 deg is beyond the steepest"
     ) as reported:
         good.compensate(1e-3, tilt_vector(np.radians(50.0), np.radians(30.0)))
     assert "nearest calibrated: inclination 40.0 deg at rotation 30.0 deg" in str(reported.value)
 
 
-def test_a_hole_is_refused_where_it_is_used(holed: InclinationCalibration) -> None:
+def test_a_tilt_in_a_hole_is_refused(holed: InclinationCalibration) -> None:
     q = tilt_vector(np.radians([30.0, 30.0]), np.radians([5.0, 45.0]))
     assert holed.supported(q).tolist() == [True, False]
-    with pytest.raises(
-        MethodError, match=r"rotation 45\.0 deg lies in a hole between the calibrated settings \(1 of 2"
-    ):
+    with pytest.raises(MethodError, match=r"rotation 45\.0 deg is in a hole between the calibrated settings \(1 of 2"):
         holed.compensate([1e-3, 1e-3], q)
     assert holed.compensate([1e-3, 1e-3], q, extrapolate=True).uncertainty[1] > 0
 
@@ -132,11 +130,11 @@ def test_along_a_single_row_of_settings_is_supported(holed: InclinationCalibrati
     assert holed.supported(tilt_vector(alpha, np.radians(91.5))).all()
 
 
-def test_near_right_angles_the_rows_are_close_enough_everywhere(holed: InclinationCalibration) -> None:
+def test_near_right_angles_all_rows_are_close_enough(holed: InclinationCalibration) -> None:
     assert holed.supported(tilt_vector(np.radians(12.0), np.radians(np.arange(0.0, 360.0, 5.0)))).all()
 
 
-def test_holes_are_found_without_being_used(holed: InclinationCalibration, good: InclinationCalibration) -> None:
+def test_holes_are_listed(holed: InclinationCalibration, good: InclinationCalibration) -> None:
     holes = holed.support.holes()
     assert len(holes) == 4  # one in each quarter
     assert not holed.supported(np.array([hole.middle for hole in holes])).any()
@@ -146,14 +144,14 @@ def test_holes_are_found_without_being_used(holed: InclinationCalibration, good:
     assert len(good.support.holes()) == 0
 
 
-def test_settings_that_were_left_out_support_nothing() -> None:
+def test_omitted_settings_support_no_tilt() -> None:
     a, _ = np.meshgrid(INCLINATIONS, ROTATIONS)
     steep = (np.abs(np.degrees(a.ravel()) - 40) < 1).astype(np.int8)
     assert not calibration(setting_left_out=steep).supported(tilt_vector(np.radians(38.0), 0.0))
 
 
 @pytest.mark.parametrize("tilts", [[[0.0, 0.0]], [[0.0, 0.0], [0.2, 0.0]], [[0.0, 0.0], [0.2, 0.1], [0.4, 0.2]]])
-def test_settings_on_a_line_support_that_line_only(tilts: list[list[float]]) -> None:
+def test_settings_on_a_line_support_only_this_line(tilts: list[list[float]]) -> None:
     support = TiltSupport(np.array(tilts), gap=0.5, margin=0.02)
     inside = np.mean(tilts, axis=0)
     assert support.holds(inside)
@@ -162,12 +160,12 @@ def test_settings_on_a_line_support_that_line_only(tilts: list[list[float]]) -> 
 
 
 def test_a_reading_beyond_the_calibrated_depths_is_refused(good: InclinationCalibration) -> None:
-    with pytest.raises(MethodError, match=r"a reading 12\.000 mm from mid range lies beyond the calibrated -10\.000"):
+    with pytest.raises(MethodError, match=r"a reading 12\.000 mm from mid range is beyond the calibrated -10\.000"):
         good.compensate([1e-3, 12e-3], tilt_vector(0.1, 0.0))
     assert good.compensate([12e-3], tilt_vector(0.1, 0.0), extrapolate=True).value.shape == (1,)
 
 
-def test_the_grid_shows_the_surface_and_where_it_holds(good: InclinationCalibration) -> None:
+def test_the_grid_contains_the_surface_and_its_support(good: InclinationCalibration) -> None:
     grid = good.grid(21)
     q = np.array([float(grid.q1[5]), float(grid.q2[8])])
     assert float(grid.slope[5, 8]) == good.slope(q)[0]
@@ -175,7 +173,7 @@ def test_the_grid_shows_the_surface_and_where_it_holds(good: InclinationCalibrat
     assert not bool(grid.supported[0, 0])
 
 
-def test_a_calibration_comes_back_from_its_file(good: InclinationCalibration, tmp_path: Path) -> None:
+def test_a_calibration_is_unchanged_by_storage(good: InclinationCalibration, tmp_path: Path) -> None:
     again = InclinationCalibration.load(good.save(tmp_path / "lk_h050.nc"))
     q = tilt_vector(np.radians(25.0), 0.3)
     assert again.name == "lk_h050"
@@ -187,7 +185,7 @@ def test_a_calibration_comes_back_from_its_file(good: InclinationCalibration, tm
 
 @pytest.fixture
 def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working folder and, beside it, a folder of a bench file."""
+    """A working folder and the folder of a bench file."""
     for name in ("here", "bench/calibrations", "shared"):
         (tmp_path / name).mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here")
@@ -195,7 +193,7 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_calibration_is_found_by_name_beside_the_file_that_names_it(
+def test_a_calibration_is_found_by_name_in_the_folder_of_the_campaign(
     good: InclinationCalibration, folders: Path
 ) -> None:
     good.save(folders / "bench" / "calibrations" / "left.nc")
@@ -214,7 +212,7 @@ def test_a_calibration_is_found_by_name_in_the_working_folder_and_in_the_named_o
     assert [InclinationCalibration.find(name).name for name in ("one", "two", "three.nc")] == ["one", "two", "three"]
 
 
-def test_a_calibration_that_is_not_there_says_where_it_was_looked_for(
+def test_a_missing_calibration_is_reported_with_the_searched_folders(
     good: InclinationCalibration, folders: Path
 ) -> None:
     good.save(folders / "bench" / "calibrations" / "left.nc")
@@ -227,13 +225,13 @@ def test_a_calibration_that_is_not_there_says_where_it_was_looked_for(
     assert "ERRORMOTION_CALIBRATIONS" in message
 
 
-def test_readings_are_no_calibration(tmp_path: Path) -> None:
+def test_readings_are_refused_as_a_calibration(tmp_path: Path) -> None:
     datasets.save(xr.Dataset(attrs={"schema": "errormotion.raw.inclination/1"}), tmp_path / "data.nc")
     with pytest.raises(DatasetError, match="make a calibration of them with 'errormotion calibrate"):
         InclinationCalibration.load(tmp_path / "data.nc")
 
 
-def test_every_breach_of_the_schema_is_reported(good: InclinationCalibration, tmp_path: Path) -> None:
+def test_all_violations_of_the_schema_are_reported(good: InclinationCalibration, tmp_path: Path) -> None:
     broken = good.dataset.drop_vars("noise").assign(
         mid_range=5.0, coefficient_covariance=(("term", "term_"), -np.eye(4)), tilt_scale=np.nan
     )

@@ -35,7 +35,7 @@ def test_the_serial_number_of_a_dataset_is_stated_or_that_of_its_only_instrument
 
 
 @pytest.mark.parametrize("text", ["", " ", "unknown", "Unknown", "not told over RS-232C"])
-def test_a_text_that_says_that_there_is_none_is_no_serial_number(text: str) -> None:
+def test_a_text_for_a_missing_serial_number_is_not_one(text: str) -> None:
     assert known(text) == ""
 
 

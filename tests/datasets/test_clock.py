@@ -1,4 +1,4 @@
-"""How long a record was interrupted, on clocks that are set, stand still and start again."""
+"""Duration of an interruption of a record, with clocks that are set, stop and restart."""
 
 import json
 import math
@@ -29,7 +29,7 @@ def at(monkeypatch):
 
 
 @pytest.mark.parametrize("change", [0.0, HOUR, -HOUR, DAY, -DAY, YEARS, -YEARS])
-def test_without_a_restart_the_duration_is_known_whatever_the_wall_clock_states(change):
+def test_without_a_restart_the_duration_does_not_depend_on_the_wall_clock(change):
     now = replace(STORED, wall=STORED.wall + 30.0 + change, steady=STORED.steady + 30.0)
     seconds, reason = clock.interval(STORED, now)
     assert seconds == 30.0
@@ -47,13 +47,13 @@ def test_without_a_restart_the_duration_is_known_whatever_the_wall_clock_states(
         (YEARS, 60.0, math.nan),
     ],
 )
-def test_after_a_restart_the_wall_clock_is_believed_where_it_can_be_right(passed, uptime, expected):
+def test_after_a_restart_the_wall_clock_is_used_if_it_is_possible(passed, uptime, expected):
     seconds, reason = clock.interval(STORED, Reading(STORED.wall + passed, uptime, "b", 0.0, 0.0))
     assert seconds == pytest.approx(expected, nan_ok=True)
     assert bool(reason) == math.isnan(expected)
 
 
-def test_time_of_a_computer_that_states_no_identity_of_its_start_is_the_wall_clock():
+def test_time_without_identity_of_the_boot_is_the_wall_clock():
     first = replace(STORED, boot="")
     assert clock.interval(first, Reading(STORED.wall + 30.0, 10.0, "", 0.0, 0.0)) == (30.0, "")
     assert math.isnan(clock.interval(first, Reading(STORED.wall - 30.0, 10.0, "", 0.0, 0.0))[0])
@@ -89,7 +89,7 @@ def test_age_of_a_record_is_that_of_its_own_clock(at):
 
 
 @pytest.mark.parametrize("stored", ["", "{}", "[]", '{"wall": "x"}', "no JSON", '{"wall": NaN, "steady": 1}'])
-def test_record_without_a_readable_clock_has_the_age_that_the_wall_clock_states(at, stored):
+def test_age_of_a_record_without_a_readable_clock_is_that_of_the_wall_clock(at, stored):
     done = xr.Dataset(attrs={"start": START, clock.CLOCK: stored, clock.JOINS: "[1]"})
     at(AT_START + 60.0, 1.0, "a")
     assert clock.age(done) == pytest.approx(60.0)
@@ -105,7 +105,7 @@ def test_record_without_a_start_has_no_age(start):
 
 
 @pytest.mark.parametrize("text", ["[" * 5000, '{"wall": ' + "9" * 400 + "}", "null"])
-def test_damaged_clocks_of_a_record_are_none(text):
+def test_damaged_clocks_of_a_record_are_ignored(text):
     attrs = {clock.CLOCK: text, clock.JOINS: text, "start": START}
     whole = json.dumps(asdict(STORED)).replace("5000.0", "9" * 400)
     for stated in (attrs, attrs | {clock.CLOCK: whole}):
@@ -114,7 +114,7 @@ def test_damaged_clocks_of_a_record_are_none(text):
         assert clock.RecordClock(stated).attributes().keys() == {clock.CLOCK}
 
 
-def test_an_interruption_of_unknown_duration_is_in_the_notes_of_the_errors_whatever_the_method():
+def test_an_interruption_of_unknown_duration_is_in_the_notes_of_the_errors_of_any_method():
     unknown = clock.Join(index=60, seconds=None, reason="the wall clock was set", time=5.9)
     raw = xr.Dataset(attrs={clock.JOINS: json.dumps([asdict(unknown), asdict(replace(unknown, seconds=3.0))])})
     (expected,) = clock.notes(raw.attrs)

@@ -1,6 +1,6 @@
-"""Damaged datasets and calibrations: cut off, or with other content, they are read or refused with a stated error.
+"""Damaged datasets and calibrations, truncated or with other contents, are read or refused with an error.
 
-Other changes to the bytes of a NetCDF file are the matter of the HDF5 library, which does not bound its time on them.
+Other changes of the bytes of a NetCDF file are not tested: the HDF5 library does not limit its time for them.
 """
 
 import contextlib

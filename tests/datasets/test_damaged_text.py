@@ -1,4 +1,4 @@
-"""Damaged text files: every mutant is read, or refused with an error of the project, in bounded time."""
+"""Damaged text files: every mutant is read, or refused with an error of the package, in limited time."""
 
 import warnings
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Errors that are seen along one known direction, over dimensions that the method declares."""
+"""Errors along one known direction, over dimensions that the method declares."""
 
 from typing import Any
 
@@ -84,7 +84,7 @@ def test_the_accessor_treats_the_deviation_as_the_only_freedom() -> None:
     assert figure.axes[0].get_xlabel() == "angle / deg"
 
 
-def test_the_sensitivity_moves_so_that_the_deviation_stays() -> None:
+def test_the_sensitivity_is_transformed_so_that_the_deviation_is_unchanged() -> None:
     """h . E is the same number at another functional point and in another frame."""
     ds, point = radial(), np.array([0.3, -0.1, 0.5])
     pose = RigidTransform.from_components([0.1, 0, 0.2], Rotation.from_rotvec([0.3, -0.2, 0.5]))
@@ -115,7 +115,7 @@ def test_the_sensitivity_moves_so_that_the_deviation_stays() -> None:
         ({"component": "chain"}, "component_description"),
     ],
 )
-def test_what_breaks_the_schema_is_refused(changes: dict[str, Any], text: str) -> None:
+def test_a_violation_of_the_schema_is_refused(changes: dict[str, Any], text: str) -> None:
     with pytest.raises(DatasetError, match=text):
         radial(**changes)
 
@@ -125,11 +125,11 @@ def test_a_declared_component_is_described() -> None:
     assert datasets.violations(ds) == []
 
 
-def test_a_known_freedom_beside_a_deviation_is_refused() -> None:
+def test_a_known_freedom_in_a_dataset_with_deviation_is_refused() -> None:
     ds = radial()
     ds["EX"][:] = 1e-6
     ds["covariance"].values[..., 0, 0] = 1e-14
-    assert "EX: expected NaN beside deviation, which is their combination" in datasets.violations(ds)
+    assert "EX: expected NaN in a dataset with deviation, their combination" in datasets.violations(ds)
 
 
 @pytest.mark.parametrize("name", ["sensitivity", "deviation_variance", "deviation"])

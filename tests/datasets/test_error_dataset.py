@@ -27,13 +27,13 @@ def test_a_result_has_the_schema_its_units_and_its_attributes(errors) -> None:
     assert "temperature" in ds.coords
 
 
-def test_one_place_needs_no_dimension(errors) -> None:
+def test_one_point_needs_no_dimension(errors) -> None:
     ds = errors(values=np.zeros(6), covariance=np.eye(6) * 1e-12, dims=(), coords={}, influence=None)
     assert ds["EX"].dims == ()
     assert datasets.violations(ds) == []
 
 
-def test_what_is_not_seen_is_nan_in_covariance_and_influence_too(errors) -> None:
+def test_an_undetermined_freedom_is_nan_in_covariance_and_influence(errors) -> None:
     ds = errors(unseen=(5,))
     assert np.isnan(ds["covariance"].sel(dof="EC")).all()
     assert np.isnan(ds["covariance"].sel(dof_="EC")).all()
@@ -48,10 +48,10 @@ def test_a_value_may_be_unknown_at_single_times(errors) -> None:
     assert int(np.isnan(ds["covariance"]).sum()) == 11  # one row and one column of one matrix
 
 
-def test_extra_results_ride_along_but_may_not_take_a_name(errors) -> None:
+def test_extra_results_are_stored_except_with_a_name_of_the_schema(errors) -> None:
     ds = errors(extras={"bar_radius": xr.DataArray(0.005, attrs={"units": "m"})})
     assert ds["bar_radius"].attrs["units"] == "m"
-    with pytest.raises(DatasetError, match="taken already: EX"):
+    with pytest.raises(DatasetError, match="not used by the schema; found EX"):
         errors(extras={"EX": xr.DataArray(0.0)})
 
 
@@ -85,7 +85,7 @@ def test_all_violations_of_a_result_are_reported_at_once(errors) -> None:
         ({"coords": {}}, "time: missing"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(errors, changes, message) -> None:
+def test_arrays_of_wrong_shape_are_refused(errors, changes, message) -> None:
     with pytest.raises(DatasetError, match=message):
         errors(**changes)
 
@@ -117,7 +117,7 @@ def test_a_covariance_is_symmetric_and_positive(errors) -> None:
     assert "positive semidefinite" in violations(overdone)
 
 
-def test_rounding_of_a_singular_covariance_is_no_violation(errors) -> None:
+def test_rounding_of_a_singular_covariance_is_accepted(errors) -> None:
     rng = np.random.default_rng(0)
     F = rng.normal(size=(2, 7, 6)) * 1e-6  # rank 2: four eigenvalues are zero up to rounding
     C = np.einsum("spi,spj->pij", F, F)
@@ -130,16 +130,16 @@ def test_influence_is_not_larger_than_the_covariance(errors) -> None:
     assert "for EB they exceed it" in violations(ds)
 
 
-def test_the_rest_beside_the_influences_is_a_covariance(errors) -> None:
+def test_the_covariance_minus_the_influences_is_a_covariance(errors) -> None:
     F = np.zeros((1, 7, 6))
     F[0, :, 0] = F[0, :, 1] = 0.9e-6
-    message = "expected the covariance less the influences to be a covariance"
+    message = "expected the covariance minus the influences to be a covariance"
     with pytest.raises(DatasetError, match=message):
-        # each variance holds its influence, but the two freedoms are not correlated as the common source makes them
+        # each variance contains its influence, but the correlation of the two freedoms by the common source is missing
         errors(covariance=np.tile(np.eye(6) * 1e-12, (7, 1, 1)), influence=F, sources=["a"], source_groups=["a"])
 
 
-def test_nan_of_value_and_covariance_go_together(errors) -> None:
+def test_value_and_covariance_are_nan_together(errors) -> None:
     ds = errors()
     ds["EY"][2] = np.nan
     message = violations(ds)
@@ -177,7 +177,7 @@ def test_an_unknown_schema_is_refused_with_the_nearest(errors) -> None:
     assert "attribute 'schema': missing" in violations(ds)
 
 
-def test_fifty_thousand_instants_are_checked_like_seven(errors) -> None:
+def test_fifty_thousand_instants_are_checked_completely(errors) -> None:
     ds = errors(n=50_000)
     ds["covariance"][49_999, 0, 1] *= 2
     assert "symmetric" in violations(ds)

@@ -1,7 +1,7 @@
-"""Datasets that this version wrote: every later version loads them, and finds them valid and unchanged.
+"""Stored datasets of released schemas: every later version loads them unchanged, and they are valid.
 
-They are real results with few instants, without the larger further results. A file is never written again; a version
-with a new schema adds files.
+They are results with few instants, without the larger further results. Files are not replaced; a version with a new
+schema adds files.
 """
 
 from pathlib import Path
@@ -28,12 +28,12 @@ def test_a_stored_dataset_loads_and_is_valid(file: Path) -> None:
         assert np.array_equal(np.isfinite(values), np.isfinite(u))
 
 
-def test_there_is_one_of_every_kind() -> None:
+def test_every_kind_of_dataset_is_stored() -> None:
     methods = {str(datasets.load(file).attrs.get("method", "")) for file in FILES}
     assert methods >= {"spindle_drift", "normal_vector", "beam_direction", "multilateration", "crossbeam_scan", ""}
 
 
-def test_what_a_comparison_needs_is_kept() -> None:
+def test_the_data_for_a_comparison_are_stored() -> None:
     drift = datasets.load(FOLDER / "spindle_drift_drift.nc")
     named = dict(zip(drift["source"].values.tolist(), drift["source_id"].values.tolist(), strict=True))
     assert named["beam X1.1"].startswith("sha256:")

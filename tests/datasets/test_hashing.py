@@ -28,7 +28,7 @@ def record(samples: int = 3 * LEAF + 777, seed: int = 0) -> xr.Dataset:
 
 
 def defined(variable: xr.Variable, new: Callable) -> bytes:
-    """The digests of the leaves of a numeric variable, as the definition says, value by value."""
+    """The digests of the leaves of a numeric variable by the definition, value by value."""
     values = variable.values
     axis, inner = values.ndim, 1
     while axis and inner * values.shape[axis - 1] <= LEAF:
@@ -71,7 +71,7 @@ def test_the_hash_is_the_one_that_is_defined(shape, dtype, form, new) -> None:
 
 
 @pytest.mark.parametrize("step", [LEAF, 2 * LEAF, 1000, LEAF + 1, 10**6])
-def test_parts_that_are_handed_over_give_the_same_hash_and_are_not_read_again(step) -> None:
+def test_supplied_parts_result_in_the_same_hash_and_are_not_read_again(step) -> None:
     ds = record()
     unreadable = ds.map(lambda each: xr.zeros_like(each) if "time" in each.dims else each, keep_attrs=True)
     with DatasetHasher(unreadable) as hasher:
@@ -83,7 +83,7 @@ def test_parts_that_are_handed_over_give_the_same_hash_and_are_not_read_again(st
         assert hasher.value() == hash_dataset(ds)
 
 
-def test_what_is_not_handed_over_or_not_in_order_is_read() -> None:
+def test_parts_that_are_missing_or_not_in_order_are_read() -> None:
     ds = record()
     with DatasetHasher(ds) as hasher:
         hasher.update("distance", ds["distance"].values[:, :1000], time=slice(0, 1000))
@@ -174,11 +174,11 @@ def test_the_hash_of_evenly_spaced_times_reads_none_of_them(drift, tmp_path) -> 
         lambda ds: ds.assign(distance=ds["distance"].where(ds["time"] != 10.0)),
     ],
 )
-def test_whatever_changes_changes_the_hash(drift, change) -> None:
+def test_any_change_changes_the_hash(drift, change) -> None:
     assert hash_dataset(change(drift())) != hash_dataset(drift())
 
 
-def test_a_nan_is_a_nan_whatever_its_bits() -> None:
+def test_the_bits_of_a_nan_do_not_change_the_hash() -> None:
     one = xr.Dataset({"a": ("x", np.array([np.nan]))})
     other = xr.Dataset({"a": ("x", np.array([0xFFF8000000000001], dtype=np.uint64).view(float))})
     assert hash_dataset(one) == hash_dataset(other)

@@ -1,4 +1,4 @@
-"""Errors at other instants: coverage at left-out instants, exact points, what is not extrapolated."""
+"""Errors at other instants: coverage at omitted instants, exact points, no extrapolation."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def truth(t, rng):
 
 
 @pytest.mark.parametrize(("noise", "step"), [(1e-7, 60.0), (1e-7, 600.0), (2e-8, 900.0)])
-def test_intervals_hold_the_truth_at_left_out_instants(noise, step):
+def test_intervals_contain_the_truth_at_omitted_instants(noise, step):
     rng, inside, count = np.random.default_rng(11), 0, 0
     t = np.arange(0, 7200 + step, step)
     left_out = t[1:-1:2] + rng.uniform(-0.4, 0.4, t[1:-1:2].size) * step
@@ -56,7 +56,7 @@ def test_intervals_hold_the_truth_at_left_out_instants(noise, step):
 
 
 @pytest.mark.parametrize("start", [20.0, 60.0, 110.0])
-def test_the_interval_holds_a_start_between_the_first_two_instants(start):
+def test_the_interval_contains_a_start_between_the_first_two_instants(start):
     """A bend at one place deviates by sqrt(3) standard deviations of the process whose slope changes as much."""
     t = np.arange(0, 721, 120.0)
     values = 1e-8 * np.repeat(np.maximum(t - start, 0.0)[:, None], 6, axis=1)
@@ -65,7 +65,7 @@ def test_the_interval_holds_a_start_between_the_first_two_instants(start):
     assert score == pytest.approx(np.sqrt(3), rel=1e-3)
 
 
-def test_an_instant_of_the_dataset_is_returned_as_it_is():
+def test_an_instant_of_the_dataset_is_returned_unchanged():
     rng = np.random.default_rng(0)
     t = np.arange(10) * 60.0
     F = rng.normal(0, 1e-7, (1, 10, 6))
@@ -78,7 +78,7 @@ def test_an_instant_of_the_dataset_is_returned_as_it_is():
     assert list(found.attrs["interpolation_intensity"]) == [0] * 6
 
 
-def test_sources_keep_their_correlation_between_new_instants():
+def test_sources_have_their_correlation_between_new_instants():
     t = np.arange(4) * 60.0
     F = np.zeros((1, 4, 6))
     F[0, :, 0] = [1e-7, 2e-7, 3e-7, 4e-7]
@@ -90,7 +90,7 @@ def test_sources_keep_their_correlation_between_new_instants():
     assert found.em.covariance_between(0, 1).values[0, 0] == pytest.approx(1.5e-7 * 2.5e-7)
 
 
-def test_nothing_is_extrapolated_and_a_gap_stays_a_gap():
+def test_no_value_is_extrapolated_or_interpolated_in_a_gap():
     t = np.arange(5) * 60.0
     values = np.zeros((5, 6))
     values[2] = np.nan

@@ -1,4 +1,4 @@
-"""Dates and times in logs: orders of day and month, two columns, local zones, holes, thousands, equal mistakes."""
+"""Dates and times in logs: orders of day and month, two columns, local zones, gaps, thousands, equal mistakes."""
 
 import json
 from pathlib import Path
@@ -66,7 +66,7 @@ def test_date_and_time_of_day_in_two_columns(run) -> None:
     assert notes(raw) == []
 
 
-def test_two_columns_and_the_zone_serve_a_drift_too(run) -> None:
+def test_two_columns_and_the_zone_are_read_for_a_drift(run) -> None:
     raw = run("".join(f"27.10.2024;{time};1\n" for time in ("01:30", "02:30", "02:30", "03:30")), SPINDLE)
     np.testing.assert_array_equal(raw["time"], [0, 3600, 7200, 10800])
     assert raw.attrs["start"] == "2024-10-27T01:30:00+02:00"
@@ -98,7 +98,7 @@ def test_orders_of_a_date(unit: str, text: str) -> None:
 
 
 @pytest.mark.parametrize("unit", ["s", "dd.mm", "dd.mm/yyyy", "dd.dd.yyyy", "", "dd.mm.yyyy hh"])
-def test_units_that_are_no_dates(unit: str) -> None:
+def test_units_that_are_not_dates_are_refused(unit: str) -> None:
     assert not is_date(unit)
 
 
@@ -147,12 +147,12 @@ def test_an_unknown_zone_is_a_mistake_of_the_map(mistakes) -> None:
         assert "format.zone: expected a time zone such as 'Europe/Berlin', 'UTC' or '+01:00'" in found
 
 
-def test_a_hole_in_the_rows_is_noted(run) -> None:
+def test_a_gap_in_the_rows_is_noted(run) -> None:
     raw = run(LOG.replace("14:04", "14:14").replace("14:05", "14:15"), MAP)
     assert notes(raw) == ["1 hole in the rows, where the usual interval is 60 s; the longest, of 660 s, ends in line 6"]
 
 
-def test_rows_at_irregular_times_have_no_holes(run) -> None:
+def test_rows_at_irregular_times_have_no_gaps(run) -> None:
     log = LOG
     for k, minute in enumerate((0, 1, 5, 11, 12, 30)):
         log = log.replace(f"14:0{k}:00;20", f"14:{minute:02}:30;20")
@@ -172,7 +172,7 @@ columns.displacement = {column = "L", unit = "m"}
     ]
 
 
-def test_a_point_that_may_stand_between_thousands_is_refused_until_it_is_stated(run, mistakes) -> None:
+def test_an_ambiguous_point_is_refused_until_the_format_is_stated(run, mistakes) -> None:
     log = LOG.replace("20,", "15.000,")
     (found,) = mistakes(log, MAP)
     assert found.startswith("lines 2, 3, 4, 5, 6 and 1 more: column 'T': the point in '15.000,0' may be a decimal sign")
@@ -181,7 +181,7 @@ def test_a_point_that_may_stand_between_thousands_is_refused_until_it_is_stated(
     np.testing.assert_allclose(run(log, wide)["temperature"][:, 0], 15 + 1e-4 * np.arange(6))
 
 
-def test_a_point_is_a_decimal_sign_where_the_map_says_so(run) -> None:
+def test_a_point_is_a_decimal_sign_if_the_map_states_it(run) -> None:
     raw = run(LOG.replace("20,", "20.00"), MAP + "thousands = ''\n")
     np.testing.assert_allclose(raw["temperature"][:, 0], 20 + 1e-3 * np.arange(6))
 

@@ -95,7 +95,7 @@ def test_lengths_of_a_tracker_in_si(run) -> None:
     assert json.loads(raw.attrs["missing_values"]) == {"displacement": 1}
 
 
-def test_touches_of_balls_count_themselves_within_a_cycle(run) -> None:
+def test_touches_of_balls_are_numbered_within_a_cycle(run) -> None:
     raw = run(TOUCH_LOG, TOUCHES)
     assert datasets.violations(raw) == []
     assert raw["touch"].dims == ("time", "ball", "touch", "direction")
@@ -105,7 +105,7 @@ def test_touches_of_balls_count_themselves_within_a_cycle(run) -> None:
     np.testing.assert_array_equal(raw["ball_radius"], [0.01, 0.01])
 
 
-def test_an_imported_log_gives_the_errors_of_the_raw_dataset(run) -> None:
+def test_an_imported_log_has_the_errors_of_the_raw_dataset(run) -> None:
     raw = simulation.raw(VirtualMachine("cframe", seed=3), seed=1, inclination_error=False)
     lines = ["face,d,x,y,z"]
     for i, plane in enumerate(raw["stage"].values):

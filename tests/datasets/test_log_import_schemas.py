@@ -1,4 +1,4 @@
-"""Every raw schema can be imported: a log of any content of a schema gives the same content back."""
+"""Every raw schema can be imported: the dataset from a log has the contents of the log."""
 
 import importlib.util
 from pathlib import Path
@@ -13,12 +13,12 @@ from errormotion.datasets.schemas import RawSchema, Row, raw_schemas
 
 BALLBAR = Path(__file__).parents[2] / "examples" / "ballbar_distribution"
 FREE = 3
-"""Length of a dimension whose length the schema leaves open."""
+"""Length of a dimension without a length in the schema."""
 SECOND = {"direction_": "direction", "p_": "p"}
 
 
 def foreign() -> tuple[RawSchema, ...]:
-    """Return the raw schemas of the method that is a distribution of its own."""
+    """Return the raw schemas of the method in a separate distribution."""
     path = BALLBAR / "ballbar_test" / "schema.py"
     spec = importlib.util.spec_from_file_location("ballbar_schema", path)
     module = importlib.util.module_from_spec(spec)
@@ -30,7 +30,7 @@ TABLES = (*raw_schemas(), *foreign())
 
 
 def content(table: RawSchema, rng: np.random.Generator) -> xr.Dataset:
-    """Return a dataset with every variable of a raw schema, plausible and else at random."""
+    """Return a dataset with random plausible values of all variables of a raw schema."""
     variables = {row.name: xr.Variable(row.dims, values(row, table, rng)) for row in table.rows}
     for row in table.rows:
         if row.unit:
@@ -95,9 +95,7 @@ def log_and_map(raw: xr.Dataset, table: RawSchema) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.title)
-def test_a_log_of_any_raw_schema_gives_its_content(
-    table: RawSchema, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_of_any_raw_schema_is_imported(table: RawSchema, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if table in foreign():
         owner = type("Foreign", (), {"raw_schemas": foreign()})
         monkeypatch.setattr(plugins, "owner_of_schema", lambda schema: owner)
@@ -113,7 +111,7 @@ def test_a_log_of_any_raw_schema_gives_its_content(
         assert found[row.name].attrs == raw[row.name].attrs
 
 
-def test_the_log_of_a_ballbar_comes_in_by_the_map_of_its_distribution(
+def test_the_log_of_a_ballbar_is_imported_with_the_map_of_its_distribution(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plugins, "owner_of_schema", lambda schema: type("Foreign", (), {"raw_schemas": foreign()}))

@@ -1,4 +1,4 @@
-"""Messages on files that a person wrote: alike mistakes in one line, suggestions for units."""
+"""Messages on files of users: similar mistakes in one line, suggestions for units."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from errormotion.datasets.files import tomlfile
 from errormotion.datasets.units import KINDS, LENGTH, SPEED, TIME
 
 
-def test_alike_mistakes_are_one_line_and_all_are_counted() -> None:
+def test_similar_mistakes_are_one_line_with_their_count() -> None:
     mistakes = ["a.x: missing", "b[0].x: missing", "c: expected 1; found 2", "Not a key: text", "Not a key: text"]
     text = tomlfile.report("f.toml", mistakes)
     assert text.splitlines() == [
@@ -23,13 +23,13 @@ def test_alike_mistakes_are_one_line_and_all_are_counted() -> None:
     ("quantity", "text", "meant"),
     [(LENGTH, "5 m m", "'mm'"), (LENGTH, "5 MM", "'mm'"), (TIME, "3 mins.", "'min'"), (SPEED, "15000 /mn", "'/min'")],
 )
-def test_a_unit_that_is_not_known_gets_a_suggestion(quantity, text, meant) -> None:
+def test_an_unknown_unit_is_reported_with_a_suggestion(quantity, text, meant) -> None:
     with pytest.raises(ValueError, match="did you mean") as refused:
         quantity.parse(text)
     assert meant in str(refused.value).partition("did you mean ")[2]
 
 
-def test_what_is_suggested_is_read() -> None:
+def test_a_suggested_unit_is_valid() -> None:
     from errormotion.datasets.units import _USUAL
 
     for quantity in KINDS:

@@ -1,4 +1,4 @@
-"""NetCDF-4 files hold what xarray's own reader and writer make of them, and each object is looked up once."""
+"""NetCDF-4 files agree with the reader and writer of xarray, and each object is looked up once."""
 
 import io
 import pickle
@@ -53,7 +53,7 @@ def by_xarray(ds: xr.Dataset) -> bytes:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_files_are_those_of_xarray_to_the_last_bit(kind: str) -> None:
+def test_files_are_equal_to_those_of_xarray(kind: str) -> None:
     ready = storable(example(kind))
     assert compose_netcdf(ready, encoding(ready)) == by_xarray(ready)
 
@@ -69,7 +69,7 @@ def test_files_are_read_as_xarray_reads_them(kind: str, tmp_path: Path) -> None:
         xr.testing.assert_identical(found.load(), expected.load())
 
 
-def test_an_open_file_can_be_handed_to_another_process(tmp_path: Path) -> None:
+def test_an_open_file_can_be_sent_to_another_process(tmp_path: Path) -> None:
     file = tmp_path / "some.nc"
     file.write_bytes(by_xarray(storable(example("usual"))))
     with open_netcdf(file) as found, pickle.loads(pickle.dumps(found)) as other:

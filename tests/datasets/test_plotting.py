@@ -1,4 +1,4 @@
-"""The figures of error datasets: what is drawn where, and what is refused."""
+"""The figures of error datasets: drawn elements, and refused forms."""
 
 import numpy as np
 import pytest
@@ -82,7 +82,7 @@ def test_freedoms_point_factor_and_axes_are_chosen(errors) -> None:
     assert not ds.em.plot("EY", k=0).axes[0].collections
 
 
-def test_both_units_take_two_axes(errors) -> None:
+def test_two_units_need_two_axes(errors) -> None:
     figure = Figure()
     pair = figure.subplots(2)
     assert errors().em.plot(ax=pair) is figure
@@ -106,7 +106,7 @@ def test_what_cannot_be_drawn_is_refused(errors, arguments, message) -> None:
         errors().em.plot(**arguments)
 
 
-def test_flat_axes_get_bars_at_targets_and_arrows_need_space(errors) -> None:
+def test_flat_axes_show_bars_at_targets_and_arrows_need_space(errors) -> None:
     ds = volume(errors)
     axes = Figure().subplots()
     ds.em.plot(ax=axes)
@@ -115,7 +115,7 @@ def test_flat_axes_get_bars_at_targets_and_arrows_need_space(errors) -> None:
         ds.em.plot(ax=axes, form="arrows")
 
 
-def test_names_of_strangers_are_text(errors) -> None:
+def test_names_in_data_are_drawn_as_text(errors) -> None:
     strange = "$\\frac{<script>$ and a name that goes on and on"
     ds = volume(errors, machine=strange).assign_coords(target=[strange, *(f"T{k}" for k in range(1, 8))])
     for form in ("arrows", "curves"):

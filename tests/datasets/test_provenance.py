@@ -12,7 +12,7 @@ class Settings(BaseModel):
     limit: float = float("inf")
 
 
-def test_provenance_holds_settings_with_defaults_hash_and_software(drift) -> None:
+def test_provenance_contains_settings_with_defaults_hash_and_software(drift) -> None:
     raw = drift()
     found = provenance.make(Settings(), raw, [{"serial_number": "7"}], seed=3, steps=("averaged",))
     assert found["settings"] == {"radius": 0.005, "limit": "inf"}
@@ -27,13 +27,13 @@ def test_the_same_work_has_the_same_provenance(drift) -> None:
     assert provenance.make(Settings(), drift(), []) == provenance.make(Settings(), drift(), [])
 
 
-def test_instruments_come_from_the_raw_dataset_unless_given(drift) -> None:
+def test_instruments_are_taken_from_the_raw_dataset_unless_stated(drift) -> None:
     raw = drift().assign_attrs(instruments=json.dumps([{"address": "sim://a"}]))
     assert provenance.make({}, raw, None)["instruments"] == [{"address": "sim://a"}]
     assert provenance.make({}, raw, [])["instruments"] == []
 
 
-def test_an_error_dataset_carries_its_provenance(errors) -> None:
+def test_an_error_dataset_has_its_provenance(errors) -> None:
     assert provenance.of(errors())["settings"] == {"average": 0.5}
 
 

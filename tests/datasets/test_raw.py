@@ -12,7 +12,7 @@ def reported(ds: xr.Dataset) -> str:
 
 
 class Counting:
-    """An array on some disk: what is read of it is counted."""
+    """A simulated array on a disk that counts the values read."""
 
     def __init__(self, shape: tuple[int, ...], value: float) -> None:
         self.shape, self.ndim, self.dtype = shape, len(shape), np.dtype("f4")
@@ -31,12 +31,12 @@ class Counting:
         return np.full(sizes, self.value, dtype=self.dtype)
 
 
-def test_good_datasets_follow_their_schema(drift, beams) -> None:
+def test_valid_datasets_conform_to_their_schema(drift, beams) -> None:
     assert datasets.violations(drift()) == []
     assert datasets.violations(beams()) == []
 
 
-def test_either_layout_and_float32_are_welcome(drift) -> None:
+def test_both_layouts_and_float32_are_accepted(drift) -> None:
     ds = drift()
     assert datasets.violations(ds.assign(distance=ds["distance"].astype("f4").transpose("time", "channel"))) == []
 
@@ -92,7 +92,7 @@ def test_a_bar_radius_in_mm_is_reported(drift) -> None:
         ),
     ],
 )
-def test_what_cannot_be_is_reported_with_what_was_expected(drift, changes, sentence) -> None:
+def test_an_impossible_value_is_reported_with_the_expected_one(drift, changes, sentence) -> None:
     (found,) = datasets.violations(drift(**changes))
     assert found.startswith(sentence)
 
@@ -108,14 +108,14 @@ def test_all_violations_are_reported_at_once(drift) -> None:
 
 
 @pytest.mark.parametrize("unit", ["m", "metre", "meter"])
-def test_a_unit_that_means_the_same_is_welcome(drift, unit) -> None:
+def test_an_equivalent_unit_is_accepted(drift, unit) -> None:
     ds = drift()
     ds["distance"].attrs["units"] = unit
     assert datasets.violations(ds) == []
 
 
 @pytest.mark.parametrize("unit", ["mm", "s", "nonsense"])
-def test_a_unit_that_means_something_else_is_refused(drift, unit) -> None:
+def test_a_different_unit_is_refused(drift, unit) -> None:
     ds = drift()
     ds["distance"].attrs["units"] = unit
     assert f"distance: expected units 'm'; found '{unit}'" in reported(ds)
@@ -131,7 +131,7 @@ def test_times_increase_or_follow_from_the_rate(drift) -> None:
     assert "'sample_rate': expected a positive number" in reported(ds.drop_vars("time").assign_attrs(sample_rate=0.0))
 
 
-def test_a_huge_record_is_looked_at_in_samples(drift) -> None:
+def test_a_large_record_is_checked_by_samples(drift) -> None:
     n = 288_000_000  # 4 h at 20 kHz: 5.8 GB of float32
     lazy = Counting((5, n), 1e-3)
     times = xr.Coordinates.from_xindex(RangeIndex.linspace(0, n / 20e3, n, endpoint=False, dim="time"))
@@ -143,7 +143,7 @@ def test_a_huge_record_is_looked_at_in_samples(drift) -> None:
     assert "distance = 1 m" in reported(ds)
 
 
-def test_samples_reach_from_the_first_to_the_last_value() -> None:
+def test_samples_include_the_first_and_the_last_value() -> None:
     values = sample(xr.Variable(("time",), np.arange(1_000_000)))
     assert values[0] == 0
     assert values[-1] == 999_999
@@ -152,7 +152,7 @@ def test_samples_reach_from_the_first_to_the_last_value() -> None:
 
 
 @pytest.mark.parametrize("raw", datasets.schemas.raw_schemas(), ids=lambda raw: raw.title)
-def test_every_schema_accepts_what_it_describes_and_misses_what_is_gone(raw) -> None:
+def test_every_schema_accepts_valid_data_and_reports_missing_variables(raw) -> None:
     sizes = {"channel": 5, "height": 2, **raw.sizes}
     variables = {}
     for row in raw.rows:

@@ -1,4 +1,4 @@
-"""Readings that a person wrote: correct files are read in SI, mistakes are reported with line and column."""
+"""Readings as CSV: correct files are read in SI, mistakes are reported with line and column."""
 
 import json
 from pathlib import Path
@@ -69,15 +69,15 @@ def test_planes_of_a_beam_in_si(read) -> None:
     assert datasets.violations(raw) == []
 
 
-def test_empty_cells_are_counted_and_places_beyond_a_short_plane_are_not(read) -> None:
+def test_empty_cells_are_counted_except_after_the_end_of_a_short_plane(read) -> None:
     assert json.loads(read(HEAD + TABLE).attrs["missing_values"]) == {"distance": 1}
 
 
-def test_direction_of_a_few_digits_is_brought_to_length_1(read) -> None:
+def test_direction_with_few_digits_is_normalised(read) -> None:
     assert np.linalg.norm(read(HEAD + TABLE)["nominal_direction"]) == pytest.approx(1, abs=1e-12)
 
 
-def test_second_table_goes_by_the_names_of_the_first(read) -> None:
+def test_second_table_uses_the_names_of_the_first(read) -> None:
     normals = "\nplane,nominal_normal_x [1],nominal_normal_y [1],nominal_normal_z [1]\n2,0,0,1\n1,0,1,0\n"
     np.testing.assert_array_equal(read(HEAD + TABLE + normals)["nominal_normal"], [[0, 1, 0], [0, 0, 1]])
 
@@ -91,7 +91,7 @@ def test_planes_may_have_names_and_their_lines_may_alternate(read) -> None:
     np.testing.assert_array_equal(raw["distance"][1], [-2.004e-3, -1.508e-3, np.nan])
 
 
-def test_check_bar_in_a_table_of_its_own(read) -> None:
+def test_check_bar_in_a_separate_table(read) -> None:
     bar = "\nbar_distance [um],bar_stage_x [mm],bar_stage_y [mm],bar_stage_z [mm]\n5,1,2,3\n6,1,2,4\n"
     raw = read(HEAD + "# bar_radius = 25 mm\n# bar_axis = 0 0 1\n" + TABLE + bar)
     np.testing.assert_allclose(raw["bar_distance"], [5e-6, 6e-6])
@@ -110,13 +110,13 @@ def test_other_separators(read, sign: str) -> None:
     assert read(HEAD + TABLE.replace(",", sign)).equals(read(HEAD + TABLE))
 
 
-def test_what_a_spreadsheet_makes_of_it(read) -> None:
+def test_a_file_saved_by_a_spreadsheet_is_read(read) -> None:
     lines = (HEAD + TABLE).splitlines()
     padded = "\r\n".join(line if "," in line else line + ",,,," for line in lines) + "\r\n,,,,\r\n"
     assert read(b"\xef\xbb\xbf" + padded.encode()).equals(read(HEAD + TABLE))
 
 
-def test_load_reads_what_ends_in_csv(tmp_path: Path) -> None:
+def test_load_reads_csv_files(tmp_path: Path) -> None:
     path = tmp_path / "A.CSV"
     path.write_text(HEAD + TABLE)
     raw = datasets.load(path)
@@ -125,7 +125,7 @@ def test_load_reads_what_ends_in_csv(tmp_path: Path) -> None:
 
 
 @given(st.lists(st.floats(-100, 100), min_size=1, max_size=20))
-def test_numbers_come_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFactory, values: list[float]) -> None:
+def test_numbers_are_unchanged_by_storage(tmp_path_factory: pytest.TempPathFactory, values: list[float]) -> None:
     path = tmp_path_factory.mktemp("csv") / "readings.csv"
     lines = [f"1,{value * 1e-3!r},0,0,0" for value in values]
     path.write_text(HEAD + TABLE.splitlines()[0].replace("mm", "m") + "\n" + "\n".join(lines))
@@ -188,7 +188,7 @@ def test_numbers_come_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFact
         ("# schema = errormotion.raw.beam_direction/1\n", "", "expected a line '# schema = ...'"),
     ],
 )
-def test_mistakes_are_reported_with_their_place(complaints, old: str, new: str, message: str) -> None:
+def test_mistakes_are_reported_with_their_position(complaints, old: str, new: str, message: str) -> None:
     assert message in complaints((HEAD + TABLE).replace(old, new, 1))
 
 

@@ -1,4 +1,4 @@
-"""Another reference state, a mean, and what a comparison needs: covariances by Monte Carlo, and what is refused."""
+"""Another reference state, a mean, and data for a comparison: covariances by Monte Carlo, and refused cases."""
 
 import numpy as np
 import pytest
@@ -102,7 +102,7 @@ def test_time_and_start_count_from_the_new_state(tmp_path):
     assert found["source_reference"].values.tolist() == [1] * 6
 
 
-def test_unseen_freedoms_stay_unknown_and_a_state_without_values_is_refused():
+def test_undetermined_freedoms_are_unknown_and_a_state_without_values_is_refused():
     values = np.zeros((N, 6))
     values[:, 5] = np.nan
     values[3] = np.nan
@@ -116,7 +116,7 @@ def test_unseen_freedoms_stay_unknown_and_a_state_without_values_is_refused():
         ds.em.mean("position")
 
 
-def test_a_mean_carries_its_covariance():
+def test_a_mean_has_its_covariance():
     rng = np.random.default_rng(2)
     own, F = model(rng)
     values = rng.normal(0, 1e-6, (N, 6))
@@ -132,7 +132,7 @@ def test_a_mean_carries_its_covariance():
 
 
 @pytest.mark.parametrize("change", [lambda ds: ds.mean("time"), lambda ds: ds.interp(time=T[:-1] + 20.0)])
-def test_what_plain_xarray_does_to_a_covariance_is_reported(change):
+def test_the_effect_of_plain_xarray_on_a_covariance_is_reported(change):
     ds = made(np.zeros((N, 6)), np.tile(np.eye(6) * 1e-14, (N, 1, 1)))
     changed = change(ds).assign_attrs(ds.attrs)
     assert any("time_index" in each and "ds.em" in each for each in datasets.violations(changed))

@@ -1,4 +1,4 @@
-"""The reference page of the schemas says what the validator checks."""
+"""The reference page of the schemas agrees with the validator."""
 
 import math
 import re

@@ -30,7 +30,7 @@ def names(folder: Path) -> list[str]:
 
 
 @both
-def test_an_error_dataset_comes_back_identical(errors, tmp_path, suffix) -> None:
+def test_an_error_dataset_is_unchanged_by_storage(errors, tmp_path, suffix) -> None:
     ds = errors(unseen=(5,))
     back = load(save(ds, tmp_path / f"errors{suffix}"))
     xr.testing.assert_identical(back, ds)
@@ -40,7 +40,7 @@ def test_an_error_dataset_comes_back_identical(errors, tmp_path, suffix) -> None
 
 
 @both
-def test_a_long_record_is_stored_small_and_all_but_the_influences_to_the_last_bit(errors, tmp_path, suffix) -> None:
+def test_a_long_record_is_compressed_and_only_influences_are_rounded(errors, tmp_path, suffix) -> None:
     ds = errors(n=20_000)
     path = save(ds, tmp_path / f"errors{suffix}")
     back = load(path)
@@ -58,7 +58,7 @@ def test_a_long_record_is_stored_small_and_all_but_the_influences_to_the_last_bi
     xr.testing.assert_identical(load(save(back, tmp_path / f"again{suffix}")), back)  # rounded once
 
 
-def test_rounding_keeps_what_is_no_number_or_has_few_bits(errors) -> None:
+def test_rounding_does_not_change_nan_or_values_with_few_bits(errors) -> None:
     kept = np.array([np.nan, np.inf, -np.inf, 0.0, -0.0, 1.5e-6, np.finfo(float).max])  # the last would overflow
     kept[5] = 1.0 + 2.0**-27
     assert round_significand(kept).tobytes() == kept.tobytes()
@@ -67,7 +67,7 @@ def test_rounding_keeps_what_is_no_number_or_has_few_bits(errors) -> None:
     assert as_stored(errors(n=10)).identical(errors(n=10))  # small ones as they are
 
 
-def test_rounded_influences_follow_the_schema_where_nothing_is_independent(errors, tmp_path) -> None:
+def test_rounded_influences_conform_to_the_schema_without_independent_noise(errors, tmp_path) -> None:
     influence = np.random.default_rng(3).normal(size=(8, 5000, 6)) * 1e-6
     covariance = np.einsum("spi,spj->pij", influence, influence)
     groups = {"sources": [f"source {k}" for k in range(8)], "source_groups": ["all"] * 8}
@@ -97,7 +97,7 @@ def test_a_store_with_texts_of_fixed_length_is_read(drift, tmp_path) -> None:
 
 
 @both
-def test_a_raw_dataset_comes_back_equal_and_lazy(drift, tmp_path, suffix) -> None:
+def test_a_raw_dataset_is_loaded_unchanged_and_lazily(drift, tmp_path, suffix) -> None:
     ds = drift()
     with load(save(ds, tmp_path / f"raw{suffix}")) as back:
         assert not back["distance"].variable._in_memory
@@ -106,7 +106,7 @@ def test_a_raw_dataset_comes_back_equal_and_lazy(drift, tmp_path, suffix) -> Non
 
 
 @both
-def test_what_was_loaded_can_be_saved_as_the_other_kind(drift, tmp_path, suffix) -> None:
+def test_a_loaded_dataset_can_be_saved_in_the_other_format(drift, tmp_path, suffix) -> None:
     other = {".nc": ".zarr", ".zarr": ".nc"}[suffix]
     with load(save(drift(), tmp_path / f"a{suffix}")) as first, load(save(first, tmp_path / f"b{other}")) as second:
         xr.testing.assert_identical(second, drift())
@@ -129,7 +129,7 @@ def test_evenly_spaced_times_are_reported_by_rate_and_start(drift, tmp_path, suf
             np.testing.assert_array_equal(part["time"], thinned["time"])
 
 
-def test_the_times_of_a_long_record_stay_a_rule(tmp_path) -> None:
+def test_the_times_of_a_long_record_are_stored_as_a_rule(tmp_path) -> None:
     n = 3_000_000  # of 60 MB, without any: less than what is refused as out of proportion
     root = zarr.create_group(tmp_path / "raw.zarr", attributes={"sample_rate": 20e3})
     root.create_array("distance", shape=(5, n), chunks=(5, 2**20), dtype="f4", dimension_names=("channel", "time"))
@@ -138,7 +138,7 @@ def test_the_times_of_a_long_record_stay_a_rule(tmp_path) -> None:
         assert float(ds["time"][-1]) == pytest.approx((n - 1) / 20e3, rel=1e-15)
 
 
-def test_long_stored_times_are_not_pulled_into_memory(drift, tmp_path) -> None:
+def test_long_stored_times_are_not_loaded_into_memory(drift, tmp_path) -> None:
     n = 100_001
     ds = drift(n=n).drop_vars(["temperature"])
     with load(save(ds, tmp_path / "raw.nc")) as back:
@@ -148,7 +148,7 @@ def test_long_stored_times_are_not_pulled_into_memory(drift, tmp_path) -> None:
         assert not back["time"].variable._in_memory
 
 
-def test_metadata_in_the_root_counts_before_that_of_the_arrays(tmp_path) -> None:
+def test_metadata_in_the_root_have_priority_over_those_of_the_arrays(tmp_path) -> None:
     root = zarr.create_group(tmp_path / "raw.zarr")
     a = root.create_array("a", shape=(4,), chunks=(4,), dtype="f8", dimension_names=("time",))
     with pytest.warns(zarr.errors.ZarrUserWarning, match="not part in the Zarr format 3"):
@@ -159,7 +159,7 @@ def test_metadata_in_the_root_counts_before_that_of_the_arrays(tmp_path) -> None
 
 
 @both
-def test_nothing_is_overwritten_unless_asked(errors, tmp_path, suffix) -> None:
+def test_a_file_is_overwritten_only_on_request(errors, tmp_path, suffix) -> None:
     path = save(errors(seed=1), tmp_path / f"errors{suffix}")
     with pytest.raises(DatasetError, match="exists already"):
         save(errors(seed=2), path)
@@ -171,7 +171,7 @@ def test_nothing_is_overwritten_unless_asked(errors, tmp_path, suffix) -> None:
 
 @both
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_leaves_nothing_behind_and_the_old_file_as_it_was(
+def test_a_full_disk_leaves_no_part_and_does_not_change_the_old_file(
     errors, tmp_path, monkeypatch, suffix, code
 ) -> None:
     path = save(errors(seed=1), tmp_path / f"errors{suffix}")
@@ -181,15 +181,15 @@ def test_a_full_disk_leaves_nothing_behind_and_the_old_file_as_it_was(
 
     monkeypatch.setattr(os, "fsync", full)
     for target in (path, tmp_path / f"new{suffix}"):
-        with pytest.raises(DatasetError, match=r"(full|quota).*Nothing was left behind"):
+        with pytest.raises(DatasetError, match=r"(full|quota).*Nothing was written"):
             save(errors(seed=2), target, overwrite=True)
     monkeypatch.undo()
     assert names(tmp_path) == [path.name]
     xr.testing.assert_identical(load(path), errors(seed=1))
 
 
-def test_a_disk_that_is_read_only_ends_in_a_message(errors, tmp_path, monkeypatch) -> None:
-    """What was begun cannot even be removed then."""
+def test_a_read_only_disk_is_reported(errors, tmp_path, monkeypatch) -> None:
+    """The incomplete file cannot be removed either."""
 
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
@@ -200,7 +200,7 @@ def test_a_disk_that_is_read_only_ends_in_a_message(errors, tmp_path, monkeypatc
         save(errors(seed=1), tmp_path / "new.nc")
 
 
-def test_a_file_is_written_whole_or_is_as_it_was(tmp_path, monkeypatch) -> None:
+def test_a_file_is_written_completely_or_not_changed(tmp_path, monkeypatch) -> None:
     path = tmp_path / "page.html"
     path.write_text("old")
     with whole(path) as part:
@@ -218,14 +218,14 @@ def test_a_file_is_written_whole_or_is_as_it_was(tmp_path, monkeypatch) -> None:
     assert names(tmp_path) == ["page.html"]
 
 
-def test_a_limit_of_the_system_ends_in_a_message(errors, tmp_path) -> None:
+def test_a_limit_of_the_system_is_reported(errors, tmp_path) -> None:
     resource = pytest.importorskip("resource", reason="limits of a process are a matter of Unix")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     big = errors(n=2000)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
     try:
         for name in ("errors.nc", "errors.zarr"):
-            with pytest.raises(DatasetError, match=r"larger than allowed\. Nothing was left behind"):
+            with pytest.raises(DatasetError, match=r"larger than allowed\. Nothing was written"):
                 save(big, tmp_path / name)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -233,7 +233,7 @@ def test_a_limit_of_the_system_ends_in_a_message(errors, tmp_path) -> None:
 
 
 @both
-def test_an_interruption_leaves_nothing_behind(errors, tmp_path, monkeypatch, suffix) -> None:
+def test_an_interruption_leaves_no_part(errors, tmp_path, monkeypatch, suffix) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -243,7 +243,7 @@ def test_an_interruption_leaves_nothing_behind(errors, tmp_path, monkeypatch, su
     assert names(tmp_path) == []
 
 
-def test_a_folder_that_cannot_be_put_in_place_leaves_the_old_one(errors, tmp_path, monkeypatch) -> None:
+def test_a_folder_that_cannot_be_renamed_leaves_the_old_one(errors, tmp_path, monkeypatch) -> None:
     path = save(errors(seed=1), tmp_path / "errors.zarr")
     rename = Path.rename
 
@@ -259,14 +259,14 @@ def test_a_folder_that_cannot_be_put_in_place_leaves_the_old_one(errors, tmp_pat
     xr.testing.assert_identical(load(path), errors(seed=1))
 
 
-def test_a_place_that_takes_no_file_is_reported(errors, tmp_path) -> None:
+def test_a_location_that_cannot_be_written_is_reported(errors, tmp_path) -> None:
     with pytest.raises(DatasetError, match="there is no such folder"):
         save(errors(), tmp_path / "none" / "errors.nc")
     with pytest.raises(DatasetError, match=r"ends in \.nc .* or \.zarr"):
         save(errors(), tmp_path / "errors.txt")
 
 
-def test_an_attribute_that_no_file_can_hold_is_named_before_writing(errors, tmp_path) -> None:
+def test_an_attribute_that_cannot_be_stored_is_reported_before_writing(errors, tmp_path) -> None:
     ds = errors().assign_attrs(operator=None)
     ds["EX"].attrs["valid"] = True
     with pytest.raises(DatasetError) as caught:
@@ -293,7 +293,7 @@ def test_a_damaged_folder_is_reported(errors, tmp_path) -> None:
             load(path)
 
 
-def test_a_cut_off_chunk_is_reported(errors, tmp_path) -> None:
+def test_a_truncated_chunk_is_reported(errors, tmp_path) -> None:
     path = save(errors(), tmp_path / "errors.zarr")
     (chunk,) = [file for file in (path / "covariance").rglob("*") if file.is_file() and file.name != "zarr.json"]
     chunk.write_bytes(chunk.read_bytes()[:20])
@@ -301,7 +301,7 @@ def test_a_cut_off_chunk_is_reported(errors, tmp_path) -> None:
         load(path)
 
 
-def test_what_is_no_dataset_is_reported(tmp_path) -> None:
+def test_a_file_that_is_not_a_dataset_is_reported(tmp_path) -> None:
     (tmp_path / "log.csv").write_text("t;X1;X2\n")
     with pytest.raises(DatasetError, match="errormotion import"):
         load(tmp_path / "log.csv")
@@ -322,7 +322,7 @@ def test_netcdf_of_the_classic_format_is_read_as_well(tmp_path) -> None:
         np.testing.assert_array_equal(found["distance"], raw["distance"])
 
 
-def test_a_chunk_that_is_cut_off_shows_while_it_is_read(tmp_path) -> None:
+def test_a_truncated_chunk_is_reported_during_reading(tmp_path) -> None:
     raw = simulation.raw_drift(VirtualMachine("cframe", seed=1), np.arange(5000.0), seed=0)
     path = save(raw, tmp_path / "raw.zarr")
     (chunk, *_) = [file for file in (path / "distance").rglob("*") if file.is_file() and file.name != "zarr.json"]

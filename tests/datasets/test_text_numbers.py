@@ -8,7 +8,7 @@ from errormotion.datasets.text.csv_text import NUMBER
 
 
 @pytest.mark.parametrize("end", ["", ".", "x", ".5x", "e", "e+", ".5e5x"])
-def test_a_long_text_is_judged_in_time_proportional_to_its_length(end: str) -> None:
+def test_a_long_text_is_checked_in_time_proportional_to_its_length(end: str) -> None:
     text = "9" * 50_000 + end
     start = time.process_time()
     assert bool(NUMBER.fullmatch(text)) == (end in ("", "."))

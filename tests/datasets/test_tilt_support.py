@@ -1,4 +1,4 @@
-"""Where a calibration speaks for a tilt, over the designs that people measure."""
+"""Supported tilts of a calibration, for usual designs."""
 
 from functools import lru_cache
 
@@ -30,7 +30,7 @@ def scattered(count: int, seed: int = 0) -> Array:
 
 
 def support(tilts: Array) -> TiltSupport:
-    """Return the support of settings as a calibration makes it."""
+    """Return the support of settings as in a calibration."""
     return _support(tilts.tobytes())
 
 
@@ -87,7 +87,7 @@ def test_an_even_design_is_supported_throughout(tilts: Array) -> None:
         ([40], EVERY_30, 0, 40),
     ],
 )
-def test_a_hole_along_the_inclination_is_refused_all_through(inclinations, rotations, low, high) -> None:
+def test_a_hole_along_the_inclination_is_refused_completely(inclinations, rotations, low, high) -> None:
     tilts = grid(inclinations, rotations)
     # Within the margin of the settings around it, here 3 deg at right angles, a tilt is supported. Between settings
     # 30 deg apart the straight side lies by 3.4 % of its tilt farther in.
@@ -102,7 +102,7 @@ def test_a_hole_along_the_inclination_is_refused_all_through(inclinations, rotat
             assert held(tilts, beside).all()
 
 
-def test_a_hole_along_the_inclination_need_not_go_all_around() -> None:
+def test_a_hole_along_the_inclination_may_be_part_of_a_ring() -> None:
     tilts = grid(FINE, EVERY_10)
     alpha, beta = np.degrees(np.arctan(np.hypot(*tilts.T))), np.degrees(np.arctan2(tilts[:, 1], tilts[:, 0]))
     missing = (alpha > 20.1) & (alpha < 34.9) & (beta > 5) & (beta < 175)
@@ -110,7 +110,7 @@ def test_a_hole_along_the_inclination_need_not_go_all_around() -> None:
     assert support(tilts[~missing]).holds(q).tolist() == [False, False, False, True, True, True]
 
 
-def test_a_missing_sector_is_a_hole_where_it_is_wide() -> None:
+def test_a_missing_sector_is_a_hole_if_it_is_wide() -> None:
     tilts = grid(COARSE, [b for b in EVERY_10 if not 50 < b < 130])
     assert not held(tilts, 35.0, range(56, 125)).any()
     assert held(tilts, 35.0, [*range(51), *range(130, 360)]).all()
@@ -131,7 +131,7 @@ def test_the_published_design_leaves_four_holes_between_its_rotations() -> None:
     assert found == [[10, 90], [90, 170], [190, 270], [270, 350]]
 
 
-def test_a_wide_place_in_few_scattered_settings_is_a_hole() -> None:
+def test_a_wide_gap_in_few_scattered_settings_is_a_hole() -> None:
     tilts = scattered(300)
     tilts = tilts[np.hypot(*(tilts - [0.5, 0.0]).T) > 0.35]
     assert not support(tilts).holds([0.5, 0.0])
@@ -153,7 +153,7 @@ def test_neither_the_zero_of_the_rotation_nor_small_misalignments_matter(shift, 
 
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 60))
 @settings(max_examples=40, deadline=None)
-def test_a_setting_speaks_for_itself_and_nothing_beyond_the_hull_is_held(seed, count) -> None:
+def test_settings_are_supported_and_tilts_outside_of_the_hull_are_not(seed, count) -> None:
     tilts = scattered(count, seed)
     found = support(tilts)
     assert found.holds(tilts).all()

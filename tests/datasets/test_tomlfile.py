@@ -69,7 +69,7 @@ def complaints(path: Path) -> list[str]:
     return str(caught.value).split("\n  - ")
 
 
-def test_a_good_file_becomes_a_model_in_si(write) -> None:
+def test_a_valid_file_is_read_as_a_model_in_si(write) -> None:
     text = 'schema = "errormotion.example/1"\nbar_radius = "5 mm"\n[[test]]\nname = "a"\naverage = "2 min"\n'
     found = tomlfile.load_model(write("\ufeff" + text), File)
     assert (found.bar_radius, found.test[0].average) == (0.005, 120.0)
@@ -112,7 +112,7 @@ def test_every_mistake_is_reported_with_file_key_expected_and_found(write) -> No
     ]
 
 
-def test_a_rule_about_a_whole_table_speaks_for_itself(write) -> None:
+def test_a_rule_for_a_table_is_reported_with_its_own_text(write) -> None:
     path = write('schema = "errormotion.example/1"\nbar_radius = "5 mm"\n[[test]]\nname = "a"\nrepeats = 2\n')
     assert complaints(path)[1:] == ["test[0]: a drift is measured once; set repeats = 1"]
 
@@ -126,7 +126,7 @@ def test_a_rule_about_a_whole_table_speaks_for_itself(write) -> None:
         ("a = 1\na = 2\n", "line 2, column 6"),
     ],
 )
-def test_what_is_no_toml_is_reported_with_its_place(write, text: str | bytes, place: str) -> None:
+def test_invalid_toml_is_reported_with_its_position(write, text: str | bytes, place: str) -> None:
     path = write(text)
     assert complaints(path)[0].startswith(f"{path}, {place}: ")
 
@@ -136,13 +136,13 @@ def test_a_missing_file_is_an_error_of_the_chosen_class(tmp_path: Path) -> None:
         tomlfile.load_model(tmp_path / "none.toml", File)
 
 
-def test_keys_of_an_embedded_table_carry_their_place() -> None:
+def test_keys_of_an_embedded_table_are_reported_with_their_path() -> None:
     found, mistakes = tomlfile.check({"name": "a", "x": 1}, Measurement, prefix=("test", 2, "settings"))
     assert found is None
     assert mistakes[0].startswith("test[2].settings.x: unknown key")
 
 
-def test_the_nearest_name_does_not_care_for_capitals() -> None:
+def test_the_nearest_name_ignores_upper_and_lower_case() -> None:
     assert tomlfile.nearest("ERRORMOTION", ["errormotion", "other"]).startswith("did you mean 'errormotion'?")
 
 
@@ -158,11 +158,11 @@ def test_the_nearest_name_does_not_care_for_capitals() -> None:
     ],
     ids=["arrays", "tables", "digits", "dotted", "quoted", "size"],
 )
-def test_what_would_take_too_much_is_an_error(write, text: str, message: str) -> None:
+def test_a_file_that_needs_too_many_resources_is_an_error(write, text: str, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         tomlfile.read_toml(write(text))
 
 
-def test_a_long_word_and_a_sentence_with_dots_are_no_long_key(write) -> None:
+def test_a_long_word_and_a_sentence_with_dots_are_not_long_keys(write) -> None:
     text = f'a = "{"x" * 1_000_000}"\nb = "{". . " * 100}{"1.5 " * 100}"\n'
     assert set(tomlfile.read_toml(write(text))) == {"a", "b"}

@@ -1,4 +1,4 @@
-"""One value of a file that a person wrote is changed; everything else remains."""
+"""One value of a file is changed; the remaining text is unchanged."""
 
 import tomllib
 from typing import Any
@@ -64,7 +64,7 @@ def test_an_array_over_several_lines_is_one_value() -> None:
         ("a = 1" + " " * 70_000, ("a",)),
     ],
 )
-def test_what_cannot_be_changed_alone_is_refused(text: str, place: tuple[Any, ...]) -> None:
+def test_a_value_that_cannot_be_changed_separately_is_refused(text: str, place: tuple[Any, ...]) -> None:
     with pytest.raises(DatasetError):
         with_value(text, place, 5)
 
@@ -86,7 +86,7 @@ def test_a_table_is_removed_with_those_in_it_and_nothing_else(number: int) -> No
     ]  # fmt: skip
 
 
-def test_the_last_table_leaves_none() -> None:
+def test_the_last_table_can_be_removed() -> None:
     assert without_table('a = 1\n\n[[test]]\nname = "d"\n', "test", 0) == "a = 1\n\n"
 
 

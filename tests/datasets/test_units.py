@@ -46,19 +46,19 @@ def test_text_with_a_unit_is_read_to_the_last_bit(quantity: units.Quantity, text
 @pytest.mark.parametrize(
     "text", ["5", "mm", "", "5 s", "5 foo", "1,5 mm", "5 mm +", "5 %", "nan mm", "inf mm", "1e999 mm"]
 )
-def test_text_that_is_no_length_is_refused_with_an_example(text: str) -> None:
+def test_text_that_is_not_a_length_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(ValueError, match="expected a length with its unit, such as '5 mm'"):
         units.LENGTH.parse(text)
 
 
-def test_a_per_cent_is_no_angle_and_a_turn_no_frequency() -> None:
+def test_a_per_cent_is_not_an_angle_and_a_turn_not_a_frequency() -> None:
     with pytest.raises(ValueError, match="not convertible"):
         units.ANGLE.parse("5 %")
     with pytest.raises(ValueError, match="not convertible"):
         units.FREQUENCY.parse("15000 rpm")
 
 
-def test_bare_numbers_are_si_from_python_and_refused_at_the_edge() -> None:
+def test_numbers_without_unit_are_si_in_python_and_refused_in_files() -> None:
     assert Settings(radius=0.004).radius == 0.004
     assert Settings.model_validate({"radius": "4 mm"}, context=EDGE).radius == 0.004
     with pytest.raises(ValidationError, match="expected a length with its unit, such as '5 mm'; found 5"):
@@ -66,17 +66,17 @@ def test_bare_numbers_are_si_from_python_and_refused_at_the_edge() -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, True, None, [1.0]])
-def test_what_is_no_finite_number_is_refused_from_python_too(value: object) -> None:
+def test_a_value_that_is_not_a_finite_number_is_refused_in_python(value: object) -> None:
     with pytest.raises(ValidationError, match="expected a length"):
         Settings.model_validate({"radius": value})
 
 
-def test_limits_of_a_field_hold_in_si() -> None:
+def test_limits_of_a_field_are_in_si() -> None:
     with pytest.raises(ValidationError, match="greater than 0"):
         Settings.model_validate({"average": "-3 s"})
 
 
-def test_settings_survive_their_own_dump() -> None:
+def test_settings_are_unchanged_after_a_round_trip() -> None:
     settings = Settings.model_validate({"radius": "4 mm", "tilt": "2 mrad"}, context=EDGE)
     assert Settings.model_validate(settings.model_dump(mode="json")) == settings
 
@@ -104,7 +104,7 @@ def test_arrays_convert_elementwise() -> None:
 
 
 @pytest.mark.parametrize("unit", ["furlongish", "mm)", "kg"])
-def test_a_unit_that_measures_nothing_here_is_refused(unit: str) -> None:
+def test_a_unit_of_no_known_quantity_is_refused(unit: str) -> None:
     with pytest.raises(DatasetError, match=f"'{unit}'".replace(")", r"\)")):
         units.si_unit(unit)
 
@@ -149,7 +149,7 @@ def test_text_with_a_unit_of_udunits_is_read() -> None:
         *("m\0", "", "m--1", "seconds since 2020-01-01", "m" * 10_000, "m " * 10_000),
     ],
 )
-def test_a_nonsense_unit_gives_an_error_of_the_project(unit: str) -> None:
+def test_an_invalid_unit_raises_an_error_of_the_package(unit: str) -> None:
     for target in ("m", "degC", "1", "W"):
         with pytest.raises(DatasetError, match=r"not (a known unit|convertible)"):
             units.convert(1.0, unit, target)
@@ -158,7 +158,7 @@ def test_a_nonsense_unit_gives_an_error_of_the_project(unit: str) -> None:
 @pytest.mark.parametrize(
     "text", ["5 mm-1", "5 nan", "5 mdegC", "9" * 90 + "e99 Ym9", "9" * 10_000 + " mm", "5" + " " * 10_000]
 )
-def test_a_nonsense_quantity_is_refused_with_an_example(text: str) -> None:
+def test_an_invalid_quantity_is_refused_with_an_example(text: str) -> None:
     for quantity in units.KINDS:
         with pytest.raises(ValueError, match=f"expected {quantity.kind} with its unit"):
             quantity.parse(text)

@@ -1,4 +1,4 @@
-"""What xarray alone finds of this package: the engine, the accessor, tables of pandas."""
+"""Use of this package through xarray only: the engine, the accessor, tables of pandas."""
 
 import subprocess
 import sys
@@ -27,7 +27,7 @@ def test_xarray_alone_opens_a_result_with_its_accessor_and_without_matplotlib(er
     assert done.stdout.splitlines() == ["EX ['warm']", "U(EXC) / um", "[]"]
 
 
-def test_the_engine_opens_what_load_opens(errors, drift, tmp_path) -> None:
+def test_the_engine_opens_the_same_datasets_as_load(errors, drift, tmp_path) -> None:
     file = datasets.save(errors(), tmp_path / "errors.nc")
     xr.testing.assert_identical(xr.open_dataset(file, engine="errormotion"), errors())
     xr.testing.assert_identical(

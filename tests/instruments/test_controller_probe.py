@@ -122,7 +122,7 @@ def test_a_map_of_another_probe_is_refused_unless_allowed(tmp_path: Path) -> Non
 def test_a_map_without_a_serial_number_is_used_with_a_note(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = str(lobed(1e-6).save(tmp_path / "probe.nc"))
     ControllerProbeSettings(arm=True, pretravel=path, serial_number="P2").pretravel_map()
-    assert "holds no serial number" in caplog.text
+    assert "states no serial number" in caplog.text
 
 
 def test_a_map_takes_contacts_to_where_the_tip_met_the_surface(tmp_path: Path) -> None:

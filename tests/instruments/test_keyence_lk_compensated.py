@@ -204,6 +204,6 @@ def test_a_calibration_of_another_mid_range_is_refused(known) -> None:
 
 def test_a_serial_number_that_is_missing_is_noted(known) -> None:
     with numbered("H17") as sensor:
-        assert "holds no serial number" in CompensatedSensor(sensor, known).notes[0]
+        assert "states no serial number" in CompensatedSensor(sensor, known).notes[0]
     with numbered("") as sensor:
         assert "The sensor reports no serial number" in CompensatedSensor(sensor, of_sensor(known, "H17")).notes[0]

@@ -1,4 +1,4 @@
-"""A foreign method, installed as a distribution of its own: from raw data to report, by the command line alone."""
+"""A method in a separate distribution: from raw data to report by the command line."""
 
 import json
 import os
@@ -20,7 +20,7 @@ FIGURES = ("G(CCW) XY", "G(CW) XY", "G(b) XY", "H XY", "Fmax XY", "Fmin XY", "D 
 
 
 def run(*arguments, folder, site, code=0):
-    """Return what a command prints; it runs in an interpreter of its own that has the distribution on its path."""
+    """Return the output of a command in a separate interpreter with the distribution on its path."""
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
         cwd=folder,
@@ -47,7 +47,7 @@ def installed(tmp_path_factory):
     with Commands([site, ROOT]) as commands:
 
         def command(*arguments, code=0):
-            """Return what a command prints; it runs in a process of its own, forked from one with this path."""
+            """Return the output of a command in a process forked from one with this path."""
             done = commands.run(*arguments, cwd=work, environment={"COLUMNS": "200"})
             assert done.returncode == code, done.stdout + done.stderr
             return done.stdout
@@ -58,7 +58,7 @@ def installed(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def measured(installed):
-    """Write simulated raw data, their truth, and the same readings as a person writes them into a CSV file."""
+    """Write simulated raw data, their truth, and the same readings as a CSV file."""
     script = (
         "from errormotion import datasets, plugins; from ballbar_test.simulation import simulate\n"
         "Ballbar = plugins.get('methods', 'ballbar')\n"
@@ -104,7 +104,7 @@ def as_csv(raw):
 
 
 def as_log(raw):
-    """Return the readings as one table, the temperature beside each."""
+    """Return the readings with their temperatures as one table."""
     lines = ["direction;circle;length;angle;time;T"]
     for direction in raw["direction_of_travel"].values:
         for number in range(raw.sizes["run"]):
@@ -118,7 +118,7 @@ def as_log(raw):
     return "\n".join(lines) + "\n"
 
 
-def test_nothing_in_the_package_knows_of_it():
+def test_the_package_does_not_refer_to_it():
     files = [path for path in (ROOT / "errormotion").rglob("*") if path.suffix in (".py", ".toml", ".j2")]
     knowing = [path for path in files if re.search(r"ballbar_test|[\"']ballbar[\"']|raw\.ballbar", path.read_text())]
     assert knowing == []
@@ -129,7 +129,7 @@ def test_it_is_listed_with_its_distribution(installed):
     assert re.search(r"(?m)^ballbar +simulated_only +errormotion-ballbar 0\.1\.0", listed)
 
 
-def test_its_raw_data_are_validated_by_its_own_table(installed, measured):
+def test_its_raw_data_are_validated_with_its_table(installed, measured):
     for name in ("raw.nc", "truth.nc", "readings.csv"):
         assert "valid" in installed("validate", name)
     raw = datasets.load(measured / "raw.nc").load()
@@ -162,7 +162,7 @@ def test_the_command_line_prints_its_figures(identified, measured):
             assert abs(figure["value"] - true) < 2 * figure["expanded_uncertainty"], figure  # four u
 
 
-def test_the_csv_file_and_the_imported_log_give_the_same_errors(identified, measured):
+def test_the_csv_file_and_the_imported_log_have_the_same_errors(identified, measured):
     with datasets.load(measured / "errors.nc") as one:
         assert one["deviation"].dims == ("direction_of_travel", "angle")
         for name in ("from_csv.nc", "from_log.nc"):
@@ -189,7 +189,7 @@ def test_a_campaign_is_planned(installed):
     answer = json.loads(installed("plan", "campaign.toml", "--out", "plan.nc", "--json"))
     (planned,) = answer["plans"]
     assert [row["name"] for row in planned["expected"]] == ["deviation"]
-    assert 1.0 < planned["expected"][0]["expanded_uncertainty"] < 1.5  # the bar's 2 x 0.5 um, and little beside
+    assert 1.0 < planned["expected"][0]["expanded_uncertainty"] < 1.5  # 2 x 0.5 um of the bar, and little else
     assert "G(b)" in planned["notes"][0]
 
 
@@ -200,8 +200,8 @@ def test_it_passes_the_kit(installed):
 
 
 @pytest.mark.slow
-def test_its_own_tests_pass_where_it_lies():
-    """Without the kit, which the command above runs."""
+def test_its_own_tests_pass():
+    """Without the kit, which is run by the command above."""
     arguments = ["-q", "-c", "pyproject.toml", "--rootdir", ".", "-p", "no:cacheprovider", "-k", "not TestBallbar"]
     environment = {
         "PYTHONPATH": f"{EXAMPLE}{os.pathsep}{ROOT}",

@@ -1,4 +1,4 @@
-"""The example of a foreign distribution, installed without network, is a plugin like ours and passes the kit."""
+"""The example of a separate distribution, installed without network, is registered and passes the kit."""
 
 import os
 import subprocess
@@ -33,7 +33,7 @@ def installed(tmp_path, monkeypatch):
     plugins.refresh()
 
 
-def test_it_stands_in_the_registry_beside_ours_and_a_broken_one(installed):
+def test_it_is_registered_together_with_built_in_and_broken_plugins(installed):
     broken = installed / "wreck-0.dist-info"
     broken.mkdir()
     (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: wreck\nVersion: 0\n")
@@ -52,7 +52,7 @@ def test_it_passes_every_check_of_the_kit():
     assert not any(result.skipped for result in results)
 
 
-def test_its_own_test_passes_where_it_lies():
+def test_its_own_test_passes():
     arguments = ["-q", "-c", "pyproject.toml", "--rootdir", ".", "-p", "no:cacheprovider", "tests"]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *arguments],
@@ -65,7 +65,7 @@ def test_its_own_test_passes_where_it_lies():
     assert done.returncode == 0, done.stdout
 
 
-def test_it_stays_small():
+def test_it_is_small():
     lines = {path.name: len(path.read_text().splitlines()) for path in EXAMPLE.rglob("*.py")}
     assert lines["driver.py"] < 60
     assert lines["test_line_gauge.py"] <= 10

@@ -1,4 +1,4 @@
-"""``errormotion plugins new`` writes a distribution whose own tests pass as they stand."""
+"""``errormotion plugins new`` writes a distribution whose tests pass."""
 
 import os
 import subprocess

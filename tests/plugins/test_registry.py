@@ -1,4 +1,4 @@
-"""The registry finds plugins of any distribution, and a broken one harms nobody."""
+"""The registry finds plugins of any distribution, and a broken plugin does not affect others."""
 
 import sys
 
@@ -23,7 +23,7 @@ class Good:
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Put a distribution on the path, as pip would leave it: a dist-info folder and a module."""
+    """Put a distribution on the path as installed by pip: a dist-info folder and a module."""
 
     names = []
 
@@ -54,13 +54,13 @@ def by_id(group="instruments"):
     return {plugin.id: plugin for plugin in plugins.available(group)}
 
 
-def test_the_built_in_plugins_come_through_the_same_door():
+def test_the_built_in_plugins_are_registered_by_entry_points():
     assert {"optoncdt", "five_sensor_frame", "virtual_controller", "dcon_temperature"} <= by_id().keys()
     assert "spindle_drift" in by_id("methods")
     assert by_id()["optoncdt"].distribution.startswith("errormotion ")
 
 
-def test_a_foreign_plugin_stands_beside_them_with_its_distribution(install):
+def test_another_plugin_is_listed_with_its_distribution(install):
     install("elsewhere", instrument("good", "elsewhere:Good"), GOOD.format(id="good"))
     plugin = by_id()["good"]
     assert (plugin.error, plugin.distribution) == ("", "elsewhere 1.2")
@@ -74,12 +74,12 @@ def test_a_foreign_plugin_stands_beside_them_with_its_distribution(install):
         ("raise SystemExit(3)", "SystemExit: 3"),
         ("class Good: pass", "expected a class with an `info` of type InstrumentInfo, found None"),
         ("Worse = 1", "AttributeError"),
-        (GOOD.format(id="better"), "the entry point is called 'broken' but the class calls itself 'better'"),
+        (GOOD.format(id="better"), "the entry point is called 'broken', but the id of the class is 'better'"),
         (GOOD.format(id="broken").replace("def read", "def reed"), "class Good lacks read"),
         ("def", "SyntaxError"),
     ],
 )
-def test_a_broken_plugin_is_listed_with_its_error_and_harms_nobody(install, module, complaint):
+def test_a_broken_plugin_is_listed_with_its_error_and_affects_no_other(install, module, complaint):
     install("elsewhere", instrument("good", "elsewhere:Good"), GOOD.format(id="good"))
     install("wreck", instrument("broken", "wreck:Good"), module)
     listed = by_id()
@@ -90,13 +90,13 @@ def test_a_broken_plugin_is_listed_with_its_error_and_harms_nobody(install, modu
         plugins.get("instruments", "broken")
 
 
-def test_a_list_of_entry_points_that_cannot_be_read_is_named_and_harms_nobody(install):
+def test_an_unreadable_list_of_entry_points_is_reported_and_affects_no_other(install):
     install("scrawl", "[errormotion.instruments]\nthis line has no equals sign\n")
     assert "entry_points.txt cannot be read" in by_id()["scrawl"].error
     assert "optoncdt" in by_id()
 
 
-def test_a_folder_without_metadata_harms_nobody(install):
+def test_a_folder_without_metadata_affects_no_plugin(install):
     folder = install("bare", instrument("good", "bare:Good"), GOOD.format(id="good"))
     (folder / "bare-1.2.dist-info" / "METADATA").unlink()
     plugins.refresh()
@@ -104,17 +104,17 @@ def test_a_folder_without_metadata_harms_nobody(install):
     assert "optoncdt" in by_id()
 
 
-def test_two_distributions_that_claim_one_id_are_both_named(install):
+def test_two_distributions_with_one_id_are_both_named(install):
     install("one", instrument("good", "one:Good"), GOOD.format(id="good"))
     install("two", instrument("good", "two:Good"), GOOD.format(id="good"))
     rivals = [plugin for plugin in plugins.available("instruments") if plugin.id == "good"]
     assert len(rivals) == 2
     assert all("one 1.2" in plugin.error and "two 1.2" in plugin.error for plugin in rivals)
-    with pytest.raises(PluginError, match="Several distributions claim the instrument 'good'"):
+    with pytest.raises(PluginError, match="Several distributions provide the instrument 'good'"):
         plugins.get("instruments", "good")
 
 
-def test_of_two_copies_the_first_on_the_path_counts_even_without_plugins(install, tmp_path, monkeypatch):
+def test_of_two_copies_the_first_on_the_path_is_used_even_without_plugins(install, tmp_path, monkeypatch):
     install("copied", instrument("copied_sensor", "copied:Good"), GOOD.format(id="copied_sensor"))
     assert "copied_sensor" in by_id()
     first = tmp_path / "first" / "copied-1.3.dist-info"
@@ -137,7 +137,7 @@ def test_getting_one_plugin_loads_no_other(install):
     assert "bystander" not in sys.modules
 
 
-def test_what_was_installed_meanwhile_is_seen_after_a_refresh(install, tmp_path):
+def test_a_newly_installed_plugin_is_found_after_a_refresh(install, tmp_path):
     folder = install("elsewhere", "", GOOD.format(id="late"))
     assert "late" not in by_id()
     (folder / "elsewhere-1.2.dist-info" / "entry_points.txt").write_text(instrument("late", "elsewhere:Good"))
@@ -157,7 +157,7 @@ class Kind:
 
 
 @pytest.mark.parametrize("tables", ['lazy("no_such_module:TABLES")', 'lazy("wreck:UNKNOWN")', "lazy('nothing')"])
-def test_tables_of_a_plugin_that_do_not_load_are_ignored_with_a_warning(install, tables):
+def test_tables_of_a_plugin_that_cannot_be_loaded_are_ignored_with_a_warning(install, tables):
     install("wreck", "[errormotion.datasets]\nbroken = wreck:Kind\n", DATASET.format(tables=tables))
     with pytest.warns(PluginWarning, match="The plugin 'broken': `raw_schemas` is ignored"):
         known = schemas.known_schemas()
@@ -166,7 +166,7 @@ def test_tables_of_a_plugin_that_do_not_load_are_ignored_with_a_warning(install,
     assert plugins.owner_of_schema("errormotion.raw.spindle_drift/1").info.id == "spindle_drift"
 
 
-def test_tables_that_are_no_schemas_are_ignored(install):
+def test_tables_that_are_not_schemas_are_ignored(install):
     install("wreck", "[errormotion.datasets]\nbroken = wreck:Kind\n", DATASET.format(tables="(1, 'text')"))
     assert {"errormotion.errors/1", "errormotion.raw.spindle_drift/1"} <= schemas.known_schemas()
     assert plugins.owner_of_schema("lab.unknown/1") is None

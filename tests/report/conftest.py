@@ -1,4 +1,4 @@
-"""Error datasets as the methods hand them over, made by hand: a warm-up with its end, and a beam detection."""
+"""Error datasets of a warm-up with its end, and of a beam detection."""
 
 import json
 

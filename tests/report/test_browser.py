@@ -1,4 +1,4 @@
-"""The page in a browser: values under the pointer, zoom, and a drawing in space that is drawn by its script."""
+"""The page in a browser: values under the pointer, zoom, and a drawing in space by its script."""
 
 import re
 import shutil

@@ -1,4 +1,4 @@
-"""Figures keep what the eye would see, and stand in a page without reaching out of it."""
+"""Figures show all visible features, and have no external references in a page."""
 
 import re
 from xml.etree import ElementTree
@@ -20,7 +20,7 @@ def test_a_single_spike_survives_thinning():
     assert (np.diff(thin_t) > 0).all()
 
 
-def test_a_gap_stays_a_gap():
+def test_a_gap_is_drawn_as_a_gap():
     t = np.arange(10_000.0)
     y = np.ones(10_000)
     y[4000:5000] = np.nan
@@ -30,7 +30,7 @@ def test_a_gap_stays_a_gap():
     assert np.isnan(thin_y[inside]).all()
 
 
-def test_short_curves_are_left_as_they_are():
+def test_short_curves_are_not_changed():
     t, y = np.arange(5.0), np.array([1.0, np.nan, 3.0, 2.0, 1.0])
     assert canvas.decimate(t, y)[1] is y
 
@@ -57,7 +57,7 @@ def test_names_that_look_like_mathematics_or_markup_are_drawn_as_written():
     assert "主軸" in svg
 
 
-def test_svg_has_no_address_and_no_loose_identifier():
+def test_svg_has_no_address_and_no_unused_identifier():
     def paint(figure):
         axes = figure.subplots()
         axes.plot([0, 1], [0, 1], marker="o")
@@ -74,7 +74,7 @@ def test_svg_has_no_address_and_no_loose_identifier():
     ElementTree.fromstring(one)
 
 
-def test_a_picture_inside_a_drawing_is_kept_in_it():
+def test_a_picture_inside_a_drawing_is_embedded():
     def paint(figure):
         axes = figure.subplots()
         figure.colorbar(axes.scatter([0, 1], [0, 1], c=[0, 1]))  # many colours: matplotlib embeds a picture
@@ -84,7 +84,7 @@ def test_a_picture_inside_a_drawing_is_kept_in_it():
     assert "#k-data:" not in svg
 
 
-def test_the_page_can_read_values_and_uncertainty_off_a_drawn_curve():
+def test_a_drawn_curve_contains_values_and_uncertainty_for_the_page():
     t, values = np.linspace(0, 50, 40), np.sin(np.linspace(0, 6, 40)) * 7
     values[11] = np.nan
     expanded = 0.1 + 0.01 * t
@@ -128,7 +128,7 @@ def test_limits_near_a_curve_are_lines_and_others_are_named():
     assert "EZ" not in svg
 
 
-def test_numbers_of_a_narrow_panel_do_not_touch():
+def test_numbers_of_a_narrow_panel_do_not_overlap():
     kept = []
 
     def paint(figure):

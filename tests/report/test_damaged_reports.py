@@ -1,4 +1,4 @@
-"""Reports of altered error datasets: a page or a sentence that names the file, never a traceback."""
+"""Reports of altered error datasets: a page, or a message that names the file."""
 
 from contextlib import suppress
 from pathlib import Path

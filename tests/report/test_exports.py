@@ -93,7 +93,7 @@ def test_every_table_of_a_report_is_exported(drift, tmp_path):
     assert float(rows[1][3]) == pytest.approx(0.40)
 
 
-def test_where_nothing_prints_the_message_says_what_to_install(beams, tmp_path, monkeypatch):
+def test_without_a_printing_program_the_message_names_packages(beams, tmp_path, monkeypatch):
     monkeypatch.setattr(pdf, "browser", lambda: "")
     monkeypatch.setitem(sys.modules, "weasyprint", None)
     with pytest.raises(RunError, match=r"apt install chromium.*errormotion\[pdf\]"):
@@ -102,7 +102,7 @@ def test_where_nothing_prints_the_message_says_what_to_install(beams, tmp_path, 
 
 
 @pytest.mark.skipif(not pdf.browser(), reason="no browser is installed")
-def test_the_command_prints_for_the_wanted_paper(beams, tmp_path: Path) -> None:
+def test_the_command_prints_with_the_stated_paper(beams, tmp_path: Path) -> None:
     save(beams, tmp_path / "errors.nc")
     done = CliRunner().invoke(app, ["report", str(tmp_path / "errors.nc"), "--pdf", "--paper", "Letter", "--json"])
     assert done.exit_code == 0, done.output

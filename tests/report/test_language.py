@@ -1,4 +1,4 @@
-"""A report in German: all texts that a catalogue has, decimal comma, names of the data untouched."""
+"""A report in German: texts of the catalogues, decimal comma, unchanged names of the data."""
 
 import re
 import tomllib
@@ -20,7 +20,7 @@ NAME = '<script>alert("Test")</script>'
 
 @pytest.fixture
 def german(tmp_path, monkeypatch):
-    """Write a report in German; return its HTML and the texts that no catalogue has."""
+    """Write a report in German; return its HTML and the texts without translation."""
 
     def write(errors, **run):
         made = []
@@ -38,7 +38,7 @@ def german(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.parts[-3])
-def test_translations_keep_the_values_of_the_text(file):
+def test_translations_contain_the_values_of_the_text(file):
     for english, translated in tomllib.loads(file.read_text(encoding="utf-8")).items():
         assert len(re.findall(r"\{\d*\}", translated)) == english.count("{}"), english
 
@@ -53,7 +53,7 @@ def test_every_fixed_text_of_the_page_is_in_the_catalogue():
     assert not t.missing
 
 
-def test_a_spindle_report_is_german_throughout(german, make_drift):
+def test_a_spindle_report_is_completely_german(german, make_drift):
     drift = make_drift(300).assign_attrs(reference="mean of the record from 4.000 s to 8.000 s")
     html, missing = german(drift, tolerances={"freedoms": LIMITS}, operator="Test")
     assert missing == []
@@ -80,14 +80,14 @@ def test_an_unknown_language_of_a_campaign_is_english(drift, tmp_path):
     assert "<h2>Summary</h2>" in html
 
 
-def test_hostile_names_stay_text_in_every_language(german, make_drift):
+def test_hostile_names_are_text_in_every_language(german, make_drift):
     drift = make_drift(300, machine=NAME)
     drift = drift.assign_coords(sensor=[f"{NAME}{i}" for i in range(5)])
     html, _ = german(drift, operator=NAME, head={"customer": NAME, "number": NAME})
     assert html.count("<script") == 1  # that of the page
 
 
-def test_a_plugin_brings_a_catalogue_of_its_own():
+def test_a_plugin_has_its_own_catalogue():
     t = Catalogue("de", [{"Gauge of {} at {}.": "Bei {2} Lehre von {1}.", "Summary": "Kurzfassung"}])
     assert t("Gauge of 2.5 µm at X <b>. Reported as unknown, not as zero.") == (
         "Bei X <b> Lehre von 2,5 µm. Als unbekannt angegeben, nicht als Null."

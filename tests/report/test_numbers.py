@@ -37,7 +37,7 @@ def test_rounding_moves_a_value_by_at_most_a_twentieth_of_its_uncertainty(value,
     assert abs(float(uncertainty) - expanded) <= expanded / 20 * (1 + 1e-9)
 
 
-def test_a_share_is_never_rounded_up_to_all_or_down_to_none():
+def test_a_share_is_not_rounded_to_all_or_none():
     assert percent(1.0) == "100 %"
     assert percent(0.9999999) == "99.99 %"
     assert percent(1e-9) == "0.01 %"
@@ -45,7 +45,7 @@ def test_a_share_is_never_rounded_up_to_all_or_down_to_none():
     assert percent(math.nan) == DASH
 
 
-def test_plain_numbers_have_a_true_minus_and_unknown_is_a_dash():
+def test_numbers_have_a_typographic_minus_and_unknown_is_a_dash():
     assert fixed(-1.25, 1) == "−1.3"
     assert fixed(math.nan, 1) == DASH
     assert significant(0.01234) == "0.012"

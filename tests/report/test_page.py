@@ -1,4 +1,4 @@
-"""The page around the chapters: verdict, head of the laboratory, annex; names from files are text."""
+"""The page around the chapters: verdict, head of the laboratory, annex; names from files are escaped."""
 
 import base64
 import json
@@ -70,7 +70,7 @@ def test_the_limit_that_decides_comes_first():
     assert verdict([Conformity((), ("A",), limits(EX="2 um"))]) is None
 
 
-def test_the_verdict_stands_before_everything_else_and_the_annex_behind(beams, tmp_path):
+def test_the_verdict_is_first_and_the_annex_last(beams, tmp_path):
     html = written(beams, tmp_path, tolerances=limits(EX="1 um").model_dump(mode="json"))
     places = [html.index(f'id="{name}"') for name in ("verdict", "summary-1", "limits", "provenance-1")]
     assert places == sorted(places)
@@ -79,7 +79,7 @@ def test_the_verdict_stands_before_everything_else_and_the_annex_behind(beams, t
     assert "Tolerances: n" in html
 
 
-def test_the_head_shows_what_the_laboratory_states_and_nothing_else(beams, tmp_path):
+def test_the_head_shows_only_statements_of_the_laboratory(beams, tmp_path):
     html = written(beams, tmp_path, head=HEAD, created="2026-03-02T08:00:00+00:00")
     text = visible(html)
     for words in ("Measuring room Main street 1 Town", "Customer A &amp; B", "Order 4711", "Report R-17"):
@@ -94,7 +94,7 @@ def test_the_head_shows_what_the_laboratory_states_and_nothing_else(beams, tmp_p
     assert "Operator" not in facts
 
 
-def test_a_calibration_counts_on_its_last_day():
+def test_a_calibration_is_valid_on_its_last_day():
     head = head_of({"head": {"calibrated_until": {"bar": "2026-03-02"}}})
     assert head.calibrated_until == {"bar": date(2026, 3, 2)}
     assert calibrations(head, "2026-03-02T23:00:00+00:00")[1] == []
@@ -102,7 +102,7 @@ def test_a_calibration_counts_on_its_last_day():
     assert calibrations(head_of({}), "2026-03-02") is None
 
 
-def test_hostile_names_in_the_head_stay_text(beams, tmp_path):
+def test_hostile_names_in_the_head_are_text(beams, tmp_path):
     head = dict.fromkeys(("laboratory", "address", "accreditation", "customer", "order", "number"), HOSTILE)
     head |= {"calibrated_until": {HOSTILE: "2026-01-31"}, "certificates": {HOSTILE: HOSTILE}}
     html = written(beams, tmp_path, head=head, logo='data:image/png;base64,"><script>')

@@ -1,4 +1,4 @@
-"""The page: complete, self-contained, honest about what is unknown, and deaf to hostile names."""
+"""The page is complete and self-contained, marks unknown values, and escapes hostile names."""
 
 import base64
 import hashlib
@@ -81,7 +81,7 @@ def test_every_tag_is_closed(page):
     assert page.unbalanced == []
 
 
-def test_nothing_leads_out_of_the_file(page, drift_html):
+def test_the_page_has_no_external_references(page, drift_html):
     assert "http:" not in drift_html
     assert "https:" not in drift_html
     assert "@import" not in drift_html
@@ -112,7 +112,7 @@ def test_every_figure_is_described_in_words(page):
     assert all(len(words) > 40 for words in described)
 
 
-def test_the_head_says_who_measured_what_and_when(page):
+def test_the_head_states_operator_object_and_time(page):
     for words in (
         "C-frame 610",
         "Warm-up",
@@ -139,30 +139,30 @@ def test_the_iso_table_names_range_and_difference(page, drift):
         assert words in page.text
 
 
-def test_a_value_that_holds_a_compensation_step_says_so(page):
+def test_a_value_with_a_compensation_step_is_marked(page):
     assert "includes the step of a compensation that was switched in this interval" in page.text
 
 
 def test_a_switched_compensation_is_reported_with_its_change(page):
     found = re.search(r"Z compensation off at 101.0 min: .*? stepped by \+(\d+\.\d+) ±", page.text)
-    # 29.3 um were put in; the warm-up adds less than 0.02 um between the two means.
+    # The step is 29.3 um; the warm-up adds less than 0.02 um between the two means.
     assert float(found[1]) == pytest.approx(29.3, abs=0.1)
 
 
-def test_an_unseen_freedom_is_a_dash_with_its_reason_and_never_a_zero(page):
+def test_an_undetermined_freedom_is_a_dash_with_its_reason(page):
     row = re.search(r"EC ECC arcsec (.*?) a not determined by this method", page.text)
     assert row[1].replace("a", "").split() == ["—"] * 3
     assert "Not observed by this test: EC (ECC)" in page.text
 
 
-def test_an_iso_value_that_could_not_be_found_says_why(read, make_drift):
+def test_a_missing_iso_value_has_a_reason(read, make_drift):
     text = read(make_drift(400, minutes=30.0, temperature=False, speed=False)).text
     assert "the record is 30.0 min long, shorter than 60 min" in text
     assert "the curve is not described by one exponential" in text
     assert "No temperatures were recorded" in text
     assert "no temperature was recorded" in text
     assert "the spindle speed was not recorded" in text
-    # What was planned for later than the record's end did not happen in it.
+    # Events after the end of the record are not part of it.
     assert "compensation off" not in text
 
 
@@ -171,7 +171,7 @@ def test_the_budget_names_its_groups_and_adds_up(page, drift):
         assert name in page.text
 
 
-def test_hostile_names_stay_text(read, make_drift):
+def test_hostile_names_are_text(read, make_drift):
     name = '<script>alert("1")</script>&amp;{{ 7*7 }}$\\frac{'
     drift = make_drift(300, machine=name)
     drift = drift.assign_coords(sensor=[f"{name}{i}" for i in range(4)] + ["_hidden"])
@@ -181,11 +181,11 @@ def test_hostile_names_stay_text(read, make_drift):
     assert seen.unbalanced == []
 
 
-def test_simulated_data_cannot_pass_for_real(read, make_drift, simulated_instruments):
+def test_simulated_data_are_marked(read, make_drift, simulated_instruments):
     seen = read(make_drift(300, instruments=simulated_instruments))
     assert "SIMULATED DATA" in seen.text
     assert "sim://cframe/frame?seed=3" in seen.text
-    # The banner comes before everything else.
+    # The banner is the first element.
     assert seen.text.index("SIMULATED DATA") < seen.text.index("Test report")
 
 
@@ -200,17 +200,17 @@ def test_simulated_data_cannot_pass_for_real(read, make_drift, simulated_instrum
         {"attributes": '[{"name": "frame", "address": "sim://cframe"}]'},
     ],
 )
-def test_simulation_is_found_wherever_it_is_told(instrument):
+def test_simulation_is_detected_in_all_sources(instrument):
     assert provenance.simulated({"instruments": [{"name": "thermometer"}, instrument]})
 
 
-def test_real_instruments_are_not_taken_for_simulated():
+def test_real_instruments_are_not_marked_as_simulated():
     real = {"address": "tcp://10.0.0.7", "status": "simulated_only", "identity": {"simulated": False}}
     assert provenance.simulated({"instruments": [real], "machine": "simulator of the sim:// kind"}) == ""
     assert provenance.replayed({"instruments": [real]}) == ""
 
 
-def test_measured_data_carry_no_banner(page):
+def test_measured_data_have_no_banner(page):
     assert "SIMULATED" not in page.text
     assert "REPLAYED" not in page.text
 
@@ -235,7 +235,7 @@ def test_a_dead_channel_is_shown_as_such(read, make_drift):
     assert seen.unbalanced == []
 
 
-def test_only_the_compulsory_part_of_a_spindle_dataset_is_enough(read, drift):
+def test_the_required_part_of_a_spindle_dataset_is_sufficient(read, drift):
     bare = drift.drop_vars([name for name in drift.data_vars if name[0] != "E" and name != "covariance"])
     bare = bare.drop_dims(["channel", "sensor"], errors="ignore").drop_vars("spindle_speed")
     seen = read(bare)
@@ -245,23 +245,23 @@ def test_only_the_compulsory_part_of_a_spindle_dataset_is_enough(read, drift):
 
 
 @pytest.mark.parametrize("instants", [0, 1])
-def test_a_record_of_almost_nothing_still_gets_a_page(read, drift, instants):
+def test_a_record_with_few_values_has_a_page(read, drift, instants):
     assert read(drift.isel(time=slice(0, instants))).unbalanced == []
 
 
-def test_remarks_of_the_method_and_lost_samples_are_passed_on(read, drift):
+def test_remarks_of_the_method_and_lost_samples_are_reported(read, drift):
     raw = xr.Dataset(attrs={"dropped": 1234, "invalid": '{"out_of_range": 7}'})
     text = read(drift.assign_attrs(notes=["Sensor X1 was cold."]), raw=raw).text
     assert "Sensor X1 was cold." in text
     assert "dropped samples 1 234, invalid because of out of range 7" in text
 
 
-def test_a_long_record_stays_small(make_drift, tmp_path):
+def test_the_page_of_a_long_record_is_small(make_drift, tmp_path):
     path = write_report(make_drift(12_000), tmp_path / "report.html")
     assert path.stat().st_size < 2_000_000
 
 
-def test_an_older_report_is_replaced_and_nothing_is_left_beside(beams, tmp_path):
+def test_an_older_report_is_replaced_without_remains(beams, tmp_path):
     path = tmp_path / "report.html"
     path.write_text("old")
     assert write_report(beams, path) == path
@@ -269,7 +269,7 @@ def test_an_older_report_is_replaced_and_nothing_is_left_beside(beams, tmp_path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["report.html"]
 
 
-def test_the_dataset_is_left_as_it_was(beams, tmp_path):
+def test_the_dataset_is_not_changed(beams, tmp_path):
     before = beams.copy(deep=True)
     write_report(beams, tmp_path / "report.html")
     xr.testing.assert_identical(beams, before)
@@ -282,14 +282,14 @@ def test_a_beam_detection_is_reported_with_both_constructions(read, beams):
     assert "Not determined: X2" in seen.text
     assert "X2 —" in seen.text
     assert seen.unbalanced == []
-    # 0.7 um were added to each coordinate of the circles-and-line origin: 0.7 sqrt(3) = 1.21.
+    # Each coordinate of the origin by circles and line was increased by 0.7 um: 0.7 sqrt(3) = 1.21.
     assert "+0.70 +0.70 +0.70 1.21" in seen.text
-    # X1 lies 0.1 mm beside nominal.
+    # X1 deviates by 0.1 mm from nominal.
     assert re.search(r"X1 0\.00 ± 0\.\d+ \+100\.00 ± 0\.\d+ 0\.00", seen.text)
 
 
 @pytest.mark.parametrize(("dims", "shape"), [(("position",), (21,)), (("time", "position"), (3, 8)), ((), ())])
-def test_any_component_gets_a_report(read, dims, shape):
+def test_any_component_has_a_report(read, dims, shape):
     rng = np.random.default_rng(3)
     values = rng.normal(0, 1e-6, (*shape, 6))
     values[..., 5] = np.nan
@@ -314,7 +314,7 @@ def test_any_component_gets_a_report(read, dims, shape):
     assert seen.unbalanced == []
 
 
-def test_several_results_make_several_chapters(read, drift, beams):
+def test_several_results_have_several_chapters(read, drift, beams):
     seen = read([beams, drift])
     assert "1 Detection of the laser beams" in seen.text
     assert "2 Thermal drift of the spindle" in seen.text
@@ -322,7 +322,7 @@ def test_several_results_make_several_chapters(read, drift, beams):
     assert len(ids) == len(set(ids))
 
 
-def test_what_is_no_error_dataset_is_refused(tmp_path):
+def test_a_dataset_without_errors_is_refused(tmp_path):
     with pytest.raises(DatasetError, match="lacks EX, EY, EZ, EA, EB, EC, covariance"):
         write_report(xr.Dataset(), tmp_path / "report.html")
     with pytest.raises(DatasetError, match="at least one"):

@@ -1,4 +1,4 @@
-"""A run folder becomes a report that lies in it."""
+"""The report of a run folder is written into it."""
 
 import json
 
@@ -25,7 +25,7 @@ def run_folder(tmp_path, make_drift):
     return folder
 
 
-def test_a_run_folder_gets_its_report(run_folder):
+def test_a_report_is_written_into_a_run_folder(run_folder):
     path = write_run_report(run_folder)
     assert path == run_folder / "report.html"
     text = path.read_text(encoding="utf-8")
@@ -34,24 +34,24 @@ def test_a_run_folder_gets_its_report(run_folder):
     assert sorted(entry.name for entry in run_folder.iterdir()) == ["errors", "report.html", "run.json"]
 
 
-def test_simulation_told_only_by_the_run_is_seen(run_folder):
+def test_simulation_stated_only_in_the_run_is_detected(run_folder):
     run = json.loads((run_folder / "run.json").read_text())
     run["instruments"] = [{"name": "frame", "address": "sim://cframe/frame?seed=3"}]
     (run_folder / "run.json").write_text(json.dumps(run))
     assert "SIMULATED DATA" in write_run_report(run_folder).read_text(encoding="utf-8")
 
 
-def test_a_folder_without_results_says_what_to_do(tmp_path):
+def test_a_folder_without_results_is_reported_with_a_remedy(tmp_path):
     with pytest.raises(RunError, match="errormotion identify"):
         write_run_report(tmp_path)
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path):
+def test_a_missing_folder_is_reported(tmp_path):
     with pytest.raises(RunError, match="nowhere"):
         write_run_report(tmp_path / "nowhere")
 
 
-def test_a_broken_run_file_is_named(run_folder):
+def test_a_damaged_run_file_is_reported(run_folder):
     (run_folder / "run.json").write_text("{")
     with pytest.raises(RunError, match=r"run\.json: is not valid JSON"):
         write_run_report(run_folder)

@@ -1,14 +1,13 @@
-"""Every example in the README and the docs runs as written, from top to bottom of its page, in an empty folder.
+"""Every example in the README and the docs is executed as written, in the order of its page, in an empty folder.
 
 ``python`` blocks are executed; with ``>>>`` their output is compared. ``console`` blocks: each line that starts with
-``$`` is run, must succeed, and what follows it is compared with what it prints (``...`` stands for anything). A
+``$`` is run and must succeed, and its output is compared with the following lines (``...`` matches any text). A
 ``code-block`` with a ``:caption:`` is a file and is written. Other languages (``text``, ``sh``) are only shown.
-``% skip: next`` leaves out one block. A page with ``% continues: OTHER.md`` runs after that page, with its files and
-names.
+``% skip: next`` skips one block. A page with ``% continues: OTHER.md`` runs after that page, with its files and names.
 
-``make demo``, with which two pages begin, runs once: each gets what was printed, and a copy of the files.
-A call of ``errormotion`` runs in this process, which has its libraries loaded already: that takes seconds a command.
-Anything else runs in a shell, as does every command of the README. Workers share the pages by files of tests.
+``make demo``, the first command of two pages, runs once: both use its output and a copy of its files. A call of
+``errormotion`` runs in this process, which has already loaded its libraries, to save seconds for each command. Other
+commands run in a shell, as do all commands of the README. The pages are distributed to workers by files of tests.
 """
 
 import doctest
@@ -43,7 +42,7 @@ SLOW = ("README.md", "docs/tutorial/index.md", "docs/how-to/measure-a-crossbeam.
 
 
 def _line_of_make(command: str) -> str:
-    """Return what the Makefile does for ``make TARGET``, to be run here instead of in the repository."""
+    """Return the command of ``make TARGET`` in the Makefile, to be run here instead of in the repository."""
     outside = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
     recipe = subprocess.run(
         ["make", "-n", "-s", *command.split()[1:]], cwd=ROOT, env=outside, capture_output=True, text=True, check=True
@@ -64,7 +63,7 @@ def _in_a_shell(command: str) -> tuple[int, str]:
 
 
 def _here(command: str) -> tuple[int, str]:
-    """Run a call of errormotion in this process; the next one finds no simulated world, as in a process of its own."""
+    """Run a call of errormotion in this process, and remove its simulated world as at the end of a process."""
     words = [name for word in shlex.split(command)[1:] for name in sorted(glob.glob(word)) or [word]]
     try:
         result = CliRunner().invoke(app, words)
@@ -98,7 +97,7 @@ def _run(command: str, page: Path) -> tuple[int, str]:
 
 
 def run_console(example: Example) -> str | None:
-    """Run every ``$`` line of a console block; return what went wrong."""
+    """Run every ``$`` line of a console block; return the failures."""
     first, *parts = re.split(r"^\$ ", example.parsed, flags=re.MULTILINE)
     if first.strip() or not parts:
         return "A console block starts with '$ ' and a command."
@@ -113,7 +112,7 @@ def run_console(example: Example) -> str | None:
 
 
 def captioned_files(document: Document) -> list[Region]:
-    """Find the ``code-block`` directives with a caption: files that the reader is asked to write."""
+    """Find the ``code-block`` directives with a caption: files of an example."""
     regions = []
     for region in DirectiveLexer("code-block")(document):
         if name := region.lexemes["options"].get("caption"):
@@ -137,7 +136,7 @@ def parse(page: Path) -> Document:
 
 
 def continues(page: Path) -> Path | None:
-    """Return the page whose files and names the examples of a page use."""
+    """Return the page with the files and names that the examples of a page use."""
     found = re.search(r"^% continues: (\S+)$", page.read_text(), re.MULTILINE)
     return (page.parent / found[1]).resolve(strict=True) if found else None
 
@@ -149,7 +148,7 @@ def continuations(page: Path) -> list[Path]:
 
 
 def home(page: Path) -> str:
-    """Return the file of tests that runs a page: each takes one worker about as long as the others."""
+    """Return the file of tests that runs a page; the files have similar durations."""
     if page.parent.name != "how-to":
         return "test_docs"
     return "test_docs_measuring" if page.stem.startswith(("measure-", "calibrate-")) else "test_docs_how_to"
@@ -168,13 +167,13 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture
 def examples() -> Callable[[Path], Document]:
-    """Return what parses a page."""
+    """Return the parser of pages."""
     return parse
 
 
 @pytest.fixture
 def run_examples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
-    """Return what runs the examples of a page in order, and of those that continue it, in an empty folder."""
+    """Return a function that runs the examples of a page, and of those that continue it, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("MPLBACKEND", "agg")

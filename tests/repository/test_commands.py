@@ -10,7 +10,7 @@ from errormotion.cli.app import app
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-# A call stands at the start of a line of a block (behind "$ " or not), or in backquotes.
+# A call is at the start of a line of a block (after "$ " or not), or in backquotes.
 CALL = re.compile(r"(?:^(?:\$ )?|`|&& |python -m )errormotion[ \t]+([^`\n#|&;]*)", re.MULTILINE)
 
 
@@ -21,7 +21,7 @@ def _calls(page: Path) -> list[str]:
 
 
 def mistake(call: str) -> str | None:
-    """Return what is wrong with the words behind ``errormotion``; None when they are a call."""
+    """Return the mistake in the words after ``errormotion``; None for a valid call."""
     command = typer.main.get_command(app)
     words = call.split()
     while (commands := getattr(command, "commands", None)) and words and not words[0].startswith("-"):
@@ -41,12 +41,12 @@ def test_docs_mention_only_commands_that_exist(page: Path) -> None:
 
 
 @pytest.mark.parametrize("call", ["measure", "plugins show optoncdt --color", "demo --fast", "plugins list|remove"])
-def test_a_command_that_does_not_exist_is_noticed(call: str) -> None:
+def test_a_missing_command_is_detected(call: str) -> None:
     assert mistake(call)
 
 
 @pytest.mark.parametrize(
     "call", ["--help", "plugins list|show|check", "run campaign.toml --resume", "report RUN --out a.html"]
 )
-def test_a_command_that_exists_is_let_pass(call: str) -> None:
+def test_an_existing_command_is_accepted(call: str) -> None:
     assert mistake(call) is None

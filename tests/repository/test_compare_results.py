@@ -1,4 +1,4 @@
-"""The comparison of results sees a change of one value, and nothing where nothing has changed."""
+"""The comparison of results detects a change of one value, and reports no difference of equal results."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def errors() -> xr.Dataset:
 
 
 def store(folder: Path, ds: xr.Dataset) -> Path:
-    """Write a folder of results that holds one dataset."""
+    """Write a folder of results with one dataset."""
     (folder / "errors").mkdir(parents=True)
     ds.to_netcdf(folder / "errors" / "one.nc", engine="h5netcdf")
     (folder / "digests.json").write_text('{"raw": {"one": {"digests": {"distance": "0"}}}, "measured": {}}')
@@ -87,7 +87,7 @@ def changed(what: str) -> xr.Dataset:
     return ds
 
 
-def test_equal_results_are_equal_whatever_the_software(tmp_path: Path) -> None:
+def test_equal_results_are_equal_with_any_software(tmp_path: Path) -> None:
     old, new = store(tmp_path / "old", errors()), errors()
     new.attrs["provenance"] = new.attrs["provenance"].replace("0.1.0", "0.2.0")
     code, text = compared(old, store(tmp_path / "new", new))
@@ -113,7 +113,7 @@ def test_within_is_a_fraction_of_the_standard_uncertainty(tmp_path: Path, fracti
 
 
 @pytest.mark.parametrize(("notes", "code"), [("left out: 4 readings", 0), ("left out: 5 readings", 1)])
-def test_another_wording_is_accepted_with_the_same_numbers_only(tmp_path: Path, notes: str, code: int) -> None:
+def test_another_wording_is_accepted_only_with_the_same_numbers(tmp_path: Path, notes: str, code: int) -> None:
     old, new = store(tmp_path / "old", errors()), store(tmp_path / "new", errors().assign_attrs(notes=notes))
     assert compared(old, new)[0] == 1
     assert compared(old, new, wording=True)[0] == code

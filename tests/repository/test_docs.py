@@ -1,4 +1,4 @@
-"""Examples of the README, the tutorial, the explanations and the reference; and what is wrong in one is noticed.
+"""Examples of the README, the tutorial, the explanations and the reference; wrong examples are detected.
 
 How examples are written and run: see conftest.py.
 """
@@ -34,13 +34,13 @@ def page(tmp_path: Path) -> Path:
         "```{code-block} toml\n:caption: a/b.toml\nx = 1\n```\n\n```console\n$ cat a/b.toml\nx = 2\n```\n",
     ],
 )
-def test_an_example_that_is_wrong_is_noticed(page: Path, run_examples: Run, text: str) -> None:
+def test_a_wrong_example_is_detected(page: Path, run_examples: Run, text: str) -> None:
     page.write_text(text)
     with pytest.raises((AssertionError, ValueError)):
         run_examples(page)
 
 
-def test_examples_of_a_page_build_on_one_another(
+def test_examples_of_a_page_share_names_and_files(
     page: Path, run_examples: Run, examples: Callable[[Path], Document]
 ) -> None:
     page.write_text(

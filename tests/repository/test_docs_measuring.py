@@ -1,4 +1,4 @@
-"""Examples of the pages that measure something and calibrate a sensor.
+"""Examples of the pages on measurements and calibrations.
 
 How examples are written and run: see conftest.py.
 """

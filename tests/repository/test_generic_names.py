@@ -1,4 +1,4 @@
-"""Generic code names no plugin: what belongs to a method, an instrument or a kind of dataset stands in its folder."""
+"""Generic code names no plugin: code for a method, an instrument or a kind of dataset is in its folder."""
 
 import re
 import tomllib
@@ -14,9 +14,9 @@ HOMES = {
     for group in GROUPS
     for plugin_id, value in ENTRY_POINTS[f"errormotion.{group}"].items()
 }
-#: Folder of the package with examples: campaigns and benches that a person may write, and their programs.
+#: Folder of the package with examples: campaigns and benches, and their programs.
 EXAMPLES = "errormotion/cli/demo/"
-#: Words that are ids and something else as well: variables of published datasets, the command of a package, and
+#: Words that are ids and also have another meaning: variables of published datasets, the command of a package, and
 #: defaults of published settings that name another plugin; the package of thermal models; a format of tables;
 #: a simulated server on the parts of another; a control.
 OTHER_MEANINGS = {
@@ -39,7 +39,7 @@ def sources() -> list[Path]:
 
 
 def named(path: Path, text: str) -> list[str]:
-    """Return the ids that a file names although it stands outside their folders."""
+    """Return the ids that a file outside of their folders names."""
     place = path.relative_to(ROOT).as_posix()
     if place.startswith(EXAMPLES):
         return []

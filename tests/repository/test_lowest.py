@@ -1,4 +1,4 @@
-"""What `make lowest` installs follows from pyproject.toml and the lock."""
+"""The packages of `make lowest` follow from pyproject.toml and the lock file."""
 
 import importlib.util
 import tomllib
@@ -29,7 +29,7 @@ def test_every_dependency_is_installed_at_its_lower_bound(tool: ModuleType) -> N
     assert all("==" in pin for pin in pins)
 
 
-def test_a_marker_is_kept(tool: ModuleType) -> None:
+def test_a_marker_is_not_removed(tool: ModuleType) -> None:
     assert tool.lowest(["a>=1.2; python_version < '3.13'"]) == ["a==1.2; python_version < '3.13'"]
 
 
@@ -39,7 +39,7 @@ def test_a_requirement_without_a_single_lower_bound_is_refused(tool: ModuleType,
         tool.lowest([text])
 
 
-def test_a_tool_that_is_not_locked_is_named(tool: ModuleType) -> None:
+def test_a_tool_that_is_not_locked_is_reported(tool: ModuleType) -> None:
     assert tool.locked(["pytest"], "pytest-xdist==3\npytest==9.1 \\\n") == ["pytest==9.1"]
     with pytest.raises(ValueError, match="expected pytest"):
         tool.locked(["pytest"], "pytest-xdist==3\n")

@@ -1,4 +1,4 @@
-"""Set-up is pinned, happens once, and says what is missing."""
+"""The set-up uses pinned packages, runs once, and reports missing tools."""
 
 import os
 import re
@@ -48,7 +48,7 @@ def test_core_lock_is_part_of_the_full_one() -> None:
     assert {(name, version) for name, version, _ in _pins("requirements-core.lock")} <= full
 
 
-def test_locks_hold_what_pyproject_asks_for() -> None:
+def test_locks_contain_the_requirements_of_pyproject() -> None:
     core, rest = _wanted()
     for lock, wanted in (("requirements-core.lock", core), ("requirements.lock", core + rest)):
         pins = _pins(lock)
@@ -92,7 +92,7 @@ def _renew(path: Path) -> None:
     os.utime(path, (later, later))
 
 
-def test_set_up_happens_once(house: Path) -> None:
+def test_the_environment_is_set_up_once(house: Path) -> None:
     assert _make(house, ".venv/.core") == ["core"]
     assert _make(house, ".venv/.core") == ["core"]
     assert _make(house, "setup") == ["core", "dev"]
@@ -126,21 +126,21 @@ def _path_with(folder: Path, **commands: str) -> str:
     return str(folder)
 
 
-def test_says_so_when_there_is_no_python(tmp_path: Path) -> None:
-    # A version manager's shim that stands for nothing must not be taken for a Python.
+def test_a_missing_python_is_reported(tmp_path: Path) -> None:
+    # The shim of a version manager without a Python must not be used as a Python.
     done = _real_setup(tmp_path, _path_with(tmp_path / "bin", python3="echo 'no such version' >&2; exit 127"))
     assert done.returncode == 1
     assert "no Python 3.11 or newer found" in done.stderr
     assert "make setup PYTHON=" in done.stderr
 
 
-def test_says_so_when_the_named_python_is_none(tmp_path: Path) -> None:
+def test_an_invalid_python_is_reported(tmp_path: Path) -> None:
     done = _real_setup(tmp_path, _path_with(tmp_path / "bin"), PYTHON="/nowhere/python")
     assert done.returncode == 1
     assert "PYTHON=/nowhere/python" in done.stderr
 
 
-def test_says_so_when_the_venv_module_is_missing(tmp_path: Path) -> None:
+def test_a_missing_venv_module_is_reported(tmp_path: Path) -> None:
     python = f'case "$*" in *venv*) exit 1;; *) exec {sys.executable} "$@";; esac'
     done = _real_setup(tmp_path, _path_with(tmp_path / "bin", python3=python))
     assert done.returncode == 1
@@ -148,7 +148,7 @@ def test_says_so_when_the_venv_module_is_missing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_the_installer_is_heard_only_when_it_fails(tmp_path: Path, fails: bool) -> None:
+def test_the_output_of_the_installer_is_shown_only_if_it_fails(tmp_path: Path, fails: bool) -> None:
     uv = f"""case "$*" in
         venv*) mkdir -p .venv/bin; printf '#!{shutil.which("sh")}\necho Python 3.11.7\n' >.venv/bin/python
                 PATH={os.environ["PATH"]} chmod +x .venv/bin/python;;

@@ -1,4 +1,4 @@
-"""In CI a skip is a failure; on a user's machine it is a skip with its reason."""
+"""In CI a skip is a failure; elsewhere it is a skip with its reason."""
 
 from pathlib import Path
 

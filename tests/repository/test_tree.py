@@ -1,4 +1,4 @@
-"""What holds for the files of the repository as a whole."""
+"""Rules for the files of the repository."""
 
 import re
 import subprocess
@@ -40,7 +40,7 @@ def _lines(paths: list[Path]) -> list[tuple[str, str]]:
         ("the number of an issue", r"(?i)\b(?:issue|ticket|task) ?#?\d"),
     ],
 )
-def test_no_tracked_file_holds(what: str, pattern: str) -> None:
+def test_no_tracked_file_contains(what: str, pattern: str) -> None:
     found = [f"{where}: {line.strip()[:100]}" for where, line in _lines(_tracked()) if re.search(pattern, line)]
     found = [line for line in found if not line.startswith("tests/repository/test_tree.py:")]
     assert not found, f"{what} stands in\n" + "\n".join(found)
@@ -73,7 +73,7 @@ def test_every_package_has_tests() -> None:
     assert packages <= tested
 
 
-def test_no_folder_holds_more_modules_than_a_reader_surveys() -> None:
+def test_no_folder_has_more_than_twelve_modules() -> None:
     full = {
         str(folder.relative_to(ROOT)): count
         for folder in sorted({path.parent for path in (ROOT / "errormotion").rglob("*.py")})
@@ -82,7 +82,7 @@ def test_no_folder_holds_more_modules_than_a_reader_surveys() -> None:
     assert not full, "Modules in one folder: divide them into rooms, each a package with one purpose"
 
 
-def test_links_between_pages_lead_somewhere() -> None:
+def test_links_between_pages_have_targets() -> None:
     broken = []
     for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]:
         for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):

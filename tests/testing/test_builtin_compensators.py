@@ -1,4 +1,4 @@
-"""Every compensator that the registry finds in this distribution passes the kit."""
+"""Every compensator of this distribution passes the kit."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from errormotion import plugins
 from errormotion.testing.kit import run_check
 from errormotion.testing.run import checks_for, subjects_of
 
-ALONE = {"linuxcnc"}  # a computer has room for one LinuxCNC: its own tests try what needs one
+ALONE = {"linuxcnc"}  # only one LinuxCNC can run on a computer: the tests of LinuxCNC include these checks
 OURS = [plugin.id for plugin in plugins.available("compensators") if plugin.distribution.startswith("errormotion ")]
 SUBJECTS = [
     subject

@@ -1,4 +1,4 @@
-"""Every instrument that the registry finds in this distribution passes the kit."""
+"""Every instrument of this distribution passes the kit."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from errormotion import plugins
 from errormotion.testing.kit import run_check
 from errormotion.testing.run import checks_for, subjects_of
 
-ALONE = {"linuxcnc"}  # a computer has room for one LinuxCNC: its own tests try it with the kit
+ALONE = {"linuxcnc"}  # only one LinuxCNC can run on a computer: the tests of LinuxCNC include the kit
 OURS = [plugin.id for plugin in plugins.available("instruments") if plugin.distribution.startswith("errormotion ")]
 SUBJECTS = [
     subject for plugin_id in OURS if plugin_id not in ALONE for subject in subjects_of("instruments", plugin_id)

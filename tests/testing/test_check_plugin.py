@@ -1,4 +1,4 @@
-"""``check_plugin`` finds what to check, runs every check, and says what is missing."""
+"""``check_plugin`` finds the subjects, runs all checks, and reports missing subjects."""
 
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ from errormotion.testing.run import subjects_of
 
 @pytest.fixture
 def registered(monkeypatch):
-    """Put a class into the registry, under the id that it calls itself."""
+    """Put a class into the registry, under its id."""
 
     def register(**attributes):
         cls = type("Foreign", (), attributes)
@@ -23,18 +23,18 @@ def registered(monkeypatch):
     return register
 
 
-def test_runs_every_check_and_tells_which_do_not_apply():
+def test_runs_all_checks_and_reports_which_do_not_apply():
     results = check_plugin("instruments", "dcon_temperature")
     assert all(result.ok for result in results)
     assert {result.name for result in results if result.skipped} == {"stream_blocks", "monotonic_time", "counted_drops"}
 
 
-def test_an_address_takes_the_place_of_the_simulator():
+def test_an_address_replaces_the_simulator():
     (subject,) = subjects_of("instruments", "dcon_temperature", address="sim://cframe?seed=8")
     assert subject.address == "sim://cframe?seed=8"
 
 
-def test_a_plugin_names_its_own_subjects(registered, tmp_path, monkeypatch):
+def test_a_plugin_states_its_subjects(registered, tmp_path, monkeypatch):
     (tmp_path / "mine_kit.py").write_text(
         "from errormotion.testing import MethodSubject\n"
         "ONE, TWO = (MethodSubject(None, None, {}, name=name) for name in ('one', 'two'))\n"
@@ -48,11 +48,11 @@ def test_a_plugin_names_its_own_subjects(registered, tmp_path, monkeypatch):
     registered(info=info, conformance="mine_kit:BOTH")
     assert [subject.name for subject in subjects_of("methods", "mine")] == ["one", "two"]
     registered(info=info, conformance="mine_kit:NONE")
-    with pytest.raises(PluginError, match="gives no MethodSubject"):
+    with pytest.raises(PluginError, match="expected MethodSubject"):
         subjects_of("methods", "mine")
 
 
-def test_a_method_that_names_none_is_reported_how_to(registered):
+def test_a_method_without_subjects_is_reported_with_a_remedy(registered):
     registered(info=MethodInfo("mine", "", "simulated_only"))
     with pytest.raises(PluginError, match="conformance = 'module:name'"):
         subjects_of("methods", "mine")
@@ -71,7 +71,7 @@ def test_an_unknown_plugin_is_named_with_the_nearest():
         check_plugin("instruments", "optonct")
 
 
-def test_a_simulator_that_does_not_load_fails_its_checks_and_stops_no_other():
+def test_a_simulator_that_cannot_be_loaded_fails_only_its_checks():
     info = InstrumentInfo("mine", "point_lds", "A sensor of nobody", "simulated_only", simulator="no_such:Device")
     subject = InstrumentSubject(SimpleNamespace(info=info), "sim://cframe")
     results = {result.name: result for result in run_checks(subject)}

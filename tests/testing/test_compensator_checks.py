@@ -1,4 +1,4 @@
-"""A compensator that does one thing wrong fails the check that claims it."""
+"""A compensator with one fault fails the check for it."""
 
 import json
 import re
@@ -120,19 +120,19 @@ class WithoutArm(OffsetFile):
     ("cls", "check", "text"),
     [
         (WithoutArm, "members", "'arm' is missing"),
-        (WritesOnOpening, "nothing_on_connecting", "expected no order, found 1"),
+        (WritesOnOpening, "nothing_on_connecting", "expected no command, found 1"),
         (SwapsAxes, "arrives", "expected 6.0000, -4.0000, 2.0000 um, found 2.0000"),
         (WrongSign, "arrives", "found -6.0000, 4.0000, -2.0000 um"),
-        (NeedsNoArming, "refused_orders", r"write\(\) unarmed: expected an InstrumentError, but it was done"),
-        (WritesChangesOnly, "sign_of_life", "the machine got nothing after write"),
-        (ZeroOnClosing, "closed", "closing sent an order"),
-        (RepeatsTheLastNumber, "restart", "the machine got nothing after write"),
-        (AnswersUnopened, "use_before_open", "but it was done"),
+        (NeedsNoArming, "refused_orders", r"write\(\) unarmed: expected an InstrumentError, found none"),
+        (WritesChangesOnly, "sign_of_life", "the machine received nothing after write"),
+        (ZeroOnClosing, "closed", "closing sent a command"),
+        (RepeatsTheLastNumber, "restart", "the machine received nothing after write"),
+        (AnswersUnopened, "use_before_open", "expected an InstrumentError, found none"),
         (SaysNothingOfStops, "states", "fault is not reported"),
         (RaisesForeignErrors, "faults", "garbage: expected an InstrumentError, found ValueError"),
-        (OverlooksDamage, "faults", "garbage: passed unnoticed"),
-        (LeavesThread, "nothing_left", "still there: thread"),
-        (ForgetsTheOther, "two_connections", "the second connection sent an order"),
+        (OverlooksDamage, "faults", "garbage: not detected"),
+        (LeavesThread, "nothing_left", "still open: thread"),
+        (ForgetsTheOther, "two_connections", "the second connection sent a command"),
     ],
     ids=lambda value: value.__name__ if isinstance(value, type) else "",
 )

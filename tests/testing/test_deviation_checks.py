@@ -1,4 +1,4 @@
-"""The kit examines a method that sees one direction only: a sound one passes, a faulty one fails where it is wrong."""
+"""Checks of a method that measures one direction only: a correct one passes, a faulty one fails its check."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ FEATURES = {"component": "tool", "machine": "none", "frame": "machine", "referen
 
 
 class Sound:
-    """One sensor looks at a body along its beam."""
+    """One sensor measures a body along its beam."""
 
     info = MethodInfo("one_sensor", "A method that exists in this test only", "simulated_only", cannot_see=("most",))
     needs = Needs((), SCHEMA)
@@ -121,13 +121,13 @@ class Timid(Sound):
 
 
 class Stiff(Sound):
-    """Keeps its direction where the frame turns."""
+    """The direction is not rotated with the frame."""
 
     def direction(self, beam):
         return np.array([2.0, -1.0, 2.0]) / 3
 
 
-def test_a_sound_method_passes_and_its_truth_may_be_six_freedoms():
+def test_a_correct_method_passes_and_its_truth_may_be_six_freedoms():
     assert failures(Sound) == {}
 
 
@@ -135,7 +135,7 @@ def test_a_sound_method_passes_and_its_truth_may_be_six_freedoms():
     ("method", "failing"),
     [(Confident, {"coverage", "differences"}), (Timid, {"coverage", "differences"}), (Stiff, {"frame_invariance"})],
 )
-def test_a_fault_is_found_by_the_check_that_is_made_for_it(method, failing):
+def test_a_fault_is_detected_by_its_check(method, failing):
     found = failures(method)
     assert set(found) & {"coverage", "differences", "frame_invariance"} == failing, found
     assert set(found) <= {*failing, "recovers_truth"}
@@ -147,7 +147,7 @@ def test_the_report_of_any_method_shows_a_deviation(tmp_path):
     errors = Sound().identify(make(0)[0], None)
     page = write_report(errors, tmp_path / "report.html").read_text(encoding="utf-8")
     assert "Observed: deviation, at 12 (time)." in page
-    assert "seen along one known direction only" in page
+    assert "measured along one known direction only" in page
     assert "standard uncertainty (k = 1) of the deviation, by group of sources" in page
     assert page.count("<svg") == 1
     alone = write_report(errors.isel(time=3), tmp_path / "one.html").read_text(encoding="utf-8")

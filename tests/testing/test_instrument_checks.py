@@ -1,4 +1,4 @@
-"""The kit passes a sound instrument, and each broken one fails exactly the check that is made for its fault."""
+"""A correct instrument passes the kit, and each broken one fails exactly the check for its fault."""
 
 import json
 import math
@@ -30,7 +30,7 @@ class Settings(PluginSettings):
 
 
 class Sound:
-    """A sensor behind a wire of text lines 'counter value', made of Python lists instead of sockets."""
+    """A sensor with text lines 'counter value', in Python lists instead of sockets."""
 
     info = InstrumentInfo("sound", "point_lds", "A sensor that exists in this test only", "simulated_only")
     Settings = Settings
@@ -114,7 +114,7 @@ class Sound:
 
 
 def wire(fault):
-    """Yield what comes off the wire: 'counter value' in m, from the fourth line on with a fault."""
+    """Yield the received lines: 'counter value' in m, from the fourth line on with a fault."""
     for counter in range(1000):
         text = f"{counter} {1e-3 + 1e-6 * math.sin(counter):.9f}\n"
         if fault == "split":
@@ -229,7 +229,7 @@ class TakesAPieceForALine(Sound):
 
 
 class ClosesTheGap(Sound):
-    """Puts the samples behind a gap where the lost ones belong, and counts the loss at the block's end."""
+    """Puts the samples after a gap at the positions of the lost ones, and counts the loss at the end of the block."""
 
     def block(self, values, first, dropped, invalid):
         kept = [value for value in values if not math.isnan(value)] if dropped else values
@@ -251,7 +251,7 @@ class RaisesIndexErrors(Sound):
 
 
 class ReplaysFromMemory(Sound):
-    """Does not look at the recording at all."""
+    """Ignores the recording."""
 
     def connect(self):
         return wire("") if self.address.startswith("replay") else super().connect()
@@ -334,7 +334,7 @@ def test_a_deviation_from_the_contract_is_stated_with_its_member(plugin, message
     assert re.search(message, result.message)
 
 
-def test_a_kind_that_nobody_registered_has_no_contract_and_no_bounds():
+def test_an_unregistered_kind_has_no_contract_and_no_bounds():
     class Other(Sound):
         info = replace(Sound.info, kind="other_kind")
 
@@ -344,12 +344,12 @@ def test_a_kind_that_nobody_registered_has_no_contract_and_no_bounds():
     assert results["plausible_magnitudes"].skipped
 
 
-def test_every_check_has_a_plugin_that_fails_it():
+def test_for_every_check_a_plugin_fails():
     broken_at_the_wire = {"late_answers", "time_limit", "baudrate", "mutants"}  # see test_wire_checks.py
     assert {check for check, _ in BROKEN} | broken_at_the_wire == {check.name for check in INSTRUMENT_CHECKS}
 
 
-def test_every_check_says_what_it_claims():
+def test_every_check_states_its_requirement():
     assert all(len(check.claim) > 30 for check in INSTRUMENT_CHECKS)
 
 
@@ -376,5 +376,5 @@ def test_checks_without_a_stream_do_not_apply_to_a_driver_without_one():
     assert skipped == of_streams | {"late_answers", "time_limit", "baudrate"}
 
 
-def test_a_real_device_is_spared_the_faults():
+def test_faults_are_not_tried_with_a_real_device():
     assert replace(SOUND, address="serial:///dev/ttyUSB0").menu == ()

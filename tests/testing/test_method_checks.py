@@ -1,4 +1,4 @@
-"""The kit passes a sound method, and each broken one fails exactly the check that is made for its fault."""
+"""A correct method passes the kit, and each broken one fails exactly the check for its fault."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ class Settings(PluginSettings):
 
 
 class Sound:
-    """Eight sensors look at a body from known places; its six freedoms follow by least squares."""
+    """Eight sensors measure a body from known positions; its six freedoms follow by least squares."""
 
     info = MethodInfo("body", "A method that exists in this test only", "simulated_only", cannot_see=("its shape",))
     needs = Needs((), SCHEMA)
@@ -100,12 +100,12 @@ class Sound:
 
 
 def design(origin, beam, point):
-    """Return how the readings follow from the freedoms, scaled to lengths: (channel, 6)."""
+    """Return the derivatives of the readings by the freedoms, scaled to lengths: (channel, 6)."""
     return np.concatenate([beam, np.einsum("cij,cj->ci", cross_matrix(origin - point), beam)], axis=1)
 
 
 def make(seed):
-    """Return raw data of a body that drifts by some um and urad, and its true errors."""
+    """Return raw data of a body with a drift of some um and urad, and its true errors."""
     rng = np.random.default_rng(seed)
     place = np.random.default_rng(7)  # the same set-up each time
     origin = place.uniform(-0.5, 0.5, (8, 3))
@@ -185,7 +185,7 @@ class ExaggeratesOneInstant(Sound):
 
 
 class HidesABias(Sound):
-    """Is off by as much as a fifth of a micrometre in each sensor, the same at all times."""
+    """Has a constant error of up to a fifth of a micrometre in each sensor."""
 
     def values(self, values, gain):
         return values + gain @ np.full(8, 2.5e-7)
@@ -256,7 +256,7 @@ class PlansOneFreedom(Sound):
 
 
 class Redrawn(Sound):
-    """Draws the noise of its readings and the calibration of its sensors anew."""
+    """Draws the noise of its readings and the calibration of its sensors."""
 
     calibration = CALIBRATION
     groups = ("calibration",)
@@ -340,16 +340,16 @@ def test_a_method_that_draws_its_sources_as_stated_passes():
     assert not results["sources_as_stated"].skipped
 
 
-def test_every_check_has_a_plugin_that_fails_it():
+def test_for_every_check_a_plugin_fails():
     assert {check for check, _ in BROKEN} == {check.name for check in METHOD_CHECKS}
 
 
-def test_every_check_says_what_it_claims():
+def test_every_check_states_its_requirement():
     assert all(len(check.claim) > 30 for check in METHOD_CHECKS)
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1 / 1.3, "too small"), (1.3, "too large")])
-def test_a_covariance_that_is_off_by_thirty_percent_is_seen(factor, verdict):
+def test_a_covariance_with_an_error_of_thirty_per_cent_is_detected(factor, verdict):
     class States(Sound):
         def result(self, time, values, spread, source, *rest):
             return super().result(time, values, factor * spread, np.sqrt(factor) * source, *rest)

@@ -1,4 +1,4 @@
-"""The page on checking a plugin lists every check, with the claim that the code makes."""
+"""The page on checking a plugin lists all checks with their requirements."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ ALL = [*INSTRUMENT_CHECKS, *METHOD_CHECKS, *COMPENSATOR_CHECKS]
 
 
 @pytest.mark.parametrize("check", ALL, ids=lambda check: f"{check.function.__module__.rpartition('.')[2]}-{check.name}")
-def test_lists_the_check_with_its_claim(check):
+def test_lists_the_check_with_its_requirement(check):
     assert f"| `{check.name}` | {check.claim.replace('``', '`')} |" in PAGE
 
 

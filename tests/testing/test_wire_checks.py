@@ -1,4 +1,4 @@
-"""A driver that takes a late answer for the next one, or ignores its time limit or baud rate, fails that check only."""
+"""A driver that uses late answers, or ignores its time limit or baud rate, fails only the check for it."""
 
 import math
 import time
@@ -35,7 +35,7 @@ class DialSettings(PluginSettings):
 
 
 class Dial(Driver):
-    """Asked ``R``, it answers a distance in m; asked ``N``, its name. Answers have no number."""
+    """It answers ``R`` with a distance in m, and ``N`` with its name. Answers have no number."""
 
     info = InstrumentInfo(
         "dial",
@@ -113,7 +113,7 @@ class RaisesValueErrors(Dial):
 
 
 class TakesAnySize(Dial):
-    """Takes what the device says for the size of an array."""
+    """Uses a received number as the size of an array."""
 
     def read(self) -> float:
         value = super().read()
@@ -121,7 +121,7 @@ class TakesAnySize(Dial):
 
 
 class NeedsTime(Dial):
-    """Looks for a number within a line it does not understand, for long."""
+    """Searches long for a number in a line of unknown format."""
 
     def read(self) -> float:
         try:
@@ -152,7 +152,7 @@ class Hangs(Dial):
 
 
 class AsksTwice(Dial):
-    """Opens with a request: a silent device is noticed."""
+    """Opens with a request, so that a silent device is detected."""
 
     def _start_session(self) -> None:
         self.identify()
@@ -191,7 +191,7 @@ def test_a_broken_driver_fails_exactly_its_check(check: str, plugin: type[Dial])
         (Hangs, 0.2, r"took 0\.\d s, limit 0.2 s"),
     ],
 )
-def test_a_driver_that_needs_time_or_memory_for_a_damaged_frame_fails(
+def test_a_driver_with_excessive_time_or_memory_for_a_damaged_frame_fails(
     plugin: type[Dial], limit: float, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fuzz_checks, "MEASURED", 2)
@@ -200,7 +200,7 @@ def test_a_driver_that_needs_time_or_memory_for_a_damaged_frame_fails(
         fuzz_checks.mutants(subject)
 
 
-def test_as_many_mutants_are_tried_as_are_asked_for_without_a_limit_of_the_whole(
+def test_the_requested_number_of_mutants_is_tried_without_a_total_limit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(fuzz_checks, "MUTANTS", 20)
@@ -243,31 +243,31 @@ class TakesAnyRegisters(ModbusTemperature):
     ],
     ids=lambda each: getattr(each, "__name__", "sound"),
 )
-def test_a_late_answer_that_is_taken_is_seen_in_readings_that_differ(sound: InstrumentSubject, broken: type) -> None:
-    assert wire_checks.late_answers(sound).count("right readings") == 2
-    with pytest.raises(CheckFailedError, match="was taken for that to the next request"):
+def test_a_used_late_answer_is_detected_with_different_readings(sound: InstrumentSubject, broken: type) -> None:
+    assert wire_checks.late_answers(sound).count("correct readings") == 2
+    with pytest.raises(CheckFailedError, match="was used for the next request"):
         wire_checks.late_answers(replace(sound, plugin=broken))
 
 
-def test_equal_readings_can_be_made_to_differ() -> None:
+def test_equal_readings_can_be_varied() -> None:
     class Still(Dial):
-        """Shows what it measures to 0.1 mm only."""
+        """Has a resolution of only 0.1 mm."""
 
         def read(self) -> float:
             return round(super().read(), 4)
 
     subject = InstrumentSubject(Still, ADDRESS)
-    assert wire_checks.late_answers(subject).count("equal ones, whose order is not seen: state 'vary'") == 2
-    assert wire_checks.late_answers(replace(subject, repeats=True)).count("gives a lost one again") == 2
+    assert wire_checks.late_answers(subject).count("equal readings, so that their order is unknown: state 'vary'") == 2
+    assert wire_checks.late_answers(replace(subject, repeats=True)).count("repeats lost readings") == 2
 
     moved: list[int] = []
     found = wire_checks.late_answers(replace(subject, plugin=Dial, vary=moved.append))
-    assert found.count("right readings") == 2
+    assert found.count("correct readings") == 2
     assert moved[: wire_checks.READINGS] == list(range(wire_checks.READINGS))
 
 
 @pytest.mark.parametrize("wire", ["tcp", "pty"])
-def test_readings_stay_in_step_after_an_answer_that_was_late(wire: str) -> None:
+def test_readings_have_the_correct_order_after_a_late_answer(wire: str) -> None:
     address = f"{ADDRESS}&wire={wire}&fault=late&fault_at=2&late_by=0.3"
     with Dial(address, DialSettings(timeout=0.2)) as dial:
         assert [dial.read(), dial.read()] == [0.001, 0.001001]
@@ -276,7 +276,7 @@ def test_readings_stay_in_step_after_an_answer_that_was_late(wire: str) -> None:
         assert [dial.read(), dial.read()] == [0.001003, 0.001004]
 
 
-def test_an_answer_that_is_later_still_is_lost_with_its_connection() -> None:
+def test_a_very_late_answer_is_lost_with_its_connection() -> None:
     with Dial(f"{ADDRESS}&fault=late&fault_at=1", DialSettings(timeout=0.2)) as dial:
         dial.read()
         with pytest.raises(InstrumentTimeoutError):
@@ -307,7 +307,7 @@ def test_a_device_that_does_not_stop_sending_is_an_error() -> None:
             dial.read()
 
 
-def test_settings_reach_a_line_of_the_base_class(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_are_passed_to_the_transport_by_the_base_class(monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[str, object] = {}
 
     def opened(self: SerialTransport, address: Address, **options: object) -> None:

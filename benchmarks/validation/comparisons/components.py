@@ -1,4 +1,4 @@
-"""Repeats: do the intervals of repeatability, between groups, and of reproducibility hold the truth."""
+"""Repeats: coverage of the intervals of repeatability, between groups, and of reproducibility."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def section(seeds: int, pool: Pool) -> list[str]:
         rows.append(f"| {groups} x {size} | {ratio:g} | {points} | {shared:.0%} | {held} |")
     return [
         f"{trials} simulated studies in each row: groups (such as operators) of repeats, with the standard deviation "
-        "between groups over that within (`ratio`), over a number of points whose variance is common to all points of "
-        "a repeat by some share. Coverage of 95 % intervals (standard deviation "
-        f"{np.sqrt(0.05 * 0.95 / trials):.1%}). The effective degrees of freedom are estimated, and too small by "
-        "intention where points are independent: the intervals then hold more.",
+        "between groups over that within (`ratio`), over a number of points whose variance is common to all points "
+        "of a repeat to some extent. Coverage of 95 % intervals (standard deviation "
+        f"{np.sqrt(0.05 * 0.95 / trials):.1%}). The effective degrees of freedom are estimated, and intentionally too "
+        "small for independent points: the coverage of the intervals is then larger.",
         "",
         f"| groups x repeats | ratio | points | common | {' | '.join(KINDS)} |",
         "|---|---|---|---|---|---|---|",

@@ -15,9 +15,9 @@ from errormotion.twin import Event, VirtualMachine
 START = "2026-03-02T07:00:00+00:00"
 SPEED = Event(60.0, 12000.0, None)
 SENSORS = ("frame", "spindle_front", "ambient")
-"""Temperatures that a dataset records."""
+"""Recorded temperatures of a dataset."""
 NOISE = np.array([1e-7] * 3 + [5e-7] * 3)
-"""Standard deviation of what is drawn at every instant, m, rad."""
+"""Standard deviation of the noise of each instant, m, rad."""
 
 
 @lru_cache(maxsize=8)
@@ -33,7 +33,7 @@ def warm_up(seed: int, kind: str = "gantry") -> tuple[np.ndarray, np.ndarray, np
 
 @dataclass
 class Drawn:
-    """A dataset to be: values without error, noise and sources (one standard uncertainty each)."""
+    """Parameters of a dataset: values without error, noise and sources (one standard uncertainty each)."""
 
     name: str
     time: np.ndarray
@@ -43,7 +43,7 @@ class Drawn:
     ids: Mapping[str, str] = field(default_factory=dict)
     factor: float = 1.0
     start: str = START
-    mapping: np.ndarray = field(default_factory=lambda: np.eye(6))  # of what was measured to what is stated
+    mapping: np.ndarray = field(default_factory=lambda: np.eye(6))  # from measured to stated values
 
     def dataset(self, rng: np.random.Generator | None, shared: Mapping[str, float] | None = None) -> xr.Dataset:
         """Return the dataset, drawn with a generator or exact without one; ``shared`` sources are given."""

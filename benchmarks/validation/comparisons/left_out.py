@@ -1,4 +1,4 @@
-"""Interpolation: do the intervals at instants that were left out hold the true errors."""
+"""Interpolation: coverage of the intervals at omitted instants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planted mistakes: whether a comparison detects them as often as predicted, and names the right one."""
+"""Planted mistakes: rate of detection compared with the prediction, and rate of the correct cause."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ARCSEC = np.pi / 180 / 3600
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake in the second dataset: what it does for a size, and the cause that should be named.
+    """A mistake in the second dataset: its effect by size, and the cause that should be reported.
 
     ``fixed`` mistakes have one size; the uncertainties of both datasets are scaled instead.
     """
@@ -115,7 +115,7 @@ def power(squares: float, degrees: int) -> float:
 
 
 def needed(degrees: int) -> float:
-    """Return the non-centrality at which a joint chi-square detects with the power that is asked for."""
+    """Return the non-centrality at which a joint chi-square has the required power."""
     low, high = 0.0, 1e4
     for _ in range(60):
         middle = (low + high) / 2
@@ -135,7 +135,7 @@ def planned(mistake: Mistake) -> tuple[float, float]:
 
 
 def margin(mistake: Mistake, size: float, factor: float) -> float:
-    """Return by how much the score of the planted cause exceeds that of the next one without noise."""
+    """Return the difference of the scores of the planted cause and of the next one, without noise."""
     a, b = (replace(each, factor=factor) for each in pair(0))
     sets = {"A": a.dataset(None), "B": mistake.apply(b, size).dataset(None)}
     ground = common_ground(sets)
@@ -145,7 +145,7 @@ def margin(mistake: Mistake, size: float, factor: float) -> float:
 
 
 def one(task: tuple[int, int, float, float]) -> dict:
-    """Return what a comparison says of one machine with one mistake."""
+    """Return the result of a comparison for one machine with one mistake."""
     seed, number, size, factor = task
     a, b = (replace(each, factor=factor) for each in pair(seed))
     b = MISTAKES[number].apply(b, size)
@@ -191,23 +191,23 @@ def section(seeds: int, pool: Pool) -> list[str]:
         "their own covariance about the true errors: A every minute, with the radius of a bar as a source of all "
         "values; B every 4 minutes, with an expansion; 0.1 um and 0.5 urad of noise. B has one mistake. The joint "
         f"chi-square has {degrees} degrees of freedom. With the effect d of the mistake and the covariance V its "
-        f"non-centrality is d' V^-1 d; {needed(degrees):.1f} is detected with a probability of "
-        f"{POWER:.0%} at the level {LEVEL:g}. Sizes are those of this power on the first machine; where a mistake has "
-        "no size, all uncertainties are multiplied by the factor instead. `margin`: by how much the score of the "
-        "planted cause (twice the logarithm of the likelihood ratio, less the penalties) exceeds that of the next one "
-        f"without noise; below {CLOSE:g} the two cannot be told apart at this size. `right first`: among those "
-        "detected, the planted cause has the first rank; `or alike`: it has, or the first one is said to be "
-        "indistinguishable from it.",
+        f"non-centrality is d' V^-1 d; {needed(degrees):.1f} is detected with a probability of {POWER:.0%} at the "
+        f"level {LEVEL:g}. Sizes are those of this power on the first machine; for a mistake without size, all "
+        "uncertainties are multiplied by the factor instead. `margin`: difference of the scores (twice the logarithm "
+        "of the likelihood ratio, minus the penalties) of the planted cause and of the next one, without noise; "
+        f"below {CLOSE:g} the two cannot be distinguished at this size. `right first`: of the detected mistakes, the "
+        "planted cause has the first rank; `or alike`: it has, or the first one is reported as indistinguishable "
+        "from it.",
         "",
-        "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike "
-        "| first instead | named as alike |",
+        "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike | first "
+        "instead | named as alike |",
         "|---|---|---|---|---|---|---|---|---|---|",
         *rows,
         "",
         f"Without a mistake {np.mean(alarms < LEVEL):.2%} of {alarms.size} comparisons ({DRAWS} draws of each of "
         f"{2 * seeds} machines) are alarms at the level {LEVEL:g} (standard deviation {spread:.2%}); p is uniform "
-        f"(Kolmogorov-Smirnov {kstest(alarms, 'uniform').pvalue:.2g}). The test is exact for datasets whose covariance "
-        "is right: its rate is the level, by construction.",
+        f"(Kolmogorov-Smirnov {kstest(alarms, 'uniform').pvalue:.2g}). The test is exact for datasets with a correct "
+        "covariance: its rate is the level, by construction.",
     ]
 
 
@@ -227,7 +227,7 @@ def _row(mistake: Mistake, size: float, factor: float, ahead: float, runs: list[
 
 
 def _same(found: str, planted: str) -> bool:
-    """Whether a cause is the planted one; a step may be one instant of the grid off."""
+    """Whether a cause is the planted one; a step may differ by one instant of the grid."""
     steps = [re.match(r"step at (\d+) s", name) for name in (found, planted)]
     if all(steps):
         return abs(int(steps[0][1]) - int(steps[1][1])) <= 240  # type: ignore[index]

@@ -1,4 +1,4 @@
-"""Runs of one function over many tasks, in other processes where wanted, kept in a folder where wanted."""
+"""Runs of one function over many tasks, optionally in other processes, and stored in a folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 class Pool:
     """Processes, and a folder of results of earlier runs.
 
-    Results are kept by function and task, not by version: a folder is for one state of the code.
+    Results are stored by function and task, not by version: a folder is for one state of the code.
     """
 
     workers: int = 1

@@ -21,9 +21,9 @@ from validation.comparisons.pool import Pool
 Z95 = 1.959964
 STEP, INTERVAL, DURATION = 20.0, 600.0, 7200.0
 AVERAGED = 400_000
-"""Samples in the mean over one step at 20 kHz."""
+"""Number of samples in the mean of one step at 20 kHz."""
 UNSEEN = 5e-6
-"""Rotation about the spindle axis that the bar does not show, as large as on this machine, rad."""
+"""Rotation about the spindle axis, which is not measured with the bar, as large as on this machine, rad."""
 POINT = {"functional_point": (0.0, 0.0, 0.0)}
 DISPLACEMENTS = ("EX", "EY", "EZ")
 
@@ -35,14 +35,14 @@ def identified(method: str, raw: xr.Dataset, **settings: object) -> xr.Dataset:
 
 
 def warm_machine(seed: int, kind: str = "cframe") -> VirtualMachine:
-    """Return a machine that stands for two minutes and then turns its spindle."""
+    """Return a machine that is at rest for two minutes and then turns its spindle."""
     machine = VirtualMachine(kind, seed=seed)
     machine.start([Event(120.0, 12000.0, None)])
     return machine
 
 
 def drift(machine: VirtualMachine, seed: int, **settings: object) -> xr.Dataset:
-    """Return what a bar before five sensors shows; the beams are those of the machine's calibration."""
+    """Return the result of five sensors around a bar, with the beams of the calibration of the machine."""
     beams = drifting.calibrated_beams(machine, machine.seed)
     times = np.arange(STEP / 2, DURATION, STEP)
     raw = drifting.raw_drift(
@@ -52,7 +52,7 @@ def drift(machine: VirtualMachine, seed: int, **settings: object) -> xr.Dataset:
 
 
 def methods(seed: int) -> dict:
-    """Compare a bar before sensors and probed balls; the rotation that the bar does not show has its true size."""
+    """Compare a bar with sensors and probed balls; the uncertainty of the unmeasured rotation is its true size."""
     return _methods(seed, unseen_rotation=UNSEEN)
 
 
@@ -62,7 +62,7 @@ def cautious(seed: int) -> dict:
 
 
 def gantry(seed: int) -> dict:
-    """Compare the same on a gantry, with the rotation about X, which both see there."""
+    """Compare the same on a gantry, with the rotation about X, which both measure there."""
     return _methods(seed, "gantry", (*DISPLACEMENTS, "EA"))
 
 
@@ -93,7 +93,7 @@ def _truth(machine: VirtualMachine):
 
 
 def drawn(task: tuple[int, bool]) -> dict:
-    """Compare three datasets with a bar and a thermometer in common; ``opposite``: the third one sees them inverted."""
+    """Compare three datasets with a common bar and thermometer; ``opposite``: with inverted sign in the third one."""
     seed, opposite = task
     found = {}
     rng = np.random.default_rng([seed, 7])
@@ -114,13 +114,13 @@ def _shared(each: Drawn, sign: float) -> Mapping[str, np.ndarray]:
 
 
 def _judged(sets: Mapping[str, xr.Dataset], truth, **options: object) -> dict:
-    """Return what is counted, with the identities of the sources and without them."""
+    """Return the counts, with the identities of the sources and without them."""
     apart = {name: ds.assign_coords(source_id=("source", [""] * ds.sizes["source"])) for name, ds in sets.items()}
     return {"shared": counted(sets, truth, options), "apart": counted(apart, truth, options)}
 
 
 def counted(sets: Mapping[str, xr.Dataset], truth, options: Mapping) -> dict:
-    """Return what is counted of a comparison over time, in which the first instant is the reference."""
+    """Return the counts of a comparison over time, in which the first instant is the reference."""
     found = compare(sets, causes=False, **options)
     freedoms = [datasets.DOF.index(name) for name in found["dof"].values]
     E = truth(found["time"].values)[:, freedoms]
@@ -128,7 +128,7 @@ def counted(sets: Mapping[str, xr.Dataset], truth, options: Mapping) -> dict:
 
 
 def against(found: xr.Dataset, E: np.ndarray) -> dict:
-    """Return which values of a comparison agree, and which of its consensus hold the truth (point, freedom)."""
+    """Return which values of a comparison agree, and which intervals of its consensus contain the truth."""
     u = np.sqrt(np.diagonal(found["consensus_covariance"].values, axis1=1, axis2=2))
     known = np.isfinite(found["en"].values[0]) & (u > 0)
     score = (found["consensus"].values[known] - E[known]) / u[known]
@@ -159,16 +159,15 @@ def section(seeds: int, pool: Pool) -> list[str]:
             rows += [row("", "left out", [run["apart"] for run in runs])]
     return [
         f"{seeds} virtual machines each. The first four cases are results of methods on simulated raw data of one "
-        "machine that warms up for two hours, a C-frame or a gantry: a bar before five sensors (every "
-        f"{STEP:g} s) and four balls probed every {INTERVAL / 60:g} minutes; displacements at the origin. The rotation "
-        f"about the spindle axis, which the bar does not show, is stated as {UNSEEN * 1e6:g} urad, its size on a "
-        "C-frame; the default of 20 urad makes intervals wider. The last two cases are drawn from their own covariance "
-        "about the true errors of a gantry: six freedoms, a bar whose radius scales the displacements by 5 % (k = 1), "
-        "and a thermometer. "
-        "`correlation`: whether sources with the same identity are one draw (as stated) or counted as two (left out). "
-        "Of datasets that agree 95.4 % of the |En| are below 1 (k = 2), p is "
-        "uniform, and 95 % intervals of the consensus hold the true errors in 95 %. Behind ± the standard error of "
-        "the mean over machines, since the instants of one machine share their sources.",
+        f"machine that warms up for two hours, a C-frame or a gantry: a bar before five sensors (every {STEP:g} s) "
+        f"and four balls probed every {INTERVAL / 60:g} minutes; displacements at the origin. The rotation about the "
+        f"spindle axis, which is not measured with the bar, is stated as {UNSEEN * 1e6:g} urad, its size on a "
+        "C-frame; with the default of 20 urad, intervals are wider. The last two cases are drawn from their own "
+        "covariance about the true errors of a gantry: six freedoms, a bar whose radius scales the displacements by "
+        "5 % (k = 1), and a thermometer. `correlation`: sources with the same identity are one draw (as stated) or "
+        "independent (left out). Of datasets that agree 95.4 % of the |En| are below 1 (k = 2), p is uniform, and 95 "
+        "% of the 95 % intervals of the consensus contain the true errors. After ±: standard error of the mean over "
+        "machines, because the instants of one machine share their sources.",
         "",
         "| datasets | correlation | abs(En) <= 1 | p uniform (Kolmogorov-Smirnov) | p < 0.05 | consensus: coverage |",
         "|---|---|---|---|---|---|",

@@ -18,13 +18,13 @@ SCALE = 0.3e-6
 U_AXIS = np.array([2e-7] * 3 + [5e-7] * 3)
 """Standard uncertainty of the axis, m, rad."""
 ELSEWHERE = np.array([[0.1, -0.2, 0.0], [-0.2, 0.1, 0.15], [0.15, 0.1, -0.1], [0.0, -0.15, 0.2]])
-"""By how much the second tracker stands away from the places of the first, m."""
+"""Displacement of the second tracker from the positions of the first, m."""
 SHORT = 60
-"""Most machines of the comparison through the chain, which takes seconds."""
+"""Largest number of machines of the comparison through the chain, which takes seconds."""
 
 
 def tracked(machine: VirtualMachine, q: np.ndarray, seed: int, station: np.ndarray | None = None):
-    """Return the errors of targets by a tracker of its own."""
+    """Return the errors of targets by one tracker."""
     scale = SCALE * np.random.default_rng([seed, 1]).normal()
     raw = simulation.raw(machine, q, station, seed=seed, scale=scale)
     return Multilateration().identify(raw, Settings(noise="stated", scale_uncertainty=SCALE, parametric=False))
@@ -67,13 +67,13 @@ def section(seeds: int, pool: Pool) -> list[str]:
         runs = pool.mapped(axis, [(kind, name, seed) for seed in range(few)])
         rows.append(row(f"{name} of a {kind}, tracker ({few})", "as stated", runs))
     return [
-        "Results of multilateration on simulated readings, each with a tracker of its own whose lengths are wrong by "
-        f"{SCALE * 1e6:g} um/m (k = 1), at the number of machines that stands behind each case. Two trackers stand at "
-        "other places around the same 100 targets of a C-frame. An axis is drawn from its own covariance "
+        "Results of multilateration on simulated readings, each with another tracker whose lengths have an error of "
+        f"{SCALE * 1e6:g} um/m (k = 1), for the number of machines after each case. Two trackers have different "
+        "positions around the same 100 targets of a C-frame. An axis is drawn from its own covariance "
         f"({U_AXIS[0] * 1e6:g} um, {U_AXIS[3] * 1e6:g} urad) about its true errors at {POSITIONS} positions, and "
-        f"compared with {np.prod(COUNT)} targets through the kinematic chain. The error motions of the virtual machine "
-        "are waves and no draw of the prior by which the targets are extended to the positions of the axis, so that "
-        "these rates need not be exact.",
+        f"compared with {np.prod(COUNT)} targets through the kinematic chain. The error motions of the virtual "
+        "machine are waves, not draws of the prior with which the errors of the targets are extended to the "
+        "positions of the axis, so that these rates need not be exact.",
         "",
         "| datasets | correlation | abs(En) <= 1 | p uniform (Kolmogorov-Smirnov) | p < 0.05 | consensus: coverage |",
         "|---|---|---|---|---|---|",

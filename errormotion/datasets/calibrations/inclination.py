@@ -1,14 +1,14 @@
 """Calibrations of the inclination error of a sensor: effect of the tilt of a surface on a reading, with uncertainty.
 
-A sensor whose beam meets the surface at the tilt q = tan(alpha) (cos beta, sin beta) reads
+At a surface with the tilt q = tan(alpha) (cos beta, sin beta) to the beam, the reading is
 
     r = d + (d - m) k(q),
 
 d the true depth, m the reading at which the inclination error vanishes. k is a sum of products of Legendre polynomials
-in the two parts of x = tan(alpha / 2) (cos beta, sin beta) / s, where s puts the steepest calibrated setting at 1: the
-normal of the surface is a rational function of x, so fewer terms do than in q. The coefficients are one Gaussian: their
-covariance carries the noise, the scatter from setting to setting, and what the chosen order may leave out. All readings
-that are compensated share it (`Compensated.jacobian`).
+in the two components of x = tan(alpha / 2) (cos beta, sin beta) / s, where s scales the steepest calibrated setting to
+1: the normal of the surface is a rational function of x, so that fewer terms are needed than in q. The coefficients
+have a joint normal distribution, whose covariance includes the noise, the scatter from setting to setting, and the
+terms beyond the chosen order. All compensated readings share it (`Compensated.jacobian`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
@@ -27,28 +27,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets.calibrations import owner
+from errormotion.datasets.calibrations.dataset import Calibration, assemble, table_violations
 from errormotion.datasets.calibrations.tilt_support import Hole, TiltSupport
-from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
 from errormotion.datasets.files.folders import folders_beside
 from errormotion.datasets.provenance import hash_dataset
 from errormotion.datasets.schemas import Row
-from errormotion.datasets.storage.disk import load as load_dataset
-from errormotion.datasets.storage.disk import reading, save
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import inclination_rotation, tilt_vector
 
 SCHEMA = "errormotion.calibration.inclination/1"
 """Schema of the calibration dataset."""
 FOLDER = "calibrations"
-"""Folder in which a calibration is looked for by its name."""
+"""Folder in which a calibration is searched by its name."""
 VARIABLE = "ERRORMOTION_CALIBRATIONS"
-"""Environment variable that names one more such folder."""
+"""Environment variable with the path of a further such folder."""
 
 EXTRAPOLATION = 0.05
-"""Largest extrapolation beyond the calibrated range of readings, as a share of it."""
+"""Largest extrapolation beyond the calibrated range of readings, as a fraction of it."""
 
-_DEPTH = (-0.2, 0.2)  # m; ranges of point sensors, and mm show
-_SLOPE = (-0.5, 0.5)  # an error of half the depth is no inclination error
+_DEPTH = (-0.2, 0.2)  # m; ranges of point sensors, detects mm
+_SLOPE = (-0.5, 0.5)  # larger errors are not inclination errors
 _FREE = (-float("inf"), float("inf"))
 
 ROWS = (
@@ -58,7 +56,7 @@ ROWS = (
         ("term", "term_"),
         "1",
         *_FREE,
-        "of the coefficients: noise, scatter of the settings and what the order leaves out",
+        "of the coefficients: noise, scatter of the settings and terms beyond the order",
     ),
     Row("degree", ("term", "axis"), "", 0, 20, "degrees of the two polynomials of each term"),
     Row("tilt_scale", (), "1", 1e-6, 1.0, "s: tan of half the steepest calibrated inclination"),
@@ -75,7 +73,7 @@ ROWS = (
         20.0,
         "widest empty circle between calibrated tilts that counts as surrounded",
     ),
-    Row("support_margin", (), "1", 0.0, 20.0, "how far from joined calibrated tilts a tilt may lie"),
+    Row("support_margin", (), "1", 0.0, 20.0, "largest distance of a tilt from joined calibrated tilts"),
     Row("inclination", ("setting",), "rad", -1.5, 1.5, "of each setting that was fitted"),
     Row("rotation", ("setting",), "rad", -6.3, 6.3, "of each setting that was fitted"),
     Row("slope", ("setting",), "1", *_SLOPE, "k of each setting from its own readings"),
@@ -85,7 +83,7 @@ ROWS = (
     Row("slope_predicted_uncertainty", ("setting",), "1", 0.0, 1.0, "standard uncertainty of that prediction"),
     Row("setting_left_out", ("setting",), "", 0, 1, "1: the setting contradicts all the others and was left out"),
     Row("noise", (), "m", 0.0, 1e-3, "standard deviation of one reading about the line of its setting"),
-    Row("scatter", (), "1", 0.0, 1e3, "how many times as much as their noise the settings scatter about the surface"),
+    Row("scatter", (), "1", 0.0, 1e3, "ratio of the scatter of the settings about the surface to their noise"),
     Row("group_setting", ("group",), "", 0, 1e7, "setting of each group of readings that was fitted"),
     Row("group_depth", ("group",), "m", *_DEPTH, "its reference minus `mid_range`"),
     Row("group_residual", ("group",), "m", -0.1, 0.1, "its reading minus the line of its setting"),
@@ -93,7 +91,7 @@ ROWS = (
     Row("remaining_error", (), "1", 0.0, 1.0, "rms of `slope` minus `slope_predicted`: the cross-validated error of k"),
     Row("remaining_error_interval", ("limit",), "1", 0.0, 1.0, "95 % interval of `remaining_error`: low, high"),
 )
-"""The calibration dataset, one row a variable."""
+"""The calibration dataset, one row for each variable."""
 
 ATTRIBUTES = {
     "schema": f"`{SCHEMA}`",
@@ -102,25 +100,25 @@ ATTRIBUTES = {
     "provenance": "JSON text: settings with defaults, hash of the raw dataset, instruments, software",
 }
 _ALL_AROUND = 359.0
-"""Width of a hole along the rotation from which on it goes all around, deg."""
+"""Width of a hole along the rotation above which it extends over all rotations, deg."""
 _SIZES = {"axis": 2, "limit": 2}
 _MAY_BE_UNKNOWN = ("mid_range_found", "mid_range_uncertainty")
 
 
 @dataclass(frozen=True)
 class Compensated:
-    """Readings with the inclination error taken off, and the raw ones.
+    """Readings that are compensated for the inclination error, and the raw ones.
 
     Attributes
     ----------
     raw : ndarray (...)
-        As they were read, m.
+        Uncompensated readings, m.
     value : ndarray (...)
         True depths d = (r + m k) / (1 + k), m.
     uncertainty : ndarray (...)
-        Standard uncertainty of `value` that comes from the calibration, m; the noise of the reading is not in it.
+        Standard uncertainty of `value` due to the calibration, without the noise of the reading, m.
     jacobian : ndarray (..., term)
-        Derivative of `value` by the coefficients of the calibration, m: all readings share their covariance.
+        Derivative of `value` with respect to the coefficients, whose covariance all readings share, m.
     """
 
     raw: Array
@@ -129,60 +127,25 @@ class Compensated:
     jacobian: Array
 
 
-class InclinationCalibration:
-    """The calibrated inclination error of one sensor.
+class InclinationCalibration(Calibration):
+    """The calibrated inclination error of one sensor."""
 
-    Parameters
-    ----------
-    dataset : Dataset
-        Of the schema `SCHEMA`.
-
-    Raises
-    ------
-    DatasetError
-        The dataset breaks its schema.
-    """
+    schema, rows, what, kind, named = SCHEMA, ROWS, "calibration", "point_lds", True
+    hints: ClassVar[Mapping[str, str]] = {
+        "errormotion.raw.inclination/": ". These are readings: make a calibration of them with 'errormotion calibrate "
+        "{} -o FILE'"
+    }
 
     def __init__(self, dataset: xr.Dataset) -> None:
-        found = violations(dataset)
-        if found:
-            raise DatasetError(f"The calibration breaks its schema ({SCHEMA}):", found)
-        self.dataset = dataset.load()
+        super().__init__(dataset)
         self.name = str(dataset.attrs.get("name", "calibration"))
-        self.coefficients = self._values("coefficient")
-        self.coefficient_covariance = self._values("coefficient_covariance")
         self.mid_range = float(dataset["mid_range"])
-        self._degrees = self._values("degree").astype(int)
         self._scale = float(dataset["tilt_scale"])
 
-    def _values(self, name: str) -> Array:
-        row = next(row for row in ROWS if row.name == name)
-        return np.asarray(self.dataset[name].transpose(*row.dims).values, dtype=float)
-
-    @classmethod
-    def load(cls, path: str | Path) -> InclinationCalibration:
-        """Read a calibration.
-
-        Raises
-        ------
-        DatasetError
-            Nothing there, damaged, or no calibration of this schema.
-        """
-        with reading(path), load_dataset(path) as dataset:
-            schema = dataset.attrs.get("schema", "none")
-            if schema != SCHEMA:
-                hint = ""
-                if str(schema).startswith("errormotion.raw.inclination/"):
-                    hint = (
-                        f". These are readings: make a calibration of them with 'errormotion calibrate {path} -o FILE'"
-                    )
-                raise DatasetError(f"{path}: expected a calibration ({SCHEMA}); found schema {schema}{hint}")
-            try:
-                return cls(dataset.load().assign_attrs(name=Path(path).stem))
-            except DatasetError as error:
-                raise DatasetError(
-                    f"{path}: the calibration breaks its schema ({SCHEMA}):", error.violations
-                ) from error
+    @staticmethod
+    def violations(ds: xr.Dataset) -> list[str]:
+        """Return every violation of the schema, one sentence each."""
+        return violations(ds)
 
     @classmethod
     def find(cls, name: str | Path, folder: str | Path | None = None) -> InclinationCalibration:
@@ -191,17 +154,17 @@ class InclinationCalibration:
         Parameters
         ----------
         name : str or Path
-            A path, taken from ``folder`` if it is relative and from the working folder if it is not there; or a bare
-            name: ``NAME.nc`` in the folder `calibrations` of ``folder``, in that of the working folder, or in the
-            folder that the environment variable ``ERRORMOTION_CALIBRATIONS`` names. While a campaign runs, the folder
-            of its file counts as ``folder`` does.
+            A path, relative to ``folder`` or else to the working folder; or a name: ``NAME.nc`` in the folder
+            `calibrations` of ``folder``, in that of the working folder, or in the folder that the environment
+            variable ``ERRORMOTION_CALIBRATIONS`` names. While a campaign runs, the folder of its file is searched as
+            well.
         folder : str or Path, optional
             Folder of the file that names the calibration.
 
         Raises
         ------
         DatasetError
-            Not found (with the paths that were searched and the calibrations found there), or no calibration.
+            Not found (the message lists the searched paths and the calibrations in them), or not a calibration.
         """
         bases = [Path(folder)] if folder is not None else []
         bases += [base for base in dict.fromkeys((*folders_beside(), Path.cwd())) if base not in bases]
@@ -222,26 +185,17 @@ class InclinationCalibration:
             f"the file to one of these folders; {VARIABLE} names one more folder"
         )
 
-    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the calibration to a NetCDF file, whole or not at all."""
-        return save(self.dataset, path, overwrite=overwrite)
-
-    @property
-    def serial_number(self) -> str:
-        """Serial number of the calibrated sensor; empty where the file does not state it."""
-        return owner.serial_number(self.dataset.attrs, "point_lds")
-
     def require_sensor(self, serial_number: str, mid_range: float, *, allow_other_sensor: bool = False) -> list[str]:
-        """Return notes on the use with a sensor; see `owner.compare`.
+        """Return notes on the use with a sensor, as `owner.compare`.
 
         Parameters
         ----------
         serial_number : str
-            Of the sensor that measures; empty where unknown.
+            Of the sensor that measures; empty if unknown.
         mid_range : float
             Of its readings, m.
         allow_other_sensor : bool
-            Whether another sensor is noted instead of refused.
+            State another sensor in a note instead of refusing it.
 
         Raises
         ------
@@ -255,12 +209,12 @@ class InclinationCalibration:
 
     @property
     def order(self) -> int:
-        """Order of the polynomial that cross-validation chose; the terms of higher order are what it may leave out."""
+        """Order of the polynomial that cross-validation chose; terms of higher order represent its uncertainty."""
         return int(self.dataset.attrs["order"])
 
     @property
     def settings(self) -> Array:
-        """Tilt vectors (setting, 2) of the calibrated settings; those that were left out are not among them."""
+        """Tilt vectors (setting, 2) of the calibrated settings, without those that were left out."""
         used = self._values("setting_left_out") == 0
         return np.asarray(tilt_vector(self._values("inclination"), self._values("rotation"))[used])
 
@@ -275,11 +229,11 @@ class InclinationCalibration:
         return TiltSupport(self.settings, float(self.dataset["support_gap"]), float(self.dataset["support_margin"]))
 
     def jacobian(self, q: ArrayLike) -> Array:
-        """Return the derivative (..., term) of k at tilts (..., 2) by the coefficients."""
+        """Return the derivative (..., term) of k at tilts (..., 2) with respect to the coefficients."""
         return terms(half_tilt(np.asarray(q, float)) / self._scale, self._degrees)
 
     def slope(self, q: ArrayLike) -> tuple[Array, Array]:
-        """Return k at tilts (..., 2) and its standard uncertainty, wherever they lie; see `supported`."""
+        """Return k at any tilts (..., 2) and its standard uncertainty; see `supported`."""
         J = self.jacobian(q)
         return J @ self.coefficients, _deviation(J, self.coefficient_covariance)
 
@@ -305,7 +259,7 @@ class InclinationCalibration:
         Raises
         ------
         MethodError
-            Names the first such tilt, how many there are, and the calibrated settings nearest to it.
+            The message states the steepest such tilt, their number, and the nearest calibrated settings.
         """
         points = np.asarray(q, float).reshape(-1, 2)
         points = points[np.isfinite(points).all(axis=1)]
@@ -322,9 +276,9 @@ class InclinationCalibration:
         )
         many = f" ({len(wrong)} of {len(points)} such tilts)" if len(points) > 1 else ""
         raise MethodError(
-            f"Calibration '{self.name}': {tilt_text(first)} lies {where}{many}; nearest calibrated: {near}. "
+            f"Calibration '{self.name}': {tilt_text(first)} is {where}{many}; nearest calibrated: {near}. "
             "Calibrate there, measure within the calibrated settings, or allow extrapolation (extrapolate = true in "
-            "the test's settings): the uncertainty then grows with the distance."
+            "the test's settings): the uncertainty then increases with the distance."
         )
 
     def compensate(
@@ -335,13 +289,13 @@ class InclinationCalibration:
         Parameters
         ----------
         reading : array_like (...)
-            m; NaN stays NaN.
+            m; NaN results in NaN.
         q : array_like (..., 2)
-            Tilt vectors, broadcast against the readings; NaN makes NaN.
+            Tilt vectors, broadcast against the readings; NaN results in NaN.
         mid_range : float, optional
             Reading at which the error vanishes, m; default: that of the calibration.
         extrapolate : bool
-            Compensate also outside the support and the calibrated range.
+            Also compensate outside the support and the calibrated range.
 
         Raises
         ------
@@ -371,9 +325,9 @@ class InclinationCalibration:
         if wrong.size:
             worst = wrong.flat[np.argmax(np.abs(wrong))]
             raise MethodError(
-                f"Calibration '{self.name}': a reading {1e3 * worst:.3f} mm from mid range lies beyond the calibrated "
-                f"{1e3 * low:.3f} to {1e3 * high:.3f} mm ({wrong.size} of {depth.size} readings). Is the mid range of "
-                "the sensor right? Else measure within that range, or allow extrapolation (extrapolate = true in the "
+                f"Calibration '{self.name}': a reading {1e3 * worst:.3f} mm from mid range is beyond the calibrated "
+                f"{1e3 * low:.3f} to {1e3 * high:.3f} mm ({wrong.size} of {depth.size} readings). Check the mid range "
+                "of the sensor, measure within the calibrated range, or allow extrapolation (extrapolate = true in the "
                 "test's settings)."
             )
 
@@ -397,7 +351,7 @@ def tilt_text(q: Array) -> str:
 
 
 def hole_texts(holes: Sequence[Hole]) -> list[str]:
-    """Return holes as texts; holes between the same inclinations, as symmetry makes them, in one text."""
+    """Return holes as texts; holes between the same inclinations, due to symmetry, are in one text."""
     texts: dict[str, list[str]] = {}
     for hole in holes:
         low, high = np.degrees(hole.inclination)
@@ -413,37 +367,9 @@ def hole_texts(holes: Sequence[Hole]) -> list[str]:
 
 
 def violations(ds: xr.Dataset) -> list[str]:
-    """Return everything in which a calibration dataset breaks its schema, one sentence each."""
-    found = storable_violations(ds)
-    if ds.attrs.get("schema") != SCHEMA:
-        found.append(f"attribute 'schema': expected '{SCHEMA}'; found {ds.attrs.get('schema')!r}")
-    found += [
-        f"attribute '{name}': missing; expected {what}" for name, what in ATTRIBUTES.items() if name not in ds.attrs
-    ]
-    found += [
-        f"dimension {dim}: expected {size}; found {ds.sizes[dim]}"
-        for dim, size in _SIZES.items()
-        if ds.sizes.get(dim, size) != size
-    ]
-    for row in ROWS:
-        found += _row_violations(ds, row)
-    if not found:
-        found += _covariance_violations(ds["coefficient_covariance"].transpose("term", "term_").values)
-    return found
-
-
-def _row_violations(ds: xr.Dataset, row: Row) -> list[str]:
-    if row.name not in ds.variables:
-        return [f"{row.name}({', '.join(row.dims)}): missing; expected {row.meaning}"]
-    variable = ds.variables[row.name]
-    if set(variable.dims) != set(row.dims):
-        return [f"{row.name}: expected dims ({', '.join(row.dims)}); found {dims(variable)}"]
-    if variable.size == 0:
-        return [f"{row.name}: expected values; found none (a dimension has length 0)"]
-    complaints = magnitude_violations(row.name, variable, row)
-    if not complaints and row.name not in _MAY_BE_UNKNOWN and np.isnan(variable.values.astype(float)).any():
-        complaints = [f"{row.name}: expected numbers; found NaN"]
-    return complaints
+    """Return every violation of the schema of a calibration, one sentence each."""
+    found = table_violations(ds, SCHEMA, ROWS, ATTRIBUTES, _SIZES, _MAY_BE_UNKNOWN)
+    return found or _covariance_violations(ds["coefficient_covariance"].transpose("term", "term_").values)
 
 
 def _covariance_violations(C: Array) -> list[str]:
@@ -453,7 +379,7 @@ def _covariance_violations(C: Array) -> list[str]:
     scale[scale == 0] = 1.0
     with np.errstate(over="ignore", invalid="ignore"):
         correlation = C / scale[:, None] / scale
-        symmetric = np.abs(correlation - correlation.T).max() <= 1e-8  # not so where numbers are beyond all bounds
+        symmetric = np.abs(correlation - correlation.T).max() <= 1e-8  # False after an overflow
     if not symmetric or np.linalg.eigvalsh(correlation).min() < -1e-8:
         return ["coefficient_covariance: expected a symmetric matrix without negative variances; found another"]
     return []
@@ -465,9 +391,5 @@ def _deviation(J: Array, C: Array) -> Array:
 
 
 def build(variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> xr.Dataset:
-    """Return a calibration dataset from values by name: dims and units come from the schema."""
-    data = {}
-    for row in ROWS:
-        units = {"units": row.unit} if row.unit else {}
-        data[row.name] = (row.dims, np.asarray(variables[row.name]), {**units, "long_name": row.meaning})
-    return xr.Dataset(data, attrs={**attrs, "schema": SCHEMA})
+    """Return a calibration dataset from the values of all variables of `ROWS`."""
+    return assemble(SCHEMA, ROWS, variables, attrs)

@@ -1,4 +1,4 @@
-"""The sensor to which a calibration belongs: its serial number and the mid range of its readings."""
+"""Assignment of a calibration to its sensor, by serial number and mid range."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Any
 from errormotion.errors import DatasetError
 
 ATTRIBUTE = "serial_number"
-"""Attribute of a dataset that states the serial number of the sensor that was calibrated, or that measured."""
+"""Attribute of a dataset with the serial number of the sensor that was calibrated, or that measured."""
 UNKNOWN = "unknown"
 """Serial number of a sensor that reports none."""
 MID_RANGE_TOLERANCE = 1e-6
-"""Largest difference of two mid ranges that are the same, m."""
+"""Largest difference of two mid ranges that count as equal, m."""
 
 
 def serial_number(attrs: Mapping[str, Any], kind: str) -> str:
     """Return the serial number of the instrument of a kind that made a dataset, from its attributes; empty if unknown.
 
-    The attribute ``serial_number`` states it; without one it is that of the only instrument of this kind in the
-    attribute ``instruments``, or in the provenance.
+    It is the attribute ``serial_number``, or else that of the only instrument of this kind in the attribute
+    ``instruments`` or in the provenance.
     """
     if stated := known(str(attrs.get(ATTRIBUTE, ""))):
         return stated
@@ -35,7 +35,7 @@ def serial_number(attrs: Mapping[str, Any], kind: str) -> str:
 
 
 def known(serial: str) -> str:
-    """Return a serial number; empty where the text states that there is none."""
+    """Return a serial number; empty if the text states that there is none."""
     text = serial.strip()
     return "" if text.lower() == UNKNOWN or text.lower().startswith("not ") else text
 
@@ -48,18 +48,18 @@ def compare(
     mid_ranges: tuple[float, float] | None = None,
     allow_other_sensor: bool = False,
 ) -> list[str]:
-    """Return notes on the use of a calibration with a sensor; refuse another sensor than the calibrated one.
+    """Return notes on the use of a calibration with a sensor; refuse sensors other than the calibrated one.
 
     Parameters
     ----------
     calibration : str
         Its name, for messages.
     calibrated, used : str
-        Serial numbers of the calibrated sensor and of the one that measures; empty where unknown.
+        Serial numbers of the calibrated sensor and of the one that measures; empty if unknown.
     mid_ranges : (float, float), optional
         Mid range of the calibrated sensor and of the one that measures, m.
     allow_other_sensor : bool
-        Whether another sensor is noted instead of refused.
+        State another sensor in a note instead of refusing it.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def compare(
     ]
     if not calibrated:
         notes.append(
-            f"Calibration '{calibration}' holds no serial number: it was not checked that it belongs to this sensor."
+            f"Calibration '{calibration}' states no serial number: it was not checked that it belongs to this sensor."
         )
     elif not used:
         notes.append(

@@ -1,4 +1,4 @@
-"""The plugins of the calibrations: their schemas, and who validates them."""
+"""The plugins of the calibrations: their schemas and validators."""
 
 from __future__ import annotations
 

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 _FLAT = 1e-9
-"""Singular value, relative to the largest, below which points lie on one line."""
+"""Singular value, relative to the largest, below which points are on one line."""
 _ACUTE = 1e-6
-"""Cosine of the angle over a side, above which no other point is in the circle on that side."""
+"""Cosine of the angle opposite to a side, above which no other point is in the circle over that side."""
 
 
 @dataclass(frozen=True)
@@ -27,19 +27,19 @@ class Mesh:
     Attributes
     ----------
     triangles : ndarray (m, 3)
-        Which points are the corners.
+        Indices of the corners.
     neighbours : ndarray (m, 3)
-        Triangle beyond the side that does not have that corner; -1: none.
+        Triangle beyond the side opposite to each corner; -1: none.
     which : ndarray (m, 3)
-        That side.
+        Index of that side.
     corners : ndarray (m, 3, 2)
     middles : ndarray (m, 2)
-        Of the circles through the corners, no point being inside; where such a middle lies beyond all points, of the
-        triangle.
+        Centres of the empty circles through the corners; if such a centre is outside the hull of the points, that of
+        the triangle.
     radii : ndarray (m,)
         Of these circles.
     sides : ndarray (s, 2)
-        Which points are the ends.
+        Indices of the ends.
     empty : ndarray (s,)
         Whether no point is inside the circle that has the side as its diameter.
     joined : Delaunay or None
@@ -84,13 +84,13 @@ class Mesh:
         return cls(triangles, beyond, which, corners, middles, radii, sides, blunt == 0, joined)
 
     def locate(self, points: Array) -> NDArray[np.int64]:
-        """Return in which triangle points (n, 2) lie; -1: in none."""
+        """Return the index of the triangle that contains each point (n, 2); -1: none."""
         if self.joined is None:
             return np.full(len(points), -1)
         return np.asarray(self.joined.find_simplex(points), dtype=np.int64)
 
     def parts(self, taken: NDArray[np.bool_], parted: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-        """Return triangles that hang together: of those taken (m,), over sides that are not parted (s,)."""
+        """Return groups of connected triangles: of those taken (m,), over sides that are not parted (s,)."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 

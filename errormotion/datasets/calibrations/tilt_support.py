@@ -1,23 +1,23 @@
-"""Support of a calibration: the region of tilts that the calibrated tilts surround closely enough.
+"""Support of a calibration: the region of tilts that are surrounded by close calibrated tilts.
 
 The calibrated tilt vectors are joined to triangles (Delaunay), so that the circle through the corners of each is empty.
-A triangle counts unless it is part of a hole:
+A triangle is supported unless it is part of a hole:
 
 * across rotations: its circle is wider than ``gap``, half a period of the finest variation; or
 * along the inclination: with h the usual step of the inclination (the median over the triangles of the range of
-  inclination between corners), no setting comes within `REACH` h of the inclination at the middle of the circle, or of
-  that half-way between the corners. Settings are searched along the rotation no farther than the triangle is wide, or
-  than `REACH` h.
+  inclination between corners), no setting is within `REACH` h of the inclination at the middle of the circle, or of
+  that half-way between the corners. Settings are searched along the rotation within the width of the triangle, or
+  within `REACH` h.
 
 Two rules are needed. Across rotations, a surface that is fitted to few settings has a large uncertainty between them.
-Along the inclination, the many settings on both sides of a hole give it a small uncertainty inside the hole. The stated
-uncertainty is confirmed by predictions of settings that were left out, and leaving one out opens a hole of two steps.
+Along the inclination, the many settings on both sides of a hole make the uncertainty inside the hole small. The stated
+uncertainty is verified by predictions of settings that were left out, and leaving one out makes a hole of two steps.
 `REACH` on both sides allows two and a half, since steps are not equal. Both rules search for empty regions: a narrow
-triangle between scattered settings is none.
+triangle between scattered settings is not a hole.
 
-A side counts with its triangles. It also counts by itself if it is shorter than ``gap``, no setting is inside the
-circle on it, and its ends are at most 2 `REACH` h apart in inclination, so that a single row of settings counts. A tilt
-is supported if it lies in what counts or within ``margin`` of it.
+A side is supported with its triangles. It is also supported by itself if it is shorter than ``gap``, no setting is
+inside the circle over it, and its ends are at most 2 `REACH` h apart in inclination, so that a single row of settings
+is supported. A tilt is supported if it is in a supported triangle or side, or within ``margin`` of it.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ REACH = 1.25
 
 _TURN = 2 * np.pi
 _SQUARE = 1e-9
-"""Tilt below which a setting has no rotation."""
+"""Tilt below which the rotation of a setting is undefined."""
 _SAME = 1e-6
-"""Angles that differ by less are the same, rad."""
+"""Difference below which angles count as equal, rad."""
 _BLOCK = 2**21
-"""Distances in memory at a time."""
+"""Number of distances in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class Hole:
     inclination : (low, high)
         Of the settings around it, rad; from 0 if it contains the untilted surface.
     rotation : (low, high)
-        Of the settings around it, rad, ``low`` in [0, 2 pi); 2 pi apart if it goes all around.
+        Of the settings around it, rad, ``low`` in [0, 2 pi); 2 pi apart if it extends over all rotations.
     middle : ndarray (2,)
-        The tilt in it that is farthest from all settings.
+        The tilt in the hole that is farthest from all settings.
     """
 
     inclination: tuple[float, float]
@@ -71,9 +71,9 @@ class TiltSupport:
     tilts : ndarray (n, 2)
         Calibrated tilt vectors.
     gap : float
-        Widest empty circle (its diameter) that counts as surrounded.
+        Largest diameter of an empty circle that counts as surrounded.
     margin : float
-        How far beyond the joined points a tilt may lie.
+        Largest distance of a supported tilt from the joined points.
     """
 
     def __init__(self, tilts: Array, gap: float, margin: float) -> None:
@@ -81,7 +81,7 @@ class TiltSupport:
         self.gap, self.margin = float(gap), float(margin)
 
     def holds(self, q: Array) -> NDArray[np.bool_]:
-        """Return whether each tilt (..., 2) is supported; a NaN is not."""
+        """Return whether each tilt (..., 2) is supported; false for NaN."""
         points = np.asarray(q, float).reshape(-1, 2)
         held = np.zeros(len(points), dtype=bool)
         finite = np.isfinite(points).all(axis=1)
@@ -98,7 +98,7 @@ class TiltSupport:
         """Return the regions without support between calibrated tilts, by inclination and rotation."""
         bare = ~self._counts
         bare[bare] = ~self.holds(self._mesh.corners[bare].mean(axis=1))
-        # A row of settings that counts by itself parts two holes.
+        # A row of settings that is supported by itself separates two holes.
         found = [self._hole(part) for part in self._mesh.parts(bare, self._sides_count)]
         return sorted(found, key=lambda hole: (np.round(hole.inclination, 3).tolist(), hole.rotation))
 
@@ -108,13 +108,13 @@ class TiltSupport:
 
     @cached_property
     def step(self) -> float:
-        """The usual step of the inclination from setting to setting, rad."""
+        """The usual step of the inclination between settings, rad."""
         joined = self._mesh.triangles if len(self._mesh.triangles) else self._mesh.sides
         return float(np.median(np.ptp(self._inclination[joined], axis=1))) if len(joined) else 0.0
 
     @cached_property
     def _reach(self) -> float:
-        # Inclinations that differ by less than the margin are the same.
+        # Inclinations that differ by less than the margin count as equal.
         return max(REACH * self.step, float(np.arctan(self.margin))) + _SAME
 
     @cached_property
@@ -127,7 +127,7 @@ class TiltSupport:
 
     @cached_property
     def _counts(self) -> NDArray[np.bool_]:
-        """Which triangles (m,) count."""
+        """Whether each triangle (m,) is supported."""
         mesh = self._mesh
         counts = 2 * mesh.radii <= self.gap
         at = np.arctan(np.hypot(*mesh.middles.T))
@@ -139,7 +139,7 @@ class TiltSupport:
         return counts
 
     def _met(self, points: Array, corners: Array) -> NDArray[np.bool_]:
-        """Return whether a setting has about the inclination of each point (m, 2) and is not far along the rotation."""
+        """Return whether a setting with about the inclination of each point (m, 2) is close along the rotation."""
         wide = np.maximum(_way(corners, corners[:, [1, 2, 0]]).max(axis=1, initial=0.0), self._reach)
 
         def near(some: NDArray[np.int64], settings: Array) -> NDArray[np.bool_]:
@@ -158,7 +158,7 @@ class TiltSupport:
 
     @cached_property
     def _sides_count(self) -> NDArray[np.bool_]:
-        """Which sides (s,) count."""
+        """Whether each side (s,) is supported."""
         mesh = self._mesh
         ends = self.tilts[mesh.sides]
         short = np.hypot(*(ends[:, 1] - ends[:, 0]).T) <= self.gap
@@ -168,7 +168,7 @@ class TiltSupport:
 
     @cached_property
     def _sides(self) -> Array:
-        """Sides (m, 2, 2) that count; each point is a side of no length."""
+        """Supported sides (m, 2, 2); each point is a side of length 0."""
         points = np.stack([self.tilts, self.tilts], axis=1)
         return np.concatenate([points, self.tilts[self._mesh.sides[self._sides_count]]])
 
@@ -191,7 +191,7 @@ class TiltSupport:
 
 
 def _way(one: Array, other: Array) -> Array:
-    """Return how far tilts (..., 2) are from others along the rotation, 2 sqrt(|p| |q|) sin of half the angle."""
+    """Return the distance of tilts (..., 2) from others along the rotation, 2 sqrt(|p| |q|) sin of half the angle."""
     square = ((one - other) ** 2).sum(axis=-1) - (_size(one) - _size(other)) ** 2
     return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
@@ -201,13 +201,13 @@ def _size(q: Array) -> Array:
 
 
 def _arc(corners: Array) -> tuple[float, float]:
-    """Return from which rotation to which triangles (m, 3, 2) reach that hang together, away from right angles."""
+    """Return the range of rotations of connected triangles (m, 3, 2) that do not contain the untilted surface."""
     middle = inclination_rotation(corners.mean(axis=1))[1]
     off = np.remainder(inclination_rotation(corners)[1] - middle[:, None] + np.pi, _TURN) - np.pi
     off[_size(corners) < _SQUARE] = 0.0
     low, high = middle + off.min(axis=1), middle + off.max(axis=1)
     order = np.argsort(low)
-    # Twice around, so that an interval that starts before 0 is one interval.
+    # Two turns, so that an interval that starts before 0 is one interval.
     low, high = (np.concatenate([ends[order], ends[order] + _TURN]) for ends in (low, high))
     reached = np.maximum.accumulate(high)
     starts = np.flatnonzero(low[1:] > reached[:-1] + _SAME) + 1

@@ -1,1 +1,1 @@
-"""Files that people write and large variables: TOML, search folders, hashes, samples."""
+"""TOML files, search folders, safe reading and writing of files, hashes and samples of large variables."""

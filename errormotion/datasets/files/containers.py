@@ -1,8 +1,8 @@
-"""NetCDF files and Zarr folders of strangers: what is refused before a library reads them.
+"""Checks of NetCDF files and Zarr folders of unknown origin before a library reads them.
 
-A dataset is data only. Its values are in the file or folder itself, not behind links; they are numbers and texts, not
-objects that code makes; and the sizes that it states are in proportion to the bytes that it has, so that a small file
-does not take a large memory.
+A dataset contains data only. Its values are in the file or folder itself, not in linked files; they are numbers and
+texts, not serialised objects; and the stated sizes are in proportion to the size on disk, so that a small file
+cannot require a large memory.
 """
 
 from __future__ import annotations
@@ -26,36 +26,36 @@ OWN_BYTES = 64 << 20
 PER_BYTE = 1100
 """Bytes of values for each byte of the file or folder; deflate, the codec of NetCDF, reaches 1032."""
 MUCH = 512 << 20
-"""Bytes of values that a file or folder may state whatever its compression, beyond `OWN_BYTES`; above, it needs"""
+"""Bytes of values that a file or folder may state in addition to `OWN_BYTES` at any compression."""
 PER_BYTE_OF_MUCH = 64
-"""one byte for each so many bytes of values. Reading takes up to five copies of the values."""
+"""Bytes of values for each byte of the file or folder above `MUCH`. Reading needs up to five copies of the values."""
 MOST_VARIABLES = 2000
 LARGEST_METADATA = 16 << 20
-"""Bytes of a zarr.json."""
+"""Largest size of a zarr.json, bytes."""
 DEEPEST = 24
-"""Levels of folders in a Zarr folder."""
+"""Largest number of levels of folders in a Zarr folder."""
 CODECS = ("bytes", "transpose", "blosc", "zstd", "crc32c", "vlen-utf8")
-"""Codecs of Zarr v3 that make numbers and texts from bytes; all others are refused."""
+"""Accepted codecs of Zarr v3, which decode numbers and texts only."""
 LONGEST_TEXT = 1 << 20
-"""Bytes of a text of fixed length."""
+"""Largest size of a text of fixed length, bytes."""
 _TEXT, _WIDE = "string", "fixed_length_utf32"
 _NUMBERS = ("bool", *(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)),
             "float16", "float32", "float64")  # fmt: skip
 
 
 def check_netcdf(path: Path) -> None:
-    """Refuse a NetCDF-4 file that leads to other files, or states sizes out of proportion.
+    """Refuse a NetCDF-4 file that refers to other files, or states sizes out of proportion.
 
     Raises
     ------
     DatasetError
-        All that is wrong, in one message.
+        With all reasons in one message.
     OSError, KeyError, RuntimeError
         The file is damaged.
     """
     size = path.stat().st_size
     with h5py.File(path) as file:
-        file.attrs.get("_nc3_strict")  # h5netcdf leaves a half-made object where this fails
+        file.attrs.get("_nc3_strict")  # h5netcdf leaves an incomplete object if this fails
         if len(file) > MOST_VARIABLES:
             raise DatasetError(f"{path}: expected at most {MOST_VARIABLES} variables; found {len(file)}")
         found, total = [], 0
@@ -78,14 +78,14 @@ def check_netcdf(path: Path) -> None:
 
 
 def check_zarr(path: Path) -> None:
-    """Refuse a Zarr folder with links, other formats than v3, codecs that make objects, or sizes out of proportion.
+    """Refuse a Zarr folder with links, formats other than v3, codecs of objects, or sizes out of proportion.
 
     Raises
     ------
     DatasetError
-        All that is wrong, in one message.
+        With all reasons in one message.
     OSError, ValueError
-        The folder cannot be read, or its metadata are no JSON.
+        The folder cannot be read, or its metadata are not JSON.
     """
     if not (path / "zarr.json").exists():
         raise DatasetError(f"{path}: expected a Zarr folder of format 3 (zarr.json); found another format")
@@ -132,7 +132,7 @@ def _raise(path: Path, found: list[str], total: int, size: int) -> None:
             f"expected at most {_most(size)} bytes of values in a file or folder of {size} bytes; it states {total}"
         )
     if found:
-        raise DatasetError(f"{path}: is damaged, or made to harm:", found)
+        raise DatasetError(f"{path}: is damaged, or malicious:", found)
 
 
 def _files(folder: Path, store: Path, depth: int) -> Iterator[int]:
@@ -158,7 +158,7 @@ def _metadata(file: Path) -> dict[str, Any]:
 
 
 def _wrong(metadata: Any) -> str:
-    """Return what the metadata of an array must not state; empty for nothing."""
+    """Return a violation in the metadata of an array; empty if there is none."""
     if not isinstance(metadata, dict) or metadata.get("zarr_format") != 3 or metadata.get("node_type") != "array":
         return "expected an array of Zarr v3"
     shape: Any = metadata.get("shape")
@@ -195,7 +195,7 @@ def _chunk_shape(metadata: Mapping[str, Any]) -> Any:
 
 
 def _item(metadata: Mapping[str, Any]) -> int:
-    """Return the bytes of one value; 0 for one that is neither a number nor a text."""
+    """Return the bytes of one value; 0 if it is neither a number nor a text."""
     kind = metadata.get("data_type")
     if isinstance(kind, dict):
         configuration = kind.get("configuration")
@@ -206,12 +206,12 @@ def _item(metadata: Mapping[str, Any]) -> int:
 
 
 def _stated(metadata: Mapping[str, Any]) -> int:
-    """Return the bytes of the values of an array, or of one chunk where this is larger."""
+    """Return the bytes of the values of an array, or of one chunk if this is larger."""
     return int(max(math.prod(metadata["shape"]), math.prod(_chunk_shape(metadata))) * _item(metadata))
 
 
 def _wrong_chunks(folder: Path, metadata: Mapping[str, Any], size: int) -> Iterator[str]:
-    """Yield what is wrong with the decompressed sizes that the chunks of an array state."""
+    """Yield violations in the decompressed sizes that the chunks of an array state."""
     names = [each["name"] for each in metadata["codecs"]]
     packed = next((name for name in ("blosc", "zstd") if name in names), "")
     if not packed or not (folder / "c").exists():
@@ -237,12 +237,12 @@ def _below(path: Path) -> Iterator[str]:
 
 
 def _blosc_size(head: bytes) -> int | None:
-    """Return the decompressed size of a Blosc chunk; None for another one."""
+    """Return the decompressed size of a Blosc chunk; None if it is too short."""
     return int(struct.unpack_from("<I", head, 4)[0]) if len(head) >= 16 else None
 
 
 def _zstd_size(head: bytes) -> int | None:
-    """Return the decompressed size of a Zstandard frame (RFC 8878, section 3.1.1.1); None where it states none."""
+    """Return the decompressed size of a Zstandard frame (RFC 8878, section 3.1.1.1); None if it states none."""
     if len(head) < 6 or head[:4] != b"\x28\xb5\x2f\xfd":
         return None
     descriptor = head[4]

@@ -1,4 +1,4 @@
-"""Notes of people on a run or on a machine: ``events.jsonl``, one JSON object on each line, only ever appended to."""
+"""Notes of users on a run or a machine: ``events.jsonl`` with one JSON object on each line, which is only extended."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from errormotion.errors import RunError
 
 FILE = "events.jsonl"
 LARGEST_FILE = 1 << 20
-"""Bytes of a file of notes; it is read to this size, and takes no note beyond."""
+"""Largest size of a file of notes, bytes."""
 LONGEST_TEXT = 1000
-"""Characters of a note."""
+"""Largest number of characters of a note."""
 LONGEST_NAME = 100
-"""Characters of the name of an author or a machine."""
+"""Largest number of characters of the name of an author or a machine."""
 CLOCK_ERROR = timedelta(days=1)
-"""How far in the future the time of an event may be."""
+"""Largest accepted time of an event in the future."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class Event:
     text : str
         Printable, one line.
     noted : str
-        When the note was made, ISO 8601 in UTC.
+        Time of the note, ISO 8601 in UTC.
     at : str
-        When it happened, ISO 8601 in UTC; empty: at the time of the run.
+        Time of the event, ISO 8601 in UTC; empty: the time of the run.
     by : str
-        Who noted it; empty if unknown.
+        Author of the note; empty if unknown.
     machine : str
         The machine; empty for the machine of the run.
     """
@@ -52,19 +52,19 @@ class Event:
 
 
 def event(text: str, *, by: str = "", at: datetime | None = None, machine: str = "") -> Event:
-    """Return a note that was made now.
+    """Return a note with the present time.
 
     Parameters
     ----------
     text, by, machine : str
         See `Event`.
     at : datetime, optional
-        When it happened; without a time zone it is UTC.
+        Time of the event; UTC without a time zone.
 
     Raises
     ------
     RunError
-        A text that is empty, too long, or not printable on one line; a time in the future.
+        The text is empty, too long, or not one printable line; the time is in the future.
     """
     now = datetime.now(UTC)
     made = Event(text.strip(), _iso(now), "", by.strip(), machine.strip())
@@ -93,10 +93,10 @@ def append(folder: Path, made: Event) -> Path:
         with file.open("ab+") as stream, _locked(stream):
             size = stream.seek(0, os.SEEK_END)
             if size + len(data) + 1 > LARGEST_FILE:
-                raise RunError(f"{file}: holds {size} bytes; it takes no more than {LARGEST_FILE}")
+                raise RunError(f"{file}: the note does not fit: {size} of at most {LARGEST_FILE} bytes are used")
             if size:
                 stream.seek(-1, os.SEEK_END)
-                if stream.read(1) != b"\n":  # a line that was never completed stays by itself
+                if stream.read(1) != b"\n":  # an incomplete line
                     data = b"\n" + data
             stream.write(data)
             stream.flush()
@@ -107,7 +107,7 @@ def append(folder: Path, made: Event) -> Path:
 
 
 def read(folder: Path) -> tuple[tuple[Event, ...], tuple[str, ...]]:
-    """Return the notes of a folder in their order, and a sentence for each line that is no note."""
+    """Return the notes of a folder in their order, and a sentence for each invalid line."""
     file = folder / FILE
     try:
         require_regular(file)
@@ -132,7 +132,7 @@ def read(folder: Path) -> tuple[tuple[Event, ...], tuple[str, ...]]:
 
 
 def from_plain(line: Any) -> Event | str:
-    """Return the note of a line or of a JSON object, or what is wrong with it."""
+    """Return the note of a line or of a JSON object, or its mistake."""
     if isinstance(line, str):
         try:
             line = json.loads(line)
@@ -145,7 +145,7 @@ def from_plain(line: Any) -> Event | str:
 
 
 def _mistake(values: dict[str, Any]) -> str:
-    """Return what is wrong with the fields of a note; empty for nothing."""
+    """Return the first mistake in the fields of a note; empty if there is none."""
     for name, value in values.items():
         longest = LONGEST_TEXT if name == "text" else LONGEST_NAME
         if not isinstance(value, str) or len(value) > longest or not value.isprintable():
@@ -159,7 +159,7 @@ def _mistake(values: dict[str, Any]) -> str:
 
 
 def instant(text: str) -> datetime | None:
-    """Return a time in UTC; None for a text that is none. Without a time zone it is UTC."""
+    """Return a time in UTC; None for an invalid text. Without a time zone it is UTC."""
     try:
         time = datetime.fromisoformat(text)
         return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
@@ -173,7 +173,7 @@ def _iso(time: datetime) -> str:
 
 @contextmanager
 def _locked(stream: BufferedRandom) -> Iterator[None]:
-    """Hold other processes off a file; the lock ends when it is closed."""
+    """Lock a file against other processes until it is closed."""
     try:
         import fcntl
     except ImportError:  # Windows: no lock

@@ -1,4 +1,4 @@
-"""Folders in which files are searched that settings name: first the folder of the file with the settings."""
+"""Search folders for files that settings name: the folder of the file with the settings is the first."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _beside: ContextVar[tuple[Path, ...]] = ContextVar("beside", default=())
 
 @contextmanager
 def looking_beside(folder: Path) -> Iterator[None]:
-    """Let names in settings be looked for in a folder too, such as that of a campaign file, while this lasts."""
+    """Within this context, also search files that settings name in a folder, such as that of a campaign file."""
     token = _beside.set((folder, *_beside.get()))
     try:
         yield
@@ -21,5 +21,5 @@ def looking_beside(folder: Path) -> Iterator[None]:
 
 
 def folders_beside() -> tuple[Path, ...]:
-    """Return the folders to look into, the innermost first."""
+    """Return the search folders, the innermost context first."""
     return _beside.get()

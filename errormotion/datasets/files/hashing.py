@@ -1,4 +1,4 @@
-"""The hash of a dataset: of its names, attributes and values, whatever the file format.
+"""The hash of the names, attributes and values of a dataset, independent of the file format.
 
 The form ``blake3-tree`` is a BLAKE3 hash over, in this order,
 
@@ -6,12 +6,12 @@ The form ``blake3-tree`` is a BLAKE3 hash over, in this order,
 * for each variable, sorted by name: ``[name, dims, shape, type, attributes]``, as such a line, then the BLAKE3 digests
   of its leaves, 32 bytes each.
 
-A leaf is a run of values in C order, little-endian, with one bit pattern for NaN. The last axes that together hold at
-most `LEAF` values stay whole, the axis before them is divided into pieces of as many indices as fit, and each index of
-the axes before that one has leaves of its own. Texts are one leaf: a JSON list.
+A leaf is a run of values in C order, little-endian, with one bit pattern for NaN. The last axes that together have at
+most `LEAF` values are not divided, the axis before them is divided into pieces of as many indices as fit, and each
+index of the axes before that one has separate leaves. Texts are one leaf: a JSON list.
 
-Leaves are hashed side by side in threads, in any order, from parts that are read once. Two forms of earlier versions
-are kept to compare a dataset with a hash that was stored then: ``sha256-tree``, the same with SHA-256, and ``sha256``,
+Leaves are hashed in parallel threads, in any order, from parts that are read once. Two forms of earlier versions
+are supported to compare a dataset with a stored hash: ``sha256-tree``, the same with SHA-256, and ``sha256``,
 one SHA-256 over all values in turn.
 """
 
@@ -35,18 +35,18 @@ from xarray.indexes import RangeIndex
 from errormotion.errors import DatasetError
 
 LEAF = 2**16
-"""Most values of one leaf; part of the form's definition."""
+"""Largest number of values of one leaf; part of the form's definition."""
 
 _TREES: dict[str, Any] = {"blake3-tree": blake3, "sha256-tree": hashlib.sha256}
 _FORMS = (*_TREES, "sha256")
 _TILE = 2**25  # bytes read at a time
-_PENDING = 2**26  # bytes that wait to be hashed
-_TASK = 2**21  # bytes that one thread hashes in a row
+_PENDING = 2**26  # largest number of bytes in the queue
+_TASK = 2**21  # bytes of one task of a thread
 _FIRST_FORM_BLOCK = 2**21  # values; part of the definition of the form "sha256"
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON knows it; numbers that are not finite become text."""
+    """Return a value with the types of JSON; numbers that are not finite are converted to text."""
     if isinstance(value, BaseModel):
         return plain(value.model_dump(mode="json"))
     if isinstance(value, Mapping):
@@ -65,8 +65,9 @@ def plain(value: Any) -> Any:
 def hash_dataset(ds: xr.Dataset, form: str = "blake3-tree") -> str:
     """Return the hash of a dataset's names, dimensions, attributes and values.
 
-    Memory stays constant however large the dataset; file format, chunks, byte order and the width of texts do not
-    matter. Evenly spaced times that follow from the attributes ``sample_rate`` and ``time_start`` are not read.
+    The required memory does not depend on the size of the dataset; the hash does not depend on file format, chunks,
+    byte order and the width of texts. Evenly spaced times that follow from the attributes ``sample_rate`` and
+    ``time_start`` are not read.
 
     Parameters
     ----------
@@ -93,15 +94,15 @@ def hash_dataset(ds: xr.Dataset, form: str = "blake3-tree") -> str:
 
 
 def has_hash(ds: xr.Dataset, stored: str) -> bool:
-    """Whether a dataset has a hash that was stored, in whatever form."""
+    """Return whether a dataset has a stored hash of any form."""
     form = stored.partition(":")[0]
     return form in _FORMS and hash_dataset(ds, form) == stored
 
 
 class DatasetHasher:
-    """The hash of a dataset in the form of a tree, from parts as they are read for another purpose.
+    """The hash of a dataset in the form of a tree, from parts that are read for another purpose.
 
-    What is not handed over, or not in order, is read by `value`. To be used as a context manager.
+    `value` reads parts that were not passed, or not in order. To be used as a context manager.
     """
 
     def __init__(self, ds: xr.Dataset, form: str = "blake3-tree") -> None:
@@ -126,7 +127,7 @@ class DatasetHasher:
         values : ndarray
             With the axes of the variable; must not be changed afterwards.
         **window : slice
-            The part's indices along the dimensions that are not whole; parts come in increasing order.
+            Indices of the part along the dimensions that are not complete, in increasing order.
         """
         variable = self._ds.variables[name]
         leaves = self._leaves.setdefault(name, _Leaves(variable))
@@ -135,7 +136,7 @@ class DatasetHasher:
             self._hash(leaves, starts, values)
 
     def value(self) -> str:
-        """Return ``form:digest``; reads what was not handed over."""
+        """Return ``form:digest``; reads parts that were not passed."""
         digest = self._new(_line("attributes", _canonical(self._ds.attrs)))
         for name in sorted(map(str, self._ds.variables)):
             if isinstance(self._ds.xindexes.get(name), RangeIndex):
@@ -167,7 +168,7 @@ class DatasetHasher:
             self._pending += size
 
     def _wait(self, most: int) -> None:
-        """Wait until at most so many bytes are pending."""
+        """Wait until at most ``most`` bytes are pending."""
         while self._queue and self._pending > most:
             future, size = self._queue.popleft()
             future.result()
@@ -177,19 +178,20 @@ class DatasetHasher:
 class _Leaves:
     """The digests of one variable's leaves.
 
-    The variable is seen as (row, length, inner): ``inner`` values stay together, ``length`` is divided into pieces.
+    The shape of the variable is (row, length, inner): ``inner`` values are not divided, ``length`` is divided into
+    pieces.
 
     Attributes
     ----------
     axis : int
         The axis that is divided.
     piece : int
-        Indices along it that make a leaf.
+        Number of indices along it in a leaf.
     digests : ndarray, uint8, (row, leaf, 32)
     """
 
     def __init__(self, variable: xr.Variable) -> None:
-        self.shape = (1, *variable.shape)  # so that there always is an axis to divide
+        self.shape = (1, *variable.shape)  # at least one axis to divide
         axis, inner = len(self.shape) - 1, 1
         while axis > 0 and inner * self.shape[axis] <= LEAF:
             inner *= self.shape[axis]
@@ -208,15 +210,15 @@ class _Leaves:
         return bool(np.all(self._done == self._length))
 
     def accepts(self, starts: Sequence[int], shape: Sequence[int]) -> bool:
-        """Whether a part has whole inner axes and continues where its rows end."""
+        """Return whether a part has complete inner axes and continues its rows."""
         starts, shape = (0, *starts), (1, *shape)
         whole = self.shape[self._axis + 1 :] == tuple(shape[self._axis + 1 :])
         return whole and bool(np.all(self._done[self._within(starts, shape)] == starts[self._axis]))
 
     def take(self, starts: Sequence[int], values: np.ndarray) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
-        """Yield the values of whole leaves with the digests to fill; keep what is less than a leaf for the next part.
+        """Yield the values of complete leaves with the digests to fill; keep an incomplete leaf for the next part.
 
-        The values are one run of several leaves, or several runs that make one leaf.
+        The values are one run of several leaves, or several runs of one leaf.
         """
         starts, shape = (0, *starts), (1, *values.shape)
         start, count = starts[self._axis], shape[self._axis]
@@ -258,7 +260,7 @@ def _hash_leaves(runs: list[np.ndarray], piece: int, out: np.ndarray, new: Any) 
 
 
 def _tiles(variable: xr.Variable, axis: int) -> Iterator[tuple[slice, ...]]:
-    """Yield windows that cover a variable, each a few tens of megabytes of whole chunks; axes after ``axis`` whole."""
+    """Yield windows over a variable, of some tens of megabytes of complete chunks; axes after ``axis`` are complete."""
     stored = variable.chunksizes or variable.encoding.get("preferred_chunks") or {}
     lengths = [stored.get(dim, 1) for dim in variable.dims]
     chunk = [max(1, length[0] if isinstance(length, tuple) else int(length)) for length in lengths]
@@ -294,7 +296,7 @@ def _header(name: str, variable: xr.Variable) -> bytes:
 
 
 def _canonical(attrs: Mapping[Any, Any]) -> Any:
-    """Return attributes with what a NetCDF round trip changes made equal: arrays of one element are numbers."""
+    """Return attributes in the form after a NetCDF round trip: arrays of one element are numbers."""
     return {
         name: value[0] if isinstance(value, list) and len(value) == 1 else value for name, value in plain(attrs).items()
     }
@@ -310,9 +312,9 @@ def _texts(variable: xr.Variable) -> bytes:
 
 
 def _bytes(values: np.ndarray) -> memoryview:
-    """Return values as bytes: C order, little-endian, NaN with one bit pattern; no copy where they are so already."""
+    """Return values as bytes: C order, little-endian, NaN with one bit pattern; copied only if necessary."""
     values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
-    # A maximum is NaN where one of the values is, and is found faster than the NaN themselves.
+    # The maximum is NaN if one of the values is, and is faster than a search for NaN.
     if values.dtype.kind == "f" and np.isnan(values.max(initial=-np.inf)):
         values = np.where(np.isnan(values), values.dtype.type(np.nan), values)
     return values.reshape(-1).view(np.uint8).data
@@ -331,7 +333,7 @@ def _first_form(ds: xr.Dataset) -> str:
 
 
 def _first_form_blocks(variable: xr.Variable) -> Iterator[memoryview]:
-    """Yield the values in blocks that the shape alone determines: two dimensions at a time, along the longer one."""
+    """Yield the values in blocks that depend on the shape only: two dimensions at a time, along the longer one."""
     if variable.ndim == 0 or variable.size <= _FIRST_FORM_BLOCK:
         yield _bytes(np.asarray(variable.values))
         return

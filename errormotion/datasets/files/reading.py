@@ -1,4 +1,4 @@
-"""Files that strangers may have made, read with a bound: regular files only, and JSON of bounded depth."""
+"""Reading of files of unknown origin with limits: regular files only, and JSON of limited depth."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from pathlib import Path
 from typing import Any
 
 DEEPEST = 64
-"""Levels of objects and lists in JSON."""
+"""Largest number of levels of objects and lists in JSON."""
 
 
 def require_regular(path: str | Path) -> os.stat_result:
-    """Refuse a pipe, a device, a folder; return the state of a regular file.
+    """Return the state of a regular file; refuse a pipe, a device or a folder.
 
     Raises
     ------
     OSError
-        There is no such file, or it is not a regular one: reading it could last for ever.
+        The file does not exist, or is not a regular one, which reading may never end.
     """
     state = os.stat(path)
     if stat.S_ISDIR(state.st_mode):
@@ -42,11 +42,11 @@ def read_bytes(path: str | Path, longest: int) -> bytes:
     if size > longest:
         raise OSError(errno.EFBIG, f"expected at most {longest} bytes; it is larger", str(path))
     with open(path, "rb") as file:
-        return file.read(size + 1)[:size]  # what is appended meanwhile is not read; a large bound would be allocated
+        return file.read(size + 1)[:size]  # a large limit would be allocated; data appended meanwhile are not read
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return what JSON states.
+    """Return the content of JSON.
 
     Raises
     ------

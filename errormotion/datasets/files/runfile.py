@@ -1,4 +1,4 @@
-"""``run.json``: what a run states of itself, checked for the types of its keys when it is read."""
+"""``run.json``, the description of a run; the types of its keys are checked when it is read."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from errormotion.errors import RunError
 FILE = "run.json"
 SCHEMA = "errormotion.run/1"
 LARGEST_FILE = 16 << 20
-"""Bytes of a run.json that are read."""
+"""Largest size of a run.json, bytes."""
 
 
 class _Table(BaseModel):
@@ -93,7 +93,7 @@ class _Run(_Table):
 
 
 class State(dict[str, Any]):
-    """An object of a ``run.json``; a key that is missing is an error that names the file."""
+    """An object of a ``run.json``; a missing key raises an error that names the file."""
 
     file: Path = Path(FILE)
 
@@ -107,7 +107,7 @@ def read_run(folder: Path) -> State:
     Raises
     ------
     RunError
-        It cannot be read, is too large, is no JSON, has another schema, or keys of other types; all mistakes in one
+        It cannot be read, is too large, is not JSON, has another schema, or keys of other types; all mistakes in one
         message.
     """
     file = folder / FILE

@@ -1,4 +1,4 @@
-"""Looking at a variable without reading all of it."""
+"""Samples of large variables."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ import numpy as np
 import xarray as xr
 
 SAMPLE = 100_000
-"""Most values of one variable that a check looks at."""
+"""Largest number of values of one variable in a check."""
 
 _BLOCKS = 16
 
 
 def sample(variable: xr.Variable, limit: int = SAMPLE) -> np.ndarray:
-    """Return values spread over a variable: all of a small one, else runs of neighbours from beginning to end.
+    """Return values distributed over a variable: all of a small one, else runs of neighbours from start to end.
 
-    Runs, not single values: a stored array is read chunk by chunk.
+    Runs are read instead of single values, since a stored array is read chunk by chunk.
 
     Parameters
     ----------
     variable : Variable
-        May be lazy; what is not returned is not read.
+        May be lazy; only the returned values are read.
     limit : int
-        Most values to return.
+        Largest number of values.
 
     Returns
     -------
@@ -35,7 +35,7 @@ def sample(variable: xr.Variable, limit: int = SAMPLE) -> np.ndarray:
 
 
 def steps(variable: xr.Variable, limit: int = SAMPLE) -> Iterator[np.ndarray]:
-    """Yield runs of neighbours of a one-dimensional variable, in order, to look at its increments."""
+    """Yield runs of neighbours of a one-dimensional variable, in order, for a check of its increments."""
     if variable.size <= limit:
         yield np.asarray(variable.values)
         return

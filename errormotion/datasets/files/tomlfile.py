@@ -1,7 +1,7 @@
-"""Files that a person writes: TOML checked by a pydantic model, and all mistakes reported together.
+"""TOML files that users write, checked by a pydantic model; all mistakes are reported together.
 
-Each mistake names the file, the dotted key, what was expected, what was found, and for an unknown key the nearest
-known one.
+The report of a mistake states the file, the dotted key, what was expected, what was found, and for an unknown key the
+nearest known one.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from errormotion.datasets.units import EDGE, Quantity
 from errormotion.errors import DatasetError, ErrormotionError
 
 LARGEST_FILE = 4 << 20
-"""Bytes of a file that is read."""
+"""Largest size of a file, bytes."""
 DEEPEST = 32
-"""Levels of arrays and tables."""
+"""Largest number of levels of arrays and tables."""
 
 Model = TypeVar("Model", bound=BaseModel)
 Key = str | int
@@ -33,7 +33,7 @@ _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DOTTED = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST},}}")
 
 _KEY = re.compile(r"[\w.\[\]-]+")
-"""A dotted key, as `dotted` writes it."""
+"""A dotted key in the form of `dotted`."""
 
 _EXPECTED = {
     "model_type": "a table",
@@ -55,22 +55,22 @@ _EXPECTED = {
 
 
 def load_model(path: str | Path, model: type[Model], *, error: type[ErrormotionError] = DatasetError) -> Model:
-    """Read a TOML file into a pydantic model; units are compulsory in it.
+    """Read a TOML file into a pydantic model; units are compulsory.
 
     Parameters
     ----------
     path : str or Path
         The file, UTF-8.
     model : type of BaseModel
-        What it must hold; models with ``extra="forbid"`` refuse unknown keys.
+        Model of the content; models with ``extra="forbid"`` refuse unknown keys.
     error : type of ErrormotionError
-        What to raise.
+        Class of the error.
 
     Raises
     ------
     ErrormotionError
-        Of the type ``error``: the file cannot be read, is no TOML (with line and column), or holds mistakes (all of
-        them in one message).
+        Of the type ``error``: the file cannot be read, is not TOML (with line and column), or contains mistakes (all
+        of them in one message).
     """
     found, mistakes = check(read_toml(path, error=error), model)
     if found is None:
@@ -108,7 +108,7 @@ def parse_toml(text: str, path: str | Path, *, error: type[ErrormotionError] = D
     ErrormotionError
         Of the type ``error``: not TOML, nested too deeply, or with a number of too many digits.
     """
-    if _DOTTED.search(text):  # the time and memory of tomllib grow with the square of the parts
+    if _DOTTED.search(text):  # time and memory of tomllib increase with the square of the number of parts
         raise error(f"{path}: expected keys of at most {DEEPEST} parts; found more")
     deep = f"{path}: expected at most {DEEPEST} levels of arrays and tables; found more"
     try:
@@ -122,7 +122,7 @@ def parse_toml(text: str, path: str | Path, *, error: type[ErrormotionError] = D
         lines = text.splitlines() or [""]
         complaint = str(reason).removesuffix(" (at end of document)")
         raise error(f"{path}, line {len(lines)}, column {len(lines[-1]) + 1}: not TOML: {complaint}") from reason
-    except ValueError as reason:  # a number of too many digits, a date that there is not
+    except ValueError as reason:  # a number of too many digits, an invalid date
         raise error(f"{path}: not TOML: {reason}") from reason
     if _is_deep(content):
         raise error(deep)
@@ -130,7 +130,7 @@ def parse_toml(text: str, path: str | Path, *, error: type[ErrormotionError] = D
 
 
 def _is_deep(content: Any) -> bool:
-    """Whether tables and arrays are nested beyond the limit; without recursion."""
+    """Return whether tables and arrays are nested beyond the limit; without recursion."""
     level = [content]
     for _ in range(DEEPEST):
         level = [each for one in level for each in (one.values() if isinstance(one, dict) else one)
@@ -148,13 +148,13 @@ def check(
     Parameters
     ----------
     data : mapping
-        As TOML gives it.
+        Tables of TOML.
     model : type of BaseModel
-        What it must hold.
+        Model of the content.
     prefix : sequence of str or int
-        Position of ``data`` in its file, for the dotted keys of the messages.
+        Keys of ``data`` in its file, for the dotted keys of the messages.
     edge : bool
-        A person wrote it: bare numbers are refused where a unit belongs.
+        Whether a user wrote the file: numbers without unit are then refused for quantities.
     """
     try:
         return model.model_validate(data, context=EDGE if edge else None), []
@@ -169,7 +169,7 @@ def report(source: str | Path, mistakes: Sequence[str]) -> str:
 
 
 def grouped(mistakes: Sequence[str]) -> list[str]:
-    """Return mistakes for a person: those that are alike in one line with all their keys."""
+    """Return mistakes as lines; equal mistakes are in one line with all their keys."""
     keys: dict[str, list[str]] = {}
     for mistake in mistakes:
         key, sign, text = mistake.partition(": ")
@@ -179,7 +179,7 @@ def grouped(mistakes: Sequence[str]) -> list[str]:
 
 
 def single(line: str) -> list[str]:
-    """Return the mistakes of a line that `grouped` has made."""
+    """Return the single mistakes of a line of `grouped`."""
     keys, sign, text = line.partition(": ")
     found = keys.split(", ")
     return [f"{key}: {text}" for key in found] if sign and all(map(_KEY.fullmatch, found)) else [line]
@@ -194,7 +194,7 @@ def dotted(keys: Iterable[Key]) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a sentence for an unknown name: the nearest known one if any is near, and what there is."""
+    """Return a sentence for an unknown name: the nearest known name, if there is one, and all known names."""
     names = sorted(set(known))
     by_lower = {known_name.lower(): known_name for known_name in names}
     near = get_close_matches(name.lower(), by_lower, n=1)
@@ -215,7 +215,7 @@ def _mistake(details: ErrorDetails, model: type[BaseModel], prefix: Sequence[Key
         return f"{place}: {message}"
     if kind in ("value_error", "assertion_error"):
         text = message.partition(", ")[2]
-        complete = isinstance(found, Mapping) or "; found" in text  # of a whole table, or in its own words
+        complete = isinstance(found, Mapping) or "; found" in text  # of a whole table, or the value is in the text
         return f"{place}: {text}" if complete else f"{place}: {text}; found {_short(found)}"
     expected = _EXPECTED.get(kind) or message.removeprefix("Input should be ")
     if expected.startswith(("greater", "less")):
@@ -233,7 +233,7 @@ def _short(value: Any) -> str:
 
 
 def _wanted(model: type[BaseModel], path: Sequence[Key]) -> str:
-    """Return in words what belongs at a path."""
+    """Return a description of the value at a path."""
     for owner in _models(_walk(model, path[:-1])[0]):
         for name, field in owner.model_fields.items():
             if path[-1] not in (name, field.alias):
@@ -270,7 +270,7 @@ def _models(annotations: Iterable[Any]) -> list[type[BaseModel]]:
 
 
 def _step(annotations: Sequence[Any], key: Key) -> list[Any]:
-    """Return what stands below a key; empty if there is no such key."""
+    """Return the annotations below a key; empty if there is no such key."""
     below: list[Any] = []
     for option in (option for annotation in annotations for option in options_of(annotation)):
         if isinstance(option, type) and issubclass(option, BaseModel):
@@ -284,13 +284,13 @@ def _step(annotations: Sequence[Any], key: Key) -> list[Any]:
 
 
 def _has_tag(model: type[BaseModel], key: Key) -> bool:
-    """Whether pydantic calls this member of a union by ``key``: by its name or its discriminator."""
+    """Return whether ``key`` is the tag of pydantic for this member of a union: its name or its discriminator."""
     tags = [tag for field in model.model_fields.values() for tag in get_args(field.annotation)]
     return key == model.__name__ or key in tags
 
 
 def _walk(model: type[BaseModel], path: Sequence[Key]) -> tuple[list[Any], list[Key]]:
-    """Return what is allowed at a path, and the path without pydantic's tags for members of unions."""
+    """Return the annotations at a path, and the path without pydantic's tags for members of unions."""
     here: list[Any] = [model]
     kept: list[Key] = []
     for key in path:

@@ -1,4 +1,4 @@
-"""TOML as text: values written, and single values changed in a file that a person wrote, comments kept."""
+"""TOML as text: conversion of values to text, and changes of single values in a file, with its comments kept."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from errormotion.datasets.files.tomlfile import Key, dotted, parse_toml
 from errormotion.errors import DatasetError
 
 LONGEST_TEXT = 1 << 16
-"""Characters of a text in which single values are changed."""
+"""Largest number of characters of a text in which values are changed."""
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _HEADER = re.compile(r"[ \t]*(\[\[?)([^\n]*?)\]\]?[ \t]*(?:#[^\n]*)?")
@@ -25,7 +25,7 @@ _KEYS = re.compile(
 
 
 def key(name: str) -> str:
-    """Return a key of TOML, in quotes where it needs them."""
+    """Return a key of TOML, in quotes if necessary."""
     return name if _BARE.fullmatch(name) else value(name)
 
 
@@ -43,7 +43,7 @@ def value(content: Any) -> str:
 
 
 def value_of(text: str) -> Any:
-    """Return a value in TOML, or the text where it is none."""
+    """Return the value of a text in TOML, or the text if it is not TOML."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
@@ -51,7 +51,7 @@ def value_of(text: str) -> Any:
 
 
 def with_value(text: str, place: Sequence[Key], content: Any) -> str:
-    """Return a text in which one value is another; comments, order and all other values remain.
+    """Return a text with one value changed; comments, order and all other values are kept.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def with_value(text: str, place: Sequence[Key], content: Any) -> str:
     Raises
     ------
     DatasetError
-        The text is not TOML, is too long, or states the value in a form that cannot be changed alone.
+        The text is not TOML, is too long, or the value is in a form that cannot be changed alone.
     """
     before = _read(text)
     expected = copy.deepcopy(before)
@@ -74,7 +74,7 @@ def with_value(text: str, place: Sequence[Key], content: Any) -> str:
 
 
 def with_table(text: str, name: str, content: Mapping[str, Any]) -> str:
-    """Return a text with one more table at the end of an array of tables, which may not be there yet.
+    """Return a text with a further table at the end of an array of tables, which may not exist yet.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def with_table(text: str, name: str, content: Mapping[str, Any]) -> str:
 
 
 def without_table(text: str, name: str, number: int) -> str:
-    """Return a text without one table of an array of tables, and without the tables in it; comments around it remain.
+    """Return a text without one table of an array of tables and without the tables in it; comments around it are kept.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def without_table(text: str, name: str, number: int) -> str:
     """
     expected = _read(text)
     if not isinstance(expected.get(name), list):
-        raise DatasetError(f"{name}: there are no such tables in the text")
+        raise DatasetError(f"{name}: the text contains no such tables")
     _put(expected, (name, number), None)
     if not expected[name]:
         del expected[name]
@@ -107,7 +107,7 @@ def without_table(text: str, name: str, number: int) -> str:
     for each in [*reversed(list(_statements(text))), None]:
         if each is not None and each.table[:2] == (name, number):
             own.append(each)
-        elif own:  # these stand together, in reverse order
+        elif own:  # consecutive statements in reverse order
             head, rest = text[: own[-1].start], text[own[0].end :]
             text = head + (rest.removeprefix("\n") if head.endswith("\n\n") or not head else rest)
             own = []
@@ -129,7 +129,7 @@ def _same(changed: str, expected: Any, place: Sequence[Key]) -> str:
 
 @dataclass(frozen=True)
 class _Statement:
-    """A header or a key with its value: where its lines and its value are, the table it is in, and its own place."""
+    """A header or a key with its value: ranges of its lines and its value, its table, and its dotted key."""
 
     start: int
     end: int
@@ -149,7 +149,7 @@ def _changed(text: str, place: tuple[Key, ...], content: Any, expected: Any) -> 
     if content is None:
         return text
     beside = [each for each in found if each.value is not None and each.place[:-1] == place[:-1]]
-    table = beside[-1].table if beside else place[:-1]  # another one where the keys beside it are dotted
+    table = beside[-1].table if beside else place[:-1]  # another one if the keys beside it are dotted
     line = f"{'.'.join(key(str(name)) for name in place[len(table) :])} = {value(content)}\n"
     own = beside or [each for each in found if each.table == table]
     if not own and table:
@@ -205,9 +205,9 @@ def _names(keys: str) -> list[str]:
 
 
 def _parsed(rest: str) -> int | None:
-    """Return the length of the value that a text begins with, without a comment after it; None where it is none yet."""
+    """Return the length of the value at the start of a text, without a comment after it; None if it is incomplete."""
     if not rest.rstrip().endswith(("]", "}", '"', "'")) and "\n" in rest.rstrip() and "#" not in rest:
-        return None  # within an array: the next line is needed, and parsing would only take time
+        return None  # within an array: the next line is needed
     try:
         whole = tomllib.loads(f"value = {rest}")["value"]
     except ValueError:
@@ -228,7 +228,7 @@ def _at(content: Any, place: Sequence[Key]) -> Any:
 
 
 def _put(content: Any, place: Sequence[Key], new: Any) -> None:
-    """Set or remove a value; tables on the way are made."""
+    """Set or remove a value; missing tables are created."""
     try:
         for each in place[:-1]:
             if new is None and isinstance(content, dict) and each not in content:
@@ -242,4 +242,4 @@ def _put(content: Any, place: Sequence[Key], new: Any) -> None:
         else:
             content[last] = new
     except (KeyError, IndexError, TypeError, AttributeError):
-        raise DatasetError(f"{dotted(place)}: there is no such place in the text") from None
+        raise DatasetError(f"{dotted(place)}: the text contains no such key") from None

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all: beside their place, brought to the disk, and renamed."""
+"""Atomic writing of files: to a temporary file in the same folder, which is flushed to the disk and renamed."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from errormotion.errors import DatasetError
 
 _REASONS = {
     errno.ENOENT: "there is no such folder",
-    errno.EACCES: "permission denied; choose a place where you may write, or have the permission given",
-    errno.EPERM: "permission denied; choose a place where you may write, or have the permission given",
-    errno.EROFS: "the file system is read-only; choose another place",
-    errno.ENOSPC: "the disk is full; free some space or choose another disk. Nothing was left behind there",
-    errno.EDQUOT: "your disk quota is used up; free some space or choose another disk. Nothing was left behind there",
-    errno.EFBIG: "the file would be larger than allowed. Nothing was left behind there",
+    errno.EACCES: "permission denied; choose another folder, or change its permissions",
+    errno.EPERM: "permission denied; choose another folder, or change its permissions",
+    errno.EROFS: "the file system is read-only; choose another folder",
+    errno.ENOSPC: "the disk is full; free some space or choose another disk. Nothing was written",
+    errno.EDQUOT: "your disk quota is used up; free some space or choose another disk. Nothing was written",
+    errno.EFBIG: "the file would be larger than allowed. Nothing was written",
     errno.ENAMETOOLONG: "the name is too long",
 }
 
 
 def reason(error: Exception, missing: str) -> str:
-    """Return why a file cannot be read or written; ``missing`` for a place that is not there."""
+    """Return the reason why a file cannot be read or written; ``missing`` if a file or folder does not exist."""
     code = getattr(error, "errno", None)
     stated = re.search(r"errno = (\d+)", str(error))
     if stated is not None and code not in _REASONS:
@@ -37,17 +37,17 @@ def reason(error: Exception, missing: str) -> str:
 
 @contextmanager
 def writing(path: Path, part: Path) -> Iterator[None]:
-    """Remove what was written beside a file when its place has been taken, or when that has failed.
+    """Remove a temporary file after its context, and report errors of the disk.
 
     Raises
     ------
     DatasetError
-        The disk does not take it; the message names the file.
+        The file cannot be written; the message names it.
     """
     try:
         yield
     except (OSError, RuntimeError) as error:
-        # HDF5 closes a file on a full disk with a RuntimeError that carries the system's words.
+        # On a full disk HDF5 raises a RuntimeError with the message of the system.
         raise DatasetError(f"{path}: cannot be written: {reason(error, 'there is no such folder')}") from error
     finally:
         remove(part)
@@ -55,12 +55,12 @@ def writing(path: Path, part: Path) -> Iterator[None]:
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Yield the place where a file is written; then it replaces an older one in one step.
+    """Yield the path of a temporary file, which then replaces the file in one step.
 
     Raises
     ------
     DatasetError
-        As `writing`. An older file is as it was.
+        As `writing`. An existing file is not changed.
     """
     part = path.with_name(f"{path.name}.part")
     with writing(path, part):
@@ -70,7 +70,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Bring a file or the names in a folder to the disk."""
+    """Flush a file or the names in a folder to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -79,7 +79,7 @@ def sync(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder, if the disk lets it."""
+    """Remove a file or a folder, if possible."""
     with suppress(OSError):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)

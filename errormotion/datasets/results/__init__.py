@@ -1,1 +1,1 @@
-"""Error datasets: how they are built, checked, interpolated, reduced and drawn, and the accessor ``ds.em``."""
+"""Error datasets: building, validation, interpolation, reduction, plots, and the accessor ``ds.em``."""

@@ -1,4 +1,4 @@
-"""``ds.em``: what can be asked of an error dataset."""
+"""``ds.em``: the accessor of error datasets."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from errormotion.datasets.results.plotting.figure import Form
 
 INDEPENDENT = "independent"
-"""Name of the rest in a budget: what is drawn anew at every value."""
+"""Name of the independent contribution in a budget."""
 
 
 class Combination(NamedTuple):
@@ -35,7 +35,7 @@ class Combination(NamedTuple):
 
 
 class Pictured:
-    """The accessor ``ds.em`` of datasets that their plugin draws, such as comparisons: ``ds.em.plot()`` alone."""
+    """The accessor ``ds.em`` of datasets whose plugin plots them, such as comparisons: ``ds.em.plot()`` only."""
 
     def __init__(self, ds: xr.Dataset, draw: Callable[[xr.Dataset], Figure]) -> None:
         self._ds = ds
@@ -75,7 +75,7 @@ class ErrorMotion:
     Raises
     ------
     DatasetError
-        On first use, if the dataset has not the error schema.
+        On first use, if the dataset does not have the error schema.
     """
 
     def __init__(self, ds: xr.Dataset) -> None:
@@ -90,7 +90,7 @@ class ErrorMotion:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the estimates: the six freedoms, or ``deviation`` where the method sees one direction only."""
+        """Names of the estimates: the six freedoms, or ``deviation`` if the method measures one direction only."""
         return ("deviation",) if "deviation" in self._ds.variables else DOF
 
     def twist(self) -> xr.DataArray:
@@ -99,19 +99,19 @@ class ErrorMotion:
         Returns
         -------
         DataArray, (..., dof)
-            m and rad; NaN where not seen.
+            m and rad; NaN where unknown.
         """
         values = np.stack([self._ds[name].values for name in DOF], axis=-1)
         coords = {**self._coords(), "dof": list(DOF)}
         return xr.DataArray(values, dims=(*self.dims, "dof"), coords=coords, name="twist")
 
     def estimates(self) -> xr.DataArray:
-        """Return what was measured: the six freedoms, or the deviation as the only ``dof``.
+        """Return the estimates: the six freedoms, or the deviation as the only ``dof``.
 
         Returns
         -------
         DataArray, (..., dof)
-            m and rad; NaN where not seen.
+            m and rad; NaN where unknown.
         """
         values = np.stack([self._ds[name].values for name in self.names], axis=-1)
         return xr.DataArray(values, dims=(*self.dims, "dof"), coords=self._coords("dof"), name="estimates")
@@ -140,7 +140,7 @@ class ErrorMotion:
         return xr.DataArray(values, dims=(*self.dims, "dof"), coords=self._coords("dof"), name="uncertainty")
 
     def iso_names(self) -> dict[str, str]:
-        """Return the ISO 230-1 name of each estimate, such as ``{"EX": "EXX", ...}``; else its own."""
+        """Return the ISO 230-1 name of each estimate, such as ``{"EX": "EXX", ...}``; else its name."""
         component = self._ds.attrs["component"]
         if component not in COMPONENTS or self.names != DOF:
             return {name: name for name in self.names}
@@ -149,8 +149,8 @@ class ErrorMotion:
     def at(self, point: ArrayLike) -> xr.Dataset:
         """Return the same errors at another functional point.
 
-        Values, covariance and influence move: ``E' = E + R x r``; of a deviation, the sensitivity. Further results of
-        the method stay as it computed them, for its own point.
+        Values, covariance and influence are transformed by ``E' = E + R x r``; of a deviation, the sensitivity.
+        Further results of the method are not changed.
 
         Parameters
         ----------
@@ -160,8 +160,8 @@ class ErrorMotion:
         Raises
         ------
         DatasetError
-            Not three finite coordinates; beams, each of which is stated about its own zero point; a shift along an axis
-            that is no lever of the rotations (attribute ``lever_axes``).
+            Not three finite coordinates; errors of beams, each of which has another zero point; a shift along an axis
+            that is not a lever of the rotations (attribute ``lever_axes``).
         """
         target = _point(point)
         if self._ds.attrs.get("component") == "beam":
@@ -178,14 +178,14 @@ class ErrorMotion:
         """Return the same errors, at the same physical point, in another frame.
 
         Values, covariance, influence, sensitivity, functional point and the commanded ``x y z`` change their
-        coordinates. Further results of the method stay as it computed them, in its own frame.
+        coordinates. Further results of the method are not changed.
 
         Parameters
         ----------
         pose : RigidTransform
-            Takes coordinates of the present frame to coordinates of the new one.
+            Transforms coordinates of the present frame to coordinates of the new one.
         name : str
-            Of the new frame.
+            Name of the new frame.
 
         Raises
         ------
@@ -195,8 +195,8 @@ class ErrorMotion:
         """
         if "lever_axes" in self._ds.attrs and pose.rotation.magnitude() > 1e-9:
             raise DatasetError(
-                "The errors are not those of one rigid motion (attribute lever_axes): they have no other directions "
-                "than those of the axes, and cannot be rotated into another frame"
+                "The errors are not those of one rigid motion (attribute lever_axes): they are known along the axes "
+                "only, and cannot be rotated into another frame"
             )
         ds = self._transformed(twists.adjoint(rotation=pose.rotation))
         present = [axis for axis in "xyz" if axis in ds.variables]
@@ -215,7 +215,7 @@ class ErrorMotion:
     def covariance_between(self, i: Any, j: Any) -> xr.DataArray:
         """Return the covariance of the errors at two places.
 
-        The sum over sources of ``influence_i influence_j``; the independent rest comes in where i = j.
+        The sum over sources of ``influence_i influence_j``, plus the independent covariance if i = j.
 
         Parameters
         ----------
@@ -233,7 +233,7 @@ class ErrorMotion:
         else:
             F = np.moveaxis(self._influence(), 0, -1)
             covariance = F[first] @ F[second].T
-            if not F.size:  # no shared source: known to be 0 where both values are known
+            if not F.size:  # no shared source: 0 where both values are known
                 covariance = covariance + 0 * np.add.outer(self._values()[first], self._values()[second])
         labels = {"dof": list(self.names), "dof_": list(self.names)}
         return xr.DataArray(covariance, dims=("dof", "dof_"), coords=labels)
@@ -241,8 +241,8 @@ class ErrorMotion:
     def combine(self, weights: ArrayLike, dim: str) -> Combination:
         """Return a linear combination of the errors along a dimension, with its covariance.
 
-        A mean, a difference, a slope: ``sum_k w_k E_k``. Sources of influence add up with their signs before they are
-        squared, the independent rest adds in squares. A NaN value with weight 0 does not matter.
+        A mean, a difference, a slope: ``sum_k w_k E_k``. The effects of a source are added with their signs before
+        they are squared, independent contributions are added in squares. A NaN value with weight 0 has no effect.
 
         Parameters
         ----------
@@ -291,7 +291,7 @@ class ErrorMotion:
         return change(self._ds, before)
 
     def to_times(self, times: ArrayLike) -> xr.Dataset:
-        """Return the errors at other instants, s, with what interpolation adds; see `interpolation.to_points`."""
+        """Return the errors at other instants, s, by interpolation; see `interpolation.to_points`."""
         from errormotion.datasets.results.interpolation import to_points
 
         return to_points(self._ds, "time", "time", times)
@@ -299,13 +299,13 @@ class ErrorMotion:
     def to_positions(self, positions: ArrayLike, coordinate: str = "") -> xr.Dataset:
         """Return the errors at other positions of an axis, m; see `interpolation.to_points`.
 
-        ``coordinate`` is ``x``, ``y`` or ``z`` along ``position``; it may be left out where there is only one.
+        ``coordinate`` is ``x``, ``y`` or ``z`` along ``position``; it may be omitted if there is only one.
         """
         from errormotion.datasets.results.interpolation import to_points
 
         own = [name for name in "xyz" if name in self._ds.variables and self._ds[name].dims == ("position",)]
         if not coordinate and len(own) != 1:
-            raise DatasetError(f"Expected one coordinate along 'position'; found {', '.join(own) or 'none'}: name one")
+            raise DatasetError(f"Expected one coordinate along 'position'; found {', '.join(own) or 'none'}: state one")
         return to_points(self._ds, "position", coordinate or own[0], positions)
 
     def mean(self, dim: str) -> xr.Dataset:
@@ -321,7 +321,7 @@ class ErrorMotion:
         return [note for note in ([notes] if isinstance(notes, str) else list(notes)) if note]
 
     def budget(self) -> xr.DataArray:
-        """Return the uncertainty budget: standard uncertainty (k = 1) by group of sources, and the independent rest.
+        """Return the uncertainty budget: standard uncertainty (k = 1) by group of sources, and independent part.
 
         The groups' root sum of squares is the total.
 
@@ -351,7 +351,7 @@ class ErrorMotion:
         Curves, maps over two dims, or arrows in a volume, of some ``freedoms``, ``at`` a functional point (m), with the
         coverage factor ``k``, in the axes ``ax``.
         """
-        from errormotion.datasets.results.plotting import plot_errors  # matplotlib only when something is drawn
+        from errormotion.datasets.results.plotting import plot_errors  # imports matplotlib
 
         return plot_errors(self._ds, freedoms, at, k, ax, form)
 
@@ -362,7 +362,7 @@ class ErrorMotion:
         return to_dataframe(self._ds, freedoms, k)
 
     def _check_levers(self, shift: Array) -> None:
-        """Refuse a shift along axes whose travel is no lever of the rotations."""
+        """Refuse a shift along axes whose travel is not a lever of the rotations."""
         levers = str(self._ds.attrs.get("lever_axes", "XYZ"))
         wrong = [axis for axis, length in zip("XYZ", shift, strict=True) if axis not in levers and abs(length) > 1e-9]
         if wrong and self._ds.attrs.get("component") != "beam":
@@ -414,7 +414,7 @@ class ErrorMotion:
         return tuple(number % size for number, size in zip(index, sizes, strict=True))
 
     def _transformed(self, A: Array) -> xr.Dataset:
-        """Return a copy with twist, covariance, influence and sensitivity under a 6x6 matrix."""
+        """Return a copy with twist, covariance, influence and sensitivity transformed by a 6x6 matrix."""
         ds = self._ds.copy()
         E = twists.transform(self.twist().values, A)
         for k, name in enumerate(DOF):

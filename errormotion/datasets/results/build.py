@@ -1,4 +1,4 @@
-"""The error dataset: the one exit through which every method's result passes."""
+"""Building of error datasets, the results of all methods."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def build_errors(
     Parameters
     ----------
     values : array_like, (..., 6)
-        EX EY EZ in m, EA EB EC in rad; NaN for what the method does not see.
+        EX EY EZ in m, EA EB EC in rad; NaN for unknown ones.
     covariance : array_like, (..., 6, 6)
-        Total, influences included; m^2, m rad, rad^2. Rows and columns of NaN values become NaN.
+        Total covariance, including influences; m^2, m rad, rad^2. Rows and columns of NaN values are set to NaN.
     dims : sequence of str
-        Of ``values`` before the last axis: from time, position, target, beam, or declared by a coordinate of the same
-        name with ``long_name`` and, for numbers, ``units``; empty for one place.
+        Dims of ``values`` before the last axis: time, position, target, beam, or dims declared by a coordinate of the
+        same name with ``long_name`` and, for numbers, ``units``; empty for one place.
     coords : mapping
         Name to array, or to ``(dims, array)`` or ``(dims, array, attrs)``.
     component, machine, frame, reference, method, method_version : str
@@ -68,28 +68,28 @@ def build_errors(
     influence : array_like, (source, ..., 6), optional
         Effect of one standard uncertainty of each source that is one draw for many values; m, rad.
     sources, source_groups : sequence of str, optional
-        Name of each source, and what it belongs to in the budget; with ``influence``.
+        Name of each source, and its group in the budget; with ``influence``.
     extras : mapping of str to DataArray, optional
-        Further results, with their own units.
+        Further results, with units.
     component_description : str, optional
-        What a component is that the schema does not list.
+        Description of a component that the schema does not list.
     source_ids : mapping of str to str, optional
-        Identity of a source by its name: what makes it the same draw in another dataset, such as the hash of a
-        calibration or the number of a certificate. Sources without one are shared with no other dataset.
+        Identities of sources by name, such as the hash of a calibration or the number of a certificate. Sources with
+        equal identities are one draw in several datasets; those without identity are not shared.
     reference_sources : sequence of str, optional
         Names of the sources that are the uncertainty of the reference state.
     reference_interval : tuple of float, optional
-        First and last time of the reference state, s on the ``time`` of the dataset; alike for one instant.
+        First and last time of the reference state, s on the ``time`` of the dataset; equal for one instant.
     reference_position : float, optional
         Position whose errors are zero by definition, m or rad, for errors over ``position``.
     start : str, optional
         Instant of time 0: ISO 8601 with an offset from UTC.
     notes : sequence of str, optional
-        What a reader has to know, one sentence each.
+        Notes for the reader, one sentence each.
     measured : mapping, optional
-        Attributes of the raw dataset. Those of `schemas.CARRIED` that are texts become attributes of the errors.
+        Attributes of the raw dataset. Those of `schemas.CARRIED` that are texts are copied to the errors.
     lever_axes : str, optional
-        Axes whose travel is a lever of the rotations, such as ``Z``, where the errors are not those of one rigid
+        Axes whose travel is a lever of the rotations, such as ``Z``, if the errors are not those of one rigid
         motion.
 
     Returns
@@ -147,8 +147,8 @@ def build_errors(
         ds = xr.Dataset(variables, coords=own_coords, attrs=attrs)
         clash = sorted(set(extras or {}) & set(ds.variables))
         if clash:
-            raise DatasetError(f"Extra results need names of their own; taken already: {', '.join(clash)}.")
-        # Arrays without coordinates need no alignment, which would take longer than all the rest.
+            raise DatasetError(f"extras: expected names that are not used by the schema; found {', '.join(clash)}")
+        # Arrays without coordinates need no alignment, which would take most of the time.
         ds = ds.assign({name: each if len(each.coords) else each.variable for name, each in (extras or {}).items()})
     except ValueError as error:
         raise DatasetError(f"Values, coordinates and extra results do not fit together: {error}") from error
@@ -171,14 +171,14 @@ def build_deviations(
     extras: Mapping[str, xr.DataArray] | None = None,
     **attributes: Any,
 ) -> xr.Dataset:
-    """Return an error dataset of a method that sees the errors along one known direction only.
+    """Return an error dataset of a method that measures the errors along one known direction only.
 
-    The six freedoms are NaN: none of them is known alone.
+    The six freedoms are NaN, since none of them is determined.
 
     Parameters
     ----------
     deviation, variance : array_like, (...)
-        m and m^2, influences included; NaN where unknown.
+        m and m^2, including influences; NaN where unknown.
     sensitivity : array_like, (..., 6) or (6,)
         Effect of one unit of each freedom at the functional point on the deviation: a unit vector, and m/rad.
     dims, coords, sources, source_groups, extras
@@ -186,7 +186,7 @@ def build_deviations(
     influence : array_like, (source, ...), optional
         Effect of one standard uncertainty of each source on the deviation, m.
     **attributes
-        ``component``, ``machine``, ``frame`` and all others that `build_errors` takes.
+        ``component``, ``machine``, ``frame`` and all others of `build_errors`.
 
     Raises
     ------
@@ -251,7 +251,7 @@ def _influence(
 
 
 def _identities(names: list[str], ids: Mapping[str, str], references: Sequence[str]) -> dict[str, Any]:
-    """Return the coordinates that say which sources are draws of other datasets too, and which are the reference."""
+    """Return the coordinates with the identities of the sources, and with those of the reference state."""
     if stray := sorted({*ids, *references} - set(names)):
         raise DatasetError(f"source_ids, reference_sources: expected names among {names}; found {', '.join(stray)}")
     return {

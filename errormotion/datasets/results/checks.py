@@ -1,8 +1,8 @@
-"""What an error dataset must be.
+"""Validation of error datasets.
 
-A ballbar, a diagonal or a line of sight shows one number at each position: the deviation ``h . E`` of the six freedoms
-E along a known direction. No freedom follows from it alone, so all six are unknown; the deviation and its sensitivity h
-hold all that was measured.
+A ballbar, a diagonal or a line of sight determines one value at each position: the deviation ``h . E`` of the six
+freedoms E along a known direction. No freedom follows from it alone, so that all six are unknown; the dataset contains
+the deviation and its sensitivity h.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ ROUNDING = 1e-8
 """Rounding of a 6x6 covariance relative to its diagonal, after moves over some metres and back."""
 
 FARTHEST = 50.0
-"""Largest plausible coordinate of a functional point, m; one beyond is written in mm."""
+"""Largest plausible coordinate of a functional point, m; larger ones are probably in mm."""
 
 UNIT_LENGTH = 1e-6
 """Tolerance of the length of a unit vector."""
@@ -62,7 +62,7 @@ def error_violations(ds: xr.Dataset) -> list[str]:
     found = [*_attribute_violations(ds), *storable_violations(ds)]
     missing = [name for name in DOF if name not in ds.data_vars]
     if missing:
-        return [*found, f"{' '.join(missing)}: missing; expected all of {' '.join(DOF)}, NaN where not seen"]
+        return [*found, f"{' '.join(missing)}: missing; expected all of {' '.join(DOF)}, NaN if unknown"]
     dims = ds["EX"].dims
     found += _dim_violations(ds, dims)
     complaints = []
@@ -93,7 +93,7 @@ def _attribute_violations(ds: xr.Dataset) -> list[str]:
         elif not isinstance(value, str) or not value.strip():
             found.append(f"attribute '{name}': expected {meaning}; found {value!r}")
         elif name == "sign" and value != SIGN:
-            found.append(f"attribute 'sign': expected '{SIGN}'; found '{value}'. Turn the values and set it")
+            found.append(f"attribute 'sign': expected '{SIGN}'; found '{value}'. Reverse the values and set it")
         elif name == "schema" and value != SCHEMA:
             found.append(f"attribute 'schema': expected '{SCHEMA}'; found '{value}'")
         elif name == "component" and value not in COMPONENTS and not str(ds.attrs.get("component_description", "")):
@@ -146,7 +146,7 @@ def _coordinate_violations(ds: xr.Dataset) -> list[str]:
 
 
 def _comparison_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str]:
-    """Return what is wrong with what a comparison needs: start, reference, identities, and untouched values."""
+    """Return violations in the requirements of a comparison: start, reference, identities, unchanged values."""
     found = []
     start = ds.attrs.get("start")
     if start is not None and not _is_instant(start):
@@ -161,7 +161,7 @@ def _comparison_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str
     if "source_id" in ds.coords and ds.variables["source_id"].dims == ("source",):
         ids = [each for each in ds["source_id"].values.tolist() if each]
         if len(set(ids)) < len(ids):
-            found.append("source_id: expected texts that differ, or empty ones; found one twice")
+            found.append("source_id: expected texts that differ, or empty ones; found one repeated")
     for name in (f"{dim}{INDEX}" for dim in dims):
         if name not in ds.variables:
             continue
@@ -170,13 +170,13 @@ def _comparison_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str
         if variable.dims != (name.removesuffix(INDEX),) or not (numbers % 1 == 0).all():
             found.append(_TOUCHED.format(name))
     lost = [name for name in ds.variables if str(name).endswith(INDEX) and str(name).removesuffix(INDEX) not in dims]
-    # One value that was selected, as by isel(position=3), keeps its number; a mean makes a float of it.
+    # A selected value, as by isel(position=3), keeps its number; a mean converts it to a float.
     found += [_TOUCHED.format(name) for name in lost if ds[name].ndim or ds[name].dtype.kind not in "iu"]
     return found
 
 
 def _machine_violations(ds: xr.Dataset) -> list[str]:
-    """Return what is wrong with what the dataset states of the machine and of its frame."""
+    """Return violations in the attributes of the machine and its frame."""
     found = []
     if "chain" in ds.attrs:
         try:
@@ -195,7 +195,7 @@ _LEVERS = ("X", "Y", "Z", "XY", "XZ", "YZ", "XYZ")
 
 _TOUCHED = (
     "{}: expected whole numbers along its own dimension; a mean or an interpolation of plain xarray changed them and "
-    "did not carry the covariance along. Use ds.em.mean, ds.em.to_times or ds.em.to_positions"
+    "did not propagate the covariance. Use ds.em.mean, ds.em.to_times or ds.em.to_positions"
 )
 
 
@@ -238,7 +238,7 @@ def _shape_violations(ds: xr.Dataset, dims: tuple[Any, ...]) -> list[str]:
 
 
 def _covariance_violations(ds: xr.Dataset) -> list[str]:
-    """Return what is wrong with covariance and influence; vectorised over all places."""
+    """Return violations in covariance and influence; vectorised over all places."""
     unseen = np.stack([np.isnan(ds.variables[name].values) for name in DOF], axis=-1).reshape(-1, 6)
     C = np.asarray(ds.variables["covariance"].values, dtype=float).reshape(-1, 6, 6)
     unknown = unseen[:, :, None] | unseen[:, None, :]
@@ -281,17 +281,17 @@ def _influence_violations(ds: xr.Dataset, unseen: NDArray[np.bool_], correlation
             f"{number(100 * float(excess.max()))} %"
         ]
     if not _is_positive(correlation - shared):
-        return ["influence: expected the covariance less the influences to be a covariance; found one that is not"]
+        return ["influence: expected the covariance minus the influences to be a covariance; found one that is not"]
     return []
 
 
 def _pattern(name: str, wrong: NDArray[np.bool_]) -> str:
     names = sorted({DOF[k] for k in np.argwhere(wrong)[:, -1]}, key=DOF.index)
-    return f"{name}: expected NaN exactly where the value is NaN; not so for {' '.join(names)}"
+    return f"{name}: expected NaN exactly where the value is NaN; violated for {' '.join(names)}"
 
 
 def _is_positive(matrices: Array) -> bool:
-    """Whether no eigenvalue is below rounding; by Cholesky first, which is fast and mostly enough."""
+    """Return whether no eigenvalue is below rounding; by Cholesky first, which is fast and mostly sufficient."""
     try:
         np.linalg.cholesky(matrices + ROUNDING * np.eye(6))
     except np.linalg.LinAlgError:
@@ -300,7 +300,7 @@ def _is_positive(matrices: Array) -> bool:
 
 
 def _dim_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str]:
-    """Return what is wrong with the dimensions of the errors beyond the usual ones: each needs a coordinate."""
+    """Return violations in further dimensions of the errors, each of which needs a coordinate."""
     found = []
     for dim in (str(dim) for dim in dims if dim not in ERROR_DIMS):
         if dim not in ds.coords or not str(ds.coords[dim].attrs.get("long_name", "")).strip():
@@ -316,12 +316,12 @@ def _dim_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str]:
             if not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
                 found.append(f"{dim}: expected finite values that increase")
         elif len(set(values.tolist())) < values.size:
-            found.append(f"{dim}: expected labels that differ; found one twice")
+            found.append(f"{dim}: expected labels that differ; found one repeated")
     return found
 
 
 def _deviation_violations(ds: xr.Dataset, dims: tuple[Hashable, ...]) -> list[str]:
-    """Return what is wrong with `deviation` and what belongs to it; nothing where the dataset has none of them.
+    """Return violations in `deviation` and its variables; none if the dataset has none of them.
 
     Parameters
     ----------
@@ -333,7 +333,7 @@ def _deviation_violations(ds: xr.Dataset, dims: tuple[Hashable, ...]) -> list[st
         return []
     missing = [name for name in _DEVIATION[:3] if name not in ds.variables]
     if missing:
-        return [f"{' '.join(missing)}: missing beside {present[0]}"]
+        return [f"{' '.join(missing)}: missing; expected with {present[0]}"]
     found = []
     for name in present:
         variable = ds.variables[name]
@@ -352,7 +352,7 @@ def _value_violations(ds: xr.Dataset) -> list[str]:
     unknown = np.isnan(ds.variables["deviation"].values)
     known_freedoms = [name for name in DOF if np.isfinite(ds.variables[name].values).any()]
     if known_freedoms:
-        found.append(f"{' '.join(known_freedoms)}: expected NaN beside deviation, which is their combination")
+        found.append(f"{' '.join(known_freedoms)}: expected NaN in a dataset with deviation, their combination")
     for name in ("deviation_variance", "deviation_influence"):
         if name in ds.variables:
             gaps = np.isnan(ds.variables[name].values)

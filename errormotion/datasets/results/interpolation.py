@@ -1,16 +1,16 @@
-"""Errors at other instants or positions, with the uncertainty that the interpolation adds.
+"""Errors at other instants or positions, with the uncertainty of the interpolation.
 
-Between two neighbours the errors are taken as an integrated Wiener process of intensity q, whose mean is the straight
-line. At the share w of an interval of length h, with nothing known of the slope, it adds the variance
+Between two neighbours the errors are modelled as an integrated Wiener process of intensity q, whose mean is the
+straight line. At the fraction w of an interval of length h, with an unknown slope, it adds the variance
 ``q h^3 w^2 (1 - w)^2 / 3``. The intensity is estimated for each freedom from second differences: with neighbours
 ``a, b, c`` at distances ``h`` and ``g``, the deviation of b from the line through a and c has the variance
-``q h^2 g^2 / (3 (h + g))`` plus what the noise of the three adds. Errors bend most when a warm-up starts, so the
-intensity of an interval is that of the second differences at its ends. Before the first interval of a record over time
-there is no value. The machine is taken as steady until then: the slope is 0 before, and s and s' in the mean over the
-first two intervals. It has changed by the range J of these three at least, and ``q = J^2 / h``: the process whose slope
-changes by J (one standard deviation) within the interval. A single bend of this size, anywhere in it, deviates from the
-line by sqrt(3) standard deviations. Sources that are one draw for many values go through the same weights. Nothing
-is extrapolated.
+``q h^2 g^2 / (3 (h + g))`` plus that of the noise of the three. The curvature is largest when a warm-up starts, so the
+intensity of an interval is that of the second differences at its ends. The first interval of a record over time has no
+value before it. The machine is assumed to be steady until then: the slope is 0 before, and its means over the first two
+intervals are s and s'. The slope changes at least by the range J of these three, and ``q = J^2 / h``: the process whose
+slope changes by J (one standard deviation) within the interval. A single change of this size, anywhere in it, deviates
+from the line by sqrt(3) standard deviations. Sources that are one draw for many values are interpolated with the same
+weights. Nothing is extrapolated.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.errors import DatasetError
 
 Places = tuple[NDArray[np.intp], Array, NDArray[np.bool_], NDArray[np.bool_]]
-"""Of each new point: the known one before it, its share of the interval, whether it is one, whether it is inside."""
+"""For each new point: index of the known point before it, fraction of the interval, whether it is known or inside."""
 
 
 def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> xr.Dataset:
@@ -38,13 +38,13 @@ def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> x
     dim, coordinate : str
         Dimension, and the increasing coordinate along it: ``time`` and ``time``, or ``position`` and ``y``.
     points : array_like, (n,)
-        Increasing; s or m. A point outside of the dataset, or between neighbours one of which is unknown, is NaN.
+        Increasing; s or m. The result is NaN outside of the dataset, and beside unknown neighbours.
 
     Returns
     -------
     Dataset
-        Without the further results of the method. The attribute ``interpolation_intensity`` holds the largest q
-        that was used for each of the six freedoms (m^2/s^3 or rad^2/s^3; per m^3 along positions).
+        Without the further results of the method. The attribute ``interpolation_intensity`` states the largest q
+        for each of the six freedoms (m^2/s^3 or rad^2/s^3; per m^3 along positions).
 
     Raises
     ------
@@ -92,7 +92,7 @@ def interpolated(
     E, total, F : ndarray, (n, ..., 6), (n, ..., 6, 6), (source, n, ..., 6)
         Errors, total covariance, influence.
     starting : bool
-        Whether the errors are taken as constant before the first point.
+        Whether the errors are assumed to be constant before the first point.
 
     Returns
     -------
@@ -123,18 +123,18 @@ def interpolated(
 
 
 def intensity(t: Array, values: Array, own: Array, *, starting: bool = False, together: bool = False) -> Array:
-    """Return the intensity q of each interval, (n - 1, ..., 6), by the moments of second differences; NaN below three.
+    """Return the intensity q of each interval, (n - 1, ..., 6), from second differences; NaN for less than 3 points.
 
     Parameters
     ----------
     t : ndarray, (n,)
     values : ndarray, (n, ..., 6)
     own : ndarray, (n, ..., 6, 6)
-        Covariance of what is drawn anew at every value.
+        Independent covariance of each value.
     starting : bool
-        Whether the errors are taken as constant before the first point.
+        Whether the errors are assumed to be constant before the first point.
     together : bool
-        One intensity for all that lies between the first and the last axis; those have the length 1 then.
+        One intensity for all axes between the first and the last one, which then have the length 1.
     """
     if len(t) < 3:
         return np.full((max(len(t) - 1, 1), *values.shape[1:]), np.nan)
@@ -150,7 +150,7 @@ def intensity(t: Array, values: Array, own: Array, *, starting: bool = False, to
     if together:
         others = tuple(range(1, excess.ndim - 1))
         excess, scale = excess.sum(axis=others, keepdims=True), scale.sum(axis=others, keepdims=True)
-    # Beside the interval from value k to k + 1 are the second differences at k and at k + 1.
+    # The interval from value k to k + 1 has the second differences at k and k + 1.
     none = np.zeros((1, *excess.shape[1:]))
     beside, unit = (np.concatenate([none, each]) + np.concatenate([each, none]) for each in (excess, scale))
     found: Array = np.maximum(beside, 0.0) / np.where(unit > 0, unit, np.inf)
@@ -172,13 +172,13 @@ def _starting(h: float, g: float, values: Array, variance: Array) -> Array:
 
 
 def bracket(t: Array, new: Array) -> NDArray[np.intp]:
-    """Return the indices of the two known points that the value at each new point is made of, (2, n); alike if one."""
+    """Return the indices of the two known points for each new point, (2, n); equal if it is a known point."""
     before, _, exact, _ = _neighbours(t, new)
     return np.array([before, np.minimum(before + ~exact, len(t) - 1)])
 
 
 def _neighbours(t: Array, new: Array) -> Places:
-    """Return for each new point: the one before it, its share of the interval, whether it is one, whether inside."""
+    """Return for each new point: the known one before it, fraction of the interval, whether it is known or inside."""
     before = np.clip(np.searchsorted(t, new + TOLERANCE, side="right") - 1, 0, len(t) - 1)
     nearest = np.where(np.abs(t[np.minimum(before + 1, len(t) - 1)] - new) <= TOLERANCE, before + 1, before)
     nearest = np.minimum(nearest, len(t) - 1)

@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 
 def is_planned(errors: xr.Dataset) -> bool:
-    """Return whether a dataset states an expected covariance, and nothing was measured."""
+    """Return whether a dataset is a plan, with an expected covariance instead of measured errors."""
     return "planned" in str(errors.attrs.get("reference", ""))
 
 
 def figures_of(errors: xr.Dataset) -> list[FigureOfMerit]:
     """Return the figures of merit: those of the plugin that made the dataset, else the last values over time.
 
-    A plan states no errors and has none.
+    A plan has none.
     """
     if is_planned(errors):
         return []
@@ -30,7 +30,7 @@ def figures_of(errors: xr.Dataset) -> list[FigureOfMerit]:
 
 
 def stored(figure: FigureOfMerit) -> dict[str, Any]:
-    """Return a figure for a JSON file, SI; a number that is not known is None."""
+    """Return a figure for a JSON file, SI; unknown numbers are None."""
     numbers = {"value": figure.value, "expanded_uncertainty": figure.expanded_uncertainty, "limit": figure.limit}
     known = {
         key: None if number is None or not np.isfinite(number) else float(number) for key, number in numbers.items()

@@ -1,4 +1,4 @@
-"""Changes of an error dataset that carry its covariance along: another reference state, a mean."""
+"""Changes of an error dataset with propagation of its covariance: another reference state, a mean."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
 
 REFERENCE = "reference state"
-"""Group of the sources that a reference state has."""
+"""Group of the sources of the uncertainty of a reference state."""
 
 
 def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
     """Return the changes of the errors since an instant, or since the mean over an interval.
 
-    The uncertainty of the reference state is one draw for all values: it becomes a source of its own for each freedom
-    that is seen (and for each place, where the errors have further dimensions). The influences of all other sources are
-    differences, so that what the reference state and a value share cancels.
+    The uncertainty of the reference state is one draw for all values: it is an additional source for each known freedom
+    (and for each place, if the errors have further dimensions). The influences of all other sources are differences, so
+    that effects that the reference state and a value share cancel.
 
     Parameters
     ----------
     ds : Dataset
-        Error dataset over ``time`` and perhaps further dimensions.
+        Error dataset over ``time`` and possibly further dimensions.
     time : float or tuple of float
-        One of the instants of the dataset, or first and last time of the interval, s. ``time`` of the result counts
-        from it (from the middle of an interval).
+        One of the instants of the dataset, or first and last time of the interval, s. It is time 0 of the result (the
+        middle of an interval).
 
     Returns
     -------
@@ -83,7 +83,7 @@ def changes(E: Array, C: Array, F: Array, used: NDArray[np.bool_]) -> tuple[Arra
     E, C, F : ndarray, (n, ..., 6), (n, ..., 6, 6), (source, n, ..., 6)
         Errors, total covariance, influence.
     used : ndarray of bool, (n, ...)
-        Which errors the reference state is the mean of.
+        Whether the reference state includes each error.
 
     Returns
     -------
@@ -112,7 +112,7 @@ def changes(E: Array, C: Array, F: Array, used: NDArray[np.bool_]) -> tuple[Arra
 
 
 def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:
-    """Return the mean over a dimension, with the covariance of the mean; values that are NaN are left out.
+    """Return the mean over a dimension, with its covariance; NaN are left out.
 
     Parameters
     ----------
@@ -146,18 +146,18 @@ def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:
 
 
 def change(after: xr.Dataset, before: xr.Dataset) -> xr.Dataset:
-    """Return the changes of errors since another measurement of the same places, such as a volume warm less cold.
+    """Return the changes of errors since another measurement of the same places, such as a warm minus a cold volume.
 
     Parameters
     ----------
     after, before : Dataset
         Error datasets of one component over ``position`` or ``target``; both state ``start``. Places of ``after`` that
-        ``before`` does not have are left out.
+        are not in ``before`` are left out.
 
     Returns
     -------
     Dataset
-        Sources with one ``source_id`` are one draw in both. Without the further results of the method.
+        Sources with the same ``source_id`` are one draw. Without the further results of the method.
 
     Raises
     ------
@@ -219,7 +219,7 @@ def change(after: xr.Dataset, before: xr.Dataset) -> xr.Dataset:
 
 
 SAME_PLACE = 1e-6
-"""Distance below which two commanded positions are the same, m."""
+"""Distance below which two commanded positions count as equal, m."""
 TOLERANCE = 1e-9
 """Rounding of a time, s."""
 
@@ -233,7 +233,7 @@ def rebuilt(
     coords: dict[str, Any],
     **attrs: Any,
 ) -> xr.Dataset:
-    """Return an error dataset with other values, in the place of ``ds``; ``further`` sources are of the reference."""
+    """Return an error dataset with the attributes of ``ds`` and other values; ``further`` are reference sources."""
     dims = ds["EX"].dims
     kept = ds.drop_vars(
         [name for name in ds.variables if name not in _KEPT and not _is_place(ds, name, dims)], errors="ignore"
@@ -250,7 +250,7 @@ _KEPT = {*DOF, "covariance", "dof", "dof_"}
 
 
 def _is_place(ds: xr.Dataset, name: Any, dims: Sequence[Any]) -> bool:
-    """Whether a variable says where or when the errors are, or numbers them."""
+    """Return whether a variable states position or time of the errors, or numbers them."""
     along = set(ds.variables[name].dims) <= set(dims)
     return along and (name in ds.coords or str(name).endswith(INDEX))
 
@@ -287,7 +287,7 @@ def _sources_of(covariance: Array) -> Array:
 
 
 def influence_of(ds: xr.Dataset) -> Array:
-    """Return the influence of an error dataset, (source, ..., 6); without sources where it has none."""
+    """Return the influence of an error dataset, (source, ..., 6), possibly without sources."""
     if "influence" in ds.variables:
         return np.asarray(ds["influence"].values, dtype=float)
     return np.zeros((0, *ds["EX"].shape, 6))

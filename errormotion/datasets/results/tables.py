@@ -21,7 +21,7 @@ _COORDINATES = {"s": "min", "m": "mm", "rad": "deg"}
 
 
 def to_dataframe(ds: xr.Dataset, freedoms: str | Sequence[str] | None = None, k: float = 2.0) -> pd.DataFrame:
-    """Return the errors and their expanded uncertainties as a table, a row for each place.
+    """Return the errors and their expanded uncertainties as a table with one row for each place.
 
     Parameters
     ----------
@@ -36,8 +36,8 @@ def to_dataframe(ds: xr.Dataset, freedoms: str | Sequence[str] | None = None, k:
     -------
     DataFrame
         Columns with their unit in the name: the coordinates of the errors (min, mm, deg, degC), then each freedom and
-        its uncertainty (um, arcsec), such as ``EXC / um`` and ``U(EXC) / um``. NaN where not known. The attribute
-        ``attrs`` holds machine, component, method, functional point (m) and k.
+        its uncertainty (um, arcsec), such as ``EXC / um`` and ``U(EXC) / um``. NaN where unknown. ``attrs`` contains
+        machine, component, method, functional point (m) and k.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def to_dataframe(ds: xr.Dataset, freedoms: str | Sequence[str] | None = None, k:
     columns: dict[str, Array] = {}
     for name in [*(dim for dim in dims if dim in ds.coords), *(str(each) for each in ds.coords if each not in dims)]:
         columns |= _columns(ds[name], name, sizes)
-    for dim in dims:  # labels of targets are coordinates; without any, the number of each
+    for dim in dims:  # labels of targets are coordinates; without labels, their numbers
         if not any(ds[name].dims == (dim,) for name in ds.coords):
             columns[f"number of {dim}"] = _spread(xr.Variable((dim,), np.arange(1, sizes[dim] + 1)), sizes)
     U = float(k) * ds.em.expanded(k=1)
@@ -69,7 +69,7 @@ def to_dataframe(ds: xr.Dataset, freedoms: str | Sequence[str] | None = None, k:
 
 
 def chosen(ds: xr.Dataset, freedoms: str | Sequence[str] | None) -> list[str]:
-    """Return the names of chosen freedoms, each once; they may be those of ISO 230-1.
+    """Return the names of chosen freedoms, each once; names of ISO 230-1 are accepted.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def chosen(ds: xr.Dataset, freedoms: str | Sequence[str] | None) -> list[str]:
 
 
 def _columns(coordinate: xr.DataArray, name: str, sizes: dict[str, int]) -> dict[str, Array]:
-    """Return the columns of a coordinate of the errors: none for others, one for each sensor of the temperatures."""
+    """Return the columns of a coordinate of the errors: one for each sensor of temperatures; none for others."""
     spare = [dim for dim in coordinate.dims if dim not in sizes]
     if not coordinate.dims or len(spare) == len(coordinate.dims) or len(spare) > 1:
         return {}
@@ -111,6 +111,6 @@ def _columns(coordinate: xr.DataArray, name: str, sizes: dict[str, int]) -> dict
 
 
 def _spread(variable: xr.Variable, sizes: dict[str, int]) -> Array:
-    """Return the values at all places in the order of the dims, repeated along those that the variable lacks."""
+    """Return the values at all places in the order of the dims, repeated along dims that the variable does not have."""
     spread = variable.set_dims(sizes)  # type: ignore[no-untyped-call]
     return np.asarray(spread.transpose(*sizes).values).ravel()

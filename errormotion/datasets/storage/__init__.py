@@ -1,1 +1,1 @@
-"""Datasets on disk: files and folders, compression, and the engine of xarray."""
+"""Datasets on disk: files and folders, compression."""

@@ -1,4 +1,4 @@
-"""How the large variables of an error dataset are stored: compressed, and the influences with 28 significant bits."""
+"""Compression of the large variables of an error dataset; influences are rounded to 28 significant bits."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from errormotion.datasets.results.checks import error_violations
 from errormotion.datasets.schemas import SCHEMA
 
 LEAST_COMPRESSED = 2**16
-"""Below, the structure of the chunks takes the space that compression saves, bytes."""
+"""Smallest size of a compressed variable, bytes; below, chunks need the space that compression saves."""
 
 LEAST_ROUNDED = 2**20
-"""Influences are rounded from this size on, bytes."""
+"""Smallest size of a rounded influence, bytes."""
 
 SIGNIFICANT_BITS = 28
-"""Of each influence that is stored: a relative change of at most 2^-28, 4e-9."""
+"""Significant bits of a stored influence: a relative change of at most 2^-28, 4e-9."""
 
 ROUNDED = "_QuantizeBitRoundNumberOfSignificantBits"
-"""Attribute that states the significant bits, by the convention of NetCDF."""
+"""Attribute with the number of significant bits, after the convention of NetCDF."""
 
 LARGEST_CHUNK = 2**17
-"""Values: a chunk fits the cache that HDF5 has for one."""
+"""Largest number of values of a chunk, which fits into the cache of HDF5."""
 
 LEAST_SERIES = 2**10
-"""Values of a chunk that holds one series; shorter series share chunks."""
+"""Smallest number of values of a chunk of one series; shorter series share chunks."""
 
 _INFLUENCES = ("influence", "deviation_influence")
 
 
 def as_stored(ds: xr.Dataset) -> xr.Dataset:
-    """Return an error dataset as a file holds it: large influences are rounded to 28 significant bits.
+    """Return an error dataset as stored in a file: large influences are rounded to 28 significant bits.
 
-    All other values, the covariance included, stay as they are to the last bit. The influences of a long record are two
-    thirds of its size, and their last digits follow the noise of the readings. Rounding changes the covariance between
-    two positions by at most 8e-9 of what each source contributes. The attribute `ROUNDED` states it. Other datasets are
-    returned as they are, and so is one whose covariance holds hardly more than its influences, so that rounding would
-    leave a negative rest.
+    All other values, including the covariance, are unchanged. The influences of a long record are two thirds of its
+    size, and their last digits are noise of the readings. Rounding changes the covariance between two positions by at
+    most 8e-9 of the contribution of each source. The attribute `ROUNDED` states the rounding. Other datasets are
+    returned unchanged, as is one whose covariance is hardly larger than that of its influences, so that rounding would
+    make the independent covariance negative.
     """
     if ds.attrs.get("schema") != SCHEMA:
         return ds
@@ -56,9 +56,9 @@ def as_stored(ds: xr.Dataset) -> xr.Dataset:
 
 
 def encoding(ds: xr.Dataset) -> dict[Any, dict[str, Any]]:
-    """Return the NetCDF encoding of the large variables of an error dataset: without loss, and by any reader's means.
+    """Return the NetCDF encoding of the large variables of an error dataset: lossless, supported by all readers.
 
-    Raw datasets stay as they are: noise takes more time than it saves space.
+    Raw datasets are not compressed, since the compression of noise takes long and saves little.
     """
     if ds.attrs.get("schema") != SCHEMA:
         return {}
@@ -74,7 +74,7 @@ def encoding(ds: xr.Dataset) -> dict[Any, dict[str, Any]]:
 
 
 def _chunks(variable: xr.Variable, along: tuple[Any, ...]) -> dict[str, Any]:
-    """Return chunks that hold one series over the dimensions of the errors each, since neighbours in it are alike."""
+    """Return chunks with one series over the dimensions of the errors each, whose neighbouring values are similar."""
     sizes = [size if dim in along else 1 for dim, size in variable.sizes.items()]
     for k in range(len(sizes)):
         sizes[k] = max(1, min(sizes[k], LARGEST_CHUNK * sizes[k] // math.prod(sizes)))

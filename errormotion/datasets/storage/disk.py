@@ -1,4 +1,4 @@
-"""Datasets on disk: NetCDF-4 files and Zarr v3 folders, written whole or not at all."""
+"""Datasets on disk: NetCDF-4 files and Zarr v3 folders, written atomically."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ _READERS = ("/zarr/", "/numcodecs/", "/h5py/", "/h5netcdf/")
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _CLASSIC_SIGNATURE = b"CDF"
 
-# Longer time coordinates are left on disk: an index would pull them into memory.
+# Longer time coordinates get no index, which would load them into memory.
 _LONGEST_INDEX = 100_000
 
 
 def load(path: str | Path) -> xr.Dataset:
     """Open a dataset.
 
-    An error dataset is read into memory. A raw dataset stays on disk and is read where it is used; a long ``time`` has
-    no index, and evenly spaced times are not stored at all: they follow from the attributes ``sample_rate`` (Hz) and
+    An error dataset is read into memory. Values of a raw dataset are read when they are used; a long ``time`` has
+    no index, and evenly spaced times are not stored: they follow from the attributes ``sample_rate`` (Hz) and
     ``time_start`` (s, 0 if missing).
 
     Parameters
     ----------
     path : str or Path
-        NetCDF-4 file or Zarr folder; or ``.csv``, as `errormotion.datasets.text.readings_csv` reads it.
+        NetCDF-4 file, Zarr folder, or ``.csv`` file for `errormotion.datasets.text.readings_csv`.
 
     Returns
     -------
@@ -54,7 +54,7 @@ def load(path: str | Path) -> xr.Dataset:
     Raises
     ------
     DatasetError
-        Nothing there, no permission, not a dataset, or truncated.
+        The file does not exist, cannot be read, is not a dataset, or is truncated.
     """
     path = Path(path)
     if path.suffix.lower() == ".csv":
@@ -85,19 +85,19 @@ def load(path: str | Path) -> xr.Dataset:
 
 
 def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
-    """Write a dataset beside its place, bring it to the disk and rename it.
+    """Write a dataset to a temporary file, flush it to the disk and rename it.
 
     Large influences of an error dataset are rounded, see `errormotion.datasets.storage.compression.as_stored`. A NetCDF
-    file is composed in memory, a Zarr folder one variable at a time (piece by piece if dask holds it).
-    Evenly spaced times that the attributes ``sample_rate`` and ``time_start`` state are left out.
+    file is composed in memory, a Zarr folder one variable at a time (in pieces for dask arrays).
+    Evenly spaced times that the attributes ``sample_rate`` and ``time_start`` state are omitted.
 
     Parameters
     ----------
     ds : Dataset
     path : str or Path
-        ``.nc`` makes a NetCDF-4 file, ``.zarr`` a Zarr v3 folder.
+        ``.nc`` for a NetCDF-4 file, ``.zarr`` for a Zarr v3 folder.
     overwrite : bool
-        Replace what is there.
+        Replace an existing file or folder.
 
     Returns
     -------
@@ -106,8 +106,8 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     Raises
     ------
     DatasetError
-        The path exists already, the ending is unknown, an attribute cannot be stored, or the disk does not take it
-        (nothing is left behind then).
+        The path exists, the suffix is unknown, an attribute cannot be stored, or the file cannot be written (no
+        partial file remains).
     """
     path = Path(path)
     if path.suffix not in (*_NETCDF, ".zarr"):
@@ -122,7 +122,7 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
             # xarray's overloads do not know the type of a plain path together with zarr_format
             storable(ds).to_zarr(part, mode="w-", zarr_format=3, consolidated=False)
         else:
-            # Composed in memory: HDF5 crashes the process when the disk fills up under an open file.
+            # Composed in memory, since HDF5 crashes the process if the disk is full while a file is open.
             ready = storable(ds)
             part.write_bytes(compose_netcdf(ready, encoding(ready)))
         _sync(part)
@@ -133,12 +133,12 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
 
 
 def storable(ds: xr.Dataset) -> xr.Dataset:
-    """Return a dataset as it goes to disk: texts of free length, no former encoding, no derivable times."""
+    """Return a dataset in the form for the disk: texts of free length, no former encoding, no derivable times."""
     index = ds.xindexes.get("time")
     if isinstance(index, RangeIndex) and math.isclose(index.step * ds.attrs.get("sample_rate", 0.0), 1.0):
         ds = ds.drop_vars("time").assign_attrs(time_start=float(index.start))
     ds = as_stored(ds).drop_encoding()
-    # Zarr v3 has no type for texts of fixed width; objects become its texts of free length.
+    # Zarr v3 has no type for texts of fixed width; objects are stored as texts of free length.
     texts = {name: variable.astype(object) for name, variable in ds.variables.items() if variable.dtype.kind in "UT"}
     return (
         ds.drop_indexes([name for name in texts if name in ds.xindexes])
@@ -148,13 +148,13 @@ def storable(ds: xr.Dataset) -> xr.Dataset:
 
 
 def _engine_of(path: Path) -> str:
-    """Return the xarray engine for what is at a path; DatasetError says what is there instead of a dataset."""
+    """Return the xarray engine for a path; DatasetError states what it is instead of a dataset."""
     if path.is_dir():
         if (path / "zarr.json").exists() or (path / ".zgroup").exists():
             return "zarr"
         inside = sorted(item.name for item in path.iterdir() if item.suffix in (".zarr", ".nc"))
         hint = f" Did you mean {path / inside[0]}?" if inside else ""
-        raise DatasetError(f"{path}: is a folder without zarr.json, so no dataset.{hint}")
+        raise DatasetError(f"{path}: is a folder without zarr.json, not a dataset.{hint}")
     try:
         require_regular(path)
         with path.open("rb") as file:
@@ -176,7 +176,7 @@ def _engine_of(path: Path) -> str:
 
 
 def _is_consolidated(folder: Path) -> bool:
-    """Whether the root of a Zarr folder holds the metadata of its arrays, which then counts before their own."""
+    """Return whether the root of a Zarr folder contains the metadata of its arrays, which then take precedence."""
     root = json.loads((folder / "zarr.json").read_text(encoding="utf-8"))
     return bool(root.get("consolidated_metadata"))
 
@@ -192,14 +192,14 @@ def _reading(path: Path) -> Iterator[None]:
     except MemoryError as error:
         raise DatasetError(f"{path}: needs more memory than this computer has") from error
     except Exception as error:
-        # What h5py, zarr and xarray raise on files that were cut off or are something else.
+        # Errors of h5py, zarr and xarray for truncated files and other formats.
         what = "is truncated" if "truncated" in str(error) else "is damaged, or not a dataset of errormotion"
         raise DatasetError(f"{path}: {what}; create it again or copy it again. (Reader: {error})") from error
 
 
 @contextmanager
 def reading(path: str | Path) -> Iterator[None]:
-    """Name the file in errors of the project, and turn what a damaged one raises when its values are read into one."""
+    """Name the file in errors of the project, and convert errors of reading damaged values to such an error."""
     try:
         yield
     except ErrormotionError as error:
@@ -227,7 +227,7 @@ def _refuse_existing(path: Path, overwrite: bool) -> None:
 
 
 def _replace(part: Path, path: Path) -> None:
-    """Put the finished part in its place; a folder cannot be replaced in one step, so the old one steps aside first."""
+    """Rename the finished part; an existing folder, which cannot be replaced in one step, is renamed first."""
     if not path.is_dir():
         part.replace(path)
         return
@@ -242,7 +242,7 @@ def _replace(part: Path, path: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Bring a file, or a folder with all that is in it, to the disk."""
+    """Flush a file, or a folder with its content, to the disk."""
     for folder, _, names in os.walk(path):
         for name in names:
             sync(Path(folder) / name)
@@ -252,14 +252,14 @@ def _sync(path: Path) -> None:
 
 
 def _tidy(ds: xr.Dataset) -> xr.Dataset:
-    """Return a dataset with the same types whatever file it came from: plain texts, numbers and arrays."""
+    """Return a dataset with types that do not depend on the file format: plain texts, numbers and arrays."""
     texts = {name: variable for name, variable in ds.variables.items() if variable.dtype.kind in "OST"}
     if texts:
         coords = [name for name in texts if name in ds.coords]
         ds = ds.assign({name: _text(variable) for name, variable in texts.items()}).set_coords(coords)
         ds = ds.drop_indexes([name for name in coords if name in ds.xindexes])
     ds.attrs = _tidy_attrs(ds.attrs)
-    if isinstance(notes := ds.attrs.get("notes"), str):  # a list of one sentence comes back as a text
+    if isinstance(notes := ds.attrs.get("notes"), str):  # a list of one sentence is read as a text
         ds.attrs["notes"] = [notes]
     for variable in ds.variables.values():
         variable.attrs = _tidy_attrs(variable.attrs)
@@ -293,7 +293,7 @@ def _with_indexes(ds: xr.Dataset) -> xr.Dataset:
     rate = ds.attrs.get("sample_rate")
     if "time" in ds.sizes and "time" not in ds.variables and isinstance(rate, (int, float)) and rate > 0:
         start, size = float(ds.attrs.get("time_start", 0.0)), ds.sizes["time"]
-        # Half a step before the end: the number of times does not hang on rounding, and the step is 1 / rate exactly.
+        # Half a step before the end, so that the number of times does not depend on rounding; the step is 1 / rate.
         index = RangeIndex.arange(start, start + (size - 0.5) / rate, 1 / rate, dim="time")
         ds = ds.assign_coords(xr.Coordinates.from_xindex(index))
         ds["time"].attrs["units"] = "s"

@@ -1,7 +1,7 @@
-"""NetCDF-4 files through h5netcdf, with each object of the file looked up once.
+"""NetCDF-4 files by h5netcdf, with each object of the file looked up once.
 
-h5netcdf asks HDF5 for a variable by its path each time that it needs one of its properties: 35 to 40 times for each
-variable that is read or written. For the small variables of an error dataset this takes most of the time.
+h5netcdf looks up a variable by its path for each of its properties, 35 to 40 times for each variable that is read or
+written. For the small variables of an error dataset this takes most of the time.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ import xarray as xr
 from xarray.backends import CachingFileManager, H5NetCDFStore
 
 _HELD = "_File__h5file"
-"""Attribute with which h5netcdf holds the file of h5py. Under another name files are read and written as slowly as
-without this module."""
+"""Attribute of h5netcdf that contains the file of h5py. If it has another name, this module has no effect."""
 
 
 class _Remembering:
-    """A file of h5py that looks up each object once; objects are forgotten when one of them is deleted."""
+    """A file of h5py that looks up each object once; the cache is cleared when an object is deleted."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -70,7 +69,7 @@ class File(h5netcdf.File):  # type: ignore[misc, unused-ignore]
 
 
 def open_netcdf(path: Path) -> xr.Dataset:
-    """Open a NetCDF-4 file; its values stay in the file until they are used, and times are numbers."""
+    """Open a NetCDF-4 file; its values are read when they are used, and times are numbers."""
     store = H5NetCDFStore(CachingFileManager(File, str(path), mode="r", kwargs={"decode_vlen_strings": True}))
     ds = xr.open_dataset(
         store, engine="store", decode_times=False, decode_timedelta=False, create_default_indexes=False
@@ -81,7 +80,7 @@ def open_netcdf(path: Path) -> xr.Dataset:
 
 def compose_netcdf(ds: xr.Dataset, encoding: Mapping[Any, dict[str, Any]]) -> bytes:
     """Return the bytes of a NetCDF-4 file."""
-    composed = io.BytesIO()  # ours: Python 3.13 complains of one that is closed while its contents are in use
+    composed = io.BytesIO()  # kept here: Python 3.13 refuses to close a buffer whose content is in use
     store = H5NetCDFStore(File(composed, "w"), mode="w")
     try:
         ds.dump_to_store(store, encoding=encoding)

@@ -1,1 +1,1 @@
-"""Text files as datasets: logs of a lab, readings as CSV."""
+"""Reading of datasets from text files: logs and readings as CSV."""

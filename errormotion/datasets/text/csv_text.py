@@ -1,4 +1,4 @@
-"""A text file with header lines and tables, split into lines and cells, without interpretation of the cells."""
+"""Splitting of a text file with header lines and tables into cells, without interpretation of the cells."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from errormotion.datasets.files.reading import read_bytes
 from errormotion.errors import DatasetError
 
 NUMBER = re.compile(r"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?")
-"""A decimal number; possessive, so that a long text that is none takes time in proportion to its length."""
+"""A decimal number; possessive, so that the time for a long text is proportional to its length."""
 LARGEST_FILE = 64 << 20
-"""Bytes of a file that is read; its cells take more memory."""
+"""Largest size of a file, bytes; its cells need more memory."""
 
 _KEY = re.compile(r"#\s*([^\W\d]\w*)\s*=\s*(.*)")
 
@@ -32,7 +32,7 @@ def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
     Parameters
     ----------
     path : Path
-        UTF-8 text; fields are separated by tabulator, semicolon or comma, whichever the first line of a table has.
+        UTF-8 text; fields are separated by tabulator, semicolon or comma, according to the first line of a table.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
     header: dict[str, tuple[int, str]] = {}
     parts: list[list[tuple[int, str]]] = [[]]
     for number, line in enumerate(_lines(path), 1):
-        # Spreadsheets pad every line with separators, and may quote a line that contains commas.
+        # Spreadsheets pad lines with separators, and may quote a line that contains commas.
         bare = line.strip().strip('",;\t ')
         if bare.startswith("#"):
             match = _KEY.fullmatch(bare)

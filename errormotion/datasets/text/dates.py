@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 
 TIMESTAMP = "iso8601"
-"""Unit of a time column that holds dates and times of day as ISO 8601 writes them."""
+"""Unit of a time column with dates and times of day after ISO 8601."""
 
 _PARTS = {"dd": 2, "mm": 1, "yyyy": 0, "yy": 0}
 _PATTERN = re.compile(r"(dd|mm|yyyy|yy)([./-])(dd|mm|yyyy|yy)\2(dd|mm|yyyy|yy)")
@@ -46,16 +46,16 @@ def zone_of(name: str) -> tzinfo:
 class Clock:
     """Dates of successive lines as seconds from the first one on.
 
-    Local times of a zone with daylight saving are resolved by the order of the lines: of the two readings of a time in
-    the hour that occurs twice, the first one counts unless it is before the previous line. Where no previous line shows
-    which hour it is, and where a time does not exist, the time is refused.
+    Local times of a zone with daylight saving are resolved by the order of the lines: of the two meanings of a time in
+    the hour that occurs twice, the first is used unless it is before the previous line. The time is refused if no
+    previous line determines the hour, or if it does not exist.
 
     Attributes
     ----------
     unit : str
         ``iso8601``, or an order such as ``dd.mm.yyyy``, after which a time of day may follow.
     zone : tzinfo, optional
-        Of dates without an offset of their own.
+        Zone of dates without an offset.
     repeats : bool
         Whether several lines may have one time; otherwise a repeated time in the hour that occurs twice is the second.
     start : datetime, optional
@@ -116,7 +116,7 @@ class Clock:
         return whole + timedelta(microseconds=int(f"{match[7] or 0:0<6}"[:6]))
 
     def _local(self, wall: datetime, zone: tzinfo, text: str) -> datetime:
-        """Return a local time with its zone and the right one of its two readings."""
+        """Return a local time with its zone and the right one of its two meanings."""
         first, second = (wall.replace(tzinfo=zone, fold=fold) for fold in (0, 1))
         if first.utcoffset() == second.utcoffset():
             return first
@@ -140,7 +140,7 @@ class Clock:
 
 
 def _difference(later: datetime, earlier: datetime) -> float:
-    """Return the seconds between two dates; of one zone too, whose daylight saving Python leaves out."""
+    """Return the seconds between two dates; within one zone, where Python neglects daylight saving, as well."""
     if later.tzinfo is not None and earlier.tzinfo is not None:
         later, earlier = later.astimezone(UTC), earlier.astimezone(UTC)
     return (later - earlier).total_seconds()

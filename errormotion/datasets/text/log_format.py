@@ -47,7 +47,7 @@ class Format(LogTable):
     delimiter: Literal[",", ";", "\t", " ", "auto"] = "auto"
     decimal: Literal[".", ","] = "."
     thousands: Literal["", ".", ",", " ", "'"] | None = Field(
-        None, description="sign between groups of three digits; empty: there is none"
+        None, description="separator of groups of three digits; empty: none"
     )
     zone: Annotated[str, AfterValidator(_known_zone)] = Field(
         "", description="time zone of dates without an offset, such as 'Europe/Berlin'"
@@ -73,15 +73,15 @@ class Format(LogTable):
         Raises
         ------
         ValueError
-            The point under decimal commas may stand between thousands, and the format does not state it; a sign between
+            A point with decimal commas may separate thousands, and the format does not state it; a separator of
             thousands is not between groups of three digits.
         """
         if self.thousands:
             return self._without_thousands(text)
         if self.decimal == "," and self.thousands is None and _POINT_BETWEEN_THOUSANDS.fullmatch(text):
             raise ValueError(
-                f"the point in '{text}' may be a decimal sign or stand between thousands; set format.thousands = '.' "
-                "in the map, or '' where the point is a decimal sign"
+                f"the point in '{text}' may be a decimal sign or separate thousands; set format.thousands = '.' "
+                "in the map, or '' if the point is a decimal sign"
             )
         return text.replace(",", ".") if self.decimal == "," and "." not in text else text
 

@@ -1,4 +1,4 @@
-"""Logs with a map for any raw schema: columns of text become a raw dataset."""
+"""Import of logs with a map for any raw schema: conversion of columns of text to a raw dataset."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _free_labels(settings: LogMap) -> dict[str, tuple[str, ...]]:
 
 
 def _column(key: str, entry: MappedColumn, names: Names, mistakes: Mistakes) -> Column | None:
-    """Return a column of the map with its variable; None and a mistake where there is no such variable."""
+    """Return a column of the map with its variable; None and a mistake if there is no such variable."""
     name, dot, label = key.partition(".")
     row = names.rows.get(name)
     if row is None:
@@ -141,7 +141,7 @@ def _quantity(text: str, row: Row, where: str, mistakes: Mistakes) -> float:
 def _read_value(
     name: str, entry: MappedValue, settings: LogMap, log: Path, names: Names, found: Found, mistakes: Mistakes
 ) -> None:
-    """Read a variable whose value is in the map, or in the first lines of the log under a key given in the map."""
+    """Read a variable whose value is in the map, or in the first lines of the log after a key that the map states."""
     row, where = names.rows.get(name), f"values.{name}"
     if row is None:
         mistakes.add(0, f"{where}: unknown variable; {nearest(name, names.rows)}")
@@ -169,7 +169,7 @@ def _read_value(
 
 
 def _numbers(stated: Any, unit: str) -> tuple[Array, str] | None:
-    """Return numbers and their unit from numbers, texts such as '5 mm', and arrays of them; None for anything else."""
+    """Return numbers and their unit from numbers, texts such as '5 mm', and arrays of them; None for other values."""
     units: set[str] = set()
 
     def number(value: Any) -> Any:
@@ -192,7 +192,7 @@ def _numbers(stated: Any, unit: str) -> tuple[Array, str] | None:
 
 
 def _header_text(log: Path, key: str, settings: LogMap) -> str | None:
-    """Return the text behind a key in the first lines of a log."""
+    """Return the text after a key in the first lines of a log."""
     for line in top_lines(log, settings.format):
         match = re.fullmatch(rf"\W*{re.escape(key)}\"?\s*[:=;,\t ]\s*(.+)", line.strip())
         if match:
@@ -202,7 +202,7 @@ def _header_text(log: Path, key: str, settings: LogMap) -> str | None:
 
 
 def _table(settings: LogMap, mistakes: Mistakes) -> tuple[Table, str, list[str]]:
-    """Return the wanted columns of a log as a table with points as decimal signs, its first date, and notes."""
+    """Return the required columns of a log as a table with points as decimal signs, its first date, and notes."""
     form = settings.format
     wanted: dict[str, Place] = {f"labels.{dim}": column for dim, column in settings.labels.items()}
     wanted |= {f"columns.{key}": entry.column for key, entry in settings.columns.items()}
@@ -243,7 +243,7 @@ def _plain(text: str, place: str, form: Format, line: int, mistakes: Mistakes) -
 
 
 def _holes(cells: list[tuple[int, list[str]]], place: int, clock: Clock | None, settings: LogMap) -> list[str]:
-    """Return the notes on holes in the rows of a log with times."""
+    """Return the notes on missing rows of a log with times."""
     known = [(line, float(texts[place])) for line, texts in cells if NUMBER.fullmatch(texts[place])]
     lines, times = np.array([line for line, _ in known]), np.array([time for _, time in known])
     unit = "s" if clock else settings.columns["time"].unit
@@ -269,7 +269,7 @@ def _parts(
 ) -> Iterator[tuple[Table, dict[int, Column], dict[str, int]]]:
     """Yield the table once for each set of dimensions, with the columns of its variables and the label columns.
 
-    Variables with fewer dimensions than others repeat their values from line to line; one line of each is kept.
+    Variables with fewer dimensions than others have repeated values; one line of each is kept.
     """
     first = len(settings.labels)
     keys = {dim: number for number, dim in enumerate(settings.labels)}

@@ -11,7 +11,7 @@ from errormotion.datasets.text.log_format import Column, Format, LogTable, TimeC
 
 
 class MappedColumn(LogTable):
-    """A column of the log that holds a variable, or one component of it."""
+    """A column of the log with a variable, or one component of it."""
 
     column: TimeColumn
     unit: str = Field(
@@ -20,7 +20,7 @@ class MappedColumn(LogTable):
         "empty for pure numbers",
     )
     scale: float = Field(
-        1.0, allow_inf_nan=False, description="factor to the cells; -1 where they count in the opposite direction"
+        1.0, allow_inf_nan=False, description="factor of the cells; -1 if they count in the opposite direction"
     )
     offset: str = Field("", description="added after scaling, with its unit, such as '2 mm'")
 
@@ -34,11 +34,11 @@ class MappedColumn(LogTable):
 
 
 class MappedValue(LogTable):
-    """A value that is no column: stated in the map (``value``) or in the first lines of the log (``key``)."""
+    """A value without a column: stated in the map (``value``) or in the first lines of the log (``key``)."""
 
     value: Any = Field(None, description="a number, a text such as '5 mm', or nested arrays of them")
-    key: str = Field("", description="text before the value in the log, without the sign that separates them")
-    unit: str = Field("", description="unit, where none is stated with the value")
+    key: str = Field("", description="text before the value in the log, without the separator")
+    unit: str = Field("", description="unit, if none is stated with the value")
 
     @model_validator(mode="after")
     def _has_one_source(self) -> Self:
@@ -51,12 +51,12 @@ class LogMap(LogTable):
     """A map file for ``errormotion import`` whose key ``schema`` is a raw schema."""
 
     schema_: str = Field(alias="schema", description="raw schema, such as 'errormotion.raw.NAME/1'")
-    variant: str = Field("", description="variant of the schema, where it has several")
+    variant: str = Field("", description="variant of the schema, if it has several")
     format: Format = Field(default_factory=lambda: Format.model_validate({}))
-    machine: str = Field("", description="which machine")
+    machine: str = Field("", description="name of the machine")
     attributes: dict[str, str | float] = Field(default_factory=dict, description="further attributes of the dataset")
     labels: dict[str, Column] = Field(
-        default_factory=dict, description="columns that hold the numbers or names along a dimension"
+        default_factory=dict, description="columns with the numbers or names along a dimension"
     )
     columns: dict[str, MappedColumn] = Field(
         min_length=1, description="columns by variable, or by variable and component"
@@ -66,7 +66,7 @@ class LogMap(LogTable):
     @model_validator(mode="before")
     @classmethod
     def _tables_of_components(cls, data: Any) -> Any:
-        """Bring ``columns.stage.x`` to the key ``stage.x``, and a bare value to a table."""
+        """Convert ``columns.stage.x`` to the key ``stage.x``, and a plain value to a table."""
         if not isinstance(data, dict):
             return data
         found = dict(data)

@@ -1,4 +1,4 @@
-"""Columns of a text log, read strictly: every mistake is reported with its line."""
+"""Strict reading of the columns of a text log; every mistake is reported with its line."""
 
 from __future__ import annotations
 
@@ -23,34 +23,34 @@ from errormotion.errors import DatasetError
 
 T = TypeVar("T")
 Place = str | int | list[str | int]
-"""Name or number of a column, or those of date and time of day."""
+"""Name or number of a column, or those of the columns of date and time of day."""
 
 NOTES = "import_notes"
-"""Attribute of an imported dataset: what a reader of it should know, JSON list of sentences."""
+"""Attribute of an imported dataset with notes, JSON list of sentences."""
 
 _FEWEST_INTERVALS = 4
-"""Least number of intervals of which a usual one can be stated."""
+"""Smallest number of intervals with which a usual one is determined."""
 _SHARE_OF_USUAL = 0.7
-"""Least share of intervals that are the usual one where a longer one is a hole."""
+"""Smallest fraction of usual intervals with which a longer one counts as a hole."""
 LONGEST_LINE = 1 << 20
-"""Characters of a line, at most."""
+"""Largest number of characters of a line."""
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Wanted columns of a log.
+    """Required columns of a log.
 
     Attributes
     ----------
     values : dict of str to ndarray, (n,)
-        By the caller's key, in the log's units; NaN where a cell is empty. Dates are in s from the first line on.
+        By the caller's key, in the units of the log; NaN for empty cells. Dates are in s since the first line.
     lines : ndarray, (n,)
         Line of each value.
     start : str
         Date and time of the first line, if the log has dates.
     notes : list of str
-        What a reader of the data should know: local times that occur twice.
+        Notes on the data: local times that occur twice.
     """
 
     values: dict[str, Array]
@@ -69,13 +69,13 @@ def read_columns(
     wanted : mapping of str to str, int or two of them
         Column of each key: its name in the header, or its number from 1; two for date and time of day.
     time : str
-        Key of the time, where no cell may be empty.
+        Key of the time, whose cells must not be empty.
     form : Format
         Format of the text.
     mistakes : Mistakes
         Receives the mistakes in the cells.
     dates : str
-        Unit of dates (`errormotion.datasets.text.dates`) where the time is given as dates.
+        Unit of dates (`errormotion.datasets.text.dates`), if the times are dates.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def clock_notes(clock: Clock) -> list[str]:
 
 
 def holes(times: Array, lines: NDArray[np.int64]) -> list[str]:
-    """Return a note on holes in the rows: intervals of more than 1.5 times the usual one, where most are usual.
+    """Return a note on missing rows: intervals of more than 1.5 times the usual one, if most are usual.
 
     ``times`` are in s, with their ``lines``.
     """
@@ -155,11 +155,11 @@ def columns_of(
     Returns
     -------
     (int, list of str)
-        Line and fields of the header, or of the first line where the log has no header.
+        Line and fields of the header, or of the first line of a log without header.
     iterator of (int, list of str)
         Lines of numbers.
     dict of str to tuple of int
-        Numbers of the fields of each wanted column, from 0: one, or two for date and time of day.
+        Numbers of the fields of each required column, from 0: one, or two for date and time of day.
 
     Raises
     ------
@@ -307,7 +307,7 @@ def _number(text: str, place: str, form: Format, line: int, mistakes: Mistakes) 
 
 
 def seconds(text: str, clock: Clock, place: str, line: int, mistakes: Mistakes) -> float:
-    """Return the seconds since the first date of the log; NaN and a mistake where the text is no date."""
+    """Return the seconds since the first date of the log; NaN and a mistake if the text is not a date."""
     try:
         return clock.seconds(text)
     except ValueError as error:

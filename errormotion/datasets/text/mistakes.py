@@ -1,4 +1,4 @@
-"""Mistakes in a file, all of them in one error: those of one kind together."""
+"""Mistakes in a file, reported in one error and grouped by kind."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from errormotion.errors import DatasetError
 _MAX_REPORTED = 20
 """Largest number of kinds of mistakes that are reported with their text."""
 _MAX_KINDS = 1000
-"""Largest number of kinds of mistakes that are kept apart."""
+"""Largest number of kinds of mistakes that are distinguished."""
 _MAX_LINES = 5
 """Largest number of lines that are named for one kind of mistake."""
 _MAX_SINGLE = 3
@@ -19,7 +19,7 @@ _MAX_SINGLE = 3
 
 @dataclass
 class _Kind:
-    """Mistakes of one kind: the first of them with line and text, and how many there are."""
+    """Mistakes of one kind: line and text of the first ones, and their number."""
 
     first: list[tuple[int, str]]
     count: int = 1
@@ -40,7 +40,7 @@ class _Kind:
 
 @dataclass
 class Mistakes:
-    """Mistakes in a file: those of one kind together, the first kinds with their text, the others counted."""
+    """Mistakes in a file, grouped by kind: the first kinds with their text, the others counted."""
 
     path: Path
     count: int = 0
@@ -49,8 +49,8 @@ class Mistakes:
     def add(self, line: int, text: str, kind: str = "") -> None:
         """Add one mistake; ``line`` 0 is the file as a whole.
 
-        Mistakes of one ``kind`` are reported together with the text of the first one. The default is the text up to
-        what was found.
+        Mistakes of one ``kind`` are reported together with the text of the first one. The default kind is the text up
+        to the found value.
         """
         self.count += 1
         key = kind or text.partition("; found")[0]

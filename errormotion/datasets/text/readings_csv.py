@@ -1,4 +1,4 @@
-"""Readings in a text file: a short header and tables with units become a raw dataset.
+"""Conversion of readings in a text file, with a short header and tables with units, to a raw dataset.
 
 The names are those of the raw schema. Every schema can be written in this form::
 
@@ -10,11 +10,11 @@ The names are those of the raw schema. Every schema can be written in this form:
     1,-1.508,101.000,50.000,20.000
     2,...
 
-A line ``# key = value unit`` holds one value, or the few values of a vector separated by blanks; other lines that start
-with ``#`` are remarks. A column holds one variable, with its unit in brackets; the name of a component of a vector ends
-with the component (``stage_x [mm]``). A column without a unit is the number or name of an element of a dimension, such
-as a plane or a channel; the last dimension, here the readings of a plane, needs no column. An empty line starts another
-table, with its own names.
+A line ``# key = value unit`` states one value, or the values of a vector separated by blanks; other lines that start
+with ``#`` are comments. A column contains one variable, with its unit in brackets; the name of a component of a vector
+ends with the component (``stage_x [mm]``). A column without a unit is the number or name of an element of a dimension,
+such as a plane or a channel; the last dimension, here the readings of a plane, needs no column. An empty line starts
+another table, with its own names.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from errormotion.datasets.validation import violations
 from errormotion.errors import DatasetError
 
 TEXTS = ("schema", "machine", "sensor", "source", "title", "start")
-"""Keys of the header that are kept as attributes."""
+"""Keys of the header that are stored as attributes."""
 
 _COLUMN = re.compile(r"([^\W\d]\w*)\s*(?:\[([^\]]*)\])?")
 
@@ -60,8 +60,8 @@ def read_csv(path: str | Path) -> xr.Dataset:
     Returns
     -------
     Dataset
-        Of the schema that the header names, in SI. Empty cells are NaN, and counted in the attribute
-        ``missing_values`` (JSON, variable to count); so are the cells that pad short rows, which are not counted.
+        With the schema that the header states, in SI. Empty cells are NaN, and counted in the attribute
+        ``missing_values`` (JSON, variable to count). Padding of short rows is NaN and not counted.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def _value(key: str, line: int, text: str, names: Names, found: Found, mistakes:
     if row is None:
         known = [*TEXTS, *(row.name for row in names.rows.values() if len(row.dims) < 2)]
         mistakes.add(
-            line, f"{key}: unknown key; {nearest(key, known)}. (A remark must have no '=' after its first word)"
+            line, f"{key}: unknown key; {nearest(key, known)}. (A comment must have no '=' after its first word)"
         )
         return
     if len(row.dims) > 1:

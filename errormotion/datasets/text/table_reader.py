@@ -1,4 +1,4 @@
-"""Tables of text whose columns are variables of a raw schema: cells become arrays in the units of the schema."""
+"""Conversion of tables of text with variables of a raw schema to arrays in the units of the schema."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Names:
 
     @classmethod
     def of(cls, tables: Sequence[RawSchema], labels: Mapping[str, tuple[str, ...]] | None = None) -> Names:
-        """Return the names of the variants of a schema; of rows with the same name the first one counts.
+        """Return the names of the variants of a schema; of rows with the same name the first one is used.
 
         ``labels`` are further labels of dimensions.
         """
@@ -65,7 +65,7 @@ class Names:
 
 @dataclass
 class Found:
-    """Variables and labels of dimensions that were read so far."""
+    """Variables and labels of dimensions that have been read."""
 
     variables: dict[str, xr.Variable] = field(default_factory=dict)
     labels: dict[str, list[str]] = field(default_factory=dict)
@@ -106,7 +106,7 @@ class Column:
     unit : str
         Unit of the cells.
     scale, offset : float
-        Factor to a cell, and value in the unit of the schema that is added afterwards.
+        Factor of a cell, and value in the unit of the schema that is added afterwards.
     may_be_empty : bool
         Whether a cell without a number is allowed; it is NaN.
     """
@@ -125,7 +125,7 @@ def units_of(row: Row) -> dict[str, str]:
 
 
 def converted(values: Array, unit: str, row: Row, place: str, line: int, mistakes: Mistakes) -> Array | None:
-    """Return values in the unit of the schema; None if that is not possible, which is a mistake."""
+    """Return values in the unit of the schema; None and a mistake if that is not possible."""
     if row.unit in ("", "1") and unit in ("", "1"):
         return values
     if not unit:
@@ -150,7 +150,7 @@ def plausible(
     unit: str,
     mistakes: Mistakes,
 ) -> bool:
-    """Return whether all values are within the plausible range; one mistake otherwise, at the first such line."""
+    """Return whether all values are within the plausible range; if not, add a mistake at the first such line."""
     outside = np.flatnonzero((inside < row.low) | (inside > row.high))
     if outside.size:
         first = outside[0]
@@ -192,7 +192,7 @@ def read_table(
     columns : mapping of int to Column
         Variables by the number of their column, from 0.
     keys : mapping of str to int
-        Number of the column that holds the labels of a dimension.
+        Number of the column with the labels of a dimension.
     names : Names
         Of the schema.
     found : Found
@@ -215,7 +215,7 @@ def read_table(
         inside = converted(cells[number], column.unit, row, title, line, mistakes)
         if inside is None:
             continue
-        with np.errstate(over="ignore"):  # an infinite value is not plausible
+        with np.errstate(over="ignore"):  # infinite values are refused as implausible
             inside = inside * column.scale + column.offset
         if not plausible(inside, lines, row, title, column.unit, mistakes):
             continue
@@ -267,7 +267,7 @@ def incomplete(columns: Mapping[int, Column], keys: Mapping[str, int], names: Na
 
 
 def _cells(table: Table, columns: Mapping[int, Column], titles: list[str], mistakes: Mistakes) -> dict[int, Array]:
-    """Return the numbers of each column; every cell that is no number is a mistake."""
+    """Return the numbers of each column; every other cell is a mistake."""
     if not table.rows:
         mistakes.add(table.head[0], "expected lines of numbers below the column names; found none")
     found = {place: np.full(len(table.rows), np.nan) for place in columns}
@@ -325,7 +325,7 @@ def _places(
 
 
 def _label(text: str, dim: str, settled: bool, line: int, names: Names, found: Found, mistakes: Mistakes) -> int:
-    """Return the index of a label along its dimension; a new one is added unless another table has stated them all."""
+    """Return the index of a label along its dimension; a new one is added unless another table states all labels."""
     labels = found.labels.setdefault(dim, list(names.labels.get(dim, ())))
     if text in labels:
         return labels.index(text)

@@ -52,8 +52,8 @@ class Line:
 class Panel:
     """Curves with one ordinate; named at their ends, or in a legend.
 
-    ``strip`` panels are low and filled from 0, for working parameters. ``held`` states whether each value applies since
-    the previous instant, like a mean, or from its own instant on.
+    ``strip`` panels are low and filled from 0, for working parameters. ``held``: each value applies since the previous
+    instant, like a mean, not from its own instant on.
     """
 
     title: str

@@ -1,4 +1,4 @@
-"""A spatial drawing that can be rotated: by the script of the page from its points, else by choosing one of some views.
+"""A spatial drawing that can be rotated: by the script of the page, or without it by selecting one of several views.
 
 The views are selected with radio buttons, so that arrow keys rotate the drawing. The selected view is printed.
 """
@@ -21,7 +21,7 @@ _MARGIN = 22.0
 _TURNS = 12
 _ELEVATION = np.radians(24.0)
 _FIXED = ((0.0, np.pi / 2, "from above"), (0.0, 0.0, "along Y"), (np.pi / 2, 0.0, "along X"))
-TURN = " Dragging and the arrow keys turn it; without its script, the buttons do."
+TURN = " It can be rotated by dragging, with the arrow keys, or with the buttons."
 """End of the caption of a drawing."""
 _INK = "#222222"
 _LETTER, _LINE = 5.2, 9.5  # width of a letter and height of a line of the names, points
@@ -42,7 +42,7 @@ class Lines:
 
 @dataclass(frozen=True)
 class Dots:
-    """Points (k, 3), m, with optional names, and notes that the page shows when one points at them."""
+    """Points (k, 3), m, with optional names, and notes that the page shows under the pointer."""
 
     places: Array
     colour: str
@@ -127,7 +127,7 @@ def draw(scene: Scene, key: str) -> Markup:
 
 
 def _plain(scene: Scene, centre: Array, points: Array) -> dict[str, Any]:
-    """Return the scene for the script of the page; places to a millionth of its size."""
+    """Return the scene for the script of the page, with positions to a millionth of its size."""
     radius = float(np.linalg.norm(points - centre, axis=1).max()) or 1.0
     decimals = 6 - math.floor(math.log10(radius))
 

@@ -59,7 +59,7 @@ def write(page: Path, out: Path) -> Path:
     Raises
     ------
     RunError
-        Nothing on this computer prints, or printing failed.
+        No program for printing was found, or printing failed.
     """
     with whole(out) as beside:
         program = browser()
@@ -68,7 +68,7 @@ def write(page: Path, out: Path) -> Path:
         else:
             _by_weasyprint(page, beside)
         if not beside.is_file() or not beside.read_bytes()[:5] == b"%PDF-":
-            raise RunError(f"{out}: {program or 'weasyprint'} has not written a PDF file")
+            raise RunError(f"{out}: {program or 'weasyprint'} did not write a PDF file")
     return out
 
 
@@ -85,7 +85,7 @@ def _by_browser(program: str, page: Path, out: Path) -> None:
                 command, stdin=subprocess.DEVNULL, capture_output=True, timeout=LONGEST, check=False, cwd=profile
             )
         except subprocess.TimeoutExpired as error:
-            raise RunError(f"{page}: {program} has not printed it within {LONGEST:g} s") from error
+            raise RunError(f"{page}: {program} did not print it within {LONGEST:g} s") from error
         except OSError as error:
             raise RunError(f"{page}: {program} could not be started: {error.strerror}") from error
     if done.returncode:

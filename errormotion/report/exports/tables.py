@@ -36,7 +36,7 @@ class Sheet:
 
 
 def sheet(table: Table, number: int, section: str) -> Sheet:
-    """Return a table with a column of its own for each expanded uncertainty; a dash is an empty entry."""
+    """Return a table with a separate column for each expanded uncertainty; a dash is an empty entry."""
     names = _names(table)
     bodies = [row for row in table.rows if len(row) == len(names)]
     uncertain = [any(isinstance(row[j], Cell) and row[j].uncertainty for row in bodies) for j in range(len(names))]  # type: ignore[union-attr]
@@ -73,7 +73,7 @@ def _plain(text: str | Markup) -> str:
 
 
 def _parsed(text: str) -> tuple[Entry, int | None]:
-    """Return a number with its decimals where a text is one, else the text; None for nothing or a dash."""
+    """Return the number in a text with its decimals, else the text; None for an empty text or a dash."""
     stripped = text.strip()
     if stripped in ("", "—"):
         return None, None
@@ -116,5 +116,5 @@ def _written(entry: Entry, places: int | None, comma: bool) -> str:
 
 
 def _safe(text: str) -> str:
-    """Return a text that no spreadsheet takes for a formula."""
+    """Return a text that no spreadsheet interprets as a formula."""
     return f"'{text}" if text.startswith(_FORMULA) else text

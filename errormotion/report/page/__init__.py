@@ -1,9 +1,9 @@
-"""The page around the chapters: head, verdict, annex, and how it is put together.
+"""The page around the chapters: head, verdict, annex, and their assembly.
 
 =============  ====================================================================
-``verdict``    the decision on the tolerances: one sentence, one picture, one table
-``head``       who measured what, where and when; the laboratory; calibrations
+``verdict``    the decision on the tolerances: a sentence, a picture and a table
+``head``       object, place, time and operator of the test; the laboratory; calibrations
 ``annex``      settings, versions and values in SI units
-``assemble``   the HTML of all of it
+``assemble``   the HTML of the page
 =============  ====================================================================
 """

@@ -1,4 +1,4 @@
-"""Annex of a report: values in SI units, settings, versions. What a reader of the result does not need first."""
+"""Annex of a report: values in SI units, settings and versions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 def divided(parts: Sequence[Part]) -> tuple[list[Part], list[Section]]:
-    """Return the chapters without what belongs to the annex, and the sections of the annex."""
+    """Return the chapters without the sections of the annex, and these sections."""
     body = [replace(part, sections=[section for section in part.sections if section.name != SECTION]) for part in parts]
     annex = []
     for k, part in enumerate(parts, 1):
@@ -33,14 +33,14 @@ def divided(parts: Sequence[Part]) -> tuple[list[Part], list[Section]]:
 
 
 def values(sources: Sequence[Source]) -> list[Section]:
-    """Return the section of the figures of merit in SI units, unrounded; empty where there are none."""
+    """Return the section of the figures of merit in SI units, unrounded; empty without figures of merit."""
     blocks: list[Block] = []
     for source in sources:
         if str(source.errors.attrs.get("schema")) != plugins.ERRORS_SCHEMA:
             continue
         try:
             figures = figures_of(source.errors)
-        except Exception as error:  # of a foreign plugin
+        except Exception as error:  # of a plugin
             log.exception("the figures of merit failed")
             blocks.append(Text(f"The figures of merit could not be computed: {type(error).__name__}: {error}.", "note"))
             continue

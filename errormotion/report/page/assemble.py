@@ -23,7 +23,7 @@ from errormotion.report.page.language import Catalogue
 from errormotion.report.page.verdict import Verdict
 
 _COMPOSED = ("Method", "Report", "Instruments", "Reference state")
-"""Facts with words of the page; the others are names."""
+"""Facts whose values are translated; the others are names."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def page(
     decision: Verdict | None = None,
     texts: Sequence[Mapping[str, str]] = (),
 ) -> Page:
-    """Return a report as HTML that needs nothing else, and its tables.
+    """Return a report as self-contained HTML, and its tables.
 
     ``texts`` are the catalogues of plugins for the language of the head.
     """

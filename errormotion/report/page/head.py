@@ -1,4 +1,4 @@
-"""Head of a report: the laboratory, who measured what, where and when, and until when it is calibrated."""
+"""Head of a report: the laboratory, the measurement, and the validity of calibrations."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from errormotion.report.text import DASH
 PAPERS = {"A4": "A4", "Letter": "letter"}
 """Sizes of paper, and their names in style sheets."""
 LARGEST_LOGO = 700_000
-"""Characters of the logo as an address with its data."""
+"""Characters of the logo as a data URI."""
 
 
 @dataclass(frozen=True)
 class Head:
-    """What the laboratory states of itself and of the order; empty texts are not shown.
+    """Statements on the laboratory and the order; empty texts are not shown.
 
     Attributes
     ----------
     laboratory, address, accreditation : str
         Of the laboratory.
     logo : str
-        Its picture as an address with data.
+        Its picture as a data URI.
     customer, order, number : str
         Customer, order, and the number of the report.
     calibrated_until : mapping of str to date
@@ -51,7 +51,7 @@ class Head:
 
 
 def head_of(run: Mapping[str, Any]) -> Head:
-    """Return the head that a ``run.json`` states under ``head``; what has another form is left out."""
+    """Return the head in a ``run.json``; entries of another form are omitted."""
     stated = run.get("head")
     stated = stated if isinstance(stated, Mapping) else {}
 
@@ -80,7 +80,7 @@ def _day(value: Any) -> date | None:
 
 
 def measured(source: Source) -> str:
-    """Return when the measurement began, as it is stated; a dash where it is unknown."""
+    """Return the start of the measurement as it is stated; a dash if it is unknown."""
     return _known(source, "started", "start", "created")
 
 
@@ -95,7 +95,7 @@ def _known(source: Source, *names: str) -> str:
 
 
 def facts(source: Source, machine: str, head: Head, report: str) -> list[tuple[str, str]]:
-    """Return what heads the report, as far as it is known; what is unknown is left out."""
+    """Return the known facts in the head of the report."""
     attributes, test = source.errors.attrs, _known(source, "test", "name")
     method = [
         ("Method", f"{attributes.get('method', DASH)}, version {attributes.get('method_version', DASH)}"),
@@ -123,7 +123,7 @@ def _instrument(row: Mapping[str, str]) -> str:
 
 
 def moment(text: str) -> str:
-    """Return an ISO 8601 time as people read it; any other text as it is."""
+    """Return an ISO 8601 time in a readable form; any other text unchanged."""
     try:
         found = datetime.fromisoformat(text)
     except ValueError:
@@ -134,7 +134,7 @@ def moment(text: str) -> str:
 
 
 def calibrations(head: Head, measured: str) -> tuple[Table, Sequence[str]] | None:
-    """Return the table of calibrations, and a warning for each that had ended when it was used; None without dates."""
+    """Return the table of calibrations, and a warning for each that had expired; None without dates."""
     if not head.calibrated_until:
         return None
     day = _day(measured)

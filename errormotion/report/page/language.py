@@ -1,10 +1,10 @@
-"""The language of a report: every text of a page is looked up in a catalogue, English to the other language.
+"""The language of a report: the catalogue of a language translates each text of a page.
 
 In every language, micrometres and microradians have the sign µ, also where a text of the terminal states ``um``.
 
-A catalogue is a TOML file ``LANGUAGE.toml`` of one table: English text = its translation. ``{}`` stands for what
-differs, such as a value or a name, in the order of the English text; ``{2}`` is the second one. A text of several
-sentences may be listed by sentence. What no catalogue lists stays English. Plugins bring a catalogue of their own as
+A catalogue is a TOML file ``LANGUAGE.toml`` with one table: English text = its translation. ``{}`` replaces a variable
+part, such as a value or a name, in the order of the English text; ``{2}`` is the second one. A text of several
+sentences may be listed by sentence. Texts without entry stay English. Plugins have their own catalogues,
 ``texts(language)``.
 """
 
@@ -29,7 +29,7 @@ LANGUAGES = ("en", "de")
 COMMA = ("de",)
 """Languages with a decimal comma."""
 TO = {"de": " bis "}
-"""What stands between the ends of a range of numbers."""
+"""Text between the ends of a range of numbers."""
 LONGEST = 4000
 """Characters of a text that is compared with the catalogue."""
 
@@ -48,7 +48,7 @@ _AnyBlock = TypeVar("_AnyBlock", bound=Block)
 
 
 def texts_of(package: str, language: str) -> dict[str, str]:
-    """Return the catalogue of a package, its file ``LANGUAGE.toml``; empty where it has none."""
+    """Return the catalogue of a package, its file ``LANGUAGE.toml``; empty if it has none."""
     if language not in LANGUAGES or language == "en":
         return {}
     file = files(package) / f"{language}.toml"
@@ -99,7 +99,7 @@ class Catalogue:
         return text if found is None else found
 
     def word(self, text: Any) -> Any:
-        """Return a name or a number in the language; what is not listed is a name of the data and stays."""
+        """Return a name or a number in the language; a text without entry is a name of the data and stays unchanged."""
         if not isinstance(text, str) or isinstance(text, Markup):
             return text
         if self.language == "en":
@@ -115,7 +115,7 @@ class Catalogue:
         return "".join(pieces)
 
     def _with_units(self, text: str, decimals: re.Pattern[str] = _BEFORE_UNIT) -> str:
-        """Return a text with the decimal sign of the language where ``decimals`` are, and the signs of all pages."""
+        """Return a text with the decimal sign of the language at ``decimals``, and the signs of all pages."""
         text = signs(text)
         if self.language in COMMA:
             text = decimals.sub(lambda found: found[0].replace(".", ","), text)
@@ -147,7 +147,7 @@ class Catalogue:
         return Markup(_SVG_NAME.sub(lambda found: escape(str(self.word(unescape(found[1])))), text))
 
     def _label(self, text: str) -> Any:
-        """Return a text of a drawing: an axis has a quantity and a unit, anything else may be a name of the data."""
+        """Return a text of a drawing: an axis has a quantity and a unit, other texts may be names of the data."""
         return self(text) if " / " in text else self.word(text)
 
     def cell(self, cell: Cell | str) -> Cell | str:
@@ -157,7 +157,7 @@ class Catalogue:
         return Cell(self.word(cell.text), self.word(cell.uncertainty), self(cell.reason))
 
     def block(self, block: _AnyBlock, *, rows: bool = True) -> _AnyBlock:
-        """Return a block in the language; without ``rows``, the rows of a table stay as they are."""
+        """Return a block in the language; without ``rows``, the rows of a table stay unchanged."""
         made: Block
         if isinstance(block, Text):
             made = replace(block, text=self(block.text))
@@ -175,7 +175,7 @@ class Catalogue:
         return made  # type: ignore[return-value]
 
     def _reasons(self, table: Table) -> list[list[Cell | str]]:
-        """Return the rows of a table with only the reasons of what is unknown in the language."""
+        """Return the rows of a table with only the reasons of missing values in the language."""
         return [
             [Cell(cell.text, cell.uncertainty, self(cell.reason)) if isinstance(cell, Cell) else cell for cell in row]
             for row in table.rows

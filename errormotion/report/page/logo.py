@@ -1,4 +1,4 @@
-"""The logo of a laboratory: a picture of bounded size, copied into a run folder and embedded into the report."""
+"""The logo of a laboratory: a picture of limited size, copied into a run folder and embedded into the report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PICTURES = {
     ".jpg": (b"\xff\xd8\xff", "image/jpeg"),
     ".svg": (b"<", "image/svg+xml"),
 }
-"""How a file of each suffix begins, and its type."""
+"""First bytes of a file by suffix, and its media type."""
 
 
 def mistake(path: Path) -> str:
@@ -28,17 +28,17 @@ def mistake(path: Path) -> str:
         data = read_bytes(path, LARGEST)
     except OSError as error:
         return f"{path} cannot be read: {error.strerror}"
-    return "" if _begins(data, known[0]) else f"{path} is no {known[1]} file"
+    return "" if _begins(data, known[0]) else f"{path} is not of type {known[1]}"
 
 
 def copy(path: Path, folder: Path) -> None:
-    """Copy a logo into a run folder; one that cannot be used any more is left out."""
+    """Copy a logo into a run folder, if it can still be used."""
     if not mistake(path):
         (folder / f"{NAME}{path.suffix.lower()}").write_bytes(read_bytes(path, LARGEST))
 
 
 def of_folder(folder: Path) -> str:
-    """Return the logo of a run folder as an address with its data; empty without one."""
+    """Return the logo of a run folder as a data URI; empty without one."""
     for suffix, (_, kind) in PICTURES.items():
         path = folder / f"{NAME}{suffix}"
         if path.is_file() and not mistake(path):

@@ -18,11 +18,11 @@ from errormotion.tolerances.decision import INSIDE, OPEN, OUTSIDE, WORDS, overal
 TONES = {INSIDE: "inside", OUTSIDE: "outside", OPEN: "open"}
 COLOURS = {INSIDE: canvas.GREEN, OUTSIDE: canvas.VERMILLION, OPEN: canvas.ORANGE}
 MOST_BARS = 14
-"""Limits in the picture, those that decide first; the table holds all."""
+"""Limits in the picture, the deciding ones first; the table contains all."""
 LONGEST_NAME = 34
 """Characters of a name in the picture."""
 WIDEST = 250.0
-"""Per cent of the limit; what lies beyond is drawn at the edge."""
+"""Per cent of the limit; larger values are drawn at the edge."""
 _ORDER = {OUTSIDE: 0, OPEN: 1, INSIDE: 2}
 
 
@@ -37,9 +37,9 @@ class Verdict:
     tone : str
         ``inside``, ``outside`` or ``open``.
     sentence : str
-        What decides.
+        The deciding limits.
     picture : Figure, optional
-        Value and uncertainty of each limit; None where no value is known.
+        Value and uncertainty of each limit; None if no value is known.
     table : Table
         All limits.
     """
@@ -71,7 +71,7 @@ def verdict(found: Sequence[Conformity]) -> Verdict | None:
 
 
 def share(row: Row) -> float:
-    """Return how much of its tolerance a value takes, in per cent: 100 at a limit, 0 in the middle of two or at zero.
+    """Return a value in per cent of its tolerance: 100 at a limit, 0 in the middle of two limits or at zero.
 
     NaN where the value or the scale is unknown.
     """
@@ -118,7 +118,7 @@ def _in_words(row: Row) -> str:
 
 
 def _sentence(rows: Sequence[Row], decision: int, rule: str, failures: Sequence[str]) -> str:
-    """Return what decides, in one sentence; ``rows`` begin with the one that does."""
+    """Return the deciding limits in one sentence; the first of ``rows`` decides."""
     n = len(rows)
     if not rows:
         return f"The figures of merit could not be computed: {failures[0]}."

@@ -37,7 +37,7 @@ def part(source: Source, key: str) -> Part:
         _summary(errors),
         [
             Section("beams", "Origins and directions", _beams(errors)),
-            Section("nominal", "Difference to nominal", _nominal(errors)),
+            Section("nominal", "Difference from nominal", _nominal(errors)),
             Section("constructions", "Circles and line compared with the likelihood fit", _constructions(errors)),
             Section("quality", "Residuals and data quality", [*quality.notes(errors), *_residuals(errors, key)]),
             Section("provenance", "Provenance", provenance.blocks(source)),

@@ -1,4 +1,4 @@
-"""The chapter of any error dataset: its error motions, or its deviation, over its dims, with their bands."""
+"""The chapter of any error dataset: error motions or deviation over the dims, with uncertainty bands."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ from errormotion.report.document import (
     estimate,
     or_dash,
 )
-from errormotion.report.text import SECOND_OF_ARC, UM, finite, fixed, listed, percent
+from errormotion.report.fields import unit_of
+from errormotion.report.text import finite, fixed, listed, percent
 
-_MOST = 5  # curves drawn of a further dim
+_MOST = 5  # curves drawn over a further dim
+unit_at = unit_of
 DEVIATION = ("deviation", "deviation_variance", "deviation_influence", "sensitivity")
 
 
 def part(source: Source, key: str) -> Part:
-    """Return the chapter of one error dataset of any component; ``key`` keeps its figures' identifiers apart."""
+    """Return the chapter of one error dataset; ``key`` makes the identifiers of its figures unique."""
     errors = source.errors
     component = str(errors.attrs.get("component", "unknown"))
     return Part(
@@ -51,14 +53,9 @@ def part(source: Source, key: str) -> Part:
 
 
 def names_of(errors: xr.Dataset) -> dict[str, str]:
-    """Return the ISO 230-1 names of the component's freedoms; their own where the standard has none."""
+    """Return the ISO 230-1 names of the freedoms of the component, or their names without such names."""
     found: dict[str, str] = errors.em.iso_names()
     return found
-
-
-def unit_at(index: int) -> tuple[str, float]:
-    """Return the field unit of a freedom by its index, and its size in SI."""
-    return UM if index < 3 else SECOND_OF_ARC
 
 
 def _dims(errors: xr.Dataset) -> tuple[str, ...]:
@@ -81,7 +78,7 @@ def _worst(errors: xr.Dataset, index: int) -> tuple[float, float]:
 def _key_figures(errors: xr.Dataset) -> list[KeyFigure]:
     names, found = names_of(errors), []
     for i, freedom in enumerate(errors.em.names):
-        unit, size = unit_at(i)
+        unit, size = unit_of(i)
         value, sigma = _worst(errors, i)
         if math.isfinite(value):
             found.append(KeyFigure(names[freedom], estimate(value / size, 2 * sigma / size), unit, "largest"))
@@ -97,12 +94,12 @@ def _summary(errors: xr.Dataset) -> list[str]:
     if unseen:
         words.append(f"Not observed: {listed([names[name] for name in unseen])}. Reported as unknown, not as zero.")
     if "deviation" in errors:
-        words.append("The errors are seen along one known direction only; no freedom is known alone.")
+        words.append("The errors are measured along one known direction only; no single freedom is determined.")
     return words
 
 
 def _abscissa(errors: xr.Dataset, dim: str) -> tuple[np.ndarray, str]:
-    """Return what the errors are drawn over along a dim, and its name with the unit."""
+    """Return the abscissa of a dim, and its name with the unit."""
     size = errors.sizes[dim]
     if dim == "time" and "time" in errors.coords:
         return np.asarray(errors["time"].values, float) / 60, "time / min"
@@ -139,7 +136,7 @@ def _curves(source: Source, key: str) -> list[Block]:
         figure.subplots_adjust(left=0.075, right=0.985, top=1 - bottom / 1.8, bottom=bottom, wspace=0.19, hspace=0.3)
         for i, freedom in enumerate(errors.em.names):
             axes: Axes = panels[i % 3, i // 3]
-            unit, size = unit_at(i)
+            unit, size = unit_of(i)
             values = flat["estimates"].isel(dof=i).transpose("other_", along).values / size
             expanded = 2 * flat["sigma"].isel(dof=i).transpose("other_", along).values / size
             axes.set_title(names[freedom])
@@ -167,7 +164,7 @@ def _curves(source: Source, key: str) -> list[Block]:
 
 
 def _place_name(errors: xr.Dataset, others: list[str], index: int) -> str:
-    """Return the place of a curve along the other dims, in words; empty without other dims."""
+    """Return the position of a curve along the other dims in words; empty without other dims."""
     found = []
     for dim, k in zip(others, np.unravel_index(index, [errors.sizes[dim] for dim in others]), strict=True):
         x, label = _abscissa(errors, dim)
@@ -176,7 +173,7 @@ def _place_name(errors: xr.Dataset, others: list[str], index: int) -> str:
 
 
 def _span(errors: xr.Dataset, name: str, index: int) -> str:
-    unit, size = unit_at(index)
+    unit, size = unit_of(index)
     values = errors[name].values / size
     if not np.isfinite(values).any():
         return "not observed"
@@ -187,7 +184,7 @@ def _uncertainty(errors: xr.Dataset) -> list[Block]:
     names = names_of(errors)
     rows: list[list[Cell | str]] = []
     for i, freedom in enumerate(errors.em.names):
-        unit, size = unit_at(i)
+        unit, size = unit_of(i)
         values, expanded = errors[freedom].values / size, 2 * _sigma(errors, i) / size
         spans = (finite(np.min, values), finite(np.max, values), finite(np.median, expanded), finite(np.max, expanded))
         cells = [or_dash(fixed(value, 2, signed=j < 2), "not observed by this method") for j, value in enumerate(spans)]
@@ -206,7 +203,7 @@ def _uncertainty(errors: xr.Dataset) -> list[Block]:
 
 
 def _further(errors: xr.Dataset) -> Block:
-    """List what else the dataset holds, so that nothing rides along unseen."""
+    """Return the table of all further variables of the dataset."""
     known = {*budget.FREEDOMS, "covariance", "influence", *DEVIATION}
     rows: list[list[Cell | str]] = []
     for name, variable in errors.data_vars.items():
@@ -219,5 +216,5 @@ def _further(errors: xr.Dataset) -> Block:
         shape = ", ".join(f"{dim} {variable.sizes[dim]}" for dim in variable.dims) or "scalar"
         rows.append([str(name), shape, str(variable.attrs.get("units", "")), span])
     if not rows:
-        return Text("The result holds nothing beyond the errors and their covariance.", "note")
+        return Text("The result contains only the errors and their covariance.", "note")
     return Table("Further results in the dataset, in SI units.", ["name", "dims", "unit", "span"], rows, numeric=False)

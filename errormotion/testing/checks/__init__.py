@@ -1,1 +1,1 @@
-"""What plugins have to show, one module for each claim or kind of plugin."""
+"""The checks, by topic or kind of plugin."""

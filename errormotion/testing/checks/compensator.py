@@ -1,5 +1,5 @@
-"""What every compensator plugin has to show, with a simulated machine that takes its offsets."""
-# ruff: noqa: D401 - the docstring of a check is its claim
+"""Checks of compensator plugins, with a simulated machine for their offsets."""
+# ruff: noqa: D401 - the docstring of a check is its requirement
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from errormotion.testing.sessions import open_things
 COMPENSATOR_CHECKS: Checks[CompensatorSubject] = Checks()
 
 CYCLES = 12
-"""Cycles of reading and writing in which a fault must be noticed."""
+"""Cycles of reading and writing within which a fault must be detected."""
 PAUSE = 0.05
 """After a failed cycle, s."""
 
@@ -56,7 +56,7 @@ def _no_machine(subject: CompensatorSubject) -> str:
 
 def _no_recording(subject: CompensatorSubject) -> str:
     if not subject.mutants:
-        return "the subject asks for no mutants"
+        return "the subject states no mutants"
     recorded = "record" in inspect.signature(subject.plugin).parameters
     return _no_machine(subject) or ("" if recorded else "the compensator records no sessions")
 
@@ -95,7 +95,7 @@ def info_complete(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add()
 def members(subject: CompensatorSubject) -> str:
-    """The class has every member of the contract, and each takes the contract's arguments."""
+    """The class has all members of the contract, and each accepts the arguments of the contract."""
     with started(subject) as device:
         found = kind_registry.deviations(made(subject, device), Compensator)
     require(not found, "; ".join(found))
@@ -111,7 +111,7 @@ def settings_strict(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add()
 def identify(subject: CompensatorSubject) -> str:
-    """The compensator states maker, model and serial number of what answers, the same each time."""
+    """The compensator states manufacturer, model and serial number of the machine, the same each time."""
     with started(subject) as device, closing(made(subject, device)) as compensator:
         compensator.open()
         first, second = compensator.identify(), compensator.identify()
@@ -125,7 +125,7 @@ def identify(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add()
 def open_and_close_twice(subject: CompensatorSubject) -> str:
-    """Opening and closing are idempotent, closing an unopened one is harmless, and a closed one opens again."""
+    """Opening and closing are idempotent, closing before opening has no effect, and reopening is possible."""
     with started(subject) as device, closing(made(subject, device)) as compensator:
         compensator.close()
         for _ in range(2):
@@ -139,7 +139,7 @@ def open_and_close_twice(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add()
 def use_before_open(subject: CompensatorSubject) -> str:
-    """Used before it is opened, or after it is closed, the compensator raises an InstrumentError."""
+    """Before opening and after closing, the compensator raises an InstrumentError."""
     with started(subject) as device, closing(made(subject, device)) as compensator:
         for when in ("before open", "after close"):
             uses: dict[str, Callable[[], Any]] = {"identify": compensator.identify, "read": compensator.read}
@@ -159,12 +159,12 @@ def _require_refusal(use: Callable[[], Any], what: str) -> None:
         return
     except Exception as error:  # noqa: BLE001 - named in the verdict
         require(False, f"{what}: expected an InstrumentError, found {type(error).__name__}: {error}")
-    require(False, f"{what}: expected an InstrumentError, but it was done")
+    require(False, f"{what}: expected an InstrumentError, found none")
 
 
 @COMPENSATOR_CHECKS.add()
 def no_device(subject: CompensatorSubject) -> str:
-    """Without a machine, making the compensator succeeds, and opening it raises a typed error within the limit."""
+    """Without a machine, an instance can be created, and opening it raises a typed error within the time limit."""
     with started(subject) as device:
         settings = getattr(device, "driver_settings", None)
     with closing(subject.build(subject.dead_address, settings)) as compensator:
@@ -181,7 +181,7 @@ def no_device(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add()
 def readings(subject: CompensatorSubject) -> str:
-    """A reading is an Applied: three numbers, NaN where unknown, and two texts."""
+    """A reading is an Applied: three numbers, NaN if unknown, and two texts."""
     with started(subject) as device, closing(made(subject, device)) as compensator:
         compensator.open()
         found = [compensator.read() for _ in range(3)]
@@ -198,21 +198,21 @@ def readings(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add(why_not=_no_machine)
 def nothing_on_connecting(subject: CompensatorSubject) -> str:
-    """Opening, identifying, reading, arming and closing send no order to the machine."""
+    """Opening, identifying, reading, arming and closing send no command to the machine."""
     with started(subject) as device:
         with armed(subject, device) as compensator:
             compensator.identify()
             compensator.read()
         time.sleep(10 * POLL)
         orders = device.machine.orders
-        require(orders == 0, f"expected no order, found {orders}")
+        require(orders == 0, f"expected no command, found {orders}")
         require(not any(device.machine.offset), f"the machine has the offset {um(device.machine.offset)}")
-    return "no order"
+    return "no command"
 
 
 @COMPENSATOR_CHECKS.add(why_not=_no_machine)
 def arrives(subject: CompensatorSubject) -> str:
-    """A written offset comes into effect on each axis with its sign, and is read back."""
+    """A written offset becomes active on each axis with its sign, and is read back."""
     with started(subject) as device, armed(subject, device) as compensator:
         follow(subject, compensator, device)
         _reads_what_is_in_effect(subject, compensator, device, "read()")
@@ -221,7 +221,7 @@ def arrives(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add(why_not=_no_machine)
 def refused_orders(subject: CompensatorSubject) -> str:
-    """Offsets that are no numbers, infinite, not three, or beyond the limit, and all while unarmed, are not sent."""
+    """Offsets that are not three finite numbers within the limit are not sent; without arming, no offset is sent."""
     beyond = 1.001 * subject.limit
     wrong: list[tuple[Any, ...]] = [(), (0.0, 0.0), (0.0,) * 4, ("a", 0.0, 0.0), (None, 0.0, 0.0)]
     for value in (math.nan, math.inf, -math.inf, beyond, -beyond, 1e300):
@@ -239,40 +239,40 @@ def refused_orders(subject: CompensatorSubject) -> str:
         compensator.open()
         _require_refusal(lambda: compensator.write(zero), "write() after it was closed and opened again")
         time.sleep(10 * POLL)
-        require(device.machine.orders == 0, f"the machine got {device.machine.orders} orders")
-    return f"{len(wrong) + 6} orders refused"
+        require(device.machine.orders == 0, f"the machine received {device.machine.orders} commands")
+    return f"{len(wrong) + 6} commands refused"
 
 
 @COMPENSATOR_CHECKS.add(why_not=_no_machine)
 def sign_of_life(subject: CompensatorSubject) -> str:
-    """The same offset written again keeps it in effect; without writing, the machine ramps to zero."""
+    """Repeated writing keeps an offset active; without writing, the machine ramps to zero."""
     with started(subject) as device, armed(subject, device) as compensator:
         follow(subject, compensator, device)
         for _ in range(5):
             write(compensator, device, subject.offset)
             device.machine.elapse(0.6 * device.machine.watchdog)
         require_offset(subject, device.machine.offset, subject.offset, "the offset after it was repeated")
-        compensator.read()  # is no sign of life
-        require_ramp(device, "without a sign of life")
-    return f"kept for {5 * 0.6:g} times the watchdog's time, then a ramp to zero"
+        compensator.read()  # does not reset the watchdog
+        require_ramp(device, "without writing")
+    return f"active for {5 * 0.6:g} times the time of the watchdog, then a ramp to zero"
 
 
 @COMPENSATOR_CHECKS.add(why_not=_no_machine)
 def closed(subject: CompensatorSubject) -> str:
-    """Closing changes nothing at once: the machine ramps to zero by its watchdog."""
+    """Closing has no immediate effect: the machine ramps to zero by its watchdog."""
     with started(subject) as device:
         with armed(subject, device) as compensator:
             follow(subject, compensator, device)
             orders = device.machine.orders
         time.sleep(10 * POLL)
-        require(device.machine.orders == orders, "closing sent an order")
+        require(device.machine.orders == orders, "closing sent a command")
         require_ramp(device, "after close")
     return "a ramp to zero"
 
 
 @COMPENSATOR_CHECKS.add(why_not=_no_machine)
 def restart(subject: CompensatorSubject) -> str:
-    """Another connection reads the offset in effect and goes on from it; its first write is a sign of life."""
+    """A new connection reads the active offset and continues from it; its first write resets the watchdog."""
     with started(subject) as device:
         with armed(subject, device) as compensator:
             follow(subject, compensator, device)
@@ -288,7 +288,7 @@ def restart(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add(limit=60.0, why_not=_no_machine)
 def two_connections(subject: CompensatorSubject) -> str:
-    """A second connection is refused by a typed error, or reads the same; the first one goes on either way."""
+    """A second connection is refused with a typed error, or reads the same; the first one is not affected."""
     with started(subject) as device, armed(subject, device) as compensator:
         follow(subject, compensator, device)
         start, seen, orders = time.perf_counter(), "both read the same", device.machine.orders
@@ -301,14 +301,14 @@ def two_connections(subject: CompensatorSubject) -> str:
         seconds = time.perf_counter() - start
         require(seconds <= subject.time_limit, f"it took {seconds:.1f} s, limit {subject.time_limit:g} s")
         time.sleep(10 * POLL)
-        require(device.machine.orders == orders, "the second connection sent an order")
+        require(device.machine.orders == orders, "the second connection sent a command")
         write(compensator, device, subject.offset)
         _reads_what_is_in_effect(subject, compensator, device, "the first connection")
     return seen
 
 
 def _reads_what_is_in_effect(subject: CompensatorSubject, compensator: Any, device: Any, who: str) -> None:
-    """Wait until a compensator reads the offset in effect."""
+    """Wait until a compensator reads the active offset."""
     wait_for(
         lambda: near(compensator.read().offset, device.machine.offset, subject.resolution),
         lambda: f"{who}: expected {um(device.machine.offset)}, found {um(compensator.read().offset)}",
@@ -317,7 +317,7 @@ def _reads_what_is_in_effect(subject: CompensatorSubject, compensator: Any, devi
 
 @COMPENSATOR_CHECKS.add(why_not=_no_states)
 def states(subject: CompensatorSubject) -> str:
-    """A machine that is busy, or takes no offsets, is reported; with a fault its offset ramps to zero."""
+    """A machine that is busy or accepts no offsets is reported; with a fault its offset ramps to zero."""
     with started(subject) as device, armed(subject, device) as compensator:
         follow(subject, compensator, device)
         for state in subject.states:
@@ -332,17 +332,17 @@ def states(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add(limit=60.0, why_not=_no_lost_connection)
 def lost_connection(subject: CompensatorSubject) -> str:
-    """A connection that breaks is a typed error; the machine ramps to zero, and a person can start again."""
+    """A lost connection is a typed error; the machine ramps to zero, and the compensator can be opened again."""
     with started(subject, f"{subject.lost_fault}&fault_at={CYCLES}") as device, armed(subject, device) as compensator:
         error = _first_error(subject, compensator)
-        require(error is not None, "the lost connection passed unnoticed")
+        require(error is not None, "the lost connection was not detected")
         require_ramp(device, "after the connection was lost")
     return f"{type(error).__name__}, then a ramp to zero"
 
 
 @COMPENSATOR_CHECKS.add(limit=90.0, why_not=_no_faults)
 def faults(subject: CompensatorSubject) -> str:
-    """Each fault becomes a typed error within the time limit, and no offset beyond the limit comes into effect."""
+    """Each fault causes a typed error within the time limit, and no offset beyond the limit becomes active."""
     seen: list[str] = []
     wrong: list[str] = []
     for fault in subject.menu:
@@ -367,7 +367,7 @@ def faults(subject: CompensatorSubject) -> str:
 
 
 def _first_error(subject: CompensatorSubject, compensator: Any) -> Exception | None:
-    """Read and write in turn until something fails; return it."""
+    """Read and write alternately until an error; return it."""
     for _ in range(CYCLES):
         try:
             compensator.read()
@@ -386,19 +386,19 @@ def _complaint(subject: CompensatorSubject, fault: str, error: Exception | None,
     if highest > subject.limit:
         return f"the machine has an offset of {highest * 1e6:g} um"
     if (error is not None) == (fault in subject.harmless):
-        return "passed unnoticed" if error is None else f"should do no harm: {error}"
+        return "not detected" if error is None else f"expected no effect: {error}"
     return ""
 
 
 @COMPENSATOR_CHECKS.add(limit=_mutants_limit, why_not=_no_recording)
 def mutants(subject: CompensatorSubject) -> str:
-    """Whatever bytes answer readings and writes, only the project's errors come out, within bounded time and memory."""
+    """With any received bytes, only errors of the package are raised, within limits of time and memory."""
     return fuzz_checks.mutants(as_instrument(subject))
 
 
 @COMPENSATOR_CHECKS.add()
 def nothing_left(subject: CompensatorSubject) -> str:
-    """Closed, also after an error, the compensator leaves no thread, socket or port."""
+    """After closing, also after an error, no thread, socket or port is left open."""
     before = open_things()
     for fault in ("", *subject.menu[-1:]):
         with (
@@ -408,8 +408,8 @@ def nothing_left(subject: CompensatorSubject) -> str:
         ):
             compensator.open()
             compensator.read()
-    end = time.monotonic() + 2.0  # a simulator beyond the wire may need a moment to see that the line is cut
+    end = time.monotonic() + 2.0  # a simulator may detect the end of the connection later
     while (left := open_things() - before) and time.monotonic() < end:
         time.sleep(POLL)
-    require(not left, f"still there: {', '.join(sorted(left))}")
+    require(not left, f"still open: {', '.join(sorted(left))}")
     return "no thread, no socket"

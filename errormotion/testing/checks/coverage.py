@@ -1,11 +1,11 @@
-"""Whether a method's stated uncertainty is true: against the truth, over many seeds, between places.
+"""Checks of the stated uncertainty of a method: against the truth, over many seeds, and between points.
 
-With the right covariance C of an error e of d freedoms, e' C^-1 e (NEES, the normalised estimation error squared) is
-chi-square with d degrees of freedom, and the sum over n seeds is chi-square with n d. Its mean per degree of freedom
-is 1; a covariance that is stated too small by a factor f makes it f. (Bar-Shalom, Li, Kirubarajan, Estimation with
+For an error e of d freedoms with the covariance C, e' C^-1 e (NEES, the normalised estimation error squared) has a
+chi-square distribution with d degrees of freedom, and its sum over n seeds one with n d. Its mean per degree of freedom
+is 1; if the stated covariance is too small by a factor f, it is f. (Bar-Shalom, Li, Kirubarajan, Estimation with
 Applications to Tracking and Navigation, 2001, section 5.4.)
 """
-# ruff: noqa: D401 - the docstring of a check is its claim
+# ruff: noqa: D401 - the docstring of a check is its requirement
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from errormotion.plugins import MethodSubject
 from errormotion.testing.kit import require
 from errormotion.testing.results import covariance, influence, names, truth_at_places, values
 
-#: Probability that a method with the right covariance fails one of the checks below.
+#: Probability that a method with a correct covariance fails one of the checks below.
 FALSE_ALARM = 1e-3
-#: Error of a stated covariance, as a factor, that has to be seen, and with which probability.
+#: Error of a stated covariance, as a factor, that must be detected, and the probability of its detection.
 FACTOR, POWER = 1.3, 0.95
-#: A single result further from the truth than this many standard uncertainties is wrong, not unlucky.
+#: Largest deviation of a single result from the truth, in standard uncertainties.
 GROSS = 5.0
 FEWEST_SEEDS = 60
 
 
 def recovers_truth(subject: MethodSubject) -> str:
-    """Everywhere the result lies within five standard uncertainties of the truth."""
+    """All values agree with the truth within five standard uncertainties."""
     worst = 0.0
     for seed in range(3):
         errors, truth = subject.outcome(seed)
@@ -42,28 +42,28 @@ def recovers_truth(subject: MethodSubject) -> str:
         worst = max(worst, ratio.max())
         require(
             ratio.max() <= GROSS,
-            f"seed {seed}: {names(errors)[freedom]} at place {place} of {len(ratio)} is off by "
+            f"seed {seed}: {names(errors)[freedom]} at point {place} of {len(ratio)} deviates by "
             f"{error[place, freedom]:.3g}, {ratio.max():.1f} standard uncertainties",
         )
-    return f"at worst {worst:.1f} standard uncertainties off"
+    return f"largest deviation: {worst:.1f} standard uncertainties"
 
 
 def coverage(subject: MethodSubject) -> str:
-    """Over seeds, 95 % intervals hold the truth 95 % of the time; the covariance is neither too small nor too large."""
+    """Over many seeds, 95 % of the 95 % intervals contain the truth; the covariance is not too small or too large."""
     places = tested_places(subject)
     errors, covariances = _samples(subject, places)
     verdicts = [
-        require_honest(errors[:, i], covariances[:, i], _labels(subject), f"at place {place}", share=len(places))
+        require_honest(errors[:, i], covariances[:, i], _labels(subject), f"at point {place}", share=len(places))
         for i, place in enumerate(places)
     ]
     return f"{len(errors)} seeds; " + "; ".join(verdicts)
 
 
 def differences(subject: MethodSubject) -> str:
-    """The difference between two places has the covariance that follows from the shared sources (``influence``)."""
+    """The difference between two points has the covariance that follows from the shared sources (``influence``)."""
     places = tested_places(subject)
     if len(places) < 2:
-        return "one place only"
+        return "only one point"
     errors, covariances = _samples(subject, places)
     shared = []
     for seed in range(len(errors)):
@@ -72,23 +72,23 @@ def differences(subject: MethodSubject) -> str:
         shared.append(first.T @ second + second.T @ first)
     difference = errors[:, 1] - errors[:, 0]
     spread = covariances[:, 1] + covariances[:, 0] - np.array(shared)
-    between = f"between places {places[0]} and {places[1]}"
+    between = f"between points {places[0]} and {places[1]}"
     verdict = require_honest(difference, spread, _labels(subject), between, share=1)
     return f"{len(errors)} seeds; {verdict}"
 
 
 def tested_places(subject: MethodSubject) -> tuple[int, ...]:
-    """Return the places at which uncertainty is put to the test: one in the middle and the last that have one."""
+    """Return the points of the checks: of those with an uncertainty, one in the middle and the last."""
     errors, _ = subject.outcome(0)
     u = np.sqrt(np.einsum("pii->pi", covariance(errors)))
     uncertain = np.flatnonzero((u > 0).any(axis=1))
-    require(uncertain.size > 0, "no place has an uncertainty above zero")
+    require(uncertain.size > 0, "no point has an uncertainty greater than zero")
     return tuple(sorted({int(uncertain[uncertain.size // 2]), int(uncertain[-1])}))
 
 
 @lru_cache(maxsize=4)
 def _samples(subject: MethodSubject, places: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors (seed, place, n) and stated covariances (seed, place, n, n); two checks share them."""
+    """Return errors (seed, place, n) and stated covariances (seed, place, n, n), for two checks."""
     freedoms = int(np.isfinite(values(subject.outcome(0)[0])[list(places)]).any(axis=0).sum())
     seeds = subject.seeds or max(FEWEST_SEEDS, math.ceil(degrees_needed(share=len(places)) / freedoms))
     errors, covariances = [], []
@@ -100,7 +100,7 @@ def _samples(subject: MethodSubject, places: tuple[int, ...]) -> tuple[np.ndarra
 
 
 def degrees_needed(share: int) -> int:
-    """Return how many degrees of freedom it takes to see a covariance that is stated too large by ``FACTOR``."""
+    """Return the degrees of freedom needed to detect a covariance that is too large by ``FACTOR``."""
     degrees = 10
     while stats.chi2.ppf(POWER, degrees) / FACTOR > stats.chi2.ppf(FALSE_ALARM / 4 / share, degrees):
         degrees = math.ceil(degrees * 1.05)
@@ -112,7 +112,7 @@ def _labels(subject: MethodSubject) -> tuple[str, ...]:
 
 
 def require_honest(errors: np.ndarray, covariances: np.ndarray, labels: tuple[str, ...], where: str, share: int) -> str:
-    """Fail unless errors (seed, n) are as large as covariances (seed, n, n) say.
+    """Fail unless errors (seed, n) are consistent with covariances (seed, n, n).
 
     Half of the allowed false alarms goes to the intervals, half to NEES; ``share`` tests divide them again.
     """
@@ -129,13 +129,13 @@ def require_honest(errors: np.ndarray, covariances: np.ndarray, labels: tuple[st
     for name, hits in zip(np.array(labels)[seen], held, strict=True):
         require(
             low <= hits <= high,
-            f"{where}: 95 % intervals of {name} hold the truth in {hits} of {seeds} seeds, "
+            f"{where}: 95 % intervals of {name} contain the truth for {hits} of {seeds} seeds, "
             f"expected {low:.0f} to {high:.0f}",
         )
 
     z, R = e / u, C / (u[:, :, None] * u[:, None, :])
     weight, axes = np.linalg.eigh(R)
-    solid = weight > 1e-9  # directions without any variance hold no information
+    solid = weight > 1e-9  # directions without variance contain no information
     along = np.einsum("sij,si->sj", axes, z)
     nees = float((along[solid] ** 2 / weight[solid]).sum())
     degrees = int(solid.sum())
@@ -145,7 +145,7 @@ def require_honest(errors: np.ndarray, covariances: np.ndarray, labels: tuple[st
         f"{where}: the stated covariance is {_off(nees / degrees)}: mean NEES per freedom {nees / degrees:.2f}, "
         f"expected {floor:.2f} to {ceiling:.2f} over {seeds} seeds",
     )
-    return f"{where} {100 * held.min() / seeds:.0f} % or more held, NEES {nees / degrees:.2f}"
+    return f"{where} {100 * held.min() / seeds:.0f} % or more contain the truth, NEES {nees / degrees:.2f}"
 
 
 def _off(ratio: float) -> str:

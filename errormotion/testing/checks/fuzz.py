@@ -1,4 +1,4 @@
-"""Whether a driver stands whatever comes from the wire: a recorded session is replayed with mutated frames."""
+"""Check of a driver with arbitrary received bytes: a recorded session is replayed with mutated frames."""
 
 from __future__ import annotations
 
@@ -26,36 +26,36 @@ from errormotion.testing.kit import require
 Frames = list[tuple[str, bytes]]
 
 WAITS = (0.001, 0.02)
-"""Time limits of a missing answer in a replay: the first one within which the recording itself is replayed, s."""
+"""Time limits of a missing answer in a replay, s; the first one within which the unchanged recording is replayed."""
 MUTANTS = 300
-"""So many are tried within `BUDGET`; where more are asked for, all of them."""
+"""Up to this number, mutants are tried within `BUDGET`; a larger number is tried completely."""
 BUDGET = 6.0
 """Time after which no further mutant is tried, s."""
 LIMIT = 90.0
-"""Time limit of the check within the budget, s; a longer one has a limit for each mutant only."""
+"""Time limit of the check within the budget, s; a longer check has a limit only for each mutant."""
 MOST_TIME = 0.05
-"""Processor time of a session with a mutated frame beyond twice that of the recorded one, s.
+"""Processor time of a session with a mutated frame in addition to twice that of the recorded one, s.
 
-A driver that opens its device anew after an error does its work twice, and all work takes longer on a busy computer."""
+A driver that reopens its device after an error works twice, and all work takes longer on a busy computer."""
 REPEATS = 4
-"""A session above a limit is repeated so many times: what else the process does is no work of the driver."""
+"""Number of repetitions of a session above a limit, because other work of the process may have caused it."""
 MOST_MEMORY, MEMORY_PER_BYTE = 4 << 20, 64
-"""Largest memory of a session with a mutated frame beyond that of the recorded one: so many bytes, and so many for
-each byte of the frame."""
+"""Largest memory of a session with a mutated frame in addition to that of the recorded one: bytes, and bytes for each
+byte of the frame."""
 MEASURED = 20
-"""The memory of every so manieth session is measured."""
+"""Interval of the sessions whose memory is measured."""
 MOST_GROWTH = 128e6
 """Growth of the memory of this process over all mutants, byte."""
 TIMEOUT = 0.5
-"""Setting of an instrument that has one, s."""
+"""Value of the setting, if an instrument has it, s."""
 SEED = 20250301
 
 
 def no_mutants(subject: InstrumentSubject) -> str:
-    """Return why the check of mutants does not apply; empty where it does."""
+    """Return why the check of mutants does not apply; empty if it applies."""
     if not subject.mutants:
-        return "the subject asks for no mutants"
-    return "" if subject.simulated else "no session with a real device is recorded for it"
+        return "the subject states no mutants"
+    return "" if subject.simulated else "no session with a real device is recorded for this check"
 
 
 def limit(subject: InstrumentSubject) -> float:
@@ -64,7 +64,7 @@ def limit(subject: InstrumentSubject) -> float:
 
 
 def mutants(subject: InstrumentSubject) -> str:
-    """Whatever bytes arrive, the driver raises only the project's errors, within bounded time and memory."""
+    """With any received bytes, the driver raises only errors of the package, within limits of time and memory."""
     if subject.make is None and "timeout" in subject.plugin.Settings.model_fields:
         subject = replace(subject, settings={**subject.settings, "timeout": TIMEOUT})
     rng = np.random.default_rng(SEED)
@@ -91,20 +91,20 @@ def mutants(subject: InstrumentSubject) -> str:
 
 
 class Trial:
-    """The replays of one recording, each with a mutated frame.
+    """Replays of one recording, each with a mutated frame.
 
     Parameters
     ----------
     subject : InstrumentSubject
     address : str
-        Of the recording, which is replayed twice as it is: its time and memory are those that others are compared with.
+        Of the recording. Two unchanged replays measure the time and memory for comparison.
     """
 
     def __init__(self, subject: InstrumentSubject, address: str) -> None:
         self.tried = self.refused = 0
         self._subject, self._address = subject, address
         self._longest = self._work = self._memory = 0.0
-        for ReplayTransport.longest_wait in WAITS:  # the first replay compiles what is compiled at its first use
+        for ReplayTransport.longest_wait in WAITS:  # the first replay includes compilations at first use
             if (failed := _outcome(subject, address)) is None:
                 break
         require(failed is None, f"the replay without a mutation failed: {failed!r}")
@@ -113,7 +113,7 @@ class Trial:
         self._before = _memory(reset=True)
 
     def try_one(self, size: int, what: str) -> None:
-        """Replay the recording as it is now, with a frame of some bytes that was changed as stated."""
+        """Replay the present recording, in which a frame of ``size`` bytes was changed as ``what`` states."""
         what = f"mutant {self.tried} ({what})"
         found = self._replayed(measured=self.tried % MEASURED == 0)
         typed = found.error is None or isinstance(found.error, InstrumentError)
@@ -140,7 +140,7 @@ class Trial:
 
     @property
     def summary(self) -> str:
-        """What was found, in words."""
+        """The result in words."""
         return (
             f"{self.tried} mutants, {self.refused} of them refused; at most {1e3 * self._longest:.0f} ms a session, "
             f"{1e3 * self._work:.1f} ms of processor time and {self._memory / 1024:.0f} KiB a frame"
@@ -171,7 +171,7 @@ class Trial:
 
 @dataclass
 class _Replayed:
-    """A replayed session: its error, wall and processor time (s), and memory (bytes; 0 where it is not measured)."""
+    """A replayed session: its error, wall and processor time (s), and memory (bytes; 0 if not measured)."""
 
     error: BaseException | None = None
     seconds: float = 0.0
@@ -180,7 +180,7 @@ class _Replayed:
 
 
 def _sessions(path: Path) -> dict[Path, Frames]:
-    """Return the files of a recording that have received frames; none for a copy of files that were read."""
+    """Return the files of a recording with received frames; none for copied input files."""
     try:
         found = {part: read_recording(part)[1] for part in parts_of(path)}
     except ReplayError:
@@ -189,7 +189,7 @@ def _sessions(path: Path) -> dict[Path, Frames]:
 
 
 def _mutated(frames: Frames, rng: np.random.Generator) -> tuple[Frames, int, str]:
-    """Return frames of which one received one is changed, the length of that one, and what was changed."""
+    """Return frames with one changed received frame, the length of this frame, and a description of the change."""
     received = _received(frames)
     number = received[rng.integers(len(received))]
     data = bytearray(frames[number][1])
@@ -225,7 +225,7 @@ def _received(frames: Frames) -> list[int]:
 
 
 def _outcome(subject: InstrumentSubject, address: str, record: Path | None = None) -> BaseException | None:
-    """Go through a short session; return its error, or that of one of its threads."""
+    """Run a short session; return its error, or that of one of its threads."""
     of_threads: list[BaseException] = []
     before, threading.excepthook = threading.excepthook, lambda args: of_threads.append(args.exc_value or SystemError())
     error: BaseException | None = None
@@ -255,7 +255,7 @@ def _outcome(subject: InstrumentSubject, address: str, record: Path | None = Non
 
 @contextmanager
 def _hurried() -> Iterator[None]:
-    """Restore what a trial sets."""
+    """Restore the settings that a trial changes."""
     before = ReplayTransport.longest_wait
     try:
         yield
@@ -269,7 +269,7 @@ def _copy(original: Path, mutant: Path) -> None:
 
 
 def _memory(*, reset: bool = False) -> float:
-    """Return the largest memory of this process since the last reset, or, where there is no reset, ever; byte."""
+    """Return the largest memory of this process since the last reset, or since its start without reset, byte."""
     own = Path("/proc/self")
     with suppress(OSError, ValueError, IndexError):
         if reset:
@@ -278,6 +278,6 @@ def _memory(*, reset: bool = False) -> float:
         return 1024.0 * int(line.split()[1])
     try:
         import resource
-    except ImportError:  # not on this system
+    except ImportError:  # not available on this system
         return 0.0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)

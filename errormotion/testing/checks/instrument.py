@@ -1,5 +1,5 @@
-"""What every instrument plugin has to show."""
-# ruff: noqa: D401 - the docstring of a check is its claim
+"""Checks of instrument plugins."""
+# ruff: noqa: D401 - the docstring of a check is its requirement
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _no_dropping(subject: InstrumentSubject) -> str:
 
 
 ATTEMPTS = 3
-"""Pairs of sessions that are compared: how far a simulated device measures ahead differs on a busy computer."""
+"""Pairs of compared sessions: on a busy computer, a simulated device measures ahead by different amounts."""
 
 
 @INSTRUMENT_CHECKS.add()
@@ -87,7 +87,7 @@ def info_complete(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add(why_not=_no_contract)
 def kind_contract(subject: InstrumentSubject) -> str:
-    """The driver has every member that the contract of its kind demands, and each takes the contract's arguments."""
+    """The driver has all members of the contract of its kind, and each accepts the arguments of the contract."""
     kind = subject.plugin.info.kind
     found = kind_registry.deviations(subject.build(), kind_registry.kind(kind))
     require(not found, f"{kind}: {'; '.join(found)}")
@@ -101,11 +101,11 @@ def settings_strict(subject: InstrumentSubject) -> str:
 
 
 def check_settings(cls: Any, settings: Any) -> str:
-    """Check a plugin's class of settings with one set of them; shared with the methods."""
+    """Check a class of settings with one instance; also for methods."""
     require(issubclass(cls, PluginSettings), f"expected a subclass of PluginSettings, found {cls.__name__}")
-    require(isinstance(settings, cls), f"the plugin holds a {type(settings).__name__} instead of its own Settings")
+    require(isinstance(settings, cls), f"expected the Settings of the plugin, found a {type(settings).__name__}")
     stored = json.loads(settings.model_dump_json())
-    require(cls.model_validate(stored) == settings, f"settings come back from JSON changed: {stored}")
+    require(cls.model_validate(stored) == settings, f"settings are changed after a round trip through JSON: {stored}")
     try:
         cls.model_validate(stored | {"no_such_setting": 1})
     except ValidationError:
@@ -116,7 +116,7 @@ def check_settings(cls: Any, settings: Any) -> str:
 
 @INSTRUMENT_CHECKS.add()
 def identify(subject: InstrumentSubject) -> str:
-    """The instrument states maker, model and serial number, the same each time, and whether it is simulated."""
+    """The instrument states manufacturer, model and serial number, the same each time, and whether it is simulated."""
     with subject.build() as instrument:
         first, second = instrument.identify(), instrument.identify()
     require(isinstance(first, Identity), f"expected an Identity, found {type(first).__name__}")
@@ -130,7 +130,7 @@ def identify(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add()
 def open_and_close_twice(subject: InstrumentSubject) -> str:
-    """Opening and closing are idempotent, closing an unopened one is harmless, and a closed one opens again."""
+    """Opening and closing are idempotent, closing before opening has no effect, and reopening is possible."""
     instrument = subject.build()
     try:
         instrument.close()
@@ -140,7 +140,7 @@ def open_and_close_twice(subject: InstrumentSubject) -> str:
         instrument.close()
         instrument.close()
         with instrument as entered:
-            require(entered is instrument, "'with instrument as x' does not give the instrument itself")
+            require(entered is instrument, "'with instrument as x' does not return the instrument")
             instrument.identify()
     finally:
         instrument.close()
@@ -149,7 +149,7 @@ def open_and_close_twice(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add()
 def use_before_open(subject: InstrumentSubject) -> str:
-    """Used before it is opened, or after it is closed, the instrument raises an InstrumentError."""
+    """Before opening and after closing, the instrument raises an InstrumentError."""
     instrument = subject.build()
     _require_refusal(instrument, "before open", subject.streams)
     with instrument:
@@ -169,12 +169,12 @@ def _require_refusal(instrument: Any, when: str, streams: bool) -> None:
             continue
         except Exception as error:  # noqa: BLE001 - named in the verdict
             require(False, f"{name}() {when}: expected an InstrumentError, found {type(error).__name__}: {error}")
-        require(False, f"{name}() {when}: expected an InstrumentError, but it answered")
+        require(False, f"{name}() {when}: expected an InstrumentError, found a result")
 
 
 @INSTRUMENT_CHECKS.add()
 def no_device(subject: InstrumentSubject) -> str:
-    """Without a device, making the driver succeeds, and opening it raises a typed error within the limit."""
+    """Without a device, an instance can be created, and opening it raises a typed error within the time limit."""
     instrument = subject.build(address=subject.dead_address)
     start = time.perf_counter()
     try:
@@ -192,29 +192,29 @@ def no_device(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add()
 def readings(subject: InstrumentSubject) -> str:
-    """A reading holds numbers, as many each time; an unknown one is NaN, never None."""
+    """A reading contains numbers, the same count each time; an unknown number is NaN, not None."""
     with subject.build() as instrument:
         three = [instrument.read() for _ in range(3)]
     require(
-        all(leaf is not None for reading in three for leaf in leaves(reading)), "a reading holds None, expected NaN"
+        all(leaf is not None for reading in three for leaf in leaves(reading)), "a reading contains None, expected NaN"
     )
     values = [numbers(reading) for reading in three]
     require(bool(values[0]), "read() returned no numbers")
     require(all(len(value) == len(values[0]) for value in values), "readings differ in their number of values")
-    require(any(math.isfinite(value) for value in values[-1]), "a sound instrument gave no finite value")
+    require(any(math.isfinite(value) for value in values[-1]), "the instrument without faults returned no finite value")
     return f"{len(values[0])} values a reading"
 
 
 @INSTRUMENT_CHECKS.add(why_not=_no_bounds)
 def plausible_magnitudes(subject: InstrumentSubject) -> str:
-    """Readings and samples are in SI units: finite ones lie within plausible bounds."""
+    """Readings and samples are in SI units: finite values are within plausible bounds."""
     low, high = subject.bounds or (-math.inf, math.inf)
     with subject.build() as instrument:
         values = np.array(numbers(instrument.read()))
         if subject.streams:
             values = np.concatenate([values, *(block.values.ravel() for block in first_blocks(instrument, 2))])
     values = values[np.isfinite(values)]
-    require(values.size > 0, "no finite value at all")
+    require(values.size > 0, "no finite value")
     worst = values[np.argmax(np.maximum(low - values, values - high))]
     require(low <= worst <= high, f"expected {low:g} to {high:g} in SI units, found {worst:g}")
     return f"{values.min():g} to {values.max():g}"
@@ -238,7 +238,7 @@ def stream_blocks(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add(why_not=_no_stream)
 def monotonic_time(subject: InstrumentSubject) -> str:
-    """Device counters continue without a gap from block to block; host times never decrease nor lie ahead."""
+    """Device counters have no gaps between blocks; host times do not decrease and are not in the future."""
     before = time.monotonic()
     with subject.build() as instrument:
         blocks = first_blocks(instrument, subject.blocks)
@@ -247,12 +247,12 @@ def monotonic_time(subject: InstrumentSubject) -> str:
         expected = block.first + block.values.shape[1]
         require(following.first == expected, f"a block starts at sample {following.first}, expected {expected}")
     times = [before, *(block.host_time for block in blocks), after]
-    require(times == sorted(times), f"host times go back, or are not of time.monotonic(): {times}")
+    require(times == sorted(times), f"host times decrease, or are not from time.monotonic(): {times}")
     return f"{sum(block.values.shape[1] for block in blocks)} samples without a gap"
 
 
 def _repeated(compare: Callable[[], str]) -> str:
-    """Return the result of a comparison of two sessions; fail where it fails each time."""
+    """Return the result of a comparison of two sessions; fail if all repetitions fail."""
     for _ in range(ATTEMPTS - 1):
         with suppress(CheckFailedError):
             return compare()
@@ -261,7 +261,7 @@ def _repeated(compare: Callable[[], str]) -> str:
 
 @INSTRUMENT_CHECKS.add(why_not=_no_splitting)
 def split_reads(subject: InstrumentSubject) -> str:
-    """Frames that arrive in pieces give the same values as whole ones."""
+    """Frames received in pieces result in the same values as complete frames."""
 
     def compare() -> str:
         whole, pieces = (run_session(subject, fault=fault) for fault in ("", subject.split_fault))
@@ -269,14 +269,14 @@ def split_reads(subject: InstrumentSubject) -> str:
         require(pieces.error is None, f"split frames raised {pieces.error!r}")
         one, other = (session.stream if subject.streams else session.read for session in (whole, pieces))
         require_same(one, other, "split frames changed the values")
-        return f"{one.size} values alike"
+        return f"{one.size} equal values"
 
     return _repeated(compare)
 
 
 @INSTRUMENT_CHECKS.add(why_not=_no_dropping)
 def counted_drops(subject: InstrumentSubject) -> str:
-    """Samples that the device left out are NaN at their positions, and counted; the others keep their positions."""
+    """Samples that the device omits are NaN at their positions, and counted; other positions are unchanged."""
     later = f"{subject.drop_fault}&fault_at=10"  # a sample lost before the first one cannot be counted
 
     def compare() -> str:
@@ -290,7 +290,9 @@ def counted_drops(subject: InstrumentSubject) -> str:
         n = min(whole.stream.shape[1], holes.stream.shape[1])
         seen = np.isfinite(holes.stream[:, :n]) & np.isfinite(whole.stream[:, :n])
         same = whole.stream[:, :n][seen] == holes.stream[:, :n][seen]
-        require(bool(same.all()), f"{(~same).sum()} of {same.size} values are not where the device counter puts them")
+        require(
+            bool(same.all()), f"{(~same).sum()} of {same.size} values are not at the positions of the device counter"
+        )
         return f"{holes.dropped} of {holes.stream.size} values lost and counted"
 
     return _repeated(compare)
@@ -298,7 +300,7 @@ def counted_drops(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add(limit=90.0, why_not=_no_faults)
 def faults(subject: InstrumentSubject) -> str:
-    """Each fault becomes a typed error within the time limit, or a counted loss where data continue."""
+    """Each fault causes a typed error within the time limit, or a counted loss if the data continue."""
     seen: list[str] = []
     wrong: list[str] = []
     sound = run_session(subject)
@@ -317,9 +319,9 @@ def _complaint(outcome: Session, sound: Session, subject: InstrumentSubject, har
         return f"{outcome.summary}, limit {subject.time_limit:g} s"
     noticed = outcome.error is not None or outcome.lost > sound.lost or outcome.unread > sound.unread
     if harmless and noticed:
-        return f"should do no harm, but {outcome.summary}"
+        return f"expected no effect: {outcome.summary}"
     if not harmless and not noticed:
-        return "passed unnoticed: no error, and no loss counted"
+        return "not detected: no error, and no loss counted"
     if outcome.unexplained:
         return f"{outcome.unexplained} values are NaN without a count or a reason"
     return ""
@@ -332,12 +334,12 @@ INSTRUMENT_CHECKS.add(why_not=wire_checks.no_baudrate)(wire_checks.baudrate)
 
 @INSTRUMENT_CHECKS.add()
 def record_and_replay(subject: InstrumentSubject) -> str:
-    """A recorded session, replayed, gives the same identity, readings and samples; what was not recorded is refused."""
+    """A replayed session has the same identity, readings and samples as its recording; other requests are refused."""
     with TemporaryDirectory() as folder:
         record = Path(folder) / "session.rec"
         original = run_session(subject, record=record)
         require(original.error is None, f"recording: {original.error!r}")
-        files = list(Path(folder).iterdir())  # an instrument of several devices writes several, named after this one
+        files = list(Path(folder).iterdir())  # an instrument with several devices writes several files
         require(any(file.stat().st_size > 0 for file in files), "nothing was recorded")
         replayed = run_session(subject, address=f"replay://{record}")
         require(replayed.error is None, f"replaying: {replayed.error!r}")
@@ -349,8 +351,8 @@ def record_and_replay(subject: InstrumentSubject) -> str:
         for file in files:
             file.unlink()
         gone = run_session(subject, address=f"replay://{record}")
-        require(isinstance(gone.error, InstrumentError), f"without its recording the replay gave {gone.summary}")
-    return f"{original.stream.size + original.read.size} values alike"
+        require(isinstance(gone.error, InstrumentError), f"without recording, the replay has the result {gone.summary}")
+    return f"{original.stream.size + original.read.size} equal values"
 
 
 INSTRUMENT_CHECKS.add(limit=fuzz_checks.limit, why_not=fuzz_checks.no_mutants)(fuzz_checks.mutants)
@@ -358,7 +360,7 @@ INSTRUMENT_CHECKS.add(limit=fuzz_checks.limit, why_not=fuzz_checks.no_mutants)(f
 
 @INSTRUMENT_CHECKS.add()
 def nothing_left(subject: InstrumentSubject) -> str:
-    """Closed, also in the middle of a stream or after an error, the instrument leaves no thread, socket or port."""
+    """After closing, also during a stream or after an error, no thread, socket or port is left open."""
     before = open_things()
     run_session(subject)
     if subject.streams:
@@ -370,9 +372,9 @@ def nothing_left(subject: InstrumentSubject) -> str:
     for fault in subject.menu[-1:]:
         run_session(subject, fault=fault)
     left = open_things() - before
-    deadline = time.monotonic() + 2.0  # a simulator beyond the wire may need a moment to see that the line is cut
+    deadline = time.monotonic() + 2.0  # a simulator may detect the end of the connection later
     while left and time.monotonic() < deadline:
         time.sleep(0.01)
         left = open_things() - before
-    require(not left, f"still there: {', '.join(sorted(left))}")
+    require(not left, f"still open: {', '.join(sorted(left))}")
     return "no thread, no socket"

@@ -1,5 +1,5 @@
-"""What every method plugin has to show; the statistical claims are in ``coverage``."""
-# ruff: noqa: D401 - the docstring of a check is its claim
+"""Checks of method plugins; the statistical checks are in ``coverage``."""
+# ruff: noqa: D401 - the docstring of a check is its requirement
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ from errormotion.testing.results import covariance, functional_point, names, sig
 
 METHOD_CHECKS: Checks[MethodSubject] = Checks()
 
-#: Two results are the same when they differ by less than this fraction of their standard uncertainty: room for the
-#: rounding of sums in another order and for the last step of an iteration, and nothing else.
+#: Two results are equal if they differ by less than this fraction of their standard uncertainty, which allows for
+#: rounding of sums in another order and for the last step of an iteration.
 SAME = 1e-3
-#: The same for data stored with 24 bits: 6e-8 of a reading, next to a noise that is rarely below 1e-6 of it.
+#: The same for data stored with 24 bits, 6e-8 of a reading; noise is rarely smaller than 1e-6 of it.
 SAME_SINGLE = 0.1
 
 
 @METHOD_CHECKS.add()
 def info_complete(subject: MethodSubject) -> str:
-    """``info`` tells id, summary, status, version and what the method cannot see; ``needs`` names a raw schema."""
+    """``info`` states id, summary, status, version and what the method cannot determine; ``needs`` has a raw schema."""
     info, needs = subject.plugin.info, subject.plugin.needs
     require(isinstance(info, MethodInfo), f"info: expected a MethodInfo, found {type(info).__name__}")
     require(info.id.isidentifier() and info.id == info.id.lower(), f"info.id: expected lower case, found {info.id!r}")
@@ -63,7 +63,7 @@ def settings_strict(subject: MethodSubject) -> str:
 
 @METHOD_CHECKS.add()
 def motions_stated(subject: MethodSubject) -> str:
-    """A method that can move a machine states its motions: by programs, or where its package names such a kind."""
+    """A method that can move a machine, by programs or by a kind named in its package, states its motions."""
     plugin = subject.plugin
     if hasattr(plugin, "motions"):
         return "motions are stated"
@@ -72,12 +72,12 @@ def motions_stated(subject: MethodSubject) -> str:
     moving = {each for each in kind_registry.kinds() if kind_registry.kind_changes_machine(each)}
     found = sorted(moving & (set(plugin.needs.instruments) | _texts_of(plugin)))
     named = " and ".join(found)
-    require(not found, f"'{name}' uses a {named} and does not state its motions ('motions'); [] where nothing moves")
-    return "nothing that moves is used"
+    require(not found, f"'{name}' uses a {named} and does not state its motions ('motions'); [] for no motion")
+    return "no instrument with motions is used"
 
 
 def _texts_of(plugin: Any) -> set[str]:
-    """Return the texts in the source of a plugin's package, or of its module where it is in none."""
+    """Return the texts in the source of a plugin's package, or of its module if it is in no package."""
     source = Path(str(sys.modules[plugin.__module__].__file__))
     in_package = (source.parent / "__init__.py").exists()
     found: set[str] = set()
@@ -90,7 +90,7 @@ def _texts_of(plugin: Any) -> set[str]:
 
 @METHOD_CHECKS.add()
 def schema(subject: MethodSubject) -> str:
-    """Raw data and result follow their schemas, and the result says which method made it, from which settings."""
+    """Raw data and result conform to their schemas, and the result states its method and settings."""
     raw, _ = subject.make(0)
     tables = tuple(getattr(subject.plugin, "raw_schemas", ()))
     if tables or variants(str(raw.attrs.get("schema"))):  # a method without tables validates its raw data itself
@@ -107,16 +107,16 @@ def schema(subject: MethodSubject) -> str:
     known, spread = np.isfinite(values(errors)), np.isfinite(sigma(errors))
     require(bool(known.any()), "no freedom has a value")
     require(bool((known == spread).all()), "a value without an uncertainty, or an uncertainty without a value")
-    return f"{known.any(axis=0).sum()} freedoms at {len(known)} places"
+    return f"{known.any(axis=0).sum()} freedoms at {len(known)} points"
 
 
 @METHOD_CHECKS.add()
 def joins_along_a_dimension(subject: MethodSubject) -> str:
-    """The pieces of an acquisition join along a dimension of the raw data, and their expected length is known."""
+    """The parts of an acquisition are joined along a dimension of the raw data, and their expected length is known."""
     method, settings = subject.plugin(), subject.effective_settings()
     dim, length = method.append_dim(settings), method.progress(settings)
     raw, _ = subject.make(0)
-    # What is acquired may be another variant of the schema than what is handed to the kit.
+    # Acquired data may be another variant of the schema than the data of the kit.
     known = {str(d) for d in raw.dims}
     tables = getattr(method, "raw_schemas", ()) or variants(method.needs.raw_schema)
     known |= {d for table in tables for row in table.rows for d in row.dims}
@@ -127,9 +127,9 @@ def joins_along_a_dimension(subject: MethodSubject) -> str:
 
 @METHOD_CHECKS.add()
 def deterministic(subject: MethodSubject) -> str:
-    """One seed gives one raw dataset and, bit for bit, one result; another seed gives another."""
+    """One seed results in one raw dataset and, bit for bit, one result; another seed in another."""
     (raw, _), (again, _), (other, _) = subject.make(0), subject.make(0), subject.make(1)
-    require(raw.identical(again), "the source of raw data gives two datasets for one seed")
+    require(raw.identical(again), "the source of raw data returns two different datasets for one seed")
     require(not raw.identical(other), "the source of raw data ignores the seed")
     np.random.seed(1)  # noqa: NPY002 - a method that leans on the global generator shows itself
     first = subject.identify(raw)
@@ -137,7 +137,7 @@ def deterministic(subject: MethodSubject) -> str:
     second = subject.identify(raw)
     differ = [str(name) for name in first.variables if not first[name].identical(second[name])]
     require(not differ, f"two identifications of one raw dataset differ in {', '.join(differ)}")
-    return "two results alike"
+    return "two equal results"
 
 
 METHOD_CHECKS.add(limit=60.0)(recovers_truth)
@@ -150,7 +150,7 @@ METHOD_CHECKS.add(why_not=why_no_texts)(chapters_translated)
 
 @METHOD_CHECKS.add()
 def frame_invariance(subject: MethodSubject) -> str:
-    """Raw data moved as a whole into another frame give the same errors and covariance, moved."""
+    """Raw data in another frame result in the same errors and covariance in this frame."""
     rotation, shift = (np.array(part) for part in subject.motion)
     pose = RigidTransform.from_components(shift, Rotation.from_rotvec(rotation))
     raw, _ = subject.make(0)
@@ -170,16 +170,16 @@ def frame_invariance(subject: MethodSubject) -> str:
         twists.transform(values(there), carried),
         twists.transform_covariance(covariance(there), carried),
     )
-    return f"{np.isfinite(expected).sum()} values alike"
+    return f"{np.isfinite(expected).sum()} equal values"
 
 
 def _deviation_invariance(here: xr.Dataset, there: xr.Dataset, pose: RigidTransform) -> str:
-    """Fail unless the deviations are the same numbers, and their sensitivity turned with the frame."""
+    """Fail unless the deviations are equal, and their sensitivity is rotated with the frame."""
     expected = here.em.in_frame(pose, "moved").em.at(functional_point(there))["sensitivity"]
     same = expected.sizes == there["sensitivity"].sizes and np.allclose(expected, there["sensitivity"], atol=1e-9)
-    require(bool(same), "the sensitivity did not turn with the frame")
+    require(bool(same), "the sensitivity was not rotated with the frame")
     _require_close(values(here), covariance(here), values(there), covariance(there))
-    return f"{np.isfinite(values(here)).sum()} values alike"
+    return f"{np.isfinite(values(here)).sum()} equal values"
 
 
 def _moved_subject(subject: MethodSubject, pose: RigidTransform) -> MethodSubject:
@@ -191,7 +191,7 @@ def _moved_subject(subject: MethodSubject, pose: RigidTransform) -> MethodSubjec
 
 
 def moved_raw(raw: xr.Dataset, vectors: Any, pose: RigidTransform) -> xr.Dataset:
-    """Return a raw dataset whose vectors have been taken into another frame."""
+    """Return a raw dataset with its vectors in another frame."""
     Q, shift = pose.rotation.as_matrix(), pose.translation
     moved = raw.copy(deep=True)
     for name, kind in vectors.items():
@@ -209,7 +209,7 @@ def moved_raw(raw: xr.Dataset, vectors: Any, pose: RigidTransform) -> xr.Dataset
             moved[name] = array.copy(data=data)
         else:
             axis = "xyz".index(kind)
-            require(bool(np.allclose(Q[axis], np.eye(3)[axis])), f"the motion of the subject turns the axis {kind}")
+            require(bool(np.allclose(Q[axis], np.eye(3)[axis])), f"the motion of the subject rotates the axis {kind}")
             moved[name] = array + shift[axis]
         moved[name].attrs = dict(array.attrs)
     return moved
@@ -217,7 +217,7 @@ def moved_raw(raw: xr.Dataset, vectors: Any, pose: RigidTransform) -> xr.Dataset
 
 @METHOD_CHECKS.add()
 def number_format(subject: MethodSubject) -> str:
-    """Measured values stored as float32 give the same errors, within a tenth of their uncertainty."""
+    """Measured values stored as float32 result in the same errors, within a tenth of their uncertainty."""
     raw, _ = subject.make(0)
     single = raw.copy()
     for name in measured_variables(subject, raw):
@@ -230,7 +230,7 @@ def number_format(subject: MethodSubject) -> str:
 
 @METHOD_CHECKS.add()
 def units(subject: MethodSubject) -> str:
-    """Measured values in mm, marked as such, give the same errors or a typed error, never others."""
+    """Measured values in mm with this unit result in the same errors or a typed error."""
     raw, _ = subject.make(0)
     lengths = [name for name in measured_variables(subject, raw) if raw[name].attrs.get("units") == "m"]
     require(bool(lengths), "no measured variable has the attribute units = 'm'")
@@ -244,13 +244,13 @@ def units(subject: MethodSubject) -> str:
 
 @METHOD_CHECKS.add()
 def layout(subject: MethodSubject) -> str:
-    """The order of dimensions does not matter, nor that of labels along them, unless a typed error refuses it."""
+    """The order of dimensions and of their labels has no effect, or is refused with a typed error."""
     raw, _ = subject.make(0)
     straight = subject.identify(raw)
     turned = raw.copy()
     for name in map(str, raw.data_vars):
         turned[name] = raw[name].transpose(*reversed(raw[name].dims))
-    verdicts = [_same_or_refused(subject, straight, turned, "turned dimensions")]
+    verdicts = [_same_or_refused(subject, straight, turned, "transposed dimensions")]
     verdicts += [
         _same_or_refused(subject, straight, raw.isel({dim: slice(None, None, -1)}), f"reversed {dim}")
         for dim in _labelled(raw, raw.dims)
@@ -270,7 +270,7 @@ def _same_or_refused(subject: MethodSubject, one: xr.Dataset, raw: xr.Dataset, w
 
 @METHOD_CHECKS.add(limit=60.0)
 def refuses_missing_inputs(subject: MethodSubject) -> str:
-    """Without a variable that it needs, or with data of another schema, the method says so in a typed error."""
+    """Without a required variable, or with data of another schema, the method raises a typed error that names it."""
     raw, _ = subject.make(0)
     for name in map(str, raw.data_vars):
         less = raw.drop_vars(name)
@@ -280,12 +280,12 @@ def refuses_missing_inputs(subject: MethodSubject) -> str:
             _require_typed_refusal(subject, less, f"without '{name}'", names=name)
     foreign = raw.assign_attrs(schema="errormotion.raw.of_another_method/1")
     _require_typed_refusal(subject, foreign, "with data of another schema", names="of_another_method")
-    return f"each of {len(raw.data_vars) - len(subject.optional)} variables missed"
+    return f"each of {len(raw.data_vars) - len(subject.optional)} variables is required"
 
 
 @METHOD_CHECKS.add()
 def nothing_measured(subject: MethodSubject) -> str:
-    """Where no sensor gave a value, the method raises a typed error or returns NaN, never a number."""
+    """Without any measured value, the method raises a typed error or returns NaN."""
     raw, _ = subject.make(0)
     blank = raw.copy()
     for name in measured_variables(subject, raw):
@@ -295,13 +295,13 @@ def nothing_measured(subject: MethodSubject) -> str:
         errors = subject.identify(blank)
     except ErrormotionError as error:
         return f"{type(error).__name__}: {str(error).splitlines()[0]}"
-    require(not np.isfinite(values(errors)).any(), "numbers came out of nothing")
-    return "NaN throughout"
+    require(not np.isfinite(values(errors)).any(), "finite results without measured values")
+    return "all NaN"
 
 
 @METHOD_CHECKS.add()
 def leaves_inputs_alone(subject: MethodSubject) -> str:
-    """Identification changes nothing in the raw dataset, attributes included, and works on read-only arrays."""
+    """Identification does not change the raw dataset or its attributes, and accepts read-only arrays."""
     raw, _ = subject.make(0)
     for variable in raw.variables.values():
         if isinstance(variable.data, np.ndarray):
@@ -312,22 +312,22 @@ def leaves_inputs_alone(subject: MethodSubject) -> str:
     require(before.identical(raw), "the raw dataset was changed")
     changed = [name for name, attrs in attributes.items() if dict(raw[name].attrs) != attrs]
     require(
-        not changed and before.attrs == raw.attrs, f"attributes were changed: {', '.join(changed) or 'of the whole'}"
+        not changed and before.attrs == raw.attrs, f"attributes were changed: {', '.join(changed) or 'of the dataset'}"
     )
     return "unchanged"
 
 
 @METHOD_CHECKS.add(limit=60.0)
 def round_trip(subject: MethodSubject) -> str:
-    """A result comes back from its file as it was; raw data from a file (NetCDF, Zarr) give the same result."""
+    """A result is unchanged after storage; raw data from a file (NetCDF, Zarr) have the same result."""
     raw, _ = subject.make(0)
     errors = subject.identify(raw)
     with TemporaryDirectory() as folder:
         datasets.save(errors, Path(folder) / "errors.nc")
         loaded = datasets.load(Path(folder) / "errors.nc")
         differ = [str(name) for name in errors.variables if not errors[name].equals(loaded[name])]
-        require(not differ, f"came back from NetCDF changed: {', '.join(differ)}")
-        require(loaded.attrs.keys() == errors.attrs.keys(), "attributes were lost or added in NetCDF")
+        require(not differ, f"changed by storage as NetCDF: {', '.join(differ)}")
+        require(loaded.attrs.keys() == errors.attrs.keys(), "attributes were lost or added by storage as NetCDF")
         loaded.close()
         for name in ("raw.nc", "raw.zarr"):
             datasets.save(raw, Path(folder) / name)
@@ -340,20 +340,20 @@ def round_trip(subject: MethodSubject) -> str:
 
 @METHOD_CHECKS.add()
 def plan(subject: MethodSubject) -> str:
-    """``plan`` returns zeros with the covariance to expect, of the same freedoms that identification sees."""
+    """``plan`` returns zeros with the expected covariance, for the same freedoms as ``identify``."""
     planned = subject.plugin().plan(subject.effective_settings())
     datasets.validate(planned)
     expected = np.isfinite(values(subject.outcome(0)[0])).any(axis=0)
     found = np.isfinite(sigma(planned)).any(axis=0)
     seen, planned_for = (", ".join(np.array(names(planned))[which]) for which in (expected, found))
-    require(bool((found == expected).all()), f"plan covers {planned_for or 'nothing'}, identification sees {seen}")
+    require(bool((found == expected).all()), f"plan determines {planned_for or 'nothing'}, identification {seen}")
     known = values(planned)
     require(bool((known[np.isfinite(known)] == 0).all()), "planned values are not zero")
     return f"{planned_for}"
 
 
 def measured_variables(subject: MethodSubject, raw: xr.Dataset) -> tuple[str, ...]:
-    """Return the names of what sensors read: as the subject says, else all arrays of float64 that are no vectors."""
+    """Return the names of the readings: as the subject states, else all arrays of float64 without vectors."""
     if subject.measured:
         return subject.measured
     arrays = {str(name): array for name, array in raw.data_vars.items() if name not in subject.raw_vectors}
@@ -368,7 +368,7 @@ def _require_typed_refusal(subject: MethodSubject, raw: xr.Dataset, what: str, *
         return
     except Exception as error:  # noqa: BLE001 - named in the verdict
         require(False, f"{what}: expected an error of errormotion.errors, found {type(error).__name__}: {error}")
-    require(False, f"{what}: expected an error, but a result came")
+    require(False, f"{what}: expected an error, found a result")
 
 
 def _labelled(dataset: xr.Dataset, dims: Iterable[Hashable]) -> list[str]:
@@ -384,7 +384,7 @@ def _require_close(
     what: str = "",
 ) -> None:
     """Fail unless two results, (place, n) with covariances, agree to a fraction of their standard uncertainty."""
-    require(one.shape == other.shape, f"{what} {one.shape[0]} places became {other.shape[0]}".strip())
+    require(one.shape == other.shape, f"{what} {one.shape[0]} points became {other.shape[0]}".strip())
     known, known_other = np.isfinite(one), np.isfinite(other)
     require(bool((known == known_other).all()), f"{what} freedoms became known or unknown".strip())
     require(bool(known.any()), "nothing to compare: no freedom is known")
@@ -396,6 +396,6 @@ def _require_close(
         place, freedom = np.unravel_index(np.argmax(ratio), ratio.shape)
         require(
             ratio.max() <= fraction,
-            f"{what} {what_differs} of {DOF[freedom]} at place {place} differs by "
+            f"{what} {what_differs} of {DOF[freedom]} at point {place} differs by "
             f"{ratio.max():.2g} of its uncertainty, expected at most {fraction:g}".strip(),
         )

@@ -1,5 +1,4 @@
-"""Whether a method draws its sources anew as it states them: the door of the Monte Carlo evaluation."""
-# ruff: noqa: D401 - the docstring of a check is its claim
+"""Checks of the random draws of the sources of a method, for the Monte Carlo evaluation."""
 
 from __future__ import annotations
 
@@ -18,35 +17,35 @@ from errormotion.testing.kit import require
 from errormotion.testing.results import covariance, influence, names, values
 
 TRIALS = 40
-"""Trials of each source: with five freedoms, a standard uncertainty that is 1.25 times too large is seen."""
+"""Trials of each source; with five freedoms, a standard uncertainty that is 1.25 times too large is detected."""
 SMALL = 1e-3
-"""Share of a standard uncertainty below which a source need not be drawn."""
+"""Fraction of a standard uncertainty below which a source need not be drawn."""
 
 
 def why_no_redrawing(subject: MethodSubject) -> str:
-    """Return why the checks do not apply: the method does not state how its sources are drawn."""
-    return "" if hasattr(subject.plugin, "redrawing") else "the method does not draw its sources anew (redrawing)"
+    """Return why the checks do not apply: the method has no draws of its sources."""
+    return "" if hasattr(subject.plugin, "redrawing") else "the method has no draws of its sources (redrawing)"
 
 
 def sources_drawn(subject: MethodSubject) -> str:
-    """Sources are drawn by the seed alone, leave data and settings as they are, and cover every group of influences."""
+    """Draws depend only on the seed, do not change data and settings, and include all groups of influences."""
     raw, errors, drawn = _drawn(subject)
     before, settings = drawn.raw.copy(deep=True), drawn.settings.model_dump_json()
     with _quiet():
         first, again, other = (trial(subject.plugin(), drawn, SeedSequence(seed)) for seed in (1, 1, 2))
-    require(np.array_equal(values(first), values(again), equal_nan=True), "one seed gives two different trials")
+    require(np.array_equal(values(first), values(again), equal_nan=True), "one seed results in two different trials")
     require(not np.array_equal(values(first), values(other), equal_nan=True), "the trials ignore the seed")
     require(before.identical(drawn.raw), "a trial changed the raw data")
     require(drawn.settings.model_dump_json() == settings, "a trial changed the settings")
     covered = {group for source in drawn.sources.values() for group in source.groups}
     missing = sorted(_groups(errors) - covered)
-    require(not missing, f"no source stands for the groups {', '.join(missing)} of the influence")
-    require(any(source.own for source in drawn.sources.values()), "no source stands for the independent noise (own)")
+    require(not missing, f"no source represents the groups {', '.join(missing)} of the influence")
+    require(any(source.own for source in drawn.sources.values()), "no source represents the independent noise (own)")
     return f"{', '.join(drawn.sources)}; reduced from {raw.nbytes} to {drawn.raw.nbytes} bytes"
 
 
 def sources_as_stated(subject: MethodSubject) -> str:
-    """Each source drawn alone has the spread of its influence, and all of them together the stated covariance."""
+    """Draws of a single source have the covariance of its influence, and draws of all sources the stated covariance."""
     _, errors, drawn = _drawn(subject)
     places, verdicts = tested_places(subject), []
     for what, only in {"all sources": list(drawn.sources), **_parts(drawn)}.items():
@@ -70,7 +69,7 @@ def sources_as_stated(subject: MethodSubject) -> str:
 
 
 def _drawn(subject: MethodSubject) -> tuple[xr.Dataset, xr.Dataset, Redrawing]:
-    """Return raw data, result, and how the sources are drawn."""
+    """Return raw data, result, and the draws of the sources."""
     raw, _ = subject.make(0)
     errors = subject.identify(raw)
     with _quiet():
@@ -86,7 +85,7 @@ def _groups(errors: xr.Dataset) -> set[str]:
 
 
 def _parts(drawn: Redrawing) -> dict[str, list[str]]:
-    """Return the sources that have no independent part, those with a group in common together, by their names."""
+    """Return the sources without independent part by their names; sources with a common group together."""
     parts: list[tuple[list[str], set[str]]] = []
     for name, source in drawn.sources.items():
         together = [part for part in parts if part[1] & set(source.groups)]
@@ -98,7 +97,7 @@ def _parts(drawn: Redrawing) -> dict[str, list[str]]:
 
 
 def _of_groups(errors: xr.Dataset, groups: set[str]) -> np.ndarray:
-    """Return the covariance (place, n, n) that some groups of sources make."""
+    """Return the covariance (place, n, n) from some groups of sources."""
     chosen = np.isin(errors["source_group"].values, sorted(groups))
     F = influence(errors)[:, chosen]
     return np.asarray(np.einsum("psi,psj->pij", F, F))
@@ -106,7 +105,7 @@ def _of_groups(errors: xr.Dataset, groups: set[str]) -> np.ndarray:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep the notes of every trial out of the log."""
+    """Suppress the messages of the trials in the log."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

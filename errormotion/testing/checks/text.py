@@ -1,4 +1,4 @@
-"""Whether a method that brings catalogues of its texts brings them whole."""
+"""Check that the catalogues of texts of a method are complete."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from errormotion.testing.kit import require
 
 
 def languages_of(subject: MethodSubject) -> list[str]:
-    """Return the languages in which a method brings texts."""
+    """Return the languages of the catalogues of a method."""
     texts = getattr(subject.plugin(), "texts", None)
     return [language for language in LANGUAGES if texts is not None and texts(language)]
 
 
 def why_no_texts(subject: MethodSubject) -> str:
-    """Return why the texts are not examined; empty where they are."""
-    return "" if languages_of(subject) else "the method brings no texts in another language"
+    """Return why the check of the texts does not apply; empty if it applies."""
+    return "" if languages_of(subject) else "the method has no texts in another language"
 
 
 def chapters_translated(subject: MethodSubject) -> str:
-    """In each language for which the method brings texts, no text of its chapters is left in English."""
+    """No text of a chapter is missing in the catalogues of the method."""
     from errormotion.report.untranslated import untranslated
 
     raw, _ = subject.make(0)
@@ -29,4 +29,4 @@ def chapters_translated(subject: MethodSubject) -> str:
         missing = untranslated(subject.plugin(), errors, raw, language=language)
         listed = "".join(f"\n  {text}" for text in missing[:20])
         require(not missing, f"texts('{language}') lacks {len(missing)} texts of the chapters:{listed}")
-    return f"the chapters are whole in {', '.join(languages)}"
+    return f"the chapters are complete in {', '.join(languages)}"

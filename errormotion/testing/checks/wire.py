@@ -1,5 +1,5 @@
-"""What the kit asks of a driver at the wire: late answers, the time limit, the baud rate."""
-# ruff: noqa: D401 - the docstring of a check is its claim
+"""Checks of the communication of a driver: late answers, the time limit, the baud rate."""
+# ruff: noqa: D401 - the docstring of a check is its requirement
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from errormotion.testing.sessions import numbers
 
 LATE = "late"
 LATE_ANSWERS = (12, 20, 30, 45, 70, 110)
-"""Numbers of the answer that is late: the first one for which the instrument is open by then."""
+"""Candidates for the number of the late answer; the first one after opening is used."""
 READINGS = 24
 READINGS_AFTER_ERROR = 4
 MOST_FAILURES = 12
@@ -31,24 +31,24 @@ PAUSE = 0.1
 TIME_BETWEEN_READINGS = 120.0
 """Simulated time, s."""
 QUICK, SLOW = 0.2, 1.3
-"""Time limits that are tried, s; the default of a transport lies between them."""
+"""Tried time limits, s; the default of a transport is between them."""
 SPEEDS = (19200, 57600, 115200, 230400, 2000000)
 TCP_FORMS = ("tcp://{}", "modbus+tcp://{}?unit=1", "http://{}/")
 SERIAL_FORMS = ("serial://{}", "modbus+rtu://{}?unit=1")
 
 
 def no_late_answers(subject: InstrumentSubject) -> str:
-    """Return why the check of late answers does not apply; empty where it does."""
+    """Return why the check of late answers does not apply; empty if it applies."""
     return "" if LATE in subject.menu else f"the simulator has no fault '{LATE}'"
 
 
 def no_time_limit(subject: InstrumentSubject) -> str:
-    """Return why the check of the time limit does not apply; empty where it does."""
+    """Return why the check of the time limit does not apply; empty if it applies."""
     return _no_setting(subject, "timeout")
 
 
 def no_baudrate(subject: InstrumentSubject) -> str:
-    """Return why the check of the baud rate does not apply; empty where it does."""
+    """Return why the check of the baud rate does not apply; empty if it applies."""
     return _no_setting(subject, "baudrate")
 
 
@@ -61,7 +61,7 @@ def _no_setting(subject: InstrumentSubject, name: str) -> str:
 
 
 def late_answers(subject: InstrumentSubject) -> str:
-    """After an answer that came too late, the next reading is right, or a typed error; never the late answer."""
+    """After a late answer, the next reading is correct or a typed error, and is not the late answer."""
     if not _no_setting(subject, "timeout"):
         subject = _with_settings(subject, timeout=1.5 * QUICK)
         limit = 1.5 * QUICK
@@ -89,7 +89,7 @@ def _late_readings(subject: InstrumentSubject, when: str) -> list[Reading]:
 
 
 def _readings(subject: InstrumentSubject, fault: str) -> list[Reading]:
-    """Return readings or their errors: some without an error, or some right ones after the first error."""
+    """Return readings or their errors: some without an error, or some correct ones after the first error."""
     found: list[Reading] = []
     instrument = subject.build(fault=fault)
     try:
@@ -103,7 +103,7 @@ def _readings(subject: InstrumentSubject, fault: str) -> list[Reading]:
             except Exception as error:  # noqa: BLE001 - judged below
                 found.append(error)
                 right, failures = 0, failures + 1
-                time.sleep(PAUSE)  # some drivers wait before they connect again
+                time.sleep(PAUSE)  # some drivers wait before they reconnect
     except Exception as error:  # noqa: BLE001 - the answer was late while it was opened
         found.append(error)
     finally:
@@ -113,7 +113,7 @@ def _readings(subject: InstrumentSubject, fault: str) -> list[Reading]:
 
 
 def _vary(subject: InstrumentSubject, number: int) -> None:
-    """Make the next reading another one: an answer that is taken for another could not be seen in equal ones."""
+    """Change the next reading, so that a confusion of answers can be detected."""
     if subject.vary is not None:
         subject.vary(number)
     elif subject.simulated:
@@ -132,15 +132,14 @@ def _require_in_step(sound: list[Reading], late: list[Reading], how: str, *, rep
     after = [reading for reading in late[first:] if not isinstance(reading, Exception)]
     seen = f"{how}: {type(errors[0]).__name__}, then {len(after)}"
     if repeats:
-        return f"{seen} readings; the device gives a lost one again, so that their order is not seen"
+        return f"{seen} readings; the device repeats lost readings, so that their order is unknown"
     if first >= len(sound) or sum(_same(sound[first], reading) for reading in sound) != 1:
-        return f"{seen} readings; equal ones, whose order is not seen: state 'vary' in the subject"
+        return f"{seen} equal readings, so that their order is unknown: state 'vary' in the subject"
     require(
         not any(_same(reading, sound[first]) for reading in after),
-        f"{how}: an answer that came too late was taken for that to the next request; send requests within "
-        "'with self.exchange() as line:'",
+        f"{how}: a late answer was used for the next request; send requests within 'with self.exchange() as line:'",
     )
-    return f"{seen} right readings"
+    return f"{seen} correct readings"
 
 
 def _same(reading: Reading, other: Reading) -> bool:
@@ -150,7 +149,7 @@ def _same(reading: Reading, other: Reading) -> bool:
 
 
 def time_limit(subject: InstrumentSubject) -> str:
-    """A silent instrument is given up after the ``timeout`` of the settings: neither sooner nor much later."""
+    """Without answer, an error is raised after the ``timeout`` of the settings, not earlier or much later."""
     for wire, forms in (("tcp", TCP_FORMS), ("pty", SERIAL_FORMS)):
         for form in forms:
             if _seconds_to_timeout(subject, wire, form, QUICK) is None:
@@ -158,17 +157,17 @@ def time_limit(subject: InstrumentSubject) -> str:
             slow = _seconds_to_timeout(subject, wire, form, SLOW)
             require(
                 slow is None or slow >= 0.95 * SLOW,
-                f"timeout = {SLOW} s: given up after {slow or 0:.2f} s; pass the setting to the transport",
+                f"timeout = {SLOW} s: error after {slow or 0:.2f} s; pass the setting to the transport",
             )
             most = 1.0 + 5 * QUICK
             quick = min(_seconds_to_timeout(subject, wire, form, QUICK) or 0.0 for _ in range(2))
-            require(quick <= most, f"timeout = {QUICK} s: given up after {quick:.2f} s, expected at most {most:g} s")
+            require(quick <= most, f"timeout = {QUICK} s: error after {quick:.2f} s, expected at most {most:g} s")
             return f"{form.partition(':')[0]}: {quick:.2f} s for {QUICK} s, {slow or 0:.2f} s for {SLOW} s"
     return "it opens without an answer of the device"
 
 
 def _seconds_to_timeout(subject: InstrumentSubject, wire: str, form: str, limit: float) -> float | None:
-    """Return the time until a silent device is given up, s; None where this is not what happens."""
+    """Return the time until the error without answer of the device, s; None for other errors."""
     with _silent(wire) as server:
         subject = _with_settings(subject, timeout=limit)
         instrument = subject.build(address=form.format(_place(server)))
@@ -186,7 +185,7 @@ def _seconds_to_timeout(subject: InstrumentSubject, wire: str, form: str, limit:
 
 
 def baudrate(subject: InstrumentSubject) -> str:
-    """The ``baudrate`` of the settings is that of the serial line."""
+    """The serial line has the ``baudrate`` of the settings."""
     default = subject.plugin.Settings.model_fields["baudrate"].default
     limit = {} if _no_setting(subject, "timeout") else {"timeout": QUICK}
     for form in SERIAL_FORMS:
@@ -198,7 +197,7 @@ def baudrate(subject: InstrumentSubject) -> str:
                     instrument = _with_settings(subject, baudrate=speed, **limit).build(
                         address=form.format(_place(server))
                     )
-                except ValueError:  # the instrument has no such rate
+                except ValueError:  # the instrument does not support this rate
                     continue
                 with suppress(InstrumentError):
                     instrument.open()

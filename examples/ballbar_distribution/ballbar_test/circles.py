@@ -15,9 +15,9 @@ REFERENCE_TEMPERATURE = 20.0  # degC
 class Circles:
     """Readings in the order of ``DIRECTIONS``, (2, run, sample), SI.
 
-    ``length`` holds NaN where a reading is missing. ``time`` counts from the calibration of the bar; None where it is
-    not given. ``expansion`` is the effect of the bar's temperature on its length, (2, run), ``shared`` that of one
-    standard uncertainty of each source that all readings share.
+    ``length`` is NaN for a missing reading. ``time`` is relative to the calibration of the bar; None if it is not
+    stated. ``expansion`` is the effect of the temperature of the bar on its length, (2, run), ``shared`` that of one
+    standard uncertainty of each source common to all readings.
     """
 
     length: np.ndarray
@@ -39,12 +39,12 @@ class Circles:
 
 
 def read(raw, notes):
-    """Return the readings of a raw dataset that follows its schema.
+    """Return the readings of a raw dataset that conforms to its schema.
 
     Raises
     ------
     MethodError
-        Directions of travel, axes or constants that do not fit together.
+        Directions of travel, axes or constants are inconsistent.
     """
     dims = ("direction_of_travel", "run", "sample")
     labels = sorted(map(str, raw["direction_of_travel"].values)) if "direction_of_travel" in raw.coords else []
@@ -64,7 +64,7 @@ def read(raw, notes):
         time = over_readings("reading_time")
         length[~np.isfinite(time)] = np.nan
     if not np.isfinite(length).any(axis=(1, 2)).all():
-        raise MethodError("length: expected readings in both directions of travel; found one or both without any")
+        raise MethodError("length: expected readings in both directions of travel; found none in one or both")
     expansion, shared = _temperature(sorted_raw, radius, length.shape[:2], notes)
     return Circles(
         length=length,
@@ -111,17 +111,17 @@ def _positive(raw, name):
 
 
 def _temperature(raw, radius, shape, notes):
-    """Return how much longer the bar was than its reading states, (2, run), and the shared uncertainties of that."""
+    """Return the expansion of the bar, (2, run), and its shared uncertainties."""
     if "temperature" not in raw:
         return np.zeros(shape), {}
     if "expansion" not in raw:
-        notes.append("The temperature of the bar is not corrected: its expansion coefficient is not given.")
+        notes.append("The temperature of the bar is not corrected: its expansion coefficient is not stated.")
         return np.zeros(shape), {}
     excess = raw["temperature"].transpose("direction_of_travel", "run").values - _scalar(
         raw, "calibration_temperature", REFERENCE_TEMPERATURE
     )
     if not np.isfinite(excess).all():
-        raise MethodError("temperature: expected one of the bar for each circle; found NaN. Leave the variable out")
+        raise MethodError("temperature: expected one of the bar for each circle; found NaN. Omit the variable")
     coefficient = float(raw["expansion"])
     return coefficient * radius * excess, {
         "expansion coefficient of the bar": radius * excess * _scalar(raw, "expansion_uncertainty", 0.0),

@@ -1,4 +1,4 @@
-"""What the conformance kit examines."""
+"""The subject of the conformance kit."""
 
 from errormotion.plugins import MethodSubject
 
@@ -14,7 +14,7 @@ OPTIONAL = (
 
 
 def subjects():
-    """Return the method with simulated tests on few sectors, which takes seconds."""
+    """Return the method with simulated tests with few sectors, for a duration of seconds."""
     from ballbar_test.method import Ballbar
 
     settings = Ballbar.Settings(samples=540, places=60)

@@ -1,14 +1,14 @@
 """From readings to radial deviations, parameters of the path and the figures of the standard.
 
 The bar reads ``L = |R u + o + e| `` with the set-up offset o of the path from the ball on the table, so that
-``L - R = u . (o + e) + second(o)``; the second order of the offset is removed with the fitted offset. What remains is
+``L - R = u . (o + e) + second(o)``; the second order of the offset is removed with the fitted offset. The remainder is
 averaged by sectors, and the offset of the common least-squares circle is subtracted: the estimate is ``P g`` of the
-means g, with the projection P that removes cosine and sine. The radius remains: it compares the machine's scales with
-the calibrated bar.
+means g, with the projection P that removes cosine and sine. The radius is not removed: it compares the scales of the
+machine with the calibrated bar.
 
 Covariance: the means have independent noise S, so that ``P S P'`` is that of the deviations. Its diagonal is stated
-exactly. Between different places it differs from zero by at most 1/places of the variance, and not at all in what is
-orthogonal to cosine and sine; the places are therefore stated as independent, beside the sources that they share.
+exactly. Between different sectors it differs from zero by at most 1/places of the variance, and it is zero orthogonal
+to cosine and sine; the sectors are therefore stated as independent, in addition to their shared sources.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from ballbar_test.extremes import Figures, figures
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Radial deviations over (2, place), CCW first, and what follows from them; SI, NaN = unknown.
+    """Radial deviations over (2, place), CCW first, and further results; SI, NaN = unknown.
 
     ``independent`` is the standard uncertainty of a deviation by noise, ``shared`` the effect of one standard
     uncertainty of each named source. ``model`` is the fitted path, ``offset`` (2,) that of the path from the ball on
@@ -85,7 +85,7 @@ def _fit(averaged, design, notes):
     model = M @ path
     circle_covariance = (to_circle * u**2) @ to_circle.T + _outer(shared @ to_circle.T)
     if (missing := int((~known).sum())) > 0:
-        notes.append(f"{missing} of {known.size} sectors of the circles hold no reading; their deviation is unknown.")
+        notes.append(f"{missing} of {known.size} sectors of the circles have no reading; their deviation is unknown.")
     return Evaluation(
         deviation=deviation,
         independent=independent,
@@ -102,7 +102,7 @@ def _fit(averaged, design, notes):
 
 
 def _weighted_inverse(M, u):
-    """Return the matrix that takes values with uncertainties u to the least-squares parameters of M, (p, n)."""
+    """Return the matrix from values with uncertainties u to the least-squares parameters of M, (p, n)."""
     scale = np.linalg.norm(M / u[:, None], axis=0)
     return np.linalg.pinv(M / u[:, None] / scale) / u / scale[:, None]
 

@@ -1,7 +1,7 @@
 """The figures of ISO 230-4, with an uncertainty that allows for the noise in extreme values.
 
-The actual path enters as its radial deviation F(direction of travel, angle), positive outward. The set-up error, which
-is the offset of the centre, is removed by the least-squares circle. The figures follow clause 3 of ISO 230-4:2005:
+The actual path is stated by its radial deviation F(direction of travel, angle), positive outward. The set-up error, the
+offset of the centre, is removed by the least-squares circle. The figures conform to clause 3 of ISO 230-4:2005:
 
 ``G(CCW)``, ``G(CW)``
     Circular deviation: radial separation of the two circles that enclose the path of one direction of travel,
@@ -14,20 +14,19 @@ is the offset of the centre, is removed by the least-squares circle. The figures
     Radial deviation: the largest and the smallest deviation of the actual paths from the nominal path, whose centre
     is that of the least-squares circle and whose radius is nominal.
 ``D``
-    Mean bi-directional radial deviation: radius of the least-squares circle of both paths, less the nominal radius.
+    Mean bi-directional radial deviation: radius of the least-squares circle of both paths, minus the nominal radius.
 
-A maximum of noisy values is too large on average: it takes the noise that points outward. How much depends on the shape
-of the path. SIMEX (Cook, Stefanski, J. Am. Stat. Assoc. 89 (1994) 1314) finds it from the path itself. Noise of the
-same size is added once more, which raises a figure from g_0 to g_1 = g_0 + d on average. The bias grows with the
-standard deviation of the noise where the path is flat about its extremes, and with its variance where it is pointed.
-Extrapolated to no noise, this gives::
+A maximum of noisy values is too large on average, by an amount that depends on the shape of the path. SIMEX (Cook,
+Stefanski, J. Am. Stat. Assoc. 89 (1994) 1314) estimates it from the path: noise of the same size is added once more,
+which increases a figure from g_0 to g_1 = g_0 + d on average. The bias is proportional to the standard deviation of the
+noise for a path that is flat about its extremes, and to its variance for a pointed one. Extrapolation to zero noise::
 
     flat      g = g_0 - d / (sqrt(2) - 1)
     pointed   g = g_0 - d
 
 The value is the first, without bias on flat paths. The standard uncertainty combines the standard deviation of the
-figure under noise with the difference of the two, taken as the standard uncertainty of the extrapolation: with that,
-intervals of two standard uncertainties hold the true figure in about 95 % of tests, on flat and on pointed paths.
+figure under noise with the difference of the two as standard uncertainty of the extrapolation: intervals of two
+standard uncertainties then contain the true figure in about 95 % of tests, on flat and on pointed paths.
 """
 
 from dataclasses import dataclass
@@ -49,7 +48,7 @@ MEANINGS = (
 POSITIVE = ("G(CCW)", "G(CW)", "G(b)", "H")
 DRAWS = 1000
 FLAT, POINTED = 1 / (np.sqrt(2) - 1), 1.0
-"""Bias of a figure over the difference that as much noise again makes, for the two shapes of a path."""
+"""Ratio of the bias of a figure to its change by additional noise of the same size, for the two shapes of a path."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ def centred(deviation):
 
 
 def evaluate(deviation):
-    """Return the figures (..., 7) of radial deviations (..., 2, place), CCW first, m; without regard to noise."""
+    """Return the figures (..., 7) of radial deviations (..., 2, place), CCW first, m, without correction for noise."""
     both = centred(deviation)
     single = [np.nanmax(path, axis=(-2, -1)) - np.nanmin(path, axis=(-2, -1)) for path in _single(deviation)]
     top, bottom = np.nanmax(both, axis=(-2, -1)), np.nanmin(both, axis=(-2, -1))
@@ -94,7 +93,7 @@ def _single(deviation):
 
 
 def radius(deviation):
-    """Return the radius of the least-squares circle of both paths, less the nominal one, (...), m."""
+    """Return the radius of the least-squares circle of both paths, minus the nominal one, (...), m."""
     paths, places = deviation.shape[-2:]
     flat = deviation.reshape(*deviation.shape[:-2], -1)
     known = np.isfinite(flat.reshape(-1, paths * places)[0])
@@ -103,22 +102,22 @@ def radius(deviation):
 
 
 def figures(deviation, independent, shared):
-    """Return the figures, freed of the bias by noise, with their covariance.
+    """Return the figures, corrected for the bias by noise, with their covariance.
 
     Parameters
     ----------
     deviation : ndarray, (2, place)
         Radial deviation, CCW first, m; NaN = unknown.
     independent : ndarray, (2, place)
-        Standard uncertainty by what is new at every place, m.
+        Standard uncertainty by independent noise, m.
     shared : ndarray, (source, 2, place)
-        Effect of one standard uncertainty of each source that all places share, m.
+        Effect of one standard uncertainty of each shared source, m.
     """
     draw = np.random.default_rng(0).standard_normal
     half = independent * draw((DRAWS // 2, *deviation.shape))
     half += np.tensordot(draw((DRAWS // 2, len(shared))), shared, axes=1)
     first = evaluate(deviation)
-    again = evaluate(deviation + np.concatenate([half, -half]))  # in pairs: no bias from the draws themselves
+    again = evaluate(deviation + np.concatenate([half, -half]))  # in pairs, so that the draws cause no bias
     d = again.mean(axis=0) - first
     value = first - FLAT * d
     covariance = np.cov(again.T)

@@ -9,7 +9,7 @@ from errormotion.datasets import provenance
 from errormotion.datasets.timing import start_of
 
 MISFIT = 2.0
-"""Chi-square of the model by degree of freedom from which a note reports it."""
+"""Chi-square of the model by degree of freedom above which a note reports it."""
 
 
 def identify(raw, settings, method, version):
@@ -18,7 +18,7 @@ def identify(raw, settings, method, version):
     Raises
     ------
     MethodError
-        The readings are no full circles in both directions of travel, or their constants do not fit together.
+        The readings are not full circles in both directions of travel, or their constants are inconsistent.
     """
     notes = []
     read = circles.read(raw, notes)
@@ -39,14 +39,14 @@ def identify(raw, settings, method, version):
 
 
 def effective(settings, read):
-    """Return the settings with the test that the raw dataset states."""
+    """Return the settings with the test of the raw dataset."""
     runs, samples = read.length.shape[1:]
     test = {"plane": read.plane, "centre": tuple(read.centre), "nominal_radius": read.radius, "feed": read.feed}
     return settings.model_copy(update={**test, "runs": runs, "samples": samples})
 
 
 def plan(settings, method, version):
-    """Return zeros with the covariance to expect: the evaluation of a test without errors of machine and bar."""
+    """Return zeros with the expected covariance: the evaluation of a test without errors of machine and bar."""
     silent = settings.model_copy(update={"length_noise": 0.0, "length_uncertainty": 0.0})
     raw = measure(silent, Machine(), np.random.default_rng(0))
     for name in ("length_noise", "length_uncertainty"):
@@ -83,10 +83,14 @@ def dataset(found, read, settings, **attributes):
         "model": (over, found.model, {**metre, "long_name": "radial deviation of the fitted path"}),
         "noise_u": (over, found.independent, {**metre, "long_name": "standard uncertainty by noise"}),
         "reading_count": (over, found.averaged.count, {"units": "1", "long_name": "readings in each sector"}),
-        "offset": ("axis", found.offset, {**metre, "long_name": "set-up error: path against the table's ball"}),
+        "offset": (
+            "axis",
+            found.offset,
+            {**metre, "long_name": "set-up error: offset from the ball on the table"},
+        ),
         "offset_u": ("axis", found.offset_u, metre),
         "reading_noise": ((), found.averaged.noise, {**metre, "long_name": "standard deviation of one reading"}),
-        "spike_decay": ((), settings.spike_decay, {"units": "rad", "long_name": "of the model's spikes"}),
+        "spike_decay": ((), settings.spike_decay, {"units": "rad", "long_name": "of the spikes of the model"}),
         "misfit": ((), found.misfit, {"units": "1", "long_name": "chi-square of the model by degree of freedom"}),
         "drift": ((), found.averaged.drift, {"units": "m/s", "long_name": "of the bar; NaN = not determined"}),
         "drift_u": ((), found.averaged.drift_u, {"units": "m/s"}),
@@ -107,7 +111,7 @@ def dataset(found, read, settings, **attributes):
 
 
 def steps(found):
-    """Return what was done, for the provenance."""
+    """Return the steps of the evaluation, for the provenance."""
     removed = ["offset of the least-squares circle removed"]
     if np.isfinite(found.averaged.drift):
         removed.append("linear drift of the bar removed")
@@ -115,23 +119,23 @@ def steps(found):
 
 
 def remarks(found, read):
-    """Return what is worth a note: a large set-up error, or a path that the model does not describe."""
+    """Return notes on a large set-up error, and on a path that the model does not describe."""
     notes = []
     size = float(np.hypot(*found.offset))
     if size > 1e-3 * read.radius:
         notes.append(
-            f"The path lies {1e3 * size:.3f} mm off the ball on the table. Set up to within "
-            f"{1e6 * read.radius / 1e3:.0f} um: the bar then sees errors across it."
+            f"The offset of the path from the ball on the table is {1e3 * size:.3f} mm. Set up to within "
+            f"{1e6 * read.radius / 1e3:.0f} um: a larger offset makes the readings depend on errors across the bar."
         )
     if found.misfit > MISFIT:
         notes.append(
             f"The path has errors beyond the model (chi-square by degree of freedom {found.misfit:.1f}); the "
-            "uncertainties of its parameters are enlarged."
+            "uncertainties of its parameters are increased."
         )
     return notes
 
 
 def limits(settings):
-    """Return the limits of the figures that settings state, as attributes."""
+    """Return the limits of the figures in the settings as attributes."""
     stated = {name: getattr(settings, name) for name in result.LIMITS}
     return {name: value for name, value in stated.items() if value is not None}

@@ -17,10 +17,10 @@ class Ballbar:
         status="simulated_only",
         version="1",
         cannot_see=(
-            "errors across the bar: only the radial one of the three displacements is seen",
+            "errors across the bar: only the radial displacement is measured",
             "the position of the circle: its centre is that of the least-squares circle",
-            "arcs: only full circles are centred",
-            "a drift of the bar, where each direction of travel has one circle only",
+            "arcs: only full circles can be centred",
+            "a drift of the bar, if each direction of travel has only one circle",
         ),
     )
     needs = Needs(instruments=(), raw_schema=SCHEMA)
@@ -32,7 +32,7 @@ class Ballbar:
     figures = staticmethod(figures_of)
 
     def acquire(self, bench, settings, *, inputs, done=None):
-        """Refuse: readings of a ballbar come from the software of its maker, as a CSV file."""
+        """Raise an error: readings of a ballbar are imported as a CSV file of its software."""
         raise MethodError(
             "ballbar does not acquire. Record with the software of the ballbar, write the readings to a CSV file of "
             f"schema {SCHEMA}, and use 'errormotion identify FILE'."
@@ -47,7 +47,7 @@ class Ballbar:
         return float(settings.runs)
 
     def identify(self, raw, settings=None):
-        """Turn a raw dataset into an error dataset; see ``identification``."""
+        """Return the error dataset of a raw dataset; see ``identification``."""
         from ballbar_test.identification import identify
 
         checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
@@ -57,7 +57,7 @@ class Ballbar:
         return identify(checked, settings or Settings(), self.info.id, self.info.version)
 
     def plan(self, settings=None):
-        """Return zeros with the covariance to expect; see ``identification``."""
+        """Return zeros with the expected covariance; see ``identification``."""
         from ballbar_test.identification import plan
 
         return plan(settings or Settings(), self.info.id, self.info.version)

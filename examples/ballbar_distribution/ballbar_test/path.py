@@ -1,8 +1,8 @@
-"""The radial deviation of a circular path, as the errors of its two axes make it.
+"""The radial deviation of a circular path from the errors of its two axes.
 
-The tool is commanded to ``R u``, with ``u = (cos a, sin a)`` in the plane of the two axes and the angle ``a`` counted
-from the first axis toward the second. The sense is s = +1 counterclockwise and s = -1 clockwise, the feed is V, and the
-bar sees ``u . e`` of the error e = (e_1, e_2) of tool against workpiece. The errors of the axes give, to first order:
+The commanded position of the tool is ``R u``, with ``u = (cos a, sin a)`` in the plane of the two axes and the angle
+``a`` from the first axis towards the second. The sense is s = +1 counterclockwise and s = -1 clockwise, the feed is V,
+and the bar measures ``u . e`` of the error e = (e_1, e_2) of tool relative to workpiece. To first order:
 
 ===================  ===========================================  ==========================================
 parameter            error of the axes                            radial deviation
@@ -20,8 +20,8 @@ parameter            error of the axes                            radial deviati
 
 f is the angle travelled since the last reversal of the axis, and d the decay of its spike. ``squareness`` is the
 rotation of the second axis from the right angle to the first, about the normal of the plane: C0Y in plane XY. A bow is
-the straightness error of an axis at the ends of the circle's diameter against its middle. The second order is the
-square of the error across the bar by twice the radius: 1 nm for 17 um at a radius of 150 mm.
+the straightness error of an axis at the ends of the diameter relative to its middle. The second order is the square of
+the error across the bar divided by twice the radius: 1 nm for 17 um at a radius of 150 mm.
 """
 
 import numpy as np

@@ -10,7 +10,7 @@ from errormotion.report.document import Figure
 from errormotion.report.text import fixed, rounded
 
 INNER = 0.47
-"""Radius of the innermost ring, as a share of the outermost."""
+"""Radius of the innermost ring relative to the outermost."""
 RINGS = 7
 """Largest number of divisions between the rings."""
 STYLES = {"CCW": (canvas.BLUE, None), "CW": (canvas.VERMILLION, (5, 2))}
@@ -155,7 +155,7 @@ def _figure_texts(errors):
 
 
 def over_angle(errors, key):
-    """Return the deviations over the angle with their bands, and what the model of the path leaves."""
+    """Return the deviations over the angle with their bands, and the residuals of the model of the path."""
     angle = np.degrees(errors["angle"].values)
     deviation, model, noise = (
         1e6 * errors[name].transpose("direction_of_travel", "angle").values
@@ -182,11 +182,11 @@ def over_angle(errors, key):
 
     caption = (
         "Radial deviation over the angle, thin black: the fitted model of the path; dotted: mean radial deviation D. "
-        "Below: what the model leaves. Bands: expanded uncertainty by noise, k = 2; the bar's calibration, which "
-        "shifts all values alike, is not in them."
+        "Below: residuals of the model. Bands: expanded uncertainty by noise, k = 2, without the calibration of the "
+        "bar, which has the same effect on all values."
     )
     left = float(np.sqrt(np.nanmean((deviation - model) ** 2)))
-    alt = f"Deviation over the angle; the model leaves {fixed(left, 3)} µm rms."
+    alt = f"Deviation over the angle; residuals of the model: {fixed(left, 3)} µm rms."
     return Figure(canvas.draw(paint, key, canvas.stack_height(HEIGHTS)), caption, alt)
 
 

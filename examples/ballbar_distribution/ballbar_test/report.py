@@ -14,8 +14,8 @@ from errormotion.report.text import fixed, integer, listed
 #: Words, field unit and its size in SI of each parameter; {0} and {1} are the axes.
 WORDS = {
     "squareness": ("squareness of {1} to {0}", "µrad", 1e-6),
-    "scale_mismatch": ("scale of {0} less that of {1}", "µm/m", 1e-6),
-    "servo_mismatch": ("following lag of {0} less that of {1}", "ms", 1e-3),
+    "scale_mismatch": ("scale of {0} minus that of {1}", "µm/m", 1e-6),
+    "servo_mismatch": ("following lag of {0} minus that of {1}", "ms", 1e-3),
     "backlash_1": ("backlash of {0}", "µm", 1e-6),
     "backlash_2": ("backlash of {1}", "µm", 1e-6),
     "bow_1": ("straightness of {0} (bow)", "µm", 1e-6),
@@ -58,7 +58,7 @@ def key_figures(errors):
 
 
 def summary(errors):
-    """Return the test, the verdicts and the largest contributions in sentences."""
+    """Return sentences on the test, the verdicts and the largest contributions."""
     plane, counts = errors.attrs["plane"], errors["reading_count"].values
     words = [
         f"Circles of radius {fixed(1e3 * errors.attrs['nominal_radius'], 1)} mm in plane {plane} at a feed of "
@@ -74,7 +74,7 @@ def summary(errors):
 
 
 def verdict(figure):
-    """Return whether a figure keeps its limit, with the guard band of its uncertainty (ISO 14253-1)."""
+    """Return whether a figure conforms to its limit, with the guard band of its uncertainty (ISO 14253-1)."""
     if figure.value + figure.expanded_uncertainty <= figure.limit:
         return "within its limit"
     if figure.value - figure.expanded_uncertainty > figure.limit:
@@ -87,7 +87,7 @@ def words_of(errors, name):
 
 
 def contributions(errors):
-    """Return the range of the radial deviation that each parameter makes by itself, m."""
+    """Return the range of the radial deviation caused by each single parameter, m."""
     angle = sector_angles(errors.sizes["angle"])
     settings = errors.attrs
     values = errors["parameters"].values
@@ -100,7 +100,7 @@ def contributions(errors):
 
 
 def figure_table(errors):
-    """Return the figures of the standard with what they are."""
+    """Return the table of the figures of the standard."""
     rows = []
     for figure, meaning in zip(figures_of(errors), errors["meaning"].values, strict=True):
         limit = fixed(1e6 * figure.limit, 1) if figure.limit else "none"
@@ -109,7 +109,7 @@ def figure_table(errors):
     return Table(
         "Figures of ISO 230-4 in µm. After ±: expanded uncertainty, k = 2. G and H compare the paths with one another; "
         "F and D depend on the calibrated length of the bar.",
-        ["figure", "what it is", "value", "limit", "verdict"],
+        ["figure", "quantity", "value", "limit", "verdict"],
         rows,
         numeric=False,
     )
@@ -132,7 +132,7 @@ def parameter_table(errors):
         )
     return Table(
         "Errors of the two axes by the model of the path. After ±: expanded uncertainty, k = 2. Contribution: range of "
-        "the radial deviation that the error makes by itself.",
+        "the radial deviation caused by this error.",
         ["error", "unit", "value", "contribution / µm"],
         rows,
     )
@@ -147,11 +147,11 @@ def uncertainty(errors):
     return [
         replace(made, rows=rows),
         Text(
-            "Noise is independent from sector to sector. All other sources are one draw for the whole test: they shift "
-            "the deviations together, so that G and H hardly depend on them."
+            "Noise is independent from sector to sector. All other sources are constant in the test: they affect all "
+            "deviations equally, so that G and H hardly depend on them."
         ),
         Text(
-            "G, H, Fmax and Fmin are extreme values: noise makes them larger on average. The mean excess is "
+            "G, H, Fmax and Fmin are extreme values, which are too large on average due to noise. The mean excess is "
             "removed, and the uncertainty of this correction is included."
         ),
     ]

@@ -1,4 +1,4 @@
-"""The evaluation as an error dataset, and the figures that it holds."""
+"""The evaluation as an error dataset, and its figures."""
 
 import numpy as np
 import xarray as xr
@@ -21,7 +21,7 @@ def build(deviation, variance, circles, *, shared, parameters, covariance, figur
     deviation, variance : ndarray, (2, place)
         m, m^2.
     circles : Circles
-        Or anything with ``axes``, ``centre``, ``radius``, ``feed`` and ``plane``.
+        Or another object with ``axes``, ``centre``, ``radius``, ``feed`` and ``plane``.
     shared : mapping of str to ndarray
         Source to the effect of one standard uncertainty, (2, place), m.
     parameters, covariance : ndarray, (9,) and (9, 9)
@@ -31,7 +31,7 @@ def build(deviation, variance, circles, *, shared, parameters, covariance, figur
     """
     angle = middles(deviation.shape[1])
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ circles.axes
-    sensitivity = np.hstack([unit, np.zeros_like(unit)])  # at the centre a rotation moves the ball across the bar
+    sensitivity = np.hstack([unit, np.zeros_like(unit)])  # a rotation about the centre moves the ball across the bar
     arrays = {
         "parameters": xr.DataArray(parameters, dims="parameter", attrs={"long_name": "of the path"}),
         "parameter_covariance": xr.DataArray(covariance, dims=("parameter", "parameter_")),
@@ -65,7 +65,7 @@ def build(deviation, variance, circles, *, shared, parameters, covariance, figur
 
 
 def figures_of(errors):
-    """Return the figures of ISO 230-4 that a result holds, with their limits."""
+    """Return the figures of ISO 230-4 of a result, with their limits."""
     limits = {name: float(errors.attrs[name]) for name in LIMITS if name in errors.attrs}
     u = np.sqrt(np.diagonal(errors["figure_covariance"].values))
     return [
@@ -77,7 +77,7 @@ def figures_of(errors):
 
 
 def limit_of(name, limits):
-    """Return the limit of a figure, m; None where there is none."""
+    """Return the limit of a figure, m; None if there is none."""
     return limits.get("hysteresis_limit" if name == "H" else "circular_deviation_limit" if name[0] == "G" else "")
 
 

@@ -27,7 +27,7 @@ RAW_SCHEMAS = (
                 "rad",
                 -100.0,
                 100.0,
-                "commanded angle, from the first axis toward the second; NaN only where there is no reading",
+                "commanded angle, from the first axis towards the second; NaN only without a reading",
                 missing=True,
             ),
             Row(
@@ -47,7 +47,7 @@ RAW_SCHEMAS = (
                 ("axis", "direction"),
                 "1",
                 *UNIT_VECTOR,
-                "of the two axes of the plane; labels of axis, where given: X Y, Y Z or Z X",
+                "of the two axes of the plane; labels of axis, if stated: X Y, Y Z or Z X",
             ),
             Row("length_uncertainty", (), "m", *NOISE, "standard uncertainty of the calibrated length"),
             Row(
@@ -55,7 +55,7 @@ RAW_SCHEMAS = (
                 (),
                 "m",
                 *NOISE,
-                "standard deviation of one reading; by the scatter of the readings where not given",
+                "standard deviation of one reading; default: from the scatter of the readings",
                 required=False,
             ),
             Row(
@@ -74,7 +74,7 @@ RAW_SCHEMAS = (
                 "degC",
                 -40.0,
                 100.0,
-                "at which the calibrated length holds; 20 degC where not given",
+                "reference temperature of the calibrated length; default 20 degC",
                 required=False,
             ),
             Row("expansion", (), "1/K", 0.0, 1e-4, "expansion coefficient of the bar", required=False),

@@ -1,9 +1,9 @@
 """Readings averaged over the sectors of the circle.
 
-The estimate at a sector is the mean of its readings less the model of the path there, plus the mean of that model
-over the sector: readings that lie unevenly in a sector then cause no error to first order. A drift of the bar that is
-linear in time shows within a sector between repeated circles, where the path is the same; the means of the sectors
-are uncorrelated with it.
+The estimate of a sector is the mean of its readings minus the model of the path there, plus the mean of this model over
+the sector: an uneven distribution of the readings in a sector then causes no error to first order. A linear drift of
+the bar is determined from repeated circles within a sector, where the path is the same; the means of the sectors are
+uncorrelated with it.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from ballbar_test.path import TAU, basis, circle, sector_angles
 from errormotion.errors import MethodError
 
 SCATTER_DEGREES = 30
-"""Least number of degrees of freedom from which the noise of a reading is estimated."""
+"""Smallest number of degrees of freedom for an estimate of the noise of a reading."""
 FALSE_ALARM = 1e-3
 """Probability that readings with the stated noise are reported as noisier."""
 
@@ -54,7 +54,7 @@ def average(circles, residual, model, settings, notes):
     ----------
     circles : Circles
     residual : ndarray, (2, run, sample)
-        Radial deviation less the model of the path at each reading, m; NaN = missing.
+        Radial deviation minus the model of the path at each reading, m; NaN = missing.
     model : ndarray, (2, place)
         Mean of the model over each sector, m.
     """
@@ -84,7 +84,7 @@ def average(circles, residual, model, settings, notes):
             r = r - slope * time
             degrees -= 1
         else:
-            notes.append("A drift of the bar is not determined: each direction of travel has one circle only.")
+            notes.append("A drift of the bar is not determined: each direction of travel has only one circle.")
             spread = 0.0
     noise = _noise(circles.noise, within(r), index, count, degrees, settings, notes)
     shared = {
@@ -102,24 +102,24 @@ def average(circles, residual, model, settings, notes):
 
 
 def _determined(since, time, spread):
-    """Whether readings of one sector lie apart by more than a fifth of the test, as repeated circles do."""
+    """Whether readings of one sector differ in time by more than a fifth of the test, as with repeated circles."""
     return spread > 0 and np.sqrt(spread / len(since)) > 0.1 * np.ptp(time[np.isfinite(time)])
 
 
 def _noise(stated, residual, index, count, degrees, settings, notes):
-    """Return the standard deviation of a reading: as stated, or by the scatter within sectors."""
+    """Return the standard deviation of a reading: as stated, or from the scatter within sectors."""
     many = count > 1
     estimated, tested = np.nan, 0
     if degrees >= SCATTER_DEGREES:
-        # The median over sectors: spikes and steps within a few of them do not count as noise.
+        # The median over sectors, so that spikes and steps in a few of them are not counted as noise.
         squares = np.bincount(index, residual**2, minlength=len(count))[many]
         estimated = np.sqrt(np.median(squares / stats.chi2.ppf(0.5, count[many] - 1)))
         tested = degrees
     if not np.isfinite(stated):
         if not np.isfinite(estimated):
-            raise MethodError("length_noise: expected the standard deviation of a reading; too few readings show it")
+            raise MethodError("length_noise: expected the standard deviation of a reading; too few readings to find it")
         return float(estimated)
-    # A median of variances scatters like the mean of 4 / pi^2 as many.
+    # A median of variances scatters like the mean of a fraction 4 / pi^2 of them.
     if settings.noise == "auto" and tested:
         limit = np.sqrt(stats.chi2.ppf(1 - FALSE_ALARM, 0.4 * tested) / (0.4 * tested))
         if estimated > limit * stated:
@@ -132,12 +132,12 @@ def _noise(stated, residual, index, count, degrees, settings, notes):
 
 
 def check_gaps(count, settings):
-    """Refuse arcs: the centre of the circle follows from full circles only (ISO 230-4).
+    """Refuse arcs: only full circles determine the centre (ISO 230-4).
 
     Raises
     ------
     MethodError
-        A gap that is wider than the settings allow.
+        A gap is wider than the settings allow.
     """
     for name, row in zip(("CCW", "CW"), count, strict=True):
         empty = np.flatnonzero(np.tile(row == 0, 2))

@@ -39,7 +39,7 @@ class Settings(PluginSettings):
         "between sectors",
     )
     largest_gap: Angle = Field(
-        default=6 * DEGREE, gt=0, lt=0.5, description="largest arc without a reading; only full circles are centred"
+        default=6 * DEGREE, gt=0, lt=0.5, description="largest arc without a reading; only full circles can be centred"
     )
     spike_decay: Angle = Field(
         default=3 * DEGREE,
@@ -48,11 +48,11 @@ class Settings(PluginSettings):
         description="arc over which a spike at the reversal of an axis decays to 1/e in the model of the path",
     )
     noise: Literal["auto", "stated"] = Field(
-        default="auto", description="the stated noise of a reading, raised where the readings scatter more (auto)"
+        default="auto", description="the stated noise of a reading, increased if the readings scatter more (auto)"
     )
     drift: Literal["auto", "none"] = Field(
         default="auto",
-        description="remove a linear drift of the bar, where times and repeated circles determine it (auto)",
+        description="remove a linear drift of the bar, if times and repeated circles determine it (auto)",
     )
 
     # Limits of the figures

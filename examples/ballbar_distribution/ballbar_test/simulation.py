@@ -17,7 +17,7 @@ from ballbar_test.schema import READINGS, SCHEMA
 from errormotion.datasets import provenance
 
 MISSING = 0.002
-"""Share of readings that are missing."""
+"""Share of missing readings."""
 EXPANSION, EXPANSION_U, TEMPERATURE_U = 11.5e-6, 1e-6, 0.05  # 1/K, 1/K, K
 
 
@@ -41,7 +41,7 @@ class Machine:
         return np.array([self.squareness, *mismatch, *self.backlash, *self.bow, *self.spike])
 
     def position(self, angle, sense, radius, feed):
-        """Return where the tool is in the plane while it is commanded to an angle of the circle, (..., 2), m."""
+        """Return the position of the tool in the plane at a commanded angle of the circle, (..., 2), m."""
         x, y = radius * np.cos(angle), radius * np.sin(angle)
         velocity = feed * np.stack([-sense * np.sin(angle), sense * np.cos(angle)], axis=-1)
         since = np.stack(since_reversal(angle, sense), axis=-1)
@@ -63,7 +63,7 @@ class Machine:
 
 
 def draw_machine(settings, rng):
-    """Return a machine whose errors are those of a fair machining centre."""
+    """Return a machine with typical errors of a machining centre."""
     return Machine(
         squareness=30e-6 * rng.standard_normal(),
         scale=tuple(15e-6 * rng.standard_normal(2)),
@@ -105,7 +105,7 @@ def truth(settings, machine, seed):
 
 
 def measure(settings, machine, rng, missing=0.0):
-    """Return the raw dataset of a test: circles by turns counterclockwise and clockwise."""
+    """Return the raw dataset of a test: circles alternately counterclockwise and clockwise."""
     R, V, n = settings.nominal_radius, settings.feed, settings.samples
     step = 2 * np.pi / n
     sense = np.array(list(SENSES.values()))[:, None, None]
@@ -114,7 +114,7 @@ def measure(settings, machine, rng, missing=0.0):
     lap = 2 * np.arange(settings.runs)[None, :, None] + np.array([0, 1])[:, None, None]
     time = 60.0 + lap * (2 * np.pi * R / V + 10.0) + travelled * R / V
     position = machine.position(angle, np.broadcast_to(sense, angle.shape), R, V)
-    ball = 30e-6 * rng.standard_normal(2)  # of the table's ball from the programmed centre
+    ball = 30e-6 * rng.standard_normal(2)  # of the ball on the table from the programmed centre
     length = np.linalg.norm(position - ball, axis=-1)
     temperature = 20.6 + 0.2 * rng.standard_normal() + 2e-4 * time.mean(axis=2)
     warm = temperature + TEMPERATURE_U * rng.standard_normal()

@@ -1,4 +1,4 @@
-"""The method passes the kit; its parameters and figures are right, and no better and no worse than stated."""
+"""The method passes the kit; its parameters, figures and their uncertainties are correct."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ ONE_ERROR = {
 
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_each_error_is_found_and_makes_the_deviation_of_its_formula(name):
-    """G and H of one error follow from its formula, within 1 % for what a sector averages and for the second order."""
+    """G and H of one error agree with its formula within 1 %, for the average of a sector and the second order."""
     machine, size, g, h = ONE_ERROR[name]
     errors = silent(machine)
     found = dict(zip(PARAMETERS, errors["parameters"].values, strict=True))
@@ -86,16 +86,16 @@ def test_intervals_of_the_parameters_hold_the_truth(tests):
     held = (np.abs(tests["parameters"]) <= 1.96).sum(axis=0)
     low, high = stats.binom.ppf([FALSE_ALARM / 20, 1 - FALSE_ALARM / 20], SEEDS, 0.95)
     assert dict(zip(PARAMETERS, (held >= low) & (held <= high), strict=True)) == dict.fromkeys(PARAMETERS, True)
-    # Half of all squares, so that a covariance that is too large by a third is seen too.
+    # Half of all squares, so that a covariance that is too large by a third is also detected.
     assert 0.8 < np.mean(tests["parameters"] ** 2) < 1.2
 
 
 def test_intervals_of_the_figures_hold_the_truth(tests):
-    """Extreme values are no normal variables; two standard uncertainties hold the truth in 95 % of tests or more."""
+    """Extreme values are not normal variables; two standard uncertainties contain the truth in 95 % of tests."""
     held = (np.abs(tests["figures"]) <= 2).sum(axis=0)
     low = stats.binom.ppf(FALSE_ALARM / 7, SEEDS, 0.95)
     assert dict(zip(extremes.NAMES, held >= low, strict=True)) == dict.fromkeys(extremes.NAMES, True)
-    assert (np.mean(tests["figures"] ** 2, axis=0) > 0.4).all()  # and they are not stated far too large
+    assert (np.mean(tests["figures"] ** 2, axis=0) > 0.4).all()  # and the uncertainty is not much too large
 
 
 @pytest.mark.parametrize(("path", "size"), [("flat", 0.0), ("ellipse", 20.0), ("spikes", 20.0)])
@@ -122,7 +122,7 @@ def test_noise_does_not_make_the_figures_larger(path, size):
 def test_the_plan_is_at_the_bound_of_cramer_and_rao():
     """Averaging by sectors costs 1 %, and 10 % for the spikes, which decay within two sectors.
 
-    The bound is that of all readings for the parameters beside radius, offset and drift.
+    The bound is that of all readings for the parameters in addition to radius, offset and drift.
     """
     settings = Ballbar.Settings()
     planned = Ballbar().plan(settings)

@@ -1,1 +1,1 @@
-"""The LG7 line gauge: a point sensor that is asked by lines of text."""
+"""The LG7 line gauge: a point sensor with a protocol of text lines."""

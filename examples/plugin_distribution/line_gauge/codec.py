@@ -1,7 +1,7 @@
 """Lines of the LG7: pure functions between bytes and values, which raise a ProtocolError for anything else.
 
-Asked ``GET 3``, the gauge answers three lines ``17,+0.946142*57`` (counter, mm) and then ``.*2E``. Behind the star
-stands the sum of all characters before it, in two hexadecimal digits.
+The answer to ``GET 3`` is three lines such as ``17,+0.946142*57`` (counter, mm) and then ``.*2E``. The two hexadecimal
+digits after the asterisk are the sum of all characters before it.
 """
 
 import math

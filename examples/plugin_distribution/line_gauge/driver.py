@@ -51,7 +51,7 @@ class LineGauge(Driver):
                 )
             return [decode(text) for text in texts]
 
-    def resynchronise(self) -> None:  # an answer that is later still ends ahead of the gauge's name
+    def resynchronise(self) -> None:  # any later answer ends before the name of the gauge
         super().resynchronise()
         self.transport.write(with_check("ID"))
         self.transport.read_until(b"LG7,", limit=1 << 20)

@@ -1,4 +1,4 @@
-"""Settings of the LG7; a bench file states them beside the address."""
+"""Settings of the LG7 in a bench file, in addition to the address."""
 
 from pydantic import Field
 

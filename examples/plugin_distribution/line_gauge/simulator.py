@@ -1,4 +1,4 @@
-"""A gauge on the wire that looks at the virtual machine in the place of the frame's sensor X1."""
+"""A simulated gauge that measures the virtual machine at the position of the sensor X1 of the frame."""
 
 from errormotion.instruments.simulators.device import SimulatedDevice
 from line_gauge.codec import OUT_OF_RANGE, RATE, with_check

@@ -162,7 +162,7 @@ def test_calibration_of_another_sensor_is_refused_with_both_serial_numbers(machi
 
 def test_calibration_without_a_serial_number_is_used_with_a_note(machine, calibration):
     raw = simulation.raw(machine, FOUR, seed=0).assign_attrs(by("S2"))
-    assert "'sensor' holds no serial number" in notes(identify(raw, compensation=calibration))
+    assert "'sensor' states no serial number" in notes(identify(raw, compensation=calibration))
 
 
 def test_calibration_is_part_of_the_uncertainty(machine, calibration):

@@ -1,4 +1,4 @@
-"""Figures of error datasets, behind ``ds.em.plot()``: curves, lines, maps, and arrows in the volume."""
+"""Figures of error datasets for ``ds.em.plot()``: curves, maps, and arrows in the volume."""
 
 from errormotion.datasets.results.plotting.figure import plot_errors
 

@@ -12,13 +12,13 @@ from errormotion.datasets.results.plotting.scales import UNITS, scale_of, short
 from errormotion.datasets.units import convert, format_quantity
 
 TRIPLES = (("EX", "EY", "EZ"), ("EA", "EB", "EC"))
-"""Freedoms that make an arrow."""
+"""Freedoms of an arrow."""
 
 LONGEST = 0.18
-"""Length of the longest arrow as a share of the diagonal of the targets."""
+"""Length of the longest arrow as a fraction of the diagonal of the targets."""
 
 MOST_NAMED = 30
-"""Targets whose names are written beside them."""
+"""Largest number of targets whose names are written."""
 
 _LENGTHS = LinearSegmentedColormap.from_list("lengths", ["#6BAED6", "#0072B2", "#7A3E9D", "#D55E00", "#6B2A00"])
 
@@ -65,5 +65,5 @@ def draw(axes: Any, ds: xr.Dataset, freedoms: tuple[str, ...], unit: str, band: 
 
 
 def format_quantity_of(value: float, unit: str) -> str:
-    """Return a value that is in a field unit already as a text."""
+    """Return a value in a field unit as text."""
     return f"{value:.3g} {unit}"

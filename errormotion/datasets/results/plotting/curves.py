@@ -11,7 +11,7 @@ from errormotion.datasets.results.plotting.scales import COLOURS, MARKERS, UNITS
 from errormotion.datasets.units import convert
 
 _SPREAD = 0.5
-"""Share of the distance between two objects over which the freedoms lie beside each other."""
+"""Fraction of the distance between two objects over which the freedoms are distributed."""
 
 
 def draw(axes: Axes, ds: xr.Dataset, freedoms: tuple[str, ...], unit: str, band: xr.DataArray) -> None:
@@ -56,7 +56,7 @@ def draw(axes: Axes, ds: xr.Dataset, freedoms: tuple[str, ...], unit: str, band:
 
 
 def _band(axes: Axes, x: Array, y: Array, half: Array, name: str, colour: str) -> None:
-    # A value between two unknown ones has no line to either side.
+    # A value between two unknown ones is not part of a line.
     known = np.isfinite(y)
     alone = known & ~np.append(known[1:], False) & ~np.append(False, known[:-1])
     axes.plot(x, y, label=name, color=colour, linewidth=1.2)

@@ -1,4 +1,4 @@
-"""The figure of an error dataset: its form, its panels, and what is written around them."""
+"""The figure of an error dataset: its form, panels and titles."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Form = Literal["auto", "curves", "map", "arrows"]
 
 
 class _Panel(NamedTuple):
-    """One pair of axes: its freedoms, which have one unit."""
+    """One panel with freedoms of one unit."""
 
     freedoms: tuple[str, ...]
     unit: str
@@ -47,19 +47,19 @@ def plot_errors(
     at : array_like, (3,), optional
         Functional point, m; default: that of the dataset.
     k : float
-        Coverage factor of the uncertainties; 0 draws none.
+        Coverage factor of the uncertainties; with 0 they are not drawn.
     ax : Axes or sequence of Axes, optional
-        Where to draw: one for each panel; arrows need axes with ``projection="3d"``. Default: a new figure.
+        Axes, one for each panel; arrows need axes with ``projection="3d"``. Default: a new figure.
     form : {"auto", "curves", "map", "arrows"}
-        ``curves`` with bands or bars over one dim, of two dims one curve for each label of the shorter one; ``map``
-        of two dims, a panel for each freedom; ``arrows`` at the targets of a volume. ``auto`` draws arrows where
-        displacements are known at targets in space, curves over one dim, and a map over two dims where the shorter
+        ``curves`` with bands or bars over one dim, or one curve for each label of the shorter of two dims; ``map``
+        over two dims, a panel for each freedom; ``arrows`` at the targets of a volume. ``auto`` draws arrows if
+        displacements are known at targets in space, curves over one dim, and a map over two dims if the shorter
         one has more than 8 labels.
 
     Raises
     ------
     DatasetError
-        More than two dims, no such freedom, a form that the dataset does not have, another number of axes.
+        More than two dims, an unknown freedom, a form that the dataset does not have, or a wrong number of axes.
     """
     if not 0 <= k < math.inf:
         raise DatasetError(f"Expected a coverage factor k of 0 or more; found {k!r}")
@@ -163,7 +163,7 @@ def _axes(panels: list[_Panel], form: str, given: Sequence[Axes] | None) -> tupl
 
 
 def _share(axes: Sequence[Axes]) -> None:
-    """Let panels below each other share their abscissa, which the lowest of a column labels."""
+    """Share the abscissa of the panels of a column; only the lowest one has labels."""
     for each, below in pairwise(axes):
         each.sharex(axes[-1])
         if each.get_subplotspec().colspan == below.get_subplotspec().colspan:  # type: ignore[union-attr]

@@ -1,4 +1,4 @@
-"""Maps of one freedom over two dims: a cell for each value."""
+"""Maps of one freedom over two dims with a cell for each value."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _UNKNOWN = "#D9D9D9"
 
 
 def draw(axes: Axes, ds: xr.Dataset, freedom: str, unit: str, band: xr.DataArray, k: float) -> None:
-    """Draw one freedom over two dims, the time to the right; unknown values are grey."""
+    """Draw one freedom over two dims, with time as the abscissa; unknown values are grey."""
     upward, right = sorted(ds.em.dims, key=lambda dim: (dim == "time", scale_of(ds, dim).joined, ds.sizes[dim]))
     inside = UNITS[freedom][0]
     values = np.asarray(convert(ds[freedom].transpose(upward, right).values, inside, unit))
@@ -52,7 +52,7 @@ def edges(middles: Array) -> Array:
 
 
 def _increasing(scale: Scale) -> Scale:
-    """Return a scale whose cells do not overlap: the numbers of the values where the values go back and forth."""
+    """Return a scale whose cells do not overlap: the numbers of the values if these are not monotonic."""
     steps = np.diff(scale.values)
     if (steps > 0).all() or (steps < 0).all():
         return scale

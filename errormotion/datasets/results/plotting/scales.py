@@ -1,4 +1,4 @@
-"""What errors are drawn over: times, positions, targets, labels; and the units of what is drawn."""
+"""Scales of figures: times, positions, targets, labels; units of the drawn values."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ UNITS = {
     **dict.fromkeys(("EX", "EY", "EZ", "deviation"), ("m", "um")),
     **dict.fromkeys(("EA", "EB", "EC"), ("rad", "arcsec")),
 }
-"""Inside unit and field unit of each estimate."""
+"""SI unit and field unit of each estimate."""
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#B5558A", "#3291C8", "#B07800", "#222222", "#8C6D00")
-"""After Okabe and Ito: distinguishable with every colour vision."""
+"""Colours after Okabe and Ito, distinguishable with any colour vision."""
 
 MARKERS = "os^Dv<>P"
 
 MOST_LINES = 8
-"""More curves than this are drawn as a map."""
+"""Largest number of curves; more are drawn as a map."""
 
 MOST_LABELS = 16
-"""Texts that an axis has room for."""
+"""Largest number of texts of an axis."""
 
 LONGEST_LABEL = 24
 """Characters."""
@@ -41,13 +41,13 @@ class Scale(NamedTuple):
     Attributes
     ----------
     values : ndarray, (n,)
-        In the field unit; the number of each where it has a text or no coordinate.
+        In the field unit; their numbers if they have texts or no coordinate.
     label : str
         Name and unit.
     texts : list of str
-        Of each value where it has a name; else empty.
+        Names of the values, if they have names; else empty.
     joined : bool
-        Whether the errors lie along a scale, so that a line may join them, and are not single objects.
+        Whether the values are points of a continuous scale, which a line may join, and not single objects.
     """
 
     values: Array
@@ -57,7 +57,7 @@ class Scale(NamedTuple):
 
 
 def scale_of(ds: xr.Dataset, dim: str) -> Scale:
-    """Return what the errors of a dataset are drawn over along a dim."""
+    """Return the scale of a dim of a dataset."""
     numbers = np.arange(1.0, ds.sizes[dim] + 1)
     letter = str(ds.attrs["component"]).lower()
     name = letter if dim == "position" and letter in ds.coords and ds[letter].dims == (dim,) else dim
@@ -74,18 +74,18 @@ def scale_of(ds: xr.Dataset, dim: str) -> Scale:
             values = np.asarray(convert(np.asarray(coordinate.values, float), inside, unit))
             shown = {"position": f"{name} position"}.get(dim, dim) if name != dim else dim
             return Scale(values, shown if unit == "1" else f"{shown} / {unit}", [], joined=True)
-        if np.unique(coordinate.values).size == coordinate.size:  # the numbers that people gave to targets
+        if np.unique(coordinate.values).size == coordinate.size:  # numbers as names of targets
             return Scale(numbers, dim, [f"{value:g}" for value in coordinate.values], joined=False)
     return Scale(numbers, f"{dim} number", [], joined=dim in ("time", "position"))
 
 
 def over(ds: xr.Dataset) -> str:
-    """Return the dim of two that curves run along: the longer, and of two alike the one that is not the time."""
+    """Return the dim of two that is the abscissa of curves: the longer one; if equal, the one that is not the time."""
     return str(max(ds.em.dims, key=lambda dim: (scale_of(ds, dim).joined, ds.sizes[dim], dim != "time")))
 
 
 def mark(axis: Axis, scale: Scale) -> None:
-    """Label an axis, with the names of single objects as far as they fit."""
+    """Label an axis, with the names of single objects if they fit."""
     axis.set_label_text(scale.label)
     if scale.texts:
         step = -(-len(scale.texts) // MOST_LABELS)
@@ -97,13 +97,13 @@ def mark(axis: Axis, scale: Scale) -> None:
 
 
 def short(text: object) -> str:
-    """Return a text that fits a drawing."""
+    """Return a text that is short enough for a drawing."""
     words = " ".join(str(text).split())
     return words if len(words) <= LONGEST_LABEL else words[: LONGEST_LABEL - 3] + "..."
 
 
 def legend(axes: Axes, title: str = "") -> None:
-    """Draw a legend with texts as they are written, where there is anything to name."""
+    """Draw a legend if there are labels, with texts verbatim."""
     handles, labels = axes.get_legend_handles_labels()
     if not handles:
         return
