@@ -34,7 +34,7 @@ from errormotion.errors import MethodError
 from errormotion.methods.multilateration.network.alternating import alternate
 from errormotion.methods.multilateration.network.model import Stations, directions, jacobian, readings
 from errormotion.methods.multilateration.network.solver import solve
-from errormotion.methods.multilateration.network.turning import fitted
+from errormotion.methods.multilateration.network.rigid_motion import fitted
 from errormotion.methods.multilateration.planning.bound import bound, relative_bound
 
 PARTS = ("compare", "coverage", "layout")
@@ -64,7 +64,7 @@ def data(m: int, places=STATION):
 
 def on_nominal(target, station, nominal):
     stations, moved, _ = fitted(Stations(station, np.zeros(4), NONE), target, nominal, np.ones(len(target), dtype=bool))
-    return moved, stations.place
+    return moved, stations.position
 
 
 # The ways. Each takes nominal targets, readings and rough stations; returns targets, stations, iterations, converged.
@@ -121,7 +121,7 @@ def least_squares_with(**options):
         dense = options.get("tr_solver") == "exact"
         found = least_squares(off, start, (lambda x: slope(x).toarray()) if dense else slope, **options)
         target, stations = unpacked(found.x, len(u))
-        return *on_nominal(target, stations.place, u), found.nfev, found.status > 0
+        return *on_nominal(target, stations.position, u), found.nfev, found.status > 0
 
     return work
 
@@ -144,7 +144,7 @@ def sparse_newton(u, d, station):
         x[keep] += step
         done, size = done + 1, np.abs(step).max()
     target, stations = unpacked(x, len(u))
-    return *on_nominal(target, stations.place, u), done, size <= 1e-12
+    return *on_nominal(target, stations.position, u), done, size <= 1e-12
 
 
 def published(u, d, station):

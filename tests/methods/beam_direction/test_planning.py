@@ -31,7 +31,7 @@ LIMITS = design.Limits(
     readings=180,
     noise=0.3e-6,
 )
-PAPER = np.radians([[20.0, 0.0], [20.0, 90.0]])
+PUBLISHED = np.radians([[20.0, 0.0], [20.0, 90.0]])
 
 
 def planes(number):
@@ -48,7 +48,7 @@ def expected(found, limits=LIMITS):
 
 @pytest.fixture(scope="module")
 def two():
-    return design.optimise(LIMITS, PAPER)
+    return design.optimise(LIMITS, PUBLISHED)
 
 
 def test_no_pair_of_planes_on_a_grid_is_better(two):
@@ -56,9 +56,8 @@ def test_no_pair_of_planes_on_a_grid_is_better(two):
     grid = np.radians(angles)
     grid = grid[design.inclinations(design.plane_normals(grid), BEAM) <= LIMITS.max_inclination]
     half = np.array([0.5, 0.5])
-    best = min(
-        design.worst_angle(design.angle_covariance(grid[[i, j]], half, LIMITS)) for i, j in combinations(range(len(grid)), 2)
-    )
+    pairs = combinations(range(len(grid)), 2)
+    best = min(design.worst_angle(design.angle_covariance(grid[[i, j]], half, LIMITS)) for i, j in pairs)
     shares = two.readings.sum(axis=1) / LIMITS.readings
     assert design.worst_angle(design.angle_covariance(two.planes, shares, LIMITS)) < best
 
@@ -82,7 +81,7 @@ def test_the_uncertainty_of_the_search_agrees_with_that_of_the_positions(two):
 
 
 def test_the_optimum_is_better_than_equal_strokes_with_as_many_readings(two):
-    usual = design.equal_strokes(PAPER, LIMITS)
+    usual = design.equal_strokes(PUBLISHED, LIMITS)
     assert usual.readings.sum() == two.readings.sum() == LIMITS.readings
     assert expected(usual) > 3 * expected(two)
 
@@ -107,7 +106,8 @@ def test_a_scale_error_of_the_sensor_cancels_with_planes_all_around_the_beam():
     pair, three = (design.optimise(limits, planes(number)) for number in (2, 3))
 
     def uncertainty(found):
-        return design.worst_angle(design.angle_covariance(found.planes, found.readings.sum(axis=1) / limits.readings, limits))
+        shares = found.readings.sum(axis=1) / limits.readings
+        return design.worst_angle(design.angle_covariance(found.planes, shares, limits))
 
     # With two planes at 45 deg the scale error goes into the angle whole; with three it cancels.
     assert uncertainty(pair) > 0.9 * limits.scale_uncertainty
@@ -116,7 +116,7 @@ def test_a_scale_error_of_the_sensor_cancels_with_planes_all_around_the_beam():
 
 def test_an_inclination_error_that_increases_with_the_tilt_results_in_flatter_planes():
     limits = replace(LIMITS, slope_uncertainty=lambda q: 1e-6 + 3e-4 * np.sum(q**2, axis=-1) ** 2)
-    steepest = design.inclinations(design.optimise(limits, PAPER).normals, BEAM).max()
+    steepest = design.inclinations(design.optimise(limits, PUBLISHED).normals, BEAM).max()
     assert steepest < np.radians(30)
 
 
@@ -128,12 +128,12 @@ def test_the_limits_of_the_gauge_are_respected():
 
 
 def test_impossible_plans_are_refused():
-    with pytest.raises(MethodError, match="Expected two planes or more.*; found 1"):
-        design.optimise(LIMITS, PAPER[:1])
-    with pytest.raises(MethodError, match="Expected 18 readings or more .*; found 12"):
-        design.optimise(replace(LIMITS, readings=12), PAPER)
+    with pytest.raises(MethodError, match=r"Expected two planes or more.*; found 1"):
+        design.optimise(LIMITS, PUBLISHED[:1])
+    with pytest.raises(MethodError, match=r"Expected 18 readings or more .*; found 12"):
+        design.optimise(replace(LIMITS, readings=12), PUBLISHED)
     with pytest.raises(MethodError, match="points down to the gauge"):
-        design.optimise(replace(LIMITS, beam=-BEAM), PAPER)
+        design.optimise(replace(LIMITS, beam=-BEAM), PUBLISHED)
 
 
 # Plans of the method
@@ -174,7 +174,7 @@ def test_a_measurement_has_the_uncertainty_of_its_plan():
     )
     found = BeamDirection().identify(raw, Settings(noise="stated"))
     u, expected = (np.sqrt(np.diagonal(ds["covariance"].values[0])[3:]) for ds in (found, planned))
-    # Both state turns of their nominal direction, and these are 0.6 deg (1 %) apart.
+    # Both are uncertainties of rotations from the nominal direction; the two differ by 0.6 deg (1 %).
     np.testing.assert_allclose(u, expected, rtol=0.02)
 
 
@@ -215,11 +215,11 @@ def test_the_best_planes_are_those_that_the_calibration_covers(calibration):
     assert InclinationCalibration.load(calibration).supported(q).all()
     assert float(ds["gain"]) > 1.5
     refused = [note for note in ds.attrs["notes"] if "does not cover" in note]
-    assert "strokes of one length, which this calibration does not cover." in refused[0]
+    assert "strokes of the same length, which this calibration does not cover." in refused[0]
     assert "plane 2 of the published set-up" in refused[1]
     assert "would be refused" in refused[1]
 
 
 def test_a_plan_with_a_calibration_needs_the_orientation_of_the_sensor(calibration):
-    with pytest.raises(MethodError, match=r"needs layout\.triangulation_normal"):
+    with pytest.raises(MethodError, match=r"layout\.triangulation_normal: expected"):
         BeamDirection().plan(settings(compensation=str(calibration), layout={"triangulation_normal": None}))

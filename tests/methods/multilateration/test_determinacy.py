@@ -193,8 +193,8 @@ def test_a_target_in_the_stations_plane_does_not_move_the_others(n):
     assert np.abs(network.target[others] - without.target[others]).max() < 1e-11
     assert np.abs(network.station - without.station).max() < 1e-11
     assert np.allclose(network.target_covariance[others], without.target_covariance[others], rtol=1e-9, atol=1e-18)
-    assert not network.carries[7]
-    assert network.carries[others].all()
+    assert not network.in_datum[7]
+    assert network.in_datum[others].all()
     assert any("do not carry the datum (1 of them): 8" in note for note in notes_of(network))
 
 

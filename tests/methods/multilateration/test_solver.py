@@ -93,7 +93,7 @@ def test_agrees_with_a_dense_least_squares_solver(n):
     assert np.abs(between - np.linalg.norm(target[:, None] - target, axis=-1)).max() < 1e-11
     assert network.sigma0 == pytest.approx(np.sqrt(2 * found.cost / network.freedom), rel=1e-9)
     assert network.freedom == 15 * (n - 3) - (4 * n - 6)
-    assert stations.place.shape == network.station.shape
+    assert stations.position.shape == network.station.shape
 
 
 def test_a_free_network_lies_on_the_nominal_targets():
@@ -120,7 +120,7 @@ def test_covariances_are_those_of_the_full_system(n, missing):
     for i in rng.choice(20, missing, replace=False):
         seen[rng.integers(n), i] = False
     network = bound(u, NEAR[:n], noise=noise, seen=seen)
-    C = dense_covariance(u, NEAR[:n], np.where(seen, 1 / noise, 0.0), network.carries)
+    C = dense_covariance(u, NEAR[:n], np.where(seen, 1 / noise, 0.0), network.in_datum)
     scale = np.abs(C[:60, :60]).max()
     blocks = C[:60, :60].reshape(20, 3, 20, 3)[np.arange(20), :, np.arange(20)]
     # Eight digits: the condition of the bordered system is its square.
@@ -133,7 +133,7 @@ def test_redundancies_are_those_of_the_hat_matrix():
     u = nominal_targets(14)
     network = bound(u, NEAR[:5], noise=NOISE)
     J = jacobian(u, network.stations, np.ones((5, 14), dtype=bool)).toarray() / NOISE
-    hat = J @ dense_covariance(u, NEAR[:5], np.full((5, 14), 1 / NOISE), network.carries) @ J.T
+    hat = J @ dense_covariance(u, NEAR[:5], np.full((5, 14), 1 / NOISE), network.in_datum) @ J.T
     assert np.abs(network.redundancy.T.ravel() - (1 - np.diag(hat))).max() < 1e-6
     assert network.redundancy.sum() == pytest.approx(network.freedom, rel=1e-8)
 

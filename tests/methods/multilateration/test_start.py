@@ -29,20 +29,20 @@ def test_distances_alone_tell_where_the_stations_are():
     u = targets()
     found = start(displacements(u), u)
     # Targets are 10 um off: curvature of 100 mm at 0.5 m is some 2.5 mm, so this is 1 % and less of the distance.
-    assert np.linalg.norm(found.place - STATION - CENTRE, axis=1).max() < 5e-3
+    assert np.linalg.norm(found.position - STATION - CENTRE, axis=1).max() < 5e-3
     assert np.abs(found.dead_path - 0.2).max() < 5e-3
 
 
 def test_exact_targets_give_exact_stations():
     u = targets()
     found = start(displacements(u, off=0.0), u)
-    assert np.abs(found.place - STATION - CENTRE).max() < 1e-9
+    assert np.abs(found.position - STATION - CENTRE).max() < 1e-9
 
 
 def test_rough_places_far_off_are_not_followed():
     u = targets()
     found = start(displacements(u), u, np.zeros((4, 3)))
-    assert np.linalg.norm(found.place - STATION - CENTRE, axis=1).max() < 5e-3
+    assert np.linalg.norm(found.position - STATION - CENTRE, axis=1).max() < 5e-3
 
 
 def test_a_fifth_of_gross_readings_is_borne():
@@ -52,7 +52,7 @@ def test_a_fifth_of_gross_readings_is_borne():
     for row in d:
         row[rng.choice(60, 12, replace=False)] += rng.uniform(-1, 1, 12)
     found = start(d, u)
-    assert np.linalg.norm(found.place - STATION - CENTRE, axis=1).max() < 10e-3
+    assert np.linalg.norm(found.position - STATION - CENTRE, axis=1).max() < 10e-3
 
 
 def test_flat_targets_need_to_be_told_the_side():
@@ -61,7 +61,7 @@ def test_flat_targets_need_to_be_told_the_side():
     with pytest.raises(MethodError, match="on which side of it a station is"):
         start(d, u)
     found = start(d, u, STATION + CENTRE + 0.02)
-    assert np.abs(found.place - STATION - CENTRE).max() < 1e-6
+    assert np.abs(found.position - STATION - CENTRE).max() < 1e-6
 
 
 def test_targets_on_a_line_are_refused():
@@ -89,7 +89,7 @@ def test_readings_in_another_unit_are_called_so(rough, factor, of_targets, messa
 def test_far_stations_betray_a_reversed_sign_by_curvature():
     u = targets()
     d = displacements(u, FAR)
-    assert np.isfinite(start(d, u).place).all()
+    assert np.isfinite(start(d, u).position).all()
     with pytest.raises(MethodError, match="sign reversed"):
         start(-d, u)
 
@@ -110,4 +110,4 @@ def test_few_readings_need_a_rough_place():
     with pytest.raises(MethodError, match="at least 5 readings of station 2"):
         initial_stations(d, weight, u, None)
     found = initial_stations(d, weight, u, STATION + CENTRE)
-    assert np.abs(found.place[1] - STATION[1] - CENTRE).max() < 1e-12
+    assert np.abs(found.position[1] - STATION[1] - CENTRE).max() < 1e-12

@@ -103,12 +103,8 @@ def _extrapolated(planes: Planes, calibration: InclinationCalibration) -> list[B
     if not outside.any():
         return []
     names = listed([planes.names[k] for k in np.flatnonzero(outside)])
-    subject = (
-        f"the tilts of planes {names} to the beam are"
-        if outside.sum() > 1
-        else f"the tilt of plane {names} to the beam is"
-    )
-    text = f"{subject[0].upper()}{subject[1:]} outside the settings of the calibration: the correction is extrapolated."
+    of = f"tilts of planes {names} to the beam are" if outside.sum() > 1 else f"tilt of plane {names} to the beam is"
+    text = f"The {of} outside the settings of the calibration: the correction is extrapolated."
     return [Text(text, "warning")]
 
 

@@ -106,7 +106,6 @@ def latest(raw: xr.Dataset) -> xr.Dataset:
     return raw if len(kept) == raw.sizes["station"] else raw.isel(station=kept)
 
 
-
 def _broken(raw: xr.Dataset) -> list[float]:
     """Return for each set-up the share of targets without a reading."""
     missing = np.isnan(raw["displacement"].transpose("station", "target").values)

@@ -31,7 +31,7 @@ def judge(state: State) -> None:
     if settings.together:
         state.machine = repeatability.from_positions(state.machine, network, positions(data.nominal), 1.0, state.notes)
     _judge_scatter(state)
-    if data.station is not None and not swapped_stations(network.station, network.rough):
+    if data.station is not None and not swapped_stations(network.station, network.approximate):
         off = np.linalg.norm(network.station - data.station, axis=1)
         for j in np.flatnonzero(off > settings.station_tolerance):
             state.notes.append(
@@ -59,7 +59,9 @@ def _judge_scatter(state: State) -> None:
         machine, network, data.noise, increase=increase, together=settings.together
     )
     if excess:
-        action = "the uncertainties are increased accordingly" if increase else "the stated noise is used (noise = stated)"
+        action = (
+            "the uncertainties are increased accordingly" if increase else "the stated noise is used (noise = stated)"
+        )
         cause = "" if settings.together or machine.sources else " Possible cause: repeatability of the machine."
         state.notes.append(
             f"The scatter of the readings is {network.sigma0:.3g} times the stated one; {action}.{cause}"

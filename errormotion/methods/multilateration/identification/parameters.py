@@ -278,7 +278,6 @@ def unknowns(model: Chain, max_order: int) -> list[Term]:
     return terms
 
 
-
 def _normal_equations(
     model: Chain, terms: list[Term], position: Array, reflector: Array, centre: Array, error: Array, own: Array,
     influence: Array, which: NDArray[np.intp],

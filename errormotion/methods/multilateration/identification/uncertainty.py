@@ -189,7 +189,7 @@ def responses(network: Network, changes: Sequence[Array]) -> Responses:
             gradient[c, : 4 * n] += np.concatenate([by_place, -rest.sum(axis=1)[:, None]], axis=1).ravel()
             if further:
                 gradient[c, 4 * n :] += np.einsum("kjt,jt->k", network.extra[:, :, part], rest)
-        carries = network.carries[part]  # targets to which the datum is fitted
+        carries = network.in_datum[part]  # targets to which the datum is fitted
         shift += np.einsum("tag,cta->cg", G[carries], alone[:, carries])
     return Responses(network, changes, gradient, shift @ network.datum.H.T)
 

@@ -1,4 +1,4 @@
-"""A plan in words: the map of predicted uncertainty, and the best layout as settings of a campaign."""
+"""Text of a plan: the map of the predicted uncertainty, and the best layout as settings of a campaign."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _ACROSS, _LEVELS = 7, 3
 
 
 def map_text(position: Array, own: Array, best: Array) -> str:
-    """Return tables of the uncertainty over the volume, um: as set, then best, one table for each of some heights.
+    """Return tables of the uncertainty over the volume, um, as set and best, one table for each of some heights.
 
     Parameters
     ----------
     position : ndarray (k, 3)
-        Axis positions of a grid, m; of anything else there is no table.
+        Axis positions, m; the text is empty if they are not a grid.
     own, best : ndarray (k,)
-        m; NaN where it is not known.
+        m; NaN where unknown.
     """
     x, y, z = (np.unique(np.round(column, 9)) for column in position.T)
     if len(x) * len(y) * len(z) != len(position):
@@ -42,7 +42,7 @@ def map_text(position: Array, own: Array, best: Array) -> str:
 
 
 def layout_text(layout: Layout, station: Array, targets: Array | None) -> str:
-    """Return the table ``[test.settings.layout]`` of a campaign file with these places, m; a grid without targets."""
+    """Return the table ``[test.settings.layout]`` of a campaign file; without targets (m), with the grid."""
     lines = ["[test.settings.layout]"]
     if targets is None:
         lines += [f"{name} = {_place(getattr(layout, name))}" for name in ("low", "high")]
