@@ -29,7 +29,7 @@ class Multilateration:
         cannot_see=(
             "the six rigid motions of the whole: position and orientation of the machine's coordinates are fitted",
             "rotations of the tool at a target: a reflector is a point",
-            "with one position of the reflector: rotations of the axis that carries it, and others with the same effect",
+            "with one reflector position: rotations of the axis that carries it, and others with the same effect",
             "drift that displaces and rotates the machine as a whole from one set-up to the next",
         ),
     )

@@ -29,7 +29,9 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     d = _displacement(raw)
     known = (errors["left_out"].transpose("station", "target").values == 0) & np.isfinite(errors["EX"].values)
     reduced = _with(raw.load(), np.where(known, d, np.nan))
-    reduced["displacement_noise"] = (raw["displacement_noise"] * DRAWN_NOISE).assign_attrs(raw["displacement_noise"].attrs)
+    reduced["displacement_noise"] = (raw["displacement_noise"] * DRAWN_NOISE).assign_attrs(
+        raw["displacement_noise"].attrs
+    )
     quiet = {"robust": False, "noise": "stated", "parametric": False, "alternating": False}
     if settings.repeatability is not None:
         quiet |= {

@@ -164,9 +164,7 @@ class Planning(PluginSettings):
     @model_validator(mode="after")
     def _has_direction(self) -> Self:
         if self.reflector_axis is not None and not any(self.reflector_axis):
-            raise ValueError(
-                "reflector_axis: expected a direction; found (0, 0, 0); remove it or state the direction"
-            )
+            raise ValueError("reflector_axis: expected a direction; found (0, 0, 0); remove it or state the direction")
         return self
 
 

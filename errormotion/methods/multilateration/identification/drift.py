@@ -166,7 +166,7 @@ def _within(groups: list[NDArray[np.intp]], d: Array, terms: Array, noise: Array
 
 
 def _scatter(returns: list[tuple[Array, Array]]) -> tuple[float, int]:
-    """Return the ratio of the variance with all drifts free to the stated one, at least 1, and its degrees of freedom."""
+    """Return the ratio, at least 1, of the variance with free drifts to the stated one, and its degrees of freedom."""
     square, freedom = 0.0, 0
     for d, A in returns:
         order = max(_orders(d, A), default=0)

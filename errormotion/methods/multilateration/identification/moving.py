@@ -1,7 +1,7 @@
 """Detection of a station that was moved between its readings, if the readings contradict one another.
 
 Readings of a station that was moved are those of two stations. For every station and a number of cuts of its sequence
-of readings, the network is solved with the two parts as separate stations; the best cut is searched from coarse to fine.
+of readings, the network is solved with the two parts as separate stations, first with a coarse, then a fine search.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _MIN_READINGS = 5  # of a part
 _MIN_SHARE = 0.5
 """Share of the excess that a cut must explain."""
 _MIN_DECREASE = 50.0
-"""Decrease of the sum of squares by a cut, over the variance that remains; by its four additional unknowns it happens by
-chance once in 3e9 cuts."""
+"""Decrease of the sum of squares by a cut, over the remaining variance; with four additional unknowns its probability
+by chance is 3e-10."""
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ series of Legendre polynomials over the measured part of its axis, starting with
 * the six rigid motions of the whole are those of the datum: they are estimated as well, and returned;
 * constants of error motions and slopes of straightness are motions of the whole or squareness, so error motions have a
   mean of zero, straightness has no slope, and squareness is that of the mean lines of the axes;
-* errors without effect on any reflector, or with the same effect as others, are not determined. With one reflector these
-  are the rotations of the axis that carries it, and of others with a constant lever.
+* errors without effect on any reflector, or with the same effect as others, are not determined. With one reflector
+  these are the rotations of the axis that carries it, and of others with a constant lever.
 
 The number of terms of an error motion follows from the evidence: the coefficient of order k has the prior standard
 deviation tau / k^p, with the tau of each error motion and the common p of largest marginal likelihood (MacKay, Bayesian
@@ -144,8 +144,8 @@ class Parametric:
     freedom : float
         Number of values less determined parameters.
     datum : ndarray (6, term)
-        Rigid motion to be subtracted from the displacements of each term, so that the measured targets have no motion of
-        the whole; about ``centre`` (3,).
+        Rigid motion, about ``centre`` (3,), to subtract from the displacements of each term, so that those of the
+        measured targets have none.
     """
 
     chain: Chain

@@ -1,13 +1,13 @@
 """Repeatability of the machine, and its contribution to the scatter of the readings.
 
-One tracker is set up at one station after the other, and the machine moves to every target again for each station. Visit
-v to target i deviates from the mean position u_i by delta_v, of standard deviation sigma_r in each coordinate, and the
+One tracker is set up at the stations in turn, and the machine moves to every target again for each station. Visit v to
+target i deviates from the mean position u_i by delta_v, of standard deviation sigma_r in each coordinate, and the
 reading changes by
 
     |u_i + delta_v - U_j| - |u_i - U_j| = e_ij . delta_v,   of variance  e' sigma_r^2 1 e = sigma_r^2,
 
-for any direction of the beam. Visits are independent, so that a reading has the variance sigma_t^2 + sigma_r^2, with the
-tracker's sigma_t, and readings are uncorrelated. If all stations are read at the same time, delta is the same for all:
+for any direction of the beam. Visits are independent, so that a reading has the variance sigma_t^2 + sigma_r^2, with
+the tracker's sigma_t, and readings are uncorrelated. If all stations are read at the same time, delta is the same for all:
 it displaces the target without any effect on residuals, and sigma_r^2 is added to the covariance of every target.
 
 The differences of returns, with f degrees of freedom, estimate sigma^2 with a variance of 2 sigma^4 / f. The residuals
@@ -150,7 +150,7 @@ def explained(
 
 
 def exceeds(network: Network, relative: float) -> bool:
-    """Return whether a network scatters more than its noise, of relative standard uncertainty of variance ``relative``."""
+    """Return whether the scatter of a network exceeds its noise, whose variance has the uncertainty ``relative``."""
     freedom = network.freedom
     # The variance of the noise has f' = 2 / relative^2 degrees of freedom.
     if relative > 0:

@@ -137,7 +137,7 @@ def read(raw: xr.Dataset, notes: list[str]) -> Readings:
     noise = float(raw["displacement_noise"])
     if not noise > 0:
         raise MethodError(
-            f"displacement_noise: expected a standard deviation above 0 m; found {noise:g} m. State that of the tracker."
+            f"displacement_noise: expected a positive standard deviation; found {noise:g} m. State that of the tracker."
         )
     if not np.isfinite(d).any():
         raise MethodError("displacement: expected readings; found only NaN. Check that the beam was not broken.")
@@ -158,7 +158,7 @@ def read(raw: xr.Dataset, notes: list[str]) -> Readings:
         if np.isnan(station).any():
             station = None
             notes.append(
-                "Not every station has an approximate position (station_nominal): all are determined from the distances."
+                "Not every station has an approximate position (station_nominal): all are determined by the distances."
             )
     if "reflector" in raw:
         reflector = _array(raw, "reflector", "target", "direction")

@@ -1,7 +1,7 @@
 """Parts of the targets' uncertainty: their readings, and sources that all targets share.
 
-The effects of the sources are one array over source, target and freedom, as in an error dataset. It is filled in blocks,
-so that no other array is as large.
+The effects of the sources are one array over source, target and freedom, as in an error dataset. It is filled in
+blocks, so that no other array is as large.
 """
 
 from __future__ import annotations
@@ -145,8 +145,8 @@ def parts(
 def _drift_first(network: Network) -> Network:
     """Return the network with the independent parts of its stations rotated, so that only the first depend on drift.
 
-    The first parts are the uncertainty of the drift with its effect on the stations; the others are the uncertainty with
-    known drift.
+    The first parts are the uncertainty of the drift with its effect on the stations; the others are the uncertainty
+    with known drift.
     """
     if not len(network.extra):
         return network

@@ -126,8 +126,8 @@ def volumetric_errors(errors: xr.Dataset, position: ArrayLike, tool: ArrayLike |
     position : array_like (k, 3)
         Commanded axis positions, m. Outside the measured part of the axes the errors are NaN.
     tool : array_like (3,), optional
-        Position of the tool with all axes at zero, m; default: that of the reflector. At another position, freedoms that
-        depend on undetermined errors are NaN.
+        Position of the tool with all axes at zero, m; default: that of the reflector. At another position, freedoms
+        that depend on undetermined errors are NaN.
 
     Returns
     -------

@@ -40,7 +40,7 @@ class Stations:
         return np.concatenate([np.column_stack([self.position, self.dead_path]).ravel(), self.value])
 
     def motions(self, centre: Array) -> Array:
-        """Return the effect of a rigid motion of the network (t, r about ``centre``) on the parameters, (4 n + k, 6)."""
+        """Return the effect (4 n + k, 6) of rigid motions of the network (t, r about ``centre``) on the parameters."""
         n = len(self.position)
         T = np.zeros((4 * n + len(self.value), 6))
         T[: 4 * n].reshape(n, 4, 6)[:, :3] = motions(self.position, centre)
