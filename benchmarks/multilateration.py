@@ -33,8 +33,8 @@ from scipy.stats import norm
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.network.alternating import alternate
 from errormotion.methods.multilateration.network.model import Stations, directions, jacobian, readings
-from errormotion.methods.multilateration.network.solver import solve
 from errormotion.methods.multilateration.network.rigid_motion import fitted
+from errormotion.methods.multilateration.network.solver import solve
 from errormotion.methods.multilateration.planning.bound import bound, relative_bound
 
 PARTS = ("compare", "coverage", "layout")

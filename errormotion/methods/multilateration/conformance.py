@@ -29,7 +29,7 @@ def subjects() -> tuple[MethodSubject, ...]:
 
 
 def tracker_readings(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return distances of a reflector from four stations, and the true errors less the undetermined rigid motion."""
+    """Return distances of a reflector from four stations, and the true errors minus the undetermined rigid motion."""
     machine = VirtualMachine("cframe", seed=seed)
     position = simulation.target_grid(machine, (4, 4, 3))
     scale = TRACKER_SCALE * np.random.default_rng([seed, 3]).normal()

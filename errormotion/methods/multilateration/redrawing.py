@@ -73,12 +73,12 @@ def _readings(noise: float) -> Redraw:
 
 def _positions(repeatability: float, errors: xr.Dataset) -> Redraw:
     """Return the repeatability of positions read by all stations at the same time: a displacement of the target."""
-    place = errors["target_place"].transpose("target", "direction").values
-    beam = place - errors["station_place"].transpose("station", "direction").values[:, None]
+    target = errors["target_place"].transpose("target", "direction").values
+    beam = target - errors["station_place"].transpose("station", "direction").values[:, None]
     beam = np.nan_to_num(beam / np.linalg.norm(beam, axis=2, keepdims=True))
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        shift = generator.normal(0.0, repeatability, place.shape)
+        shift = generator.normal(0.0, repeatability, target.shape)
         return _with(raw, _displacement(raw) + np.einsum("jta,ta->jt", beam, shift)), settings
 
     return Redraw(draw, own=True)

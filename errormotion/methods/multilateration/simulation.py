@@ -110,8 +110,8 @@ def true_errors(
     if time is not None:
         twist = twist + machine.thermal_twist(q, time)
     twist = move(twist, at)
-    place = q + at
-    lever = place - place.mean(axis=0)
+    point = q + at
+    lever = point - point.mean(axis=0)
     G = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -cross_matrix(lever)], axis=2)
     motion = np.linalg.lstsq(G.reshape(-1, 6), twist[:, :3].ravel())[0]
     twist[:, :3] -= G @ motion
@@ -178,9 +178,9 @@ def raw(
     time = SETUP_INTERVAL * np.arange(n)[:, None] + READING_INTERVAL * (m * np.arange(n)[:, None] + np.arange(m))
     rate = np.zeros((n, 4)) if drift is None else np.asarray(drift, dtype=float)
     since = time - time.mean(axis=1, keepdims=True)
-    place = reflector_positions(machine, q, reflector) + since[:, :, None] * rate[:, None, 1:]
-    place = place + repeatability * rng.normal(size=(n, m, 3))
-    way = np.linalg.norm(place - U[:, None], axis=2) - L[:, None] + since * rate[:, :1]
+    point = reflector_positions(machine, q, reflector) + since[:, :, None] * rate[:, None, 1:]
+    point = point + repeatability * rng.normal(size=(n, m, 3))
+    way = np.linalg.norm(point - U[:, None], axis=2) - L[:, None] + since * rate[:, :1]
     d = way * (1 + scale) + noise * rng.normal(size=(n, m))
     d[rng.uniform(size=(n, m)) < missing] = np.nan
     at = np.asarray(reflector, dtype=float)

@@ -1,4 +1,4 @@
-"""Measuring a beam on the faces of a gauge, with a stage and a sensor that do what real ones do."""
+"""Measurement of a beam on the faces of a gauge, with a simulated stage and sensor."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""A check bar: published measurements, and simulated bars whose truth is known."""
+"""Check bar: published measurements, and simulated bars with known true values."""
 
 from pathlib import Path
 

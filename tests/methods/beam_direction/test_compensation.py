@@ -1,4 +1,4 @@
-"""The inclination error taken off while the direction is sought."""
+"""Iterative compensation of the inclination error."""
 
 from dataclasses import dataclass
 

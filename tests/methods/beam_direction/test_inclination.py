@@ -1,4 +1,4 @@
-"""The calibration of an inclination error from readings against an interferometer."""
+"""Calibration of the inclination error by comparison with an interferometer."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Where the beam starts."""
+"""Zero point of the beam."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The chapter of a beam's direction: complete, honest about what is unknown, and readable with whatever is missing."""
+"""Chapter of a beam's direction: sections, unknown quantities, and missing variables."""
 
 import re
 from functools import cache

@@ -1,4 +1,4 @@
-"""Points from a calibrated beam: where they lie, what is known of them, and the surface's tilt taken off."""
+"""Points from a calibrated beam: positions, covariance, and compensation of the surface's tilt."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Raw datasets of beam calibrations, made without any wire."""
+"""Simulated raw datasets of beam calibrations."""
 
 import numpy as np
 import pytest

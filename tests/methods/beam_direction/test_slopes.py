@@ -1,4 +1,4 @@
-"""How the reading changes with the stage on one plane."""
+"""Gradient of the readings on one plane."""
 
 import numpy as np
 import pytest

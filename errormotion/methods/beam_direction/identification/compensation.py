@@ -151,7 +151,7 @@ def uncompensated(planes: Planes, nominal: Array, scale_uncertainty: float = 0.0
     ----------
     planes : Planes
     nominal : ndarray (3,)
-        Rough direction.
+        Approximate direction.
     scale_uncertainty : float
         Relative standard uncertainty of the readings' scale about ``mid_range`` (m), common to all planes.
     """
@@ -179,7 +179,7 @@ def converge(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, m
     planes : Planes
         As read.
     nominal : ndarray (3,)
-        Rough direction.
+        Approximate direction.
     sensor : Sensor
     tolerance : float
         Change of the direction at convergence, rad.

@@ -34,7 +34,7 @@ class Scatter:
 
 
 def true_deviations(machine: VirtualMachine, line: Line, stops: Array) -> Array:
-    """Return the true displacement along a diagonal since its first stop less the commanded one, (stop,), m."""
+    """Return the true displacement along a diagonal since its first stop minus the commanded one, (stop,), m."""
     points = np.array([line.point(float(distance)) for distance in stops])
     displaced = machine.geometry.twist(points)[:, :3]
     return np.asarray((displaced - displaced[0]) @ line.unit)

@@ -57,7 +57,7 @@ class Figures:
 
 
 def straightened(statistics: Statistics, z: Array) -> Statistics:
-    """Return means (..., approach, target) less the least-squares line of the mean bidirectional deviation."""
+    """Return means (..., approach, target) minus the least-squares line of the mean bidirectional deviation."""
     both = np.isfinite(statistics.mean).any(axis=-1).all()
     middle = statistics.bidirectional if both else _measured_approach(statistics.mean)
     known = np.isfinite(middle).reshape(-1, z.size)[0]

@@ -205,7 +205,7 @@ def _bidirectional(x: Array) -> Array:
 
 
 def _straightness_from_ends(evaluated: Evaluated) -> Evaluated:
-    """Return each straightness less the line through its first and its last target; the ends become sources."""
+    """Return each straightness minus the line through its first and its last target; the ends become sources."""
     mean, variance, ends = evaluated.mean.copy(), evaluated.variance.copy(), list[Shared]()
     effects = [source.effect.copy() for source in evaluated.sources]
     names = iso_names(evaluated.readings.axis)

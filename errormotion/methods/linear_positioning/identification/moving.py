@@ -1,6 +1,6 @@
 """Thermal distortion by a moving axis (ISO 230-3): errors at both ends of the stroke over time, and their ranges.
 
-The errors are the deviations less their mean in the cold state. The noise of a reading is found from second differences
+The errors are the deviations minus their mean in the cold state. The noise of a reading follows from second differences
 over time, ``var(x_1 - 2 x_2 + x_3) = 6 s^2``, in which a smooth drift of the machine vanishes. A range of noisy values
 is too large; ranges are therefore those of means of three successive cycles, and the uncertainty of a range is that of
 the difference of its two extremes.

@@ -46,7 +46,7 @@ class Scatter:
     common, opposite : ndarray, (2,)
         Of offset and slope of a run that the approaches share, and of those with opposite signs; estimates.
     common_mean, opposite_mean : ndarray, (2,)
-        The same for the mean of one run: with Student factor and stated drift, less the part that is already contained
+        The same for the mean of one run: with Student factor and stated drift, minus the part that is already contained
         in ``own``.
     pooled : bool
         Whether all targets have one variance.

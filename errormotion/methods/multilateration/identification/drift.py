@@ -50,7 +50,7 @@ class Drift:
     sources : list of Shared
         Its uncertainty.
     repeatability : float
-        Scatter of the returns less the noise of the readings, standard deviation of one coordinate, m; NaN without
+        Scatter of the returns minus the noise of the readings, standard deviation of one coordinate, m; NaN without
         returns.
     pairs : int
         Visits after the first one of each position.
@@ -154,7 +154,7 @@ def _visits(position: NDArray[np.intp], known: NDArray[np.bool_]) -> list[NDArra
 
 
 def _within(groups: list[NDArray[np.intp]], d: Array, terms: Array, noise: Array) -> tuple[Array, Array]:
-    """Return whitened readings and terms of each position less their weighted mean; one row fewer than visits."""
+    """Return whitened readings and terms of each position minus their weighted mean; one row fewer than visits."""
     readings, rows = [], []
     for group in groups:
         w = 1 / noise[group]

@@ -2,7 +2,7 @@
 
 The steps work on one `State` in sequence: `prepare` reads the data, corrects displacements for the refractive index of
 the air, and excludes targets that are weakly determined; `solve` estimates stations and targets; `correct` subtracts
-drift and expansion from the readings and solves again; `judge` compares the scatter with the stated one; `result`
+drift and expansion from the readings and solves again; `scatter` compares the scatter with the stated one; `result`
 computes uncertainties and builds the error dataset.
 """
 
@@ -23,8 +23,8 @@ from errormotion.methods.multilateration.identification.expansion import (
     expansion_sources,
     scale_strain,
 )
-from errormotion.methods.multilateration.identification.judging import judge, refuse_move
 from errormotion.methods.multilateration.identification.result import result
+from errormotion.methods.multilateration.identification.scatter import evaluate_scatter, refuse_move
 from errormotion.methods.multilateration.identification.state import State, read, short
 from errormotion.methods.multilateration.network import solver
 from errormotion.methods.multilateration.network.diagnosis.weakness import weak_targets
@@ -46,7 +46,7 @@ def identify_targets(raw: xr.Dataset, settings: Settings, method: str, version: 
     state = prepare(raw, settings)
     solve(state)
     correct(state)
-    judge(state)
+    evaluate_scatter(state)
     return result(state, method, version)
 
 

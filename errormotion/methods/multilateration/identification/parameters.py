@@ -119,7 +119,7 @@ class Chain:
         return np.asarray(J[:, :, index] * np.array(value).T[:, None, :])
 
     def motions(self, point: Array, centre: Array) -> Array:
-        """Return the displacements of points (m, 3) by the six rigid motions of the whole, (m, 3, 6)."""
+        """Return the displacements of points (m, 3) by the six rigid motions, (m, 3, 6)."""
         eye = np.broadcast_to(np.eye(3), (len(point), 3, 3))
         return np.concatenate([eye, -cross_matrix(point - centre)], axis=2)
 
@@ -142,7 +142,7 @@ class Parametric:
     sigma0 : float
         Rms of the residuals over the expected one: 1 if the axes explain the errors.
     freedom : float
-        Number of values less determined parameters.
+        Number of values minus determined parameters.
     datum : ndarray (6, term)
         Rigid motion, about ``centre`` (3,), to subtract from the displacements of each term, so that those of the
         measured targets have none.
@@ -282,7 +282,7 @@ def _normal_equations(
     model: Chain, terms: list[Term], position: Array, reflector: Array, centre: Array, error: Array, own: Array,
     influence: Array, which: NDArray[np.intp],
 ) -> tuple[Array, Array, float, Array]:  # fmt: skip
-    """Return N, b and y' W y over terms, six motions of the whole, and the shared sources, which have a prior of 1.
+    """Return N, b and y' W y over terms, six rigid motions, and the shared sources, which have a prior of 1.
 
     Also return the rigid motion that is the best fit to the displacements of each term, (6, term). ``own`` and
     ``influence`` are those of all targets, the other arrays those of the targets ``which``.
@@ -398,7 +398,7 @@ def _estimate(terms: list[Term], N: Array, b: Array, sources: int, square: float
         if max(abs(np.log(tau[name] / before[name])) for name in groups) < _TOLERANCE:
             break
     determined = 1 - variance[:n] * prior[:n]
-    # Twice the logarithm of the marginal likelihood, less a constant.
+    # Twice the logarithm of the marginal likelihood, minus a constant.
     log_det = 2 * float(np.log(np.diag(factor[0])).sum()) - 2 * float(np.log(unit).sum())
     evidence = float(b @ x) - log_det + float(np.log(prior[prior > 0]).sum())
     shared = slice(len(N) - sources, len(N))

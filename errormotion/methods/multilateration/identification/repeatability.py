@@ -7,7 +7,7 @@ reading changes by
     |u_i + delta_v - U_j| - |u_i - U_j| = e_ij . delta_v,   of variance  e' sigma_r^2 1 e = sigma_r^2,
 
 for any direction of the beam. Visits are independent, so that a reading has the variance sigma_t^2 + sigma_r^2, with
-the tracker's sigma_t, and readings are uncorrelated. If all stations are read at the same time, delta is the same for all:
+the tracker's sigma_t, and readings are uncorrelated. If all stations are read at the same time, delta is common to all:
 it displaces the target without any effect on residuals, and sigma_r^2 is added to the covariance of every target.
 
 The differences of returns, with f degrees of freedom, estimate sigma^2 with a variance of 2 sigma^4 / f. The residuals

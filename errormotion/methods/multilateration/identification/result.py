@@ -147,15 +147,15 @@ def _alternated(state: State) -> dict[str, xr.DataArray]:
         return {}
     start = network.station if data.station is None else data.station
     other = alternate(state.displacement[:, complete], data.nominal[complete], start)
-    place = np.full(data.nominal.shape, np.nan)
-    place[complete] = other.target
+    position = np.full(data.nominal.shape, np.nan)
+    position[complete] = other.target
     notes.append(
         f"The alternating scheme {'stopped' if other.converged else 'was ended'} after {other.iterations} iterations "
         f"(joint solution: {network.iterations}); the estimated remaining error of a target is "
         f"{other.remaining * 1e6:.2g} um."
     )
     return {
-        "alternating_place": xr.DataArray(place, dims=("target", "direction"), attrs={"units": "m"}),
+        "alternating_place": xr.DataArray(position, dims=("target", "direction"), attrs={"units": "m"}),
         "alternating_iterations": xr.DataArray(other.iterations),
         "alternating_left": xr.DataArray(other.remaining, attrs={"units": "m"}),
     }
@@ -206,7 +206,7 @@ def _extras(state: State) -> dict[str, xr.DataArray]:
         "iterations": array(network.iterations, (), ""),
         "condition": array(network.condition, (), "1", "of the stations' information, without motions of the whole"),
         "sigma0": array(network.sigma0, (), "1", "ratio of the scatter of the readings to the stated one"),
-        "freedom": array(network.freedom, (), "", "readings less unknowns"),
+        "freedom": array(network.freedom, (), "", "readings minus unknowns"),
         "noise": array(state.factor / np.max(network.weight), (), "m", "of a reading, repeatability included"),
     }
     if data.station is not None:
@@ -234,7 +234,7 @@ def build(
     Parameters
     ----------
     values, covariance, influence : ndarray (m, 6), (m, 6, 6), (source, m, 6)
-        For many targets they become part of the dataset without a copy; unknown values are set to NaN in place.
+        For many targets they become part of the dataset without a copy; unknown values are set to NaN in position.
     coords : mapping
         Name to (dims, array, attrs).
     extras : mapping of str to DataArray

@@ -65,8 +65,8 @@ def bound(
     known = None if dead_path_uncertainty is None else (np.zeros(len(U)), dead_path_uncertainty)
     problem = state_problem(d, u, noise, known)
     determinacy.refuse_too_few(problem.by_target, problem.by_station, problem.unknown)
-    place = np.ascontiguousarray(u.T)
-    return conclude(problem, State(stations, place, problem.reduce(stations, place), 0, True), U)
+    position = np.ascontiguousarray(u.T)
+    return conclude(problem, State(stations, position, problem.reduce(stations, position), 0, True), U)
 
 
 @np.errstate(all="ignore")

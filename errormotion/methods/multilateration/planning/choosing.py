@@ -48,5 +48,5 @@ def refuse_count(wanted: int, candidates: int, stations: int) -> None:
         )
 
 
-def _mm(place: Array | Position) -> str:
-    return "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * float(x) for x in place))
+def _mm(position: Array | Position) -> str:
+    return "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * float(x) for x in position))

@@ -176,7 +176,7 @@ def _best_stations(settings: Settings, planning: Planning, sight: Sight, own: Ar
     p, noise = settings.layout, reading_noise(settings)
     position, target = layout.grid(p)
     coarse = p.model_copy(update={"count": tuple(min(k, _COARSE) for k in p.count)})
-    place = layout.optimise(
+    station = layout.optimise(
         layout.grid(coarse)[1],
         boxes_of(planning, own, target),
         sight,
@@ -184,10 +184,10 @@ def _best_stations(settings: Settings, planning: Planning, sight: Sight, own: Ar
         start=own,
         minimise=planning.minimise,
     )
-    seen = sight.sees(place, target)
-    best = bound(target, place, noise=noise, seen=seen)
+    seen = sight.sees(station, target)
+    best = bound(target, station, noise=noise, seen=seen)
     there, here = (layout.uncertainty(network.target_covariance) for network in (best, expected))
-    found = Choice(position, np.arange(len(target)), place, here, there, here, seen)
+    found = Choice(position, np.arange(len(target)), station, here, there, here, seen)
     unseen = np.isnan(here).sum() - np.isnan(there).sum()
     if unseen > 0 or _minimised(planning, there) < _minimised(planning, here):
         return found

@@ -75,12 +75,12 @@ def choose(
     position = positions(choosing, p.low, p.high)
     k, own_stations = len(position), np.array(p.stations, np.float64)
     everywhere = np.concatenate([position, layout.grid(p)[0]])
-    place = everywhere + np.array(p.reflector)
-    sight = replace(sight, middle=place[:k].mean(axis=0))
+    point = everywhere + np.array(p.reflector)
+    sight = replace(sight, middle=point[:k].mean(axis=0))
     expected = _expected(settings, choosing, everywhere)
 
     def volume(station: Array) -> Volume:
-        return Volume.of(station, place, sight.sees(station, place), noise, expected, k)
+        return Volume.of(station, point, sight.sees(station, point), noise, expected, k)
 
     now = volume(own_stations)
     refuse_count(choosing.wanted, int(now.fine.sum()), len(own_stations))
@@ -93,8 +93,8 @@ def choose(
     some = _coarse(choosing)
     for turn in range(_ROUNDS):
         trial = layout.optimise(
-            place[chosen], boxes, sight, noise=noise, start=station, minimise=planning.minimise, thorough=turn == 0,
-            worth=_Worth(place, chosen, some, sight, noise, expected),
+            point[chosen], boxes, sight, noise=noise, start=station, minimise=planning.minimise, thorough=turn == 0,
+            worth=_Worth(point, chosen, some, sight, noise, expected),
         )  # fmt: skip
         there = volume(trial)
         again = np.array(there.choose(choosing.wanted, planning.minimise))
@@ -108,9 +108,9 @@ def choose(
         station, chosen, best = trial, sets[which], worth[which]
         if gained < _MIN_GAIN:
             break
-    sees = sight.sees(station, place[:k])
+    sees = sight.sees(station, point[:k])
     try:
-        bound(place[chosen], station, noise=noise, seen=sees[:, chosen])
+        bound(point[chosen], station, noise=noise, seen=sees[:, chosen])
     except MethodError as error:
         raise MethodError(
             f"The best {len(chosen)} targets do not determine positions and dead paths of the stations. {error} Choose "
@@ -153,13 +153,13 @@ class _Worth:
     """Uncertainty at some candidates with the chosen ones measured, as a function of the stations."""
 
     def __init__(
-        self, place: Array, chosen: NDArray[np.intp], some: NDArray[np.intp], sight: Sight, noise: float,
+        self, point: Array, chosen: NDArray[np.intp], some: NDArray[np.intp], sight: Sight, noise: float,
         expected: Expected | None,
     ) -> None:  # fmt: skip
         which = np.concatenate([some, chosen])
-        self.place, self.count, self.sight, self.noise = place[which], len(some), sight, noise
+        self.point, self.count, self.sight, self.noise = point[which], len(some), sight, noise
         self.expected = None if expected is None else Expected(expected.columns[which], expected.size)
 
     def __call__(self, station: Array) -> Array:
-        sees = self.sight.sees(station, self.place)
-        return Volume.of(station, self.place, sees, self.noise, self.expected, self.count).worth()
+        sees = self.sight.sees(station, self.point)
+        return Volume.of(station, self.point, sees, self.noise, self.expected, self.count).worth()

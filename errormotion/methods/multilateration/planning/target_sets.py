@@ -111,7 +111,7 @@ class Volume:
 
     @classmethod
     def of(
-        cls, station: Array, place: Array, sees: NDArray[np.bool_], noise: float, expected: Expected | None, count: int
+        cls, station: Array, point: Array, sees: NDArray[np.bool_], noise: float, expected: Expected | None, count: int
     ) -> Volume:
         """Return the candidates and their rows.
 
@@ -119,7 +119,7 @@ class Volume:
         ----------
         station : ndarray (n, 3)
             m.
-        place : ndarray (k + l, 3)
+        point : ndarray (k + l, 3)
             m.
         sees : ndarray of bool (n, k + l)
         noise : float
@@ -129,9 +129,9 @@ class Volume:
         count : int
             k: number of candidates, the first of the positions.
         """
-        n, k = len(station), len(place)
+        n, k = len(station), len(point)
         stations = Stations(station, np.zeros(n), np.zeros(0))
-        e = directions(place, stations).transpose(1, 0, 2)
+        e = directions(point, stations).transpose(1, 0, 2)
         fine = sees.sum(axis=0) >= 3
         w = np.where(sees.T & fine[:, None], 1.0 / noise, 0.0)
         Q = np.zeros((k, n, 4 * n))
@@ -140,8 +140,8 @@ class Volume:
             Q[:, j, 4 * j + 3] = -1.0
         Q *= w[..., None]
         E = w[..., None] * e
-        centre = place[:count].mean(axis=0)
-        G = motions(place[:count], centre)
+        centre = point[:count].mean(axis=0)
+        G = motions(point[:count], centre)
         if expected is None:
             A = np.einsum("kja,kjb->kab", E, E)
             A[~fine] = np.eye(3)

@@ -163,16 +163,16 @@ def _uncertainty(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
     return found
 
 
-def _parted(place: xr.Dataset) -> xr.Dataset:
+def _parted(here: xr.Dataset) -> xr.Dataset:
     """Return a result at one target with the covariance of its own readings divided by cause (``scatter_share``).
 
     The independent part is due to the tracker's noise and the machine's repeatability; the second becomes a group.
     """
-    shares = place.get("scatter_share")
+    shares = here.get("scatter_share")
     if shares is None or shares.dims != ("cause",) or shares.size < 2:
-        return place
-    C = np.asarray(place["covariance"].transpose("dof", "dof_").values, float)[:3, :3]
-    F = np.asarray(place["influence"].transpose("source", "dof").values, float)
+        return here
+    C = np.asarray(here["covariance"].transpose("dof", "dof_").values, float)[:3, :3]
+    F = np.asarray(here["influence"].transpose("source", "dof").values, float)
     values, vectors = np.linalg.eigh(C - F[:, :3].T @ F[:, :3])
     rows, groups = [], []
     for cause, share in zip(shares["cause"].values, shares.values, strict=True):
@@ -181,9 +181,9 @@ def _parted(place: xr.Dataset) -> xr.Dataset:
         for value, vector in zip(values, vectors.T, strict=True):
             rows.append(np.append(np.sqrt(max(value, 0.0) * float(share)) * vector, np.full(3, np.nan)))
             groups.append(str(cause))
-    names = [*place["source"].values.tolist(), *(f"own.{k}" for k in range(len(rows)))]
-    all_groups = [*place["source_group"].values.tolist(), *groups]
-    without = place.drop_dims("source")
+    names = [*here["source"].values.tolist(), *(f"own.{k}" for k in range(len(rows)))]
+    all_groups = [*here["source_group"].values.tolist(), *groups]
+    without = here.drop_dims("source")
     parted = without.assign_coords(source=names, source_group=("source", all_groups))
     return parted.assign(influence=(("source", "dof"), np.concatenate([F, rows])))
 

@@ -21,8 +21,8 @@ _SHADES = ("#7fb0dc", "#2a5599", "#D55E00")  # thirds of the longest, shortest f
 
 
 def _span(net: Network) -> float:
-    places = net.position[net.drawn]
-    return float(np.linalg.norm(np.ptp(places, axis=0))) if len(places) else float("nan")
+    positions = net.position[net.drawn]
+    return float(np.linalg.norm(np.ptp(positions, axis=0))) if len(positions) else float("nan")
 
 
 def _box(net: Network) -> Lines:

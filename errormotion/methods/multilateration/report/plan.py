@@ -93,6 +93,6 @@ def _table(sigma: Array, errors: xr.Dataset) -> Table:
 
 def _targets(position: Array) -> Table:
     rows: list[list[Cell | str]] = [
-        [integer(k), *(fixed(1e3 * v, 1) for v in place)] for k, place in enumerate(position, 1)
+        [integer(k), *(fixed(1e3 * v, 1) for v in row)] for k, row in enumerate(position, 1)
     ]
     return Table("Targets to measure: axis positions.", ["target", "X / mm", "Y / mm", "Z / mm"], rows)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
+from errormotion.methods.beam_direction.identification.check_bar.correlation import neighbour_correlation
 from errormotion.methods.beam_direction.identification.check_bar.estimate import (
     FALSE_ALARMS,
     Evaluation,
@@ -26,7 +27,6 @@ from errormotion.methods.beam_direction.identification.check_bar.estimate import
     fit,
     start,
 )
-from errormotion.methods.beam_direction.identification.check_bar.likeness import neighbour_correlation
 from errormotion.methods.beam_direction.identification.check_bar.scanning import Points, points
 from errormotion.methods.beam_direction.identification.check_bar.surfaces import round_bar
 
@@ -69,8 +69,8 @@ class BarFit:
         The rms expected from the stated noise; NaN if none is stated.
     exceeds_noise : bool
         Whether the residuals are significantly larger than the stated noise.
-    likeness : float
-        Correlation of neighbouring residuals less that caused by the fit itself; about 0 for noise.
+    correlation : float
+        Correlation of neighbouring residuals minus that caused by the fit itself; about 0 for noise.
     systematic : bool
         Whether this correlation is significant.
     chance : float
@@ -95,7 +95,7 @@ class BarFit:
     rms: float
     explained: float
     exceeds_noise: bool
-    likeness: float
+    correlation: float
     systematic: bool
     chance: float
     notes: tuple[str, ...]
@@ -189,7 +189,7 @@ def fit_bar(
         rms=result.rms,
         explained=result.explained,
         exceeds_noise=result.exceeds,
-        likeness=correlation,
+        correlation=correlation,
         systematic=systematic,
         chance=chance,
         notes=tuple(notes),

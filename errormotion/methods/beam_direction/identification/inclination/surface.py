@@ -261,6 +261,6 @@ class _Problem:
 
 
 def _density(rest: Array, leverage: Array, noise: Array) -> Array:
-    """Return the sums of the log densities of left-out slopes, less a constant, for residuals (setting, grid point)."""
+    """Return sums of log densities of left-out slopes, without a constant, for residuals (setting, grid point)."""
     free = np.maximum(1.0 - leverage, _ROUNDING)
     return np.asarray(-0.5 * (rest**2 / (noise * free) + np.log(noise / free)).sum(axis=0))

@@ -19,7 +19,7 @@ MANY_EXCLUDED = 0.05
 """Share of excluded readings above which a moved station is searched for."""
 
 
-def judge(state: State) -> None:
+def evaluate_scatter(state: State) -> None:
     """Set repeatability, scatter and noise factor of the state, and add notes.
 
     Raises
@@ -30,7 +30,7 @@ def judge(state: State) -> None:
     data, settings, network = state.data, state.settings, state.network
     if settings.together:
         state.machine = repeatability.from_positions(state.machine, network, positions(data.nominal), 1.0, state.notes)
-    _judge_scatter(state)
+    _set_noise_factor(state)
     if data.station is not None and not swapped_stations(network.station, network.approximate):
         off = np.linalg.norm(network.station - data.station, axis=1)
         for j in np.flatnonzero(off > settings.station_tolerance):
@@ -46,7 +46,7 @@ def judge(state: State) -> None:
         )
 
 
-def _judge_scatter(state: State) -> None:
+def _set_noise_factor(state: State) -> None:
     """Set the noise factor, its parts, and the repeatability; raise MethodError if a station was moved."""
     network, machine, data, settings = state.network, state.machine, state.data, state.settings
     freedom, excluded = network.freedom, len(network.left_out) + 4 * len(network.undecided)

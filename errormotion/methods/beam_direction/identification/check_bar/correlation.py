@@ -22,7 +22,7 @@ def neighbour_correlation(f: Array, M: Array) -> tuple[float, float]:
     Returns
     -------
     float
-        Correlation of neighbours less that caused by the fit itself; about 0 for noise.
+        Correlation of neighbours minus that caused by the fit itself; about 0 for noise.
     float
         The probability, from 0 to 1.
 
