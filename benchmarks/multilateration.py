@@ -32,8 +32,8 @@ from scipy.stats import norm
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.network.alternating import alternate
 from errormotion.methods.multilateration.network.model import Stations, directions, jacobian, readings
+from errormotion.methods.multilateration.network.rigid_motion import fitted
 from errormotion.methods.multilateration.network.solver import solve
-from errormotion.methods.multilateration.network.turning import fitted
 from errormotion.methods.multilateration.planning.bound import bound, relative_bound
 
 PARTS = ("compare", "coverage", "layout")
@@ -63,7 +63,7 @@ def data(m: int, places=STATION):
 
 def on_nominal(target, station, nominal):
     stations, moved, _ = fitted(Stations(station, np.zeros(4), NONE), target, nominal, np.ones(len(target), dtype=bool))
-    return moved, stations.place
+    return moved, stations.position
 
 
 # Solvers: from nominal targets, readings and rough stations to targets, stations, iterations, converged.
@@ -120,7 +120,7 @@ def least_squares_with(**options):
         dense = options.get("tr_solver") == "exact"
         found = least_squares(off, start, (lambda x: slope(x).toarray()) if dense else slope, **options)
         target, stations = unpacked(found.x, len(u))
-        return *on_nominal(target, stations.place, u), found.nfev, found.status > 0
+        return *on_nominal(target, stations.position, u), found.nfev, found.status > 0
 
     return work
 
@@ -143,7 +143,7 @@ def sparse_newton(u, d, station):
         x[keep] += step
         done, size = done + 1, np.abs(step).max()
     target, stations = unpacked(x, len(u))
-    return *on_nominal(target, stations.place, u), done, size <= 1e-12
+    return *on_nominal(target, stations.position, u), done, size <= 1e-12
 
 
 def published(u, d, station):

@@ -81,7 +81,7 @@ def test_check_bar_alone_is_fitted_and_tells_no_beam(run: Run, name: str, radius
     value, unit = line.split()[-3], line.split()[-1]
     digits = len(value.partition(".")[2])
     assert (float(value), unit) == (pytest.approx(radius, abs=0.51 * 10 ** -min(digits, 4)), "mm")
-    assert "the beam is taken as stated, without uncertainty, and its errors are unknown" in reported
+    assert "the stated beam is used, without uncertainty; its errors are unknown" in reported
     errors = datasets.load("errors.nc")
     assert datasets.violations(errors) == []
     assert np.isnan(errors.em.twist()).all()

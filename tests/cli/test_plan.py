@@ -13,10 +13,10 @@ def test_a_plan_says_what_to_expect_and_how_much_better_it_could_be(run, tmp_pat
     shown = run("plan", BEAM, "--out", tmp_path / "plan.nc").stdout
     assert "beam (beam_direction):" in shown
     assert "U (k=2)" in shown
-    assert "times better than the published ones" in shown
+    assert "smaller than with the published ones by the factor" in shown
     ds = datasets.load(tmp_path / "plan.nc")
     datasets.validate(ds)
-    assert f"{float(ds['gain']):.3g} times better" in shown
+    assert f"smaller by the factor {float(ds['gain']):.3g}" in shown
 
 
 def test_every_test_of_a_campaign_is_planned_for_a_program_too(answer):

@@ -1,8 +1,8 @@
-"""Origin and direction of the beam of a point sensor, from readings on planes over which a stage moves it (Lu et al.).
+"""Origin and direction of the beam of a point sensor, from its readings on planes while a stage moves it (Lu et al.).
 
 ``method`` is the plugin. In ``identification``, ``reading`` reads and checks the raw dataset, ``slopes`` fits the
-gradient of the readings on each plane, ``direction`` finds the most likely direction, ``compensation`` corrects the
-inclination error, ``origin`` finds the zero point, ``propagation`` propagates the uncertainties, and ``planes``
+gradient of the readings on each plane, ``direction`` estimates the most likely direction, ``compensation`` corrects the
+inclination error, ``origin`` estimates the zero point, ``propagation`` propagates the uncertainties, and ``planes``
 combines these parts.
 """
 

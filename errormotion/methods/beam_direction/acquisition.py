@@ -1,7 +1,7 @@
-"""Acquisition: a point sensor on a stage measures the faces of a sine gauge in turn.
+"""Acquisition: a point sensor on a stage measures the faces of a sine gauge one after the other.
 
 The stage searches each face along the beam, from far to near, moves to mid-range, and then along X, Y and Z (or along a
-given path). It rests at each position, and several readings are averaged.
+given path). It stops at each position, and several readings are averaged.
 """
 
 from __future__ import annotations
@@ -29,11 +29,9 @@ if TYPE_CHECKING:
 
 
 NO_VALUE = "no value"
-_TRIES = 5
-_CLOSE = 0.05
-_TRIAL = 0.1
-_SEARCH = 0.5
-"""Shares of the range: largest distance from mid-range; a move that shows the sign; a step of the search."""
+_CENTRING_MOVES = 5
+_CENTRED, _SIGN_MOVE, _SEARCH_STEP = 0.05, 0.1, 0.5
+"""Largest distance from mid-range, move that determines the sign, and step of the search, as shares of the range."""
 
 
 def measure_planes(
@@ -48,37 +46,36 @@ def measure_planes(
     ----------
     bench : Bench
         With a ``point_lds`` and a ``controller`` that moves the stage (``move_to``, ``state``). It also sets
-        the gauge if it can (``set_target``); otherwise the operator is asked to.
+        the gauge if it can (``set_target``); otherwise the operator is requested to set it.
     settings : Settings
     inputs : mapping
         Not used.
     done : Dataset, optional
         Data of an interrupted run, whose faces are not measured again. A virtual machine that was restarted repeats
-        them, without their data: the others are those of a run without interruption.
+        them and discards the data, so that the other faces are those of a run without interruption.
 
     Raises
     ------
     MethodError
-        No control that moves the stage, or no face within the search.
+        No control on the bench moves the stage, or a face is outside the search.
     DatasetError
-        The calibration of the settings is not found; raised before anything is measured.
+        The calibration of the settings is not found; raised before the measurement starts.
     """
     if settings.compensation is not None:
         InclinationCalibration.find(settings.compensation)
-    stand = Stand(bench, settings)
-    faces = settings.planes
-    longest = max(len(positions) for positions in stand.paths)
-    made = 0 if done is None else int(done.sizes["plane"])
-    repeats = done is not None and stand.origin is not None and clock.restarted(done, stand.origin)
-    for number in range(0 if repeats else made, len(faces)):
-        stand.set_face(number)
-        middle = stand.approach(number)
-        found = stand.measure(number, middle, longest)
-        if number >= made:
-            yield found
+    setup = Setup(bench, settings)
+    longest = max(len(positions) for positions in setup.paths)
+    finished = 0 if done is None else int(done.sizes["plane"])
+    repeats = done is not None and setup.origin is not None and clock.restarted(done, setup.origin)
+    for number in range(0 if repeats else finished, len(settings.planes)):
+        setup.set_face(number)
+        middle = setup.approach(number)
+        raw = setup.measure(number, middle, longest)
+        if number >= finished:
+            yield raw
 
 
-class Stand:
+class Setup:
     """Sensor, stage and gauge of a bench.
 
     Attributes
@@ -88,7 +85,7 @@ class Stand:
     paths : list of ndarray (n, 3)
         Stage positions on each face about its middle, m.
     origin : float or None
-        Clock of a virtual machine at the start, s; None of a real one.
+        Time of a virtual machine at the start, s; None for a real one.
     """
 
     def __init__(self, bench: Bench, settings: Settings) -> None:
@@ -97,9 +94,9 @@ class Stand:
         control = bench.of_kind("controller") if bench.has_kind("controller") else None
         if control is None or not hasattr(control, "move_to"):
             raise MethodError(
-                "The calibration of a beam moves the sensor over the faces of a gauge and needs an instrument of kind "
-                "'controller' that can move to a position (move_to); the bench has none. Measure manually, write the "
-                "readings to a table, and use 'errormotion identify READINGS.csv'."
+                "Expected an instrument of kind 'controller' that can move the sensor to a position (move_to) over the "
+                "faces of the gauge; the bench has none. Measure manually, write the readings to a table, and use "
+                "'errormotion identify READINGS.csv'."
             )
         self.control: Any = control
         virtual = hasattr(self.control, "elapse")
@@ -119,7 +116,7 @@ class Stand:
         return self.high - self.low
 
     def set_face(self, number: int) -> None:
-        """Set the gauge to a face; the sensor is moved away before."""
+        """Move the sensor away, and set the gauge to a face."""
         face = self.settings.planes[number]
         self.move(self.start() - self.sign * self.layout.search * self.beam)
         if hasattr(self.control, "set_target"):
@@ -146,7 +143,7 @@ class Stand:
         return np.array(self.control.state()["position"], np.float64)
 
     def read(self) -> float:
-        """Return the mean of several readings, m; NaN, and counted, where fewer than half of them have a value."""
+        """Return the mean of several readings, m; NaN if fewer than half of them have a value. Counts those without."""
         values = np.empty(self.layout.average)
         reasons: Counter[str] = Counter()
         for i in range(values.size):
@@ -165,11 +162,11 @@ class Stand:
         MethodError
             No reading, or readings that do not decrease towards the face.
         """
-        forth = self.sign * self.beam
-        steps = np.arange(-self.layout.search, self.layout.search + 1e-12, _SEARCH * self.range)
+        forward = self.sign * self.beam
+        steps = np.arange(-self.layout.search, self.layout.search + 1e-12, _SEARCH_STEP * self.range)
         name = f"Face {number + 1}"
         for step in steps:
-            position = self.move(self.start() + step * forth)
+            position = self.move(self.start() + step * forward)
             reading = self.read()
             if np.isfinite(reading):
                 break
@@ -179,22 +176,22 @@ class Stand:
                 f"beam about the stage position {_mm(self.start())} mm. Check layout.start or layout.pivot, the "
                 "nominal direction, and the setting of the gauge; or increase layout.search."
             )
-        ahead = _TRIAL * self.range if reading > self.middle else -_TRIAL * self.range
-        there = self.move(position + ahead * forth)
-        change = (self.read() - reading) / ahead
+        advance = _SIGN_MOVE * self.range if reading > self.middle else -_SIGN_MOVE * self.range
+        position = self.move(position + advance * forward)
+        change = (self.read() - reading) / advance
         if not abs(change + 1) < 0.5:
             raise MethodError(
-                f"{name}: while the sensor moves by {ahead * 1e3:g} mm towards the face the reading changes by "
-                f"{change * ahead * 1e3:.3g} mm; expected {-ahead * 1e3:g} mm. Check the sign of the readings, the "
+                f"{name}: while the sensor moves by {advance * 1e3:g} mm towards the face the reading changes by "
+                f"{change * advance * 1e3:.3g} mm; expected {-advance * 1e3:g} mm. Check the sign of the readings, the "
                 "nominal direction, and whether the stage carries the sensor or the target (setting moves)."
             )
-        for _ in range(_TRIES):
+        for _ in range(_CENTRING_MOVES):
             off = self.read() - self.middle
-            if abs(off) < _CLOSE * self.range:
+            if abs(off) < _CENTRED * self.range:
                 break
-            there = self.move(there + off * forth)
+            position = self.move(position + off * forward)
         self.invalid.clear()  # readings that are missing during the search are not counted
-        return there
+        return position
 
     def measure(self, number: int, middle: Array, longest: int) -> xr.Dataset:
         """Return the raw dataset of one face, padded to ``longest`` readings."""

@@ -13,8 +13,8 @@ Point = tuple[Length, Length, Length]
 Vector = tuple[float, float, float]
 
 
-SHORTEST = 1e-6
-"""Largest component of a vector that states a direction; its reciprocal is the longest."""
+MIN_COMPONENT = 1e-6
+"""Lower limit of the largest component of a vector that states a direction; its reciprocal is the upper limit."""
 
 
 class Face(PluginSettings):
@@ -29,7 +29,7 @@ class Layout(PluginSettings):
 
     # The sensor
     nominal_origin: Point | None = Field(
-        default=None, description="position of reading 0 while the stage is at 0, from the drawing"
+        default=None, description="zero point of the beam (reading 0) with the stage at 0, from the drawing"
     )
     nominal_direction: Vector = Field(
         default=(0.0, 0.0, -1.0), description="of the beam, towards the target, from the drawing"
@@ -47,7 +47,7 @@ class Layout(PluginSettings):
     used_range: float = Field(default=0.8, gt=0, le=1, description="share of the range that strokes use")
     average: int = Field(default=8, ge=1, description="readings averaged at each position")
     noise: Length = Field(
-        default=0.1e-6, gt=0, description="standard deviation of a reading, where the settings of the sensor state none"
+        default=0.1e-6, gt=0, description="standard deviation of a reading; used if the sensor's settings state none"
     )
     speckle: Length = Field(
         default=0.0,
@@ -60,9 +60,7 @@ class Layout(PluginSettings):
     )
 
     # The gauge
-    pivot: Point | None = Field(
-        default=None, description="point of the face of the gauge that is the same at every setting"
-    )
+    pivot: Point | None = Field(default=None, description="point that lies on the face of the gauge at every setting")
     pivot_uncertainty: Length = Field(
         default=2e-6,
         gt=0,
@@ -85,8 +83,8 @@ class Layout(PluginSettings):
     # The stage
     start: Point | None = Field(
         default=None,
-        description="start position of the stage for the search of the face; default where the nominal beam has the "
-        "pivot at mid-range",
+        description="start position of the stage for the search of the face; by default, where the pivot is on the "
+        "nominal beam at mid-range",
     )
     search: Length = Field(
         default=20e-3, ge=0, description="range of the search along the beam, in both directions from the start"
@@ -100,7 +98,7 @@ class Layout(PluginSettings):
         default=60, ge=9, description="number of positions on each face, evenly distributed to its three strokes"
     )
     path: tuple[Point, ...] = Field(
-        default=(), description="stage positions about the middle instead of strokes, the same for every face"
+        default=(), description="stage positions relative to the middle instead of strokes, the same for every face"
     )
 
     @model_validator(mode="after")
@@ -111,7 +109,7 @@ class Layout(PluginSettings):
                 raise ValueError(f"{name}: expected the lower limit first; found {low:g} and {high:g}")
         for name in ("nominal_direction", "triangulation_normal"):
             vector = getattr(self, name)
-            if vector is not None and not SHORTEST <= max(map(abs, vector)) <= 1 / SHORTEST:
+            if vector is not None and not MIN_COMPONENT <= max(map(abs, vector)) <= 1 / MIN_COMPONENT:
                 found = ", ".join(f"{component:g}" for component in vector)
                 raise ValueError(f"{name}: expected a direction; found ({found})")
         if self.path and len(self.path) < 9:

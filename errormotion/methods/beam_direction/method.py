@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class BeamDirection:
-    """Origin and direction of the beam of a point sensor, from readings on planes over which a stage moves it."""
+    """Origin and direction of the beam of a point sensor, from its readings on planes while a stage moves it."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="beam_direction",
@@ -24,8 +24,8 @@ class BeamDirection:
         status="simulated_only",
         version="1",
         cannot_see=(
-            "the rotation of the beam about itself",
-            "the zero point, where fewer than three planes have a known point",
+            "the rotation of the beam about its axis",
+            "the zero point, if fewer than three planes have a known point",
             "errors of the stage, whose axes are assumed to be straight and square",
         ),
     )
@@ -48,7 +48,7 @@ class BeamDirection:
         inputs: Mapping[str, xr.Dataset],
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
-        """Measure; yield one raw dataset a plane. See ``acquisition``."""
+        """Measure; yield one raw dataset per plane."""
         from errormotion.methods.beam_direction import acquisition
 
         return acquisition.measure_planes(bench, settings, inputs, done)
@@ -60,7 +60,7 @@ class BeamDirection:
         return steps(settings, instruments)
 
     def check(self, settings: BeamSettings) -> dict[str, str]:
-        """Return why the calibration of the settings cannot be used; empty where it can."""
+        """Return by setting why the calibration of the settings cannot be used; empty if it can."""
         if settings.compensation is None:
             return {}
         from errormotion.datasets.calibrations.inclination import InclinationCalibration
@@ -80,9 +80,9 @@ class BeamDirection:
         return float(len(settings.planes))
 
     def identify(self, raw: xr.Dataset, settings: BeamSettings | None = None) -> xr.Dataset:
-        """Turn a raw dataset into an error dataset of component ``beam``.
+        """Return the error dataset of component ``beam``.
 
-        A check bar alone is measured with the beam as stated in the data; the errors of the beam are then NaN.
+        A check bar without planes is evaluated with the beam stated in the data; the errors of the beam are then NaN.
 
         Parameters
         ----------
@@ -113,7 +113,7 @@ class BeamDirection:
         return identify_beam(checked, settings, self.info.id, self.info.version)
 
     def plan(self, settings: BeamSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros with the expected covariance. See ``planning``."""
+        """Return an error dataset of zeros with the expected covariance."""
         from errormotion.methods.beam_direction.planning.plan import plan
 
         return plan(self, settings or BeamSettings())

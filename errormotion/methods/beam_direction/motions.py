@@ -1,7 +1,7 @@
-"""Steps of the stage in a calibration, as far as they are known before each face is found.
+"""Steps of the stage in a calibration, as far as they are known before the faces are found.
 
-The search starts ``search`` before the start position and may end as far behind it. The strokes on a face lie about the
-position that the search finds: the steps go through them at both ends of the search.
+The search extends from ``search`` before the start position to the same distance after it. The strokes on a face lie
+about the position that is found by the search: the steps contain them at both ends of the search.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from errormotion.methods.beam_direction.settings import Settings
 
 SEARCH_MARGIN = 0.6
-"""Distance beyond the search in which a face may be, as a share of the range: half of it, and a move for its sign."""
+"""Distance of a face beyond the search, as a share of the range: half of the range, and the move for the sign."""
 
 
 def steps(settings: Settings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
-    """Return the steps of the stage: moves in rapid; what follows from the readings is bounded.
+    """Return the steps of the stage, rapid moves; positions that depend on readings are replaced by their limits.
 
     Raises
     ------
@@ -36,18 +36,18 @@ def steps(settings: Settings, instruments: Mapping[str, Any] | None = None) -> l
     stated = getattr((instruments or {}).get("point_lds"), "measuring_range", None)
     length = float(stated) if isinstance(stated, float) else high - low
     beam = np.array(settings.layout.nominal_direction, np.float64)
-    forth = (beam / np.linalg.norm(beam)) * (1.0 if settings.moves == "sensor" else -1.0)
-    unknown = 0.0 if settings.layout.start is not None else length / 2  # where the middle of the range is
+    forward = (beam / np.linalg.norm(beam)) * (1.0 if settings.moves == "sensor" else -1.0)
+    unknown = 0.0 if settings.layout.start is not None else length / 2  # of the mid-range
     start = search_start(settings, sum(settings.layout.reading_range) / 2)
     normals = design.plane_normals(np.array([(face.inclination, face.rotation) for face in settings.planes]))
     reach = settings.layout.search + unknown
-    found: list[Step] = []
+    result: list[Step] = []
     for normal in normals:
         path = stage_path(settings, normal, length)
-        for position in _face(start, forth, reach, reach + SEARCH_MARGIN * length, path):
+        for position in _face(start, forward, reach, reach + SEARCH_MARGIN * length, path):
             x, y, z = (float(each) for each in position)
-            found.append(Step("move", (x, y, z), math.nan, math.nan))
-    return found
+            result.append(Step("move", (x, y, z), math.nan, math.nan))
+    return result
 
 
 def search_start(settings: Settings, middle: float) -> Array:
@@ -63,7 +63,7 @@ def search_start(settings: Settings, middle: float) -> Array:
         return np.array(p.start, np.float64)
     if p.pivot is None or p.nominal_origin is None:
         raise MethodError(
-            "The start position of the search is unknown. Expected layout.start (a position of the stage), or both "
+            "The start position of the search is unknown: expected layout.start (a position of the stage), or both "
             "layout.pivot and layout.nominal_origin; found neither."
         )
     u = np.array(p.nominal_direction, np.float64)
@@ -85,8 +85,8 @@ def stage_path(settings: Settings, normal: Array, length: float) -> Array:
     return design.stroke_points(lengths, counts)
 
 
-def _face(start: Array, forth: Array, search: float, middle: float, path: Array) -> Iterator[Array]:
-    yield start - search * forth
-    yield start + search * forth
+def _face(start: Array, forward: Array, search: float, middle: float, path: Array) -> Iterator[Array]:
+    yield start - search * forward
+    yield start + search * forward
     for end in (-middle, middle):
-        yield from start + end * forth + path
+        yield from start + end * forward + path

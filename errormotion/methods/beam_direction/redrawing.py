@@ -1,4 +1,4 @@
-"""Sources of readings on planes, drawn anew for the Monte Carlo method."""
+"""Draws of the sources of readings on planes for the Monte Carlo method."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.identification.compensation import CALIBRATION, SCALE, TRIANGULATION
 from errormotion.methods.beam_direction.identification.planes import determine
-from errormotion.methods.beam_direction.identification.slopes import correlation_factor
+from errormotion.methods.beam_direction.identification.slopes import MAX_CORRELATED, correlation_factor
 from errormotion.methods.beam_direction.settings import Settings
 from errormotion.plugins import Redraw, Redrawing
 
@@ -24,44 +24,44 @@ if TYPE_CHECKING:
     from errormotion.methods.beam_direction.identification.compensation import Sensor
     from errormotion.methods.beam_direction.identification.planes import Determined
 
-MOST_CORRELATED = 4000
-"""Readings of a plane whose correlation is drawn; more are refused by the identification."""
-
 
 class TrialSettings(Settings):
-    """Settings of one trial: with a calibration in memory, whose coefficients were drawn."""
+    """Settings of one trial, with a calibration whose coefficients are drawn."""
 
     calibration: Any = Field(default=None, exclude=True, repr=False)
 
 
 def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
-    """Return the readings without outliers, and their sources: noise, known points, calibration or scale.
+    """Return the readings without outliers, and the draws of their sources: noise, known points, calibration or scale.
 
     Raises
     ------
     MethodError
-        A check bar alone: it has no errors of a beam.
+        A check bar without planes, which does not determine the errors of a beam.
     """
     if "distance" not in raw:
-        raise MethodError("A check bar alone gives no errors of a beam: nothing to evaluate by the Monte Carlo method.")
+        raise MethodError(
+            "The Monte Carlo method evaluates the errors of a beam: expected readings on planes; found a check bar "
+            "only."
+        )
     beam = determine(raw, settings, [])
     distance = np.asarray(raw["distance"].transpose("plane", "reading").values, dtype=float)
     used = errors["left_out"].transpose("plane", "reading").values == 0
     bar = [name for name in raw.variables if str(name).startswith("bar_")]
     reduced = _with(raw.drop_vars(bar).load(), np.where(used, distance, np.nan))
-    stated = TrialSettings(**{name: getattr(settings, name) for name in type(settings).model_fields})
-    stated = stated.model_copy(update={"robust": False, "noise": "stated", "extrapolate": True})
+    trial = TrialSettings(**{name: getattr(settings, name) for name in type(settings).model_fields})
+    trial = trial.model_copy(update={"robust": False, "noise": "stated", "extrapolate": True})
     sources = {"readings": _readings(beam)}
     if beam.origin is not None and beam.data.point_uncertainty > 0:
         sources["known points of the planes"] = _points(beam)
     if beam.sensor is not None:
-        stated = stated.model_copy(update={"calibration": beam.sensor.calibration})
+        trial = trial.model_copy(update={"calibration": beam.sensor.calibration})
         sources[CALIBRATION] = _calibration(beam.sensor.calibration)
         if beam.sensor.normal_uncertainty > 0:
             sources[TRIANGULATION] = _triangulation(beam.sensor, beam.converged.direction.direction)
     elif settings.layout.scale_uncertainty > 0:
         sources[SCALE] = _scale(settings.layout.scale_uncertainty, beam.converged.mid_range)
-    return Redrawing(reduced, stated, sources)
+    return Redrawing(reduced, trial, sources)
 
 
 def _with(raw: xr.Dataset, distance: Array) -> xr.Dataset:
@@ -69,28 +69,28 @@ def _with(raw: xr.Dataset, distance: Array) -> xr.Dataset:
 
 
 def _readings(beam: Determined) -> Redraw:
-    """Return noise and speckle of the readings, raised where they scatter more or planes contradict one another."""
-    data, size = beam.data, beam.factor * beam.closure_factor
+    """Return the draw of noise and speckle, increased if readings scatter more or planes contradict one another."""
+    data, size = beam.data, beam.noise_factor * beam.closure_factor
     factors = []
     for distance, stage in zip(data.distance, data.stage, strict=True):
-        there = np.flatnonzero(np.isfinite(distance) & np.isfinite(stage).all(axis=1))
-        correlated = data.speckle > 0 and data.speckle_length > 0 and there.size <= MOST_CORRELATED
-        L = correlation_factor(stage[there], data.noise, data.speckle, data.speckle_length) if correlated else None
-        factors.append((there, L))
+        known = np.flatnonzero(np.isfinite(distance) & np.isfinite(stage).all(axis=1))
+        correlated = data.speckle > 0 and data.speckle_length > 0 and known.size <= MAX_CORRELATED
+        L = correlation_factor(stage[known], data.noise, data.speckle, data.speckle_length) if correlated else None
+        factors.append((known, L))
     white = size * float(np.hypot(data.noise, data.speckle))
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         changed = np.array(raw["distance"].transpose("plane", "reading").values, dtype=float)
-        for row, (there, L) in zip(changed, factors, strict=True):
-            z = generator.normal(size=there.size)
-            row[there] += white * z if L is None else size * (L @ z)
+        for row, (known, L) in zip(changed, factors, strict=True):
+            z = generator.normal(size=known.size)
+            row[known] += white * z if L is None else size * (L @ z)
         return _with(raw, changed), settings
 
     return Redraw(draw, own=True)
 
 
 def _points(beam: Determined) -> Redraw:
-    """Return the known points of the planes, along the normals, independent by plane."""
+    """Return the draw of the known points of the planes, along the normals, independent by plane."""
     size = beam.data.point_uncertainty * beam.closure_factor
     normals = beam.converged.planes.normals
 
@@ -103,7 +103,7 @@ def _points(beam: Determined) -> Redraw:
 
 
 def _calibration(calibration: InclinationCalibration) -> Redraw:
-    """Return the coefficients of the inclination calibration by their covariance."""
+    """Return the draw of the coefficients of the inclination calibration."""
     values, vectors = np.linalg.eigh(calibration.coefficient_covariance)
     factor = vectors * np.sqrt(np.maximum(values, 0.0))
 
@@ -116,7 +116,7 @@ def _calibration(calibration: InclinationCalibration) -> Redraw:
 
 
 def _triangulation(sensor: Sensor, beam: Array) -> Redraw:
-    """Return the angle of the triangulation plane about the beam."""
+    """Return the draw of the angle of the triangulation plane about the beam."""
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         turn = Rotation.from_rotvec(beam * sensor.normal_uncertainty * generator.normal())
@@ -127,7 +127,7 @@ def _triangulation(sensor: Sensor, beam: Array) -> Redraw:
 
 
 def _scale(relative: float, mid_range: float) -> Redraw:
-    """Return the scale of the sensor about its mid range."""
+    """Return the draw of the scale of the sensor about its mid-range."""
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         distance = raw["distance"].transpose("plane", "reading").values

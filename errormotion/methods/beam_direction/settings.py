@@ -24,9 +24,8 @@ class Settings(PluginSettings):
 
     # Acquisition
     planes: tuple[Face, ...] = Field(
-        default_factory=_three_planes, min_length=2, description="settings of the gauge, in their order"
+        default_factory=_three_planes, min_length=2, description="settings of the gauge, in the order of measurement"
     )
-
     layout: Layout = Field(default_factory=Layout, description="set-up of the measurement or plan")
 
     # Identification
@@ -45,7 +44,7 @@ class Settings(PluginSettings):
     triangulation_normal_uncertainty: Angle = Field(
         default=float(np.radians(0.5)),
         ge=0,
-        description="standard uncertainty of the angle of the triangulation plane about the beam, where the data "
+        description="standard uncertainty of the angle of the triangulation plane about the beam; used if the data "
         "state none",
     )
     tolerance: Angle = Field(
@@ -55,9 +54,9 @@ class Settings(PluginSettings):
     robust: bool = Field(default=True, description="ignore and report outliers")
     ordered: bool = Field(
         default=True,
-        description="readings are in their order along strokes; false where the stage positions have any order",
+        description="readings are ordered along strokes; false for stage positions in any order",
     )
     noise: Literal["auto", "stated"] = Field(
         default="auto",
-        description="noise of the readings: as stated, or raised to the observed scatter where that is larger (auto)",
+        description="noise of the readings: the stated one, or the observed scatter if it is larger (auto)",
     )

@@ -1,4 +1,4 @@
-"""Raw data of the method, simulated on the virtual machine without instruments: cheap enough for Monte Carlo.
+"""Raw data of the method, simulated on the virtual machine without instruments, fast enough for Monte Carlo.
 
 Planes of the sine gauge, the check bar, and readings against an interferometer.
 """
@@ -29,20 +29,20 @@ PLANES = tuple((np.radians(20.0), np.radians(rotation)) for rotation in (0.0, 90
 ALPHAS = np.radians(np.arange(-45.0, 46.0, 5.0))
 BETAS = np.radians([*range(0, 11, 2), 90, *range(170, 181, 2)])
 DEPTHS = 1e-3 * np.arange(-10.0, 11.0)
-"""Inclinations and rotations, rad, and depths, m, of a usual calibration: about 5000 groups."""
+"""Inclinations and rotations, rad, and depths, m, of a typical calibration: about 5000 groups."""
 USED_RANGE = 0.8
 """Share of the measuring range that a stroke uses."""
 READING_TIME, SETTING_TIME = 1.0, 60.0
-"""Time from reading to reading, and for setting the gauge, s."""
+"""Interval of the readings, and duration of the setting of the gauge, s."""
 REFERENCE_NOISE = 20e-9
 """Standard deviation of the interferometer, m."""
 
-_BAR = 3
+_BAR_STREAM = 3
 _M, _1, _RAD = {"units": "m"}, {"units": "1"}, {"units": "rad"}
 
 
 def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return readings with speckle on the planes that the settings name, and the true errors of the beam.
+    """Return readings with speckle on the planes of the settings, and the true errors of the beam.
 
     The readings have no inclination error. The seed selects the machine and the noise.
     """
@@ -104,8 +104,8 @@ def strokes(
 ) -> Array:
     """Return stage positions on three strokes along X, Y and Z about ``machine.home()``, m, shape (3 count, 3).
 
-    Each is as long as four fifths of the sensor's range allow at a face of the sine gauge, but no longer than
-    twice ``half_length``.
+    Their length is limited by four fifths of the sensor's range at a face of the sine gauge, and by twice
+    ``half_length``.
     """
     sensor = sensor or machine.point_sensor
     normal = machine.sine_gauge.nominal_normal(inclination, rotation)
@@ -130,7 +130,7 @@ def raw(
     count: int = 20,
     half_length: float = 20e-3,
 ) -> xr.Dataset:
-    """Return a raw dataset of a beam calibration on planes; NaN where there is no reading.
+    """Return a raw dataset of a beam calibration on planes; NaN for missing readings.
 
     Parameters
     ----------
@@ -159,16 +159,17 @@ def raw(
     """
     sensor = sensor or machine.point_sensor
     if stage is None:
-        each = [strokes(machine, *plane, sensor=sensor, count=count, half_length=half_length) for plane in planes]
-        positions = np.array(each)
+        positions = np.array(
+            [strokes(machine, *plane, sensor=sensor, count=count, half_length=half_length) for plane in planes]
+        )
     else:
-        given = np.asarray(stage, dtype=float)
-        if given.ndim not in (2, 3) or given.shape[-1] != 3 or (given.ndim == 3 and len(given) != len(planes)):
+        stage = np.asarray(stage, dtype=float)
+        if stage.ndim not in (2, 3) or stage.shape[-1] != 3 or (stage.ndim == 3 and len(stage) != len(planes)):
             raise BenchError(
-                f"The stage positions are (reading, 3) or (plane, reading, 3) for {len(planes)} planes; found "
-                f"{given.shape}."
+                f"Expected stage positions (reading, 3), or (plane, reading, 3) for {len(planes)} planes; found "
+                f"{stage.shape}."
             )
-        positions = np.broadcast_to(given, (len(planes), *given.shape[-2:])).copy()
+        positions = np.broadcast_to(stage, (len(planes), *stage.shape[-2:])).copy()
     reader = _Readings(sensor, seed, inclination_error, speckle, machine.sensors_on_for)
     duration = SETTING_TIME + READING_TIME * positions.shape[1]
     faces = [machine.sine_gauge.face(*plane, setting=seed) for plane in planes]
@@ -208,7 +209,7 @@ def raw_check_bar(
 ) -> xr.Dataset:
     """Return readings across the check bar: ``bar_distance``, ``bar_stage``, ``bar_radius``, ``bar_axis``.
 
-    The stage moves across the bar and across the nominal beam; the readings lie about mid-range.
+    The stage moves across the bar and across the nominal beam; the readings are near mid-range.
 
     Parameters
     ----------
@@ -230,7 +231,7 @@ def raw_check_bar(
     reader = _Readings(sensor, seed, inclination_error, speckle, machine.sensors_on_for)
     positions = _bar_stage(sensor, bar, count, half_width)
     return _stated(machine, sensor, speckle).assign(
-        bar_distance=("bar_reading", reader.at(bar, positions, start, -_BAR), _M),
+        bar_distance=("bar_reading", reader.at(bar, positions, start, -_BAR_STREAM), _M),
         bar_stage=(("bar_reading", "direction"), positions, _M),
         bar_radius=((), bar.certified_radius, _M),
         bar_axis=("direction", bar.nominal_axis, _1),
@@ -247,15 +248,15 @@ def raw_inclination(
     speckle: bool = False,
     sensor: PointSensor | None = None,
 ) -> xr.Dataset:
-    """Return readings against an interferometer over ``group``; NaN where there is no reading.
+    """Return readings against an interferometer over ``group``; NaN for missing readings.
 
-    There is a group for every inclination, rotation and depth.
+    Every combination of inclination, rotation and depth is one group.
 
     Parameters
     ----------
     machine : VirtualMachine
     alphas, betas : (k,), (m,)
-        Inclinations (negative: the tilt turned by half a turn) and rotations, rad.
+        Inclinations (negative: tilted in the opposite direction) and rotations, rad.
     depths : (n,)
         From mid-range, m.
     seed : int
@@ -312,13 +313,13 @@ def _bar_stage(sensor: PointSensor, bar: CheckBar, count: int, half_width: float
     """Return stage positions on a stroke across a bar and across the nominal beam, m, shape (count, 3)."""
     if not 0 < half_width < bar.certified_radius:
         raise BenchError(
-            f"A stroke over a bar must be shorter than the radius of the bar, {bar.certified_radius * 1e3:g} mm; found "
-            f"{half_width * 1e3:g} mm."
+            f"half_width: expected a positive length below the radius of the bar, {bar.certified_radius * 1e3:g} mm; "
+            f"found {half_width * 1e3:g} mm."
         )
     u, axis = sensor.nominal_direction, bar.nominal_axis
     towards = u - (u @ axis) * axis
     if not np.linalg.norm(towards) > 0.1:
-        raise BenchError("The beam is parallel to the bar; expected a beam across it.")
+        raise BenchError("Expected a beam across the bar; found one parallel to it.")
     towards = towards / np.linalg.norm(towards)
     sag = bar.certified_radius - np.sqrt(bar.certified_radius**2 - half_width**2)
     nearest = bar.point - bar.certified_radius * towards

@@ -15,11 +15,12 @@ OPTIONAL = (
     *("temperature_uncertainty", "machine_expansion_uncertainty"),
 )
 RUNS, SEEDS = 12, 100
-"""More runs than usual: with few, the Student distribution of a mean has a tail that chi-square does not have."""
+"""More runs than usual: with few runs, the Student distribution of a mean has wider tails than chi-square."""
+MOTION = ((0.0, 0.0, 0.0), (0.1, -0.2, 0.05))
 
 
 def subjects() -> tuple[MethodSubject, ...]:
-    """Return the method on a short axis."""
+    """Return the tests on a short axis and along short diagonals."""
     moving = Settings(freedoms=("EX", "EB"), moving=Moving(cold=5, duration=7200.0, cooling=1800.0, interval=120.0))
     warming = MethodSubject(
         LinearPositioning,
@@ -29,7 +30,7 @@ def subjects() -> tuple[MethodSubject, ...]:
         name="moving axis",
         optional=("functional_point", "length_uncertainty"),
         measured=("end_deviation", "end_position"),
-        motion=((0.0, 0.0, 0.0), (0.1, -0.2, 0.05)),
+        motion=MOTION,
         seeds=SEEDS,
     )
     return (_subject("positioning", "X", ("EX",)), _subject("six freedoms", "Y", FREEDOMS), warming, _diagonals())
@@ -46,7 +47,7 @@ def _diagonals() -> MethodSubject:
         optional=("functional_point", "length_uncertainty", "alignment_uncertainty"),
         measured=("diagonal_deviation", "stop_point"),
         seeds=SEEDS,
-        motion=((0.0, 0.0, 0.0), (0.1, -0.2, 0.05)),
+        motion=MOTION,
     )
 
 
@@ -61,5 +62,5 @@ def _subject(name: str, axis: Literal["X", "Y"], freedoms: tuple[Freedom, ...]) 
         optional=OPTIONAL,
         measured=("deviation", "target_position"),
         seeds=SEEDS,
-        motion=((0.0, 0.0, 0.0), (0.1, -0.2, 0.05)),
+        motion=MOTION,
     )

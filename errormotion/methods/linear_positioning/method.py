@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class LinearPositioning:
-    """Errors of one linear axis at target positions, approached again and again from both sides (ISO 230-2)."""
+    """Errors of one linear axis at target positions, approached repeatedly from both directions (ISO 230-2)."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="linear_positioning",
@@ -27,10 +27,10 @@ class LinearPositioning:
         version="1",
         cannot_see=(
             "freedoms that were not measured",
-            "the errors between the targets, where they change faster than the targets follow one another",
+            "errors between the targets that vary over less than the interval of the targets",
             "the slope of a straightness: its reference line joins the first and the last target",
-            "errors of the instrument that its stated uncertainty does not cover",
-            "which errors of the axes a diagonal is made of: body diagonals alone do not separate them",
+            "errors of the instrument that its stated uncertainty does not include",
+            "the contribution of each axis to the errors along a diagonal: body diagonals alone do not separate them",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("controller",), raw_schema=SCHEMA)
@@ -52,7 +52,7 @@ class LinearPositioning:
         inputs: Mapping[str, xr.Dataset],  # noqa: ARG002 - part of the protocol
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
-        """Measure; yield one raw dataset a run, or a target of a pendulum cycle. See ``acquisition``."""
+        """Measure; yield one raw dataset per run, target, reading or diagonal, along `append_dim`."""
         from errormotion.methods.linear_positioning.acquisition.measure import measure_axis
         from errormotion.methods.linear_positioning.acquisition.warming import measure_moving
         from errormotion.methods.linear_positioning.diagonals.acquisition import measure_diagonals
@@ -86,16 +86,16 @@ class LinearPositioning:
         return planning.programs(settings) if settings.diagonals is not None else programs(settings)
 
     def check_machine(self, settings: PositioningSettings, machine: MachineDescription) -> dict[str, str]:
-        """Return what contradicts the machine: an axis that it has not, targets outside of its travel."""
+        """Return by setting what the machine cannot do: an axis that it does not have, targets outside its travel."""
         from errormotion.methods.linear_positioning.diagonals import planning
         from errormotion.methods.linear_positioning.planning.targets import reach
 
         if settings.diagonals is not None:
             return planning.outside(settings, machine)
-        test = settings.travel if settings.moving is not None else reach(settings)
         if settings.axis not in machine.travel:
             return {"axis": f"expected one of {', '.join(machine.travel)}; found '{settings.axis}'"}
-        (low, high), (first, last) = machine.travel[settings.axis], test
+        low, high = machine.travel[settings.axis]
+        first, last = settings.travel if settings.moving is not None else reach(settings)
         if first < low - 1e-9 or last > high + 1e-9:
             return {
                 "travel": f"expected targets and overrun within {low * 1e3:g} mm to {high * 1e3:g} mm; found "
@@ -123,7 +123,7 @@ class LinearPositioning:
         return float(settings.runs if settings.cycle == "linear" else positions(settings).size)
 
     def identify(self, raw: xr.Dataset, settings: PositioningSettings | None = None) -> xr.Dataset:
-        """Turn a raw dataset into an error dataset of an axis over ``position``, or of diagonals over their stops.
+        """Return the error dataset of an axis over ``position``, or of diagonals over their stops.
 
         Parameters
         ----------
@@ -139,26 +139,25 @@ class LinearPositioning:
             The data do not determine the result.
         """
         from errormotion.datasets import validate
+        from errormotion.methods.linear_positioning.diagonals.identification import identify_diagonals
         from errormotion.methods.linear_positioning.identification.identify import identify
+        from errormotion.methods.linear_positioning.identification.moving import identify_moving
 
         checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"linear_positioning reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
         validate(checked)
+        settings = settings or PositioningSettings()
         if "cycle" in checked.dims:
-            from errormotion.methods.linear_positioning.identification.moving import identify_moving
-
-            return identify_moving(checked, settings or PositioningSettings(), self.info)
+            return identify_moving(checked, settings, self.info)
         if "diagonal" in checked.dims:
-            from errormotion.methods.linear_positioning.diagonals.identification import identify_diagonals
-
-            return identify_diagonals(checked, settings or PositioningSettings(), self.info)
-        return identify(checked, settings or PositioningSettings(), self.info)
+            return identify_diagonals(checked, settings, self.info)
+        return identify(checked, settings, self.info)
 
     def plan(self, settings: PositioningSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros with the expected covariance. See ``planning``."""
+        """Return an error dataset of zeros with the expected covariance."""
         from errormotion.methods.linear_positioning.diagonals.plan import plan_diagonals
         from errormotion.methods.linear_positioning.planning.plan import plan
 
-        found = settings or PositioningSettings()
-        return plan(found, self.info) if found.diagonals is None else plan_diagonals(found, self.info)
+        settings = settings or PositioningSettings()
+        return plan(settings, self.info) if settings.diagonals is None else plan_diagonals(settings, self.info)

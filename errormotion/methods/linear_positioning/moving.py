@@ -1,4 +1,4 @@
-"""What the axis does in a test of its own heat (ISO 230-3): cold readings, moves with readings between, cooling."""
+"""Motions of a test with a moving axis (ISO 230-3): cold readings, moves with readings in between, cooling."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cycle:
-    """One reading of both ends, and what comes before it.
+    """One reading of both ends, and the motion before it.
 
     Attributes
     ----------
     strokes : int
-        Moves there and back with the feed of the test before the reading.
+        Moves back and forth before the reading, at the feed of the moving axis.
     rest : float
-        Rest before the reading, s.
+        Dwell before the reading, s.
     moving : bool
         Whether the axis moved before the reading.
     cold : bool
-        Whether it has not moved yet.
+        Whether the axis has not moved yet in the test.
     """
 
     strokes: int
@@ -36,23 +36,29 @@ class Cycle:
 
 
 def moving_of(settings: Settings) -> Moving:
-    """Return the settings of the moving axis; MethodError where there are none."""
+    """Return the settings of the moving axis; MethodError if there are none."""
     if settings.moving is None:
         raise MethodError("moving: expected the settings of the moving axis; found none")
     return settings.moving
 
 
 def ends(settings: Settings) -> tuple[float, float]:
-    """Return both ends of the stroke, m: those of the travel, whose overrun stays within the limits."""
+    """Return both ends of the stroke, those of the travel, m; MethodError if they are outside the limits."""
     low, high = settings.travel
-    if settings.limits is not None:
-        least, most = settings.limits
-        if low < least - 1e-9 or high > most + 1e-9:
-            raise MethodError(
-                f"limits: expected {settings.axis} from {least * 1e3:.3f} to {most * 1e3:.3f} mm; the test needs "
-                f"{low * 1e3:.3f} to {high * 1e3:.3f} mm."
-            )
+    check_limits(settings, low, high)
     return low, high
+
+
+def check_limits(settings: Settings, low: float, high: float) -> None:
+    """Raise MethodError if the axis would leave its limits between two positions, m."""
+    if settings.limits is not None:
+        lowest, highest = settings.limits
+        if low < lowest - 1e-9 or high > highest + 1e-9:
+            overrun = "" if settings.moving is not None else f", with an overrun of {settings.overrun * 1e3:g} mm"
+            raise MethodError(
+                f"limits: expected {settings.axis} from {lowest * 1e3:.3f} to {highest * 1e3:.3f} mm; the test needs "
+                f"{low * 1e3:.3f} to {high * 1e3:.3f} mm{overrun}. Shorten the travel of the test."
+            )
 
 
 def cycles(settings: Settings) -> Iterator[Cycle]:
@@ -69,7 +75,7 @@ def cycles(settings: Settings) -> Iterator[Cycle]:
 
 
 def stroke_time(settings: Settings) -> float:
-    """Return the duration of a stroke there and back, s; accelerations are neglected."""
+    """Return the duration of a stroke back and forth, s; accelerations are neglected."""
     low, high = ends(settings)
     return 2.0 * (high - low) / moving_of(settings).feed
 
@@ -81,7 +87,7 @@ def reading_time(settings: Settings) -> float:
 
 
 def stops(settings: Settings) -> Iterator[tuple[float, float, float]]:
-    """Yield every position at which the axis stops, m, the feed towards it, m/s, and how long it rests there, s.
+    """Yield every stop of the axis: position, m, feed of the move to it, m/s, and dwell, s.
 
     The axis starts at its lower end. A reading is taken at the upper end, approached forward, and then at the lower
     one, approached backward.

@@ -1,18 +1,19 @@
-"""Sources of a test, drawn anew for the Monte Carlo method.
+"""Draws of the sources of a test for the Monte Carlo method.
 
-Every source changes the readings by what it changes in their means. The cosine error of the alignment is drawn from its
-exponential distribution, all others are normal.
+Each source changes the readings by its effect on their means.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.methods.linear_positioning.diagonals.redrawing import redraw_diagonals
+from errormotion.methods.linear_positioning.diagonals.redrawing import FEWEST_TRIALS, draw_effects, redraw_diagonals
 from errormotion.methods.linear_positioning.identification import budget, moving
 from errormotion.methods.linear_positioning.identification.identify import Evaluated, evaluate
+from errormotion.methods.linear_positioning.identification.reading import labels, length_uncertainty
 from errormotion.methods.linear_positioning.schema import APPROACHES
 from errormotion.plugins import Redraw, Redrawing
 
@@ -24,25 +25,22 @@ if TYPE_CHECKING:
     from errormotion.arrays import Array
     from errormotion.methods.linear_positioning.settings import Settings
 
-FEWEST_TRIALS = 200
-"""Of the figures in a trial, whose values are not used."""
-
 
 def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
-    """Return the readings, and their sources: scatter, drift, instrument, alignment, expansion."""
+    """Return the readings, and the draws of their sources: scatter, drift, instrument, alignment, expansion."""
     if "end_deviation" in raw:
         return _moving(raw, settings, errors)
     if "diagonal_deviation" in raw:
         return redraw_diagonals(raw, settings)
-    found = evaluate(raw, settings, [])
-    groups = dict.fromkeys(source.group for source in found.sources if source.group != budget.END)
-    sources = {"readings": Redraw(_readings(found), groups=(budget.END,), own=True)}
-    sources |= {group: Redraw(_shared(found, group), groups=(group,)) for group in groups}
+    evaluated = evaluate(raw, settings, [])
+    groups = dict.fromkeys(source.group for source in evaluated.sources if source.group != budget.END)
+    sources = {"readings": Redraw(_readings(evaluated), groups=(budget.END,), own=True)}
+    sources |= {group: Redraw(_shared(evaluated, group), groups=(group,)) for group in groups}
     return Redrawing(raw.load(), settings.model_copy(update={"trials": FEWEST_TRIALS}), sources)
 
 
 def _moving(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
-    """Return the readings of a moving axis, and their sources: noise, cold reference, lengths."""
+    """Return the readings of a moving axis, and the draws of their sources: noise, cold reference, lengths."""
     dims = ("freedom", "cycle", "end")
     cold = raw["reading_time"].values <= 0.0
     shape = tuple(raw.sizes[dim] for dim in dims)
@@ -50,7 +48,7 @@ def _moving(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawin
     along = np.array([str(name)[1] == str(name)[2] for name in errors["freedom"].values])[:, None, None]
     P = raw["end_position"].values
     lever = np.broadcast_to(along * (P - P.min()), shape)
-    relative = float(raw["length_uncertainty"]) if "length_uncertainty" in raw else settings.uncertainty.length
+    relative = length_uncertainty(raw, settings)
     reference = (
         noise[:, :1] / np.sqrt(np.isfinite(raw["end_deviation"].transpose(*dims).values[:, cold]).sum(axis=1))[:, None]
     )
@@ -76,58 +74,37 @@ def _moving(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawin
     return Redrawing(raw.load(), settings, sources)
 
 
-def _readings(found: Evaluated) -> _Draw:
-    """Return a draw of what is new at each target: scatter by approach, and the instrument at the target."""
-    readings = found.readings
-    size = np.array(
-        [
-            np.sqrt(spread.own_factor * spread.own / np.maximum(np.isfinite(x).sum(axis=1), 1))
-            for x, spread in zip(readings.x, found.spreads, strict=True)
-        ]
-    )  # (freedom, approach, target)
+def _readings(evaluated: Evaluated) -> _Draw:
+    """Return a draw of the errors that are independent from target to target: scatter by approach, and instrument."""
+    size = evaluated.scatter_of_means()
 
     def change(generator: np.random.Generator) -> Array:
-        common = found.at_target[:, None, None] * generator.normal(size=(len(size), 1, size.shape[-1]))
+        common = evaluated.at_target[:, None, None] * generator.normal(size=(len(size), 1, size.shape[-1]))
         return np.asarray(size * generator.normal(size=size.shape) + common)
 
-    return _Draw(found, change)
+    return _Draw(size.shape, change)
 
 
-def _shared(found: Evaluated, group: str) -> _Draw:
+def _shared(evaluated: Evaluated, group: str) -> _Draw:
     """Return a draw of the sources of one group."""
-    effects = np.nan_to_num([source.effect for source in found.sources if source.group == group])
-
-    def change(generator: np.random.Generator) -> Array:
-        number = len(effects)
-        exponential = group == budget.ALIGNMENT
-        z = generator.exponential(size=number) - 1.0 if exponential else generator.normal(size=number)
-        return np.tensordot(z, effects, axes=1)[:, None, :]
-
-    return _Draw(found, change)
+    effects = np.nan_to_num([source.effect for source in evaluated.sources if source.group == group])
+    count, approaches, _, targets = evaluated.readings.x.shape
+    return _Draw((count, approaches, targets), partial(draw_effects, effects, group))
 
 
 class _Draw:
     """Adds a change (freedom, approach, target) to the readings of all runs, in the order of the raw dataset."""
 
-    def __init__(self, found: Evaluated, change: Callable[[np.random.Generator], Array]) -> None:
-        self._found, self._change = found, change
+    def __init__(self, shape: tuple[int, ...], change: Callable[[np.random.Generator], Array]) -> None:
+        self._shape, self._change = shape, change
 
     def __call__(
         self, raw: xr.Dataset, settings: Settings, generator: np.random.Generator
     ) -> tuple[xr.Dataset, Settings]:
-        """Return changed readings, and the settings as they are."""
+        """Return changed readings, and the unchanged settings."""
         change = np.broadcast_to(self._change(generator), self._shape)
-        approaches = [APPROACHES.index(_text(label)) for label in raw["approach"].values]
+        approaches = [APPROACHES.index(label) for label in labels(raw, "approach")]
         rank = np.argsort(np.argsort(raw["target_position"].values))
         by_label = np.nan_to_num(change)[:, approaches][..., rank]
         deviation = raw["deviation"].transpose("freedom", "approach", "run", "target")
         return raw.assign(deviation=deviation.copy(data=deviation.values + by_label[:, :, None, :])), settings
-
-    @property
-    def _shape(self) -> tuple[int, int, int]:
-        count, approaches, _, targets = self._found.readings.x.shape
-        return count, approaches, targets
-
-
-def _text(label: object) -> str:
-    return label.decode() if isinstance(label, bytes) else str(label)

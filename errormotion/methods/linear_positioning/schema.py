@@ -47,7 +47,7 @@ RAW_SCHEMAS = (
         (
             Row(
                 "deviation",
-                (*READINGS[1:], "freedom"),  # last: a map of a log gives each freedom a column with its own unit
+                (*READINGS[1:], "freedom"),  # last: in the map of a log, each freedom is a column with its own unit
                 "",
                 -0.1,
                 0.1,

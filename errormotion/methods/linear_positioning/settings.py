@@ -20,7 +20,9 @@ Freedom = Literal["EX", "EY", "EZ", "EA", "EB", "EC"]
 FREEDOMS: tuple[Freedom, ...] = ("EX", "EY", "EZ", "EA", "EB", "EC")
 MINUTE = 60.0
 BODY_DIAGONALS = ("PPP", "NPP", "PNP", "NNP")
-"""The four diagonals of a volume, all of them rising in Z."""
+"""The four body diagonals of a volume, with increasing Z."""
+LIMITS = {"A": "accuracy_limit", "R": "repeatability_limit", "B": "reversal_limit"}
+"""Figures of positioning that may have a limit, and its setting."""
 
 
 class Side(PluginSettings):
@@ -51,20 +53,20 @@ class Budget(PluginSettings):
     drift: Length | None = Field(
         default=None,
         ge=0,
-        description="range of the readings at rest during one run (test of the environment); at least this is taken "
-        "for the drift from run to run, and it is needed where there are fewer than four runs",
+        description="range of the readings at rest during one run (environmental test): lower bound of the drift from "
+        "run to run; required with fewer than four runs",
     )
     scatter: Length | None = Field(
-        default=None, gt=0, description="standard deviation of a reading, needed where there is one run"
+        default=None, gt=0, description="standard deviation of a reading; required with a single run"
     )
 
 
 class Moving(PluginSettings):
-    """Thermal distortion by a moving axis (ISO 230-3): both ends of the stroke are read while it warms and cools."""
+    """Thermal distortion by a moving axis (ISO 230-3), read at both ends of the stroke during warm-up and cooling."""
 
     cold: int = Field(default=5, ge=1, le=1000, description="readings of both ends before the axis starts to move")
-    duration: Time = Field(default=240 * MINUTE, gt=0, description="for which the axis moves")
-    cooling: Time = Field(default=60 * MINUTE, ge=0, description="for which it is read at rest afterwards")
+    duration: Time = Field(default=240 * MINUTE, gt=0, description="time for which the axis moves")
+    cooling: Time = Field(default=60 * MINUTE, ge=0, description="time for which the axis is read at rest afterwards")
     interval: Time = Field(default=5 * MINUTE, gt=0, description="from reading to reading")
     feed: Velocity = Field(default=10.0 / MINUTE, gt=0, description="feed of the moves between the readings")
 
@@ -75,24 +77,24 @@ class Diagonals(PluginSettings):
     names: tuple[str, ...] = Field(
         default=BODY_DIAGONALS,
         min_length=1,
-        description="a letter for X, Y, Z each: P the axis rises along the diagonal, N it falls, 0 it rests; PPP and "
-        "NPP are body diagonals, PP0 and NP0 those of a face parallel to XY",
+        description="one letter each for X, Y, Z: P the axis moves in positive direction, N in negative direction, 0 "
+        "it is at rest; PPP and NPP are body diagonals, PP0 and NP0 those of a face parallel to XY",
     )
     volume: tuple[Span, Span, Span] = Field(
         default=((0.0, 0.5), (0.0, 0.4), (0.0, 0.3)),
-        description="lowest and highest position of X, Y and Z; an axis that rests is at its position in start",
+        description="lowest and highest position of X, Y and Z; an axis at rest is at its position in start",
     )
     channels: dict[str, str] = Field(
         default_factory=dict,
-        description="channel of the interferometer for each diagonal, with '-' ahead where it counts down; default its "
-        "only channel",
+        description="channel of the interferometer for each diagonal, with a leading '-' if it counts down; default "
+        "its only channel",
     )
 
     @model_validator(mode="after")
     def _fits(self) -> Diagonals:
         for axis, (low, high) in zip("XYZ", self.volume, strict=True):
             if not low < high:
-                raise ValueError(f"volume: expected the lower end of {axis} first; found {low:g} and {high:g} m")
+                raise ValueError(f"volume: expected the lower end of {axis} first; found {low:g} m and {high:g} m")
         lines = []
         for name in self.names:
             if len(name) != 3 or set(name) - set("PN0") or name.count("0") > 1:
@@ -120,10 +122,10 @@ class Settings(PluginSettings):
         default=None, description="lowest and highest position of the axis, overrun included; default none"
     )
     targets: tuple[Length, ...] = Field(
-        default=(), description="target positions; default positions over the travel with a random part (ISO 230-2)"
+        default=(), description="target positions; by default over the travel, with a random part (ISO 230-2)"
     )
     count: int = Field(
-        default=0, ge=0, le=1000, description="number of targets; 0: as ISO 230-2 asks for the travel, at least 11"
+        default=0, ge=0, le=1000, description="number of targets; 0: as ISO 230-2 requires for the travel, at least 11"
     )
     random_part: Length | None = Field(
         default=None,
@@ -131,12 +133,12 @@ class Settings(PluginSettings):
         description="largest random part of a target position; default 30 % of the interval, so that periodic errors "
         "are sampled",
     )
-    seed: int = Field(default=1, ge=0, description="of the random parts")
+    seed: int = Field(default=1, ge=0, description="seed of the random parts")
     runs: int = Field(default=5, ge=1, le=100, description="approaches to each target in each direction")
     cycle: Literal["linear", "pendulum"] = Field(
         default="linear",
         description="linear: all targets forward, then all backward, for each run; pendulum: all runs at one target "
-        "from both sides, then the next target",
+        "from both directions, then the next target",
     )
     moving: Moving | None = Field(
         default=None,
@@ -146,22 +148,23 @@ class Settings(PluginSettings):
         default=None, description="measure displacements along diagonals of a volume instead of one axis"
     )
     start: Point = Field(default=(0.0, 0.0, 0.0), description="positions of the axes that do not move")
-    overrun: Length = Field(default=2e-3, gt=0, description="distance beyond a target before an approach turns")
+    overrun: Length = Field(default=2e-3, gt=0, description="distance beyond a target at which the axis reverses")
     feed: Velocity = Field(default=1.0 / MINUTE, gt=0, description="feed of the approaches")
-    dwell: Time = Field(default=4.0, ge=0, description="rest at a target, during which it is read")
-    settle: Time = Field(default=2.0, ge=0, description="part of the rest before the reading")
+    dwell: Time = Field(default=4.0, ge=0, description="dwell at a target, in which it is read")
+    settle: Time = Field(default=2.0, ge=0, description="part of the dwell before the reading")
     channels: dict[Freedom, str] = Field(
         default_factory=dict,
-        description="channel of the interferometer for each freedom, with '-' ahead where it counts down; default its "
+        description="channel of the interferometer for each freedom, with a leading '-' if it counts down; default its "
         "only channel",
     )
     average: int = Field(default=10, ge=1, le=10_000, description="readings averaged at each target")
     arrival: Length = Field(
-        default=0.1e-3, gt=0, description="distance from a target within which the axis has arrived, by the control"
+        default=0.1e-3, gt=0, description="distance from a target at which the axis has arrived, by the control"
     )
     timeout: Time = Field(default=120.0, gt=0, description="time limit of a move")
     functional_point: Point | None = Field(
-        default=None, description="point whose displacement is measured, with the axis at zero; that of the data first"
+        default=None,
+        description="point whose displacement is measured, with the axis at zero; used if the data do not state it",
     )
 
     # Evaluation
@@ -177,7 +180,7 @@ class Settings(PluginSettings):
     machine: Side = Field(default_factory=Side, description="positioning system of the axis")
     workpiece: Side = Field(
         default_factory=lambda: Side(expansion=0.0, expansion_uncertainty=0.0),
-        description="what gives the lengths; an interferometer does not expand",
+        description="artefact that embodies the lengths; the default, no expansion, is that of an interferometer",
     )
     uncertainty: Budget = Field(default_factory=Budget, description="sources that the data do not state")
 
@@ -192,13 +195,14 @@ class Settings(PluginSettings):
     def _fits(self) -> Settings:
         low, high = self.travel
         if not low < high:
-            raise ValueError(f"travel: expected the lower end first; found {low:g} and {high:g} m")
+            raise ValueError(f"travel: expected the lower end first; found {low:g} m and {high:g} m")
         if self.limits is not None and not self.limits[0] < self.limits[1]:
-            raise ValueError(f"limits: expected the lower end first; found {self.limits[0]:g} and {self.limits[1]:g} m")
+            low, high = self.limits
+            raise ValueError(f"limits: expected the lower end first; found {low:g} m and {high:g} m")
         if len(set(self.freedoms)) < len(self.freedoms):
             raise ValueError(f"freedoms: expected each once; found {', '.join(self.freedoms)}")
         if self.targets and (len(self.targets) < 3 or np.unique(self.targets).size < len(self.targets)):
-            raise ValueError("targets: expected three or more positions that differ")
+            raise ValueError("targets: expected three or more different positions")
         if 0 < self.count < 3:
             raise ValueError(f"count: expected 3 targets or more; found {self.count}")
         if self.moving is not None and self.diagonals is not None:

@@ -1,4 +1,4 @@
-"""Raw data of the method, simulated on the virtual machine with a known truth.
+"""Raw data of the method, simulated on the virtual machine with known errors.
 
 The axis has the geometric errors of the virtual machine, a reversal error, scatter, and drift from run to run. The
 instrument has an error of scale, a beam that is not parallel to the axis, and thermometers with an offset.
@@ -6,7 +6,6 @@ instrument has an error of scale, a beam that is not parallel to the axis, and t
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
-from errormotion.methods.linear_positioning.diagonals.simulation import simulate_diagonals
+from errormotion.methods.linear_positioning.diagonals.simulation import MACHINE, instruments_of, simulate_diagonals
 from errormotion.methods.linear_positioning.planning.targets import positions
 from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, SCHEMA, SENSORS
 from errormotion.methods.linear_positioning.warming import simulate_moving
@@ -24,18 +23,17 @@ from errormotion.twin import VirtualMachine, truth
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
 
-MACHINE = "gantry"
-EXPANSION, WARMTH = 11.5e-6, 2.0
+EXPANSION, EXCESS_TEMPERATURE = 11.5e-6, 2.0
 """Coefficient of expansion of the axis, 1/K, and its temperature above 20 degC, K."""
 _M = {"units": "m"}
 
 
 @dataclass(frozen=True)
 class Behaviour:
-    """How an axis departs from its mean errors; m, and rad for rotations.
+    """Variation of the errors of an axis; m, and rad for rotations.
 
     ``noise`` is the standard deviation of a reading, ``offset`` and ``slope`` those of a run, ``opposite`` that of an
-    offset whose sign is that of the approach; ``reversal`` is the mean difference of forward and backward.
+    offset with opposite signs forward and backward; ``reversal`` is the mean difference of forward and backward.
     """
 
     noise: float = 0.3e-6
@@ -65,19 +63,19 @@ def raw_and_truth(settings: Settings, seed: int, behaviour: Behaviour) -> tuple[
     axis, along = settings.axis, direction_of(settings.axis)
     columns = [DOF.index(name) for name in settings.freedoms]
     geometric = machine.geometry.motions[axis](np.append(P, P[0]))
-    error = (geometric[:-1] - geometric[-1]).T[columns]  # (freedom, target), from the first target on
-    true = error - behaviour.reversal / 2.0  # the instrument was set to zero after an approach forward
+    error = (geometric[:-1] - geometric[-1]).T[columns]  # (freedom, target), relative to the first target
+    true = error - behaviour.reversal / 2.0  # the instrument is set to zero after an approach forward
     departures = np.stack([_departures(behaviour, settings.runs, P, generator) for _ in columns])
     x = true[:, None, None, :] + departures  # (freedom, run, approach, target)
     lever = P - P[0]
     budget = settings.uncertainty
-    T = 20.0 + WARMTH + 0.2 * generator.normal(size=(settings.runs, 1, 1))
+    T = 20.0 + EXCESS_TEMPERATURE + 0.2 * generator.normal(size=(settings.runs, 1, 1))
     alpha = EXPANSION + 0.6e-6 * generator.normal()
     scale = budget.length * generator.normal()
     angle = budget.alignment * generator.normal(size=2)
     if along in columns:
         x[columns.index(along)] += (alpha * (T - 20.0) + scale - (angle @ angle) / 2.0) * lever
-    shown = np.broadcast_to(T + budget.temperature * generator.normal(), departures.shape[1:])
+    measured_T = np.broadcast_to(T + budget.temperature * generator.normal(), departures.shape[1:])
     names = iso_names(axis)
     variables: dict[str, Any] = {
         "deviation": (READINGS, x),
@@ -86,7 +84,7 @@ def raw_and_truth(settings: Settings, seed: int, behaviour: Behaviour) -> tuple[
         "functional_point": ("direction", np.zeros(3), _M),
         "length_uncertainty": ((), budget.length, {"units": "1"}),
         "alignment_uncertainty": ((), budget.alignment, {"units": "rad"}),
-        "temperature": (SENSORS, shown[..., None], {"units": "degC"}),
+        "temperature": (SENSORS, measured_T[..., None], {"units": "degC"}),
         "temperature_uncertainty": ((), budget.temperature, {"units": "K"}),
         "machine_expansion": ((), EXPANSION, {"units": "1/K"}),
         "machine_expansion_uncertainty": ((), 0.6e-6, {"units": "1/K"}),
@@ -97,8 +95,7 @@ def raw_and_truth(settings: Settings, seed: int, behaviour: Behaviour) -> tuple[
         "sensor": ["machine"],
         "direction": list("xyz"),
     }
-    note = [{"id": "virtual interferometer", "address": f"twin://{machine.kind}?seed={seed}", "simulated": True}]
-    attrs = {"schema": SCHEMA, "axis": axis, "machine": machine.name, "instruments": json.dumps(note)}
+    attrs = {"schema": SCHEMA, "axis": axis, "machine": machine.name, "instruments": instruments_of(machine)}
     return xr.Dataset(variables, coords, attrs), _truth(machine, settings, P, true)
 
 
@@ -114,7 +111,7 @@ def _departures(behaviour: Behaviour, runs: int, P: Array, generator: np.random.
 
 
 def _truth(machine: VirtualMachine, settings: Settings, P: Array, true: Array) -> xr.Dataset:
-    """Return the true errors; a straightness from the line through the first and the last target."""
+    """Return the true errors; of a straightness relative to the line through the first and the last target."""
     twist = np.full((P.size, 6), np.nan)
     along = direction_of(settings.axis)
     t = (P - P[0]) / (P[-1] - P[0])

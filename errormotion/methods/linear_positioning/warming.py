@@ -1,8 +1,7 @@
-"""Raw data of a moving axis, simulated with a known truth: the screw grows while the axis moves, and shrinks again."""
+"""Simulated raw data of a moving axis with known errors: its screw expands in motion and contracts at rest."""
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
+from errormotion.methods.linear_positioning.diagonals.simulation import MACHINE, instruments_of
 from errormotion.methods.linear_positioning.moving import cycles, ends, moving_of
 from errormotion.methods.linear_positioning.schema import SCHEMA
 from errormotion.twin import VirtualMachine, truth
@@ -17,15 +17,14 @@ from errormotion.twin import VirtualMachine, truth
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
 
-MACHINE = "gantry"
 GROWTH, SHIFT = 30e-6, 8e-6
-"""Final growth of the screw, 1, and shift of its bearing, m (rad for rotations)."""
+"""Final relative expansion of the screw, 1, and displacement of its bearing, m (rad for rotations)."""
 TIME_CONSTANT = 2400.0
-"""Of the screw, s."""
+"""Of the warm-up of the screw, s."""
 NOISE = 0.3e-6
 """Standard deviation of a reading; m, rad."""
 COLD_INTERVAL = 30.0
-"""From one cold reading to the next, s."""
+"""Interval of the cold readings, s."""
 
 
 def simulate_moving(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
@@ -44,7 +43,7 @@ def simulate_moving(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Datas
     size = 1.0 + 0.3 * generator.normal(size=len(columns))
     shape = np.array([GROWTH * (P - P[0]) * (k == along) + SHIFT for k in columns])
     change = size[:, None, None] * warmth[None, :, None] * shape[:, None, :]  # (freedom, cycle, end)
-    scale = settings.uncertainty.length * generator.normal()  # that changed since the cold state
+    scale = settings.uncertainty.length * generator.normal()  # change of the instrument's scale since the cold state
     read = change + NOISE * generator.normal(size=change.shape)
     if along in columns:
         read[columns.index(along), cold:] += scale * (P - P[0])
@@ -59,22 +58,21 @@ def simulate_moving(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Datas
     }
     coords = {"freedom": [names[name] for name in settings.freedoms], "direction": list("xyz")}
     machine = VirtualMachine(MACHINE, seed=seed)
-    note = [{"id": "virtual interferometer", "address": f"twin://{machine.kind}?seed={seed}", "simulated": True}]
-    attrs = {"schema": SCHEMA, "axis": settings.axis, "machine": machine.name, "instruments": json.dumps(note)}
+    attrs = {"schema": SCHEMA, "axis": settings.axis, "machine": machine.name, "instruments": instruments_of(machine)}
     twist = np.full((time.size - cold + 1, 2, 6), np.nan)
     for values, k in zip(change, columns, strict=True):
         twist[..., k] = np.concatenate([np.zeros((1, 2)), values[cold:]])
     origin = truth.Origin(machine.name, machine.kind, machine.seed, machine.state.schedule.events)
-    where = {"time": np.append(0.0, time[cold:]), "xyz"[along]: ("position", P, {"units": "m"})}
-    true = truth.dataset(twist, ("time", "position"), where, settings.axis, np.zeros(3), "cold state", origin)
+    at = {"time": np.append(0.0, time[cold:]), "xyz"[along]: ("position", P, {"units": "m"})}
+    true = truth.dataset(twist, ("time", "position"), at, settings.axis, np.zeros(3), "cold state", origin)
     return xr.Dataset(variables, coords, attrs), true
 
 
 def _warmth(time: Array, moving: Array) -> Array:
     """Return the state of the screw at each reading, from 0 (cold) to 1."""
-    state, found = 0.0, np.zeros_like(time)
+    state, states = 0.0, np.zeros_like(time)
     for i in range(1, time.size):
         step = 1.0 - np.exp(-(max(time[i], 0.0) - max(time[i - 1], 0.0)) / TIME_CONSTANT)
         state += step * (float(moving[i]) - state)
-        found[i] = state
-    return found
+        states[i] = state
+    return states

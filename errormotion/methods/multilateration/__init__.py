@@ -1,13 +1,14 @@
 """Multilateration: volumetric errors from displacements of a reflector, measured from four or more stations.
 
-``method`` is the plugin. ``acquisition`` measures, ``identification`` turns raw data into errors, ``planning`` predicts
-the uncertainty of a layout, ``report`` and ``figures`` show a result, ``simulation`` makes raw data with a known truth.
+``method`` is the plugin. ``acquisition`` measures, ``identification`` determines errors from raw data, ``planning``
+predicts the uncertainty of a layout, ``report`` and ``figures`` present a result, ``simulation`` makes raw data with
+known errors.
 
 ``network`` solves for targets and stations: ``model`` (the equations), ``start`` (approximate stations), ``descent``
 (Gauss-Newton with every target eliminated), ``turning`` (the datum), ``outliers`` (wrong readings), ``determinacy``
-(loose freedoms), ``network`` (result and covariances), over ``loops`` (array operations for small networks, compiled
-ones for large networks). Source: Takeuchi et al., estimation of three-dimensional volumetric errors of numerically
-controlled machine tools by a laser tracker.
+(undetermined freedoms), ``network`` (result and covariances), over ``loops`` (array operations for small networks,
+compiled loops for large networks). Source: Takeuchi et al., estimation of three-dimensional volumetric errors of
+numerically controlled machine tools by a laser tracker.
 """
 
 from errormotion.methods.multilateration.method import Multilateration

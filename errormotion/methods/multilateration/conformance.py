@@ -1,4 +1,4 @@
-"""What the conformance kit examines: one tracker at four stations in turn, 48 targets, some beams broken."""
+"""Subject of the conformance kit: one tracker at four stations one after the other, 48 targets, some beams broken."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def subjects() -> tuple[MethodSubject, ...]:
 
 
 def tracker_readings(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return distances of a reflector from four stations, and the true errors less the motion that they do not show."""
+    """Return distances of a reflector from four stations, and the true errors minus the undetermined rigid motion."""
     machine = VirtualMachine("cframe", seed=seed)
     position = simulation.target_grid(machine, (4, 4, 3))
     scale = TRACKER_SCALE * np.random.default_rng([seed, 3]).normal()

@@ -11,7 +11,7 @@ from errormotion.plugins import FigureOfMerit
 
 
 def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
-    """Return the largest and the root mean square volumetric error, and each squareness that was determined."""
+    """Return the largest and the root mean square volumetric error, and every determined squareness."""
     return [*_volumetric(errors), *_squareness(errors)]
 
 
@@ -29,7 +29,7 @@ def _volumetric(errors: xr.Dataset) -> Iterator[FigureOfMerit]:
     worst, rms = int(np.argmax(size)), float(np.sqrt(np.mean(size**2)))
     name = errors["target"].values[known][worst] if "target" in errors.coords else np.flatnonzero(known)[worst] + 1
     yield FigureOfMerit(f"largest volumetric error, target {name}", float(size[worst]), 2 * float(sigma[worst]), "m")
-    # However the errors of targets are correlated, U of the root mean square is no larger than this, to first order.
+    # For any correlation of the errors of targets, an upper limit of u of the root mean square, to first order.
     spread = float(np.mean(size * sigma)) / rms
     yield FigureOfMerit(f"root mean square volumetric error, {len(size)} targets", rms, 2 * spread, "m")
 

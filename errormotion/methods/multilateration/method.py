@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Multilateration:
-    """Errors of the volume and of the axes from distances of a reflector to four or more places of a tracker."""
+    """Errors of the volume and of the axes from distances of a reflector to four or more positions of a tracker."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="multilateration",
@@ -27,10 +27,10 @@ class Multilateration:
         status="simulated_only",
         version="1",
         cannot_see=(
-            "six motions of the whole: where the machine's coordinates lie and how they are turned is fitted",
+            "the six rigid motions of the whole: position and orientation of the machine's coordinates are fitted",
             "rotations of the tool at a target: a reflector is a point",
-            "with one place of the reflector: rotations of the axis that carries it, and others that only shift it",
-            "drift that shifts and turns the machine as a whole from one set-up to the next",
+            "with one reflector position: rotations of the axis that carries it, and others with the same effect",
+            "drift that displaces and rotates the machine as a whole from one set-up to the next",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("laser_tracker",), raw_schema=SCHEMA)
@@ -52,7 +52,7 @@ class Multilateration:
         inputs: Mapping[str, xr.Dataset],
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
-        """Measure; yield one raw dataset a set-up. See ``acquisition``."""
+        """Measure; yield one raw dataset per set-up."""
         from errormotion.methods.multilateration.acquisition import measure as acquisition
 
         return acquisition.measure_stations(bench, settings, inputs, done)
@@ -68,26 +68,26 @@ class Multilateration:
         return steps(settings)
 
     def machine_defaults(self, machine: MachineDescription) -> dict[str, str]:
-        """Return the chain of the axes that move."""
+        """Return the chain of the moving axes."""
         return {"chain": machine.moving_chain}
 
     def check_machine(self, settings: MultilaterationSettings, machine: MachineDescription) -> dict[str, str]:
-        """Return what contradicts the machine: other axes, another chain, targets outside of the travel."""
+        """Return by setting what contradicts the machine: other axes, another chain, targets outside the travel."""
         if machine.moving_axes != ("X", "Y", "Z"):
             moving = ", ".join(machine.moving_axes)
             return {"": f"expected a machine with the moving axes X, Y and Z; found {moving}. Fix the rotary axes"}
-        found = {}
+        contradictions = {}
         if settings.chain != machine.moving_chain:
-            found["chain"] = f"expected '{machine.moving_chain}'; found '{settings.chain}'"
+            contradictions["chain"] = f"expected '{machine.moving_chain}'; found '{settings.chain}'"
         corners = settings.layout.targets or (settings.layout.low, settings.layout.high)
         for axis, column in zip("XYZ", zip(*corners, strict=True), strict=True):
             low, high = machine.travel[axis]
             if min(column) < low - 1e-9 or max(column) > high + 1e-9:
-                found["layout"] = (
+                contradictions["layout"] = (
                     f"expected targets within the travel of {axis}, {low * 1e3:g} mm to {high * 1e3:g} mm; "
                     f"found {min(column) * 1e3:g} mm to {max(column) * 1e3:g} mm"
                 )
-        return found
+        return contradictions
 
     def append_dim(self, settings: MultilaterationSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``station``."""
@@ -98,20 +98,20 @@ class Multilateration:
         return float(len(settings.measuring.sequence or settings.layout.stations))
 
     def identify(self, raw: xr.Dataset, settings: MultilaterationSettings | None = None) -> xr.Dataset:
-        """Turn a raw dataset into an error dataset of component ``tool`` over ``target``.
+        """Return the error dataset of component ``tool`` over ``target``.
 
         Parameters
         ----------
         raw : Dataset
-            Schema ``errormotion.raw.multilateration/1``; stays as it is.
+            Schema ``errormotion.raw.multilateration/1``; not modified.
         settings : Settings, optional
 
         Raises
         ------
         DatasetError
-            The raw dataset does not follow its schema; all violations at once.
+            The raw dataset violates its schema; all violations are reported together.
         MethodError
-            The data do not determine the answer, or contradict one another.
+            The data do not determine the result, or contradict one another.
         """
         from errormotion.methods.multilateration.acquisition.measure import latest
         from errormotion.methods.multilateration.identification.identify import identify_targets
@@ -124,7 +124,7 @@ class Multilateration:
         return identify_targets(latest(checked), settings, self.info.id, self.info.version)
 
     def plan(self, settings: MultilaterationSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros whose covariance is the one to expect of the layout."""
+        """Return an error dataset of zeros with the expected covariance of the layout."""
         from errormotion.methods.multilateration.planning.plan import plan
 
         return plan(self.info, settings or MultilaterationSettings())

@@ -1,7 +1,7 @@
-"""Sources of tracker readings, drawn anew for the Monte Carlo method.
+"""Sources of tracker readings for the Monte Carlo method.
 
-A redrawn reading carries noise twice, that of the measurement and that of the draw. What is compared with the noise in
-the identification, drifts above all, is compared with the root of two times the noise.
+A drawn reading contains the noise twice, that of the measurement and that of the draw. The identification therefore
+tests drifts and similar effects with the noise times the square root of two.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from errormotion.arrays import Array
     from errormotion.methods.multilateration.settings import Expansion, Settings
 
-TWICE = float(np.sqrt(2.0))
+DRAWN_NOISE = float(np.sqrt(2.0))
+"""Noise of a drawn reading over that of a measured one."""
 
 
 def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
@@ -28,17 +29,19 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     d = _displacement(raw)
     known = (errors["left_out"].transpose("station", "target").values == 0) & np.isfinite(errors["EX"].values)
     reduced = _with(raw.load(), np.where(known, d, np.nan))
-    reduced["displacement_noise"] = (raw["displacement_noise"] * TWICE).assign_attrs(raw["displacement_noise"].attrs)
+    reduced["displacement_noise"] = (raw["displacement_noise"] * DRAWN_NOISE).assign_attrs(
+        raw["displacement_noise"].attrs
+    )
     quiet = {"robust": False, "noise": "stated", "parametric": False, "alternating": False}
     if settings.repeatability is not None:
         quiet |= {
-            "repeatability": settings.repeatability * TWICE,
-            "repeatability_uncertainty": settings.repeatability_uncertainty * TWICE,
+            "repeatability": settings.repeatability * DRAWN_NOISE,
+            "repeatability_uncertainty": settings.repeatability_uncertainty * DRAWN_NOISE,
         }
     sources = {"readings": _readings(float(errors["noise"]))}
     if settings.together and "repeatability" in errors:
         sources["repeatability"] = _positions(float(errors["repeatability"]), errors)
-    refraction = float(np.linalg.norm(list(air_scale(raw, settings.air, [])[1].values())))  # all act alike
+    refraction = float(np.linalg.norm(list(air_scale(raw, settings.air, [])[1].values())))  # all have the same effect
     for group, relative in (("refraction", refraction), ("scale of the tracker", settings.scale_uncertainty)):
         if relative > 0:
             sources[group] = _scale(relative, group)
@@ -59,7 +62,7 @@ def _with(raw: xr.Dataset, displacement: Array) -> xr.Dataset:
 
 
 def _readings(noise: float) -> Redraw:
-    """Return the noise of the readings; drift and repeatability of set-ups made in turn are found from it."""
+    """Return the noise of the readings, which includes drift and repeatability of separate set-ups."""
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         d = _displacement(raw)
@@ -69,13 +72,13 @@ def _readings(noise: float) -> Redraw:
 
 
 def _positions(repeatability: float, errors: xr.Dataset) -> Redraw:
-    """Return the repeatability of positions that all stations read at the same time: it moves the target."""
-    place = errors["target_place"].transpose("target", "direction").values
-    beam = place - errors["station_place"].transpose("station", "direction").values[:, None]
+    """Return the repeatability of positions read by all stations at the same time: a displacement of the target."""
+    target = errors["target_place"].transpose("target", "direction").values
+    beam = target - errors["station_place"].transpose("station", "direction").values[:, None]
     beam = np.nan_to_num(beam / np.linalg.norm(beam, axis=2, keepdims=True))
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        shift = generator.normal(0.0, repeatability, place.shape)
+        shift = generator.normal(0.0, repeatability, target.shape)
         return _with(raw, _displacement(raw) + np.einsum("jta,ta->jt", beam, shift)), settings
 
     return Redraw(draw, own=True)
@@ -89,7 +92,7 @@ def _scale(relative: float, group: str) -> Redraw:
 
 
 def _expansion(expansion: Expansion) -> Redraw:
-    """Return coefficient and temperature of the scales; each axis has one temperature for all set-ups."""
+    """Return the source of coefficient and temperature of the scales; an axis has one temperature for all set-ups."""
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         coefficient = expansion.coefficient + expansion.coefficient_uncertainty * generator.normal()

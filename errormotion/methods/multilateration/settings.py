@@ -1,4 +1,4 @@
-"""Settings of the method, as a campaign file or ``--set`` gives them."""
+"""Settings of the method, from a campaign file or ``--set``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from errormotion.datasets.units import Angle, Length, Quantity, Temperature, Tim
 from errormotion.plugins import PluginSettings
 
 HELIUM_NEON = 632.9912e-9
-"""Wavelength in vacuum of the usual red laser, m."""
+"""Wavelength in vacuum of a red helium-neon laser, m."""
 CO2 = 450e-6
 """Carbon dioxide in laboratory air, mole fraction."""
 
@@ -22,11 +22,11 @@ Relative = Annotated[float, Quantity("a relative length", "m/m", "0.3 um/m")]
 Coefficient = Annotated[float, Quantity("a coefficient of expansion", "1/K", "11.5 um/m/K")]
 TemperatureStep = Annotated[float, Quantity("a difference of temperature", "K", "0.2 K")]
 Number = Annotated[int, Field(ge=1, le=100)]
-"""Points of a grid along one axis."""
+"""Number of points of a grid along one axis."""
 
 
 class Air(PluginSettings):
-    """State of the air along the beam: its uncertainty is that of the scale."""
+    """State of the air along the beam, which determines the scale."""
 
     temperature_uncertainty: TemperatureStep = Field(
         default=0.2, ge=0, description="standard uncertainty of the air temperature along the beam"
@@ -115,9 +115,9 @@ class Choosing(PluginSettings):
     @model_validator(mode="after")
     def _one_budget(self) -> Self:
         if (self.count is None) == (self.time is None):
-            raise ValueError("expected count, a number of targets, or time, the time for a set-up: one of both")
+            raise ValueError("expected either count, the number of targets, or time, the time for a set-up")
         if (self.low is None) != (self.high is None):
-            raise ValueError("expected low and high, both corners of the box of candidates; found one of them")
+            raise ValueError("expected both low and high, the corners of the box of candidates; found only one")
         if min(self.candidates) < 1:
             raise ValueError(f"candidates: expected 1 or more along every axis; found {self.candidates}")
         return self
@@ -164,9 +164,7 @@ class Planning(PluginSettings):
     @model_validator(mode="after")
     def _has_direction(self) -> Self:
         if self.reflector_axis is not None and not any(self.reflector_axis):
-            raise ValueError(
-                "reflector_axis: expected a direction; found (0, 0, 0); leave it out or state the direction"
-            )
+            raise ValueError("reflector_axis: expected a direction; found (0, 0, 0); remove it or state the direction")
         return self
 
 

@@ -1,6 +1,6 @@
 """Raw data of a virtual machine, and its true errors: a tracker on the table, a reflector in the spindle.
 
-The tracker stands in the workpiece's frame. It is set up at one station after the other, and the machine goes to all
+The tracker is fixed in the workpiece's frame. It is set up at one station after the other, and the machine moves to all
 targets for each.
 """
 
@@ -101,18 +101,17 @@ def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Da
 def true_errors(
     machine: VirtualMachine, position: ArrayLike, reflector: ArrayLike = REFLECTOR, time: float | None = None
 ) -> xr.Dataset:
-    """Return the errors of the reflector at axis positions (n, 3), m, less the rigid motion that fits them best.
+    """Return the errors of the reflector at axis positions (n, 3), m, minus their best-fit rigid motion.
 
-    Distances do not determine that motion: it depends on the choice of the workpiece's frame. With a time, s, the
-    thermal errors at it are included.
+    Distances do not determine that motion. With a time, s, the thermal errors at that time are included.
     """
     q, at = np.atleast_2d(np.asarray(position, dtype=float)), np.asarray(reflector, dtype=float)
     twist = machine.geometry.twist(q)
     if time is not None:
         twist = twist + machine.thermal_twist(q, time)
     twist = move(twist, at)
-    place = q + at
-    lever = place - place.mean(axis=0)
+    point = q + at
+    lever = point - point.mean(axis=0)
     G = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -cross_matrix(lever)], axis=2)
     motion = np.linalg.lstsq(G.reshape(-1, 6), twist[:, :3].ravel())[0]
     twist[:, :3] -= G @ motion
@@ -149,7 +148,7 @@ def raw(
         True positions of the tracker, m, in the workpiece's frame; default: `stations`. The dataset states them with
         ``STATION_UNCERTAINTY``.
     seed : int
-        Of noise, repeatability and stated positions; the machine stays the same.
+        Of noise, repeatability and stated positions; it does not affect the machine.
     reflector : (3,)
         Position of the reflector with all axes at zero, m.
     noise : float
@@ -157,13 +156,13 @@ def raw(
     dead_path : (station,), optional
         m; default: random.
     repeatability : float
-        Standard deviation of each coordinate each time the machine goes to a target, m.
+        Standard deviation of each coordinate at each move to a target, m.
     scale : float
         Relative error of the tracker's length.
     drift : (station, 4), optional
         Of the dead path, and of the machine along X, Y, Z relative to the tracker, during each set-up, m/s.
     missing : float
-        Share of the readings at which the beam was broken.
+        Fraction of readings with an interrupted beam.
 
     Raises
     ------
@@ -179,9 +178,9 @@ def raw(
     time = SETUP_INTERVAL * np.arange(n)[:, None] + READING_INTERVAL * (m * np.arange(n)[:, None] + np.arange(m))
     rate = np.zeros((n, 4)) if drift is None else np.asarray(drift, dtype=float)
     since = time - time.mean(axis=1, keepdims=True)
-    place = reflector_positions(machine, q, reflector) + since[:, :, None] * rate[:, None, 1:]
-    place = place + repeatability * rng.normal(size=(n, m, 3))
-    way = np.linalg.norm(place - U[:, None], axis=2) - L[:, None] + since * rate[:, :1]
+    point = reflector_positions(machine, q, reflector) + since[:, :, None] * rate[:, None, 1:]
+    point = point + repeatability * rng.normal(size=(n, m, 3))
+    way = np.linalg.norm(point - U[:, None], axis=2) - L[:, None] + since * rate[:, :1]
     d = way * (1 + scale) + noise * rng.normal(size=(n, m))
     d[rng.uniform(size=(n, m)) < missing] = np.nan
     at = np.asarray(reflector, dtype=float)
@@ -206,6 +205,6 @@ def _require_within_travel(machine: VirtualMachine, q: Array) -> None:
         low, high = machine.travel[axis]
         if column.min() < low - 1e-9 or column.max() > high + 1e-9:
             raise BenchError(
-                f"Axis {axis} travels from {low:g} to {high:g} m; found targets from {column.min():g} to "
+                f"Axis {axis}: expected targets within the travel, {low:g} to {high:g} m; found {column.min():g} to "
                 f"{column.max():g} m."
             )

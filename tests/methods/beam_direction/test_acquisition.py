@@ -1,4 +1,4 @@
-"""Measuring a beam on the faces of a gauge, with a stage and a sensor that do what real ones do."""
+"""Measurement of a beam on the faces of a gauge, with a simulated stage and sensor."""
 
 from types import SimpleNamespace
 
@@ -25,7 +25,7 @@ LAYOUT = {
 
 
 class Stage:
-    """Goes to the commanded place, to the micrometre, and says where it is."""
+    """Stage that moves to the commanded position within 1 um and returns its position."""
 
     def __init__(self):
         self.place, self.moves = np.zeros(3), 0
@@ -39,7 +39,7 @@ class Stage:
 
 
 class SettingStage(Stage):
-    """Sets the gauge as well."""
+    """Stage whose control also sets the gauge."""
 
     def __init__(self):
         super().__init__()
@@ -50,7 +50,7 @@ class SettingStage(Stage):
 
 
 class Sensor:
-    """Reads the face that the gauge was last set to; NaN out of range."""
+    """Sensor that reads the distance of the last face set; NaN out of range."""
 
     info = SimpleNamespace(id="sensor")
     settings = SimpleNamespace(noise=2e-7)
@@ -103,7 +103,7 @@ def joined(chunks):
     return raw.drop_attrs().assign_attrs({k: v for k, v in chunks[0].attrs.items() if k != "invalid"})
 
 
-def test_every_face_gives_a_dataset_and_together_they_follow_the_schema():
+def test_faces_return_one_dataset_each_and_conform_to_the_schema():
     bench = Bench()
     chunks = list(measure_planes(bench, settings(), {}, None))
     assert [angles[1:] for angles in bench.stage.set] == [
@@ -118,7 +118,7 @@ def test_every_face_gives_a_dataset_and_together_they_follow_the_schema():
     np.testing.assert_array_equal(raw["plane_point"], np.tile(PIVOT, (3, 1)))
 
 
-def test_the_places_are_those_that_the_control_shows_and_the_readings_use_most_of_the_range():
+def test_positions_are_those_of_the_control_and_readings_use_most_of_the_range():
     (chunk, *_) = measure_planes(Bench(), settings(), {}, None)
     normal = chunk["nominal_normal"].values[0]
     exact = (PIVOT - ORIGIN - chunk["stage"].values[0]) @ normal / (normal @ BEAM)
@@ -128,7 +128,7 @@ def test_the_places_are_those_that_the_control_shows_and_the_readings_use_most_o
     assert abs(np.ptp(exact) / 2 - exact.max()) < 1e-3
 
 
-def test_an_interrupted_run_goes_on_with_the_next_face():
+def test_an_interrupted_run_continues_with_the_next_face():
     before = joined(list(measure_planes(Bench(), settings(), {}, None))[:2])
     bench = Bench()
     (last,) = measure_planes(bench, settings(), {}, before)
@@ -136,7 +136,7 @@ def test_an_interrupted_run_goes_on_with_the_next_face():
     assert last.sizes["plane"] == 1
 
 
-def test_the_operator_sets_a_gauge_that_no_control_sets_while_the_sensor_is_out_of_the_way():
+def test_the_operator_sets_a_manual_gauge_while_the_sensor_is_retracted():
     bench = Bench(Stage())
     chunks = list(measure_planes(bench, settings(search=15e-3), {}, None))
     assert len(chunks) == len(bench.asked) == 3
@@ -147,7 +147,7 @@ def test_the_operator_sets_a_gauge_that_no_control_sets_while_the_sensor_is_out_
     assert place @ nominal == pytest.approx((PIVOT - ORIGIN - 1e-4) @ nominal - 15e-3, abs=1e-5)
 
 
-def test_readings_out_of_range_are_nan_and_counted_by_their_reason():
+def test_readings_out_of_range_are_nan_and_counted_by_reason():
     chunk = next(iter(measure_planes(Bench(), settings(strokes=(1e-3, 1e-3, 30e-3)), {}, None)))
     lost = int(np.isnan(chunk["distance"]).sum())
     assert lost == 2  # of four places over 30 mm the outer ones are 15 mm off
@@ -155,34 +155,34 @@ def test_readings_out_of_range_are_nan_and_counted_by_their_reason():
     assert np.isfinite(chunk["stage"]).all()
 
 
-def test_a_stage_that_carries_the_target_is_moved_the_other_way():
+def test_a_stage_that_carries_the_target_moves_in_the_opposite_direction():
     bench = Bench(carries=-1.0)
     chunks = list(measure_planes(bench, settings().model_copy(update={"moves": "target"}), {}, None))
     assert all(np.isfinite(chunk["distance"]).all() for chunk in chunks)
     assert chunks[0].attrs["moves"] == "target"
 
 
-def test_a_path_takes_the_place_of_strokes():
+def test_a_path_replaces_the_strokes():
     path = [(x, y, z) for x in (-1e-3, 1e-3) for y in (-1e-3, 1e-3) for z in (-2e-3, 0.0, 2e-3)]
     chunk = next(iter(measure_planes(Bench(), settings(path=path), {}, None)))
     places = chunk["stage"].values[0]
     np.testing.assert_allclose(places - places.mean(axis=0), path, atol=1e-12)
 
 
-def test_readings_that_grow_while_the_sensor_comes_nearer_are_refused():
+def test_readings_that_increase_as_the_sensor_approaches_are_refused():
     with pytest.raises(MethodError, match="Check the sign of the readings"):
         list(measure_planes(Bench(sign=-1.0), settings(), {}, None))
 
 
-def test_a_face_that_is_not_there_is_reported_with_where_it_was_looked_for():
+def test_a_face_that_is_not_found_is_reported_with_the_search_range():
     with pytest.raises(MethodError, match=r"no reading from -5 to 5 mm along the beam"):
         list(measure_planes(Bench(), settings(start=(0.05, 0.05, 0.3), search=5e-3), {}, None))
 
 
-def test_a_bench_that_cannot_measure_says_what_it_lacks():
+def test_an_incomplete_bench_is_refused_with_what_is_missing():
     bench = Bench()
     bench.stage = SimpleNamespace(state=dict)
-    with pytest.raises(MethodError, match="'controller' that can move to a position"):
+    with pytest.raises(MethodError, match="'controller' that can move the sensor to a position"):
         list(measure_planes(bench, settings(), {}, None))
     with pytest.raises(MethodError, match=r"layout.start .* or both layout.pivot and layout.nominal_origin"):
         list(measure_planes(Bench(), settings(pivot=None), {}, None))

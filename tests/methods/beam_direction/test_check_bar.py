@@ -1,4 +1,4 @@
-"""A check bar: published measurements, and simulated bars whose truth is known."""
+"""Check bar: published measurements, and simulated bars with known true values."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def published(name: str) -> BarFit:
 
 
 def bar_points(noise: float, seed: int = 0, shape: np.ndarray | float = 0.0) -> np.ndarray:
-    """Twenty points across a bar whose axis is the z axis, with white radial errors and a shape beside them."""
+    """Return 20 points across a bar whose axis is the z axis, with white radial errors and optional form errors."""
     angle = np.arcsin(ACROSS / R)
     r = R + noise * np.random.default_rng(seed).normal(size=angle.size) + shape
     return np.column_stack([-r * np.cos(angle), r * np.sin(angle), np.zeros_like(r)])
@@ -50,32 +50,30 @@ def test_published_centres(name: str, centre: tuple[float, float]) -> None:
     np.testing.assert_allclose(1e3 * published(name).centre[:2], centre, atol=1e-3)
 
 
-def test_misprint_of_the_published_table_is_named() -> None:
+def test_misprint_of_the_published_table_is_reported() -> None:
     bar = published("scheme2_0deg_compensated")
     assert bar.left_out == (8,)
-    assert (
-        "Point 9 of 20 (index 8, reading 5.465 mm) is an outlier and was ignored: it is 130 um inside" in bar.notes[0]
-    )
+    assert "Point 9 of 20 (index 8, reading 5.465 mm) is an outlier and was ignored: 130 um inside" in bar.notes[0]
 
 
-def test_systematic_residual_of_the_published_compensation_is_called_so() -> None:
+def test_residual_of_the_published_compensation_is_reported_as_systematic() -> None:
     bar = published("scheme2_0deg_compensated")
     assert bar.systematic
     assert bar.exceeds_noise
     assert "systematic: residual rms 13.8 um" in bar.notes[1]
 
 
-def test_only_the_misprint_is_left_out_of_the_published_table() -> None:
+def test_only_the_misprint_of_the_published_table_is_ignored() -> None:
     names = ("scheme1", "scheme2_0deg_raw", "scheme2_90deg_raw", "scheme2_90deg_compensated", "scheme3")
     assert [published(name).left_out for name in names] == [()] * 5
 
 
-def test_laser_at_reading_0_and_touch_probe_see_a_bar_without_pattern() -> None:
+def test_laser_at_reading_0_and_touch_probe_have_no_systematic_residual() -> None:
     assert not published("scheme1").systematic
     assert published("scheme3").notes == ()
 
 
-def test_clean_bars_raise_few_alarms_and_cover_the_truth() -> None:
+def test_clean_bars_cause_few_false_alarms_and_intervals_cover_the_true_value() -> None:
     # Noise of 1 um at each point: each alarm is set to 1 %, and more than 6 of 150 come once in 1000 then. Of 95 %
     # intervals 150 cover between 133 and 150 times, but for one case in 1000.
     bars = [fit_bar(bar_points(1e-6, seed), ALONG_Z, noise=1e-6) for seed in range(150)]
@@ -88,7 +86,7 @@ def test_clean_bars_raise_few_alarms_and_cover_the_truth() -> None:
 
 
 @pytest.mark.parametrize("size", [130e-6, -130e-6])
-def test_wrong_reading_is_named_beside_a_systematic_error(size: float) -> None:
+def test_wrong_reading_is_found_despite_a_systematic_error(size: float) -> None:
     # Half a dozen times as far off as the wave: whatever the wave's phase, the wrong point is outside of what it makes.
     found = []
     for seed in range(20):
@@ -102,14 +100,14 @@ def test_wrong_reading_is_named_beside_a_systematic_error(size: float) -> None:
     assert sum(found) >= 19
 
 
-def test_systematic_shape_is_not_taken_for_wrong_points() -> None:
+def test_systematic_form_error_is_not_treated_as_outliers() -> None:
     wave = 14e-6 * np.sin(np.linspace(0, 3 * np.pi, 20))
     bar = fit_bar(bar_points(1e-6, 1, wave), ALONG_Z, noise=1e-6)
     assert bar.systematic
     assert bar.left_out == ()
 
 
-def test_noise_larger_than_stated_is_said_and_widens_the_uncertainty() -> None:
+def test_noise_larger_than_stated_is_reported_and_increases_the_uncertainty() -> None:
     stated, true = (fit_bar(bar_points(5e-6, 3), ALONG_Z, noise=noise) for noise in (0.5e-6, 5e-6))
     assert stated.exceeds_noise
     assert not stated.systematic
@@ -119,7 +117,7 @@ def test_noise_larger_than_stated_is_said_and_widens_the_uncertainty() -> None:
     assert stated.radius_u == pytest.approx(true.radius_u, rel=0.5)
 
 
-def test_without_stated_noise_the_residuals_tell_it() -> None:
+def test_without_stated_noise_it_is_estimated_from_the_residuals() -> None:
     bar = fit_bar(bar_points(1e-6, 4), ALONG_Z)
     reported = fit_bar(bar_points(1e-6, 4), ALONG_Z, noise=1e-6)
     assert np.isnan(bar.explained)
@@ -134,7 +132,7 @@ def test_order_of_the_points_does_not_matter_on_a_circle() -> None:
     assert mixed.chance == pytest.approx(fit_bar(scan, ALONG_Z, noise=1e-6).chance)
 
 
-def test_points_without_reading_are_no_points_left_out() -> None:
+def test_points_without_reading_are_not_counted_as_ignored() -> None:
     scan = bar_points(1e-6, 1)
     scan[4] = np.nan
     bar = fit_bar(scan, ALONG_Z, noise=1e-6)
@@ -143,7 +141,7 @@ def test_points_without_reading_are_no_points_left_out() -> None:
     assert np.isfinite(np.delete(bar.residuals, 4)).all()
 
 
-def test_held_radius_holds_the_centre_better_and_carries_its_own_uncertainty() -> None:
+def test_fixed_radius_improves_the_centre_and_contributes_its_uncertainty() -> None:
     scan = bar_points(1e-6, 1)
     free = fit_bar(scan, ALONG_Z, radius=R, noise=1e-6)
     held = fit_bar(scan, ALONG_Z, radius=R, hold_radius=True, noise=1e-6)
@@ -156,9 +154,9 @@ def test_held_radius_holds_the_centre_better_and_carries_its_own_uncertainty() -
     assert 1e-6 < np.sqrt(unsure.centre_covariance[0, 0] - sure**2) < 1.7e-6
 
 
-def test_wrong_certificate_is_said() -> None:
+def test_a_radius_that_contradicts_the_certificate_is_reported() -> None:
     bar = fit_bar(bar_points(0.2e-6, 1), ALONG_Z, radius=R + 20e-6, noise=0.2e-6)
-    assert any("um off the calibrated 25.0200 mm" in note for note in bar.notes)
+    assert any("um from the calibrated one, 25.0200 mm" in note for note in bar.notes)
     assert fit_bar(bar_points(0.2e-6, 1), ALONG_Z, radius=R, noise=0.2e-6).notes == ()
 
 
@@ -179,7 +177,7 @@ def test_cylinder_finds_a_tilted_axis() -> None:
     assert abs(bar.radius - R) < 3 * bar.radius_u
 
 
-def test_what_the_beam_shares_with_all_points_shifts_the_bar_and_is_in_its_covariance() -> None:
+def test_errors_of_the_beam_shift_all_points_and_are_in_the_covariance_of_the_bar() -> None:
     stage = np.column_stack([0 * ACROSS, ACROSS, 0 * ACROSS])
     reading = 3e-3 - np.sqrt(R**2 - ACROSS**2)
     covariance = np.zeros((6, 6))
@@ -196,7 +194,7 @@ def test_what_the_beam_shares_with_all_points_shifts_the_bar_and_is_in_its_covar
     assert np.trace(bar.common_covariance[:2, :2]) > 0.99 * (u[0] ** 2 + u[1] ** 2)
 
 
-def test_too_few_points_and_points_of_no_bar_are_refused() -> None:
+def test_too_few_points_and_points_that_form_no_bar_are_refused() -> None:
     with pytest.raises(FitError, match="at least 6 points"):
         fit_bar(bar_points(1e-6)[:4], ALONG_Z)
     line = np.column_stack([np.zeros(20), ACROSS, np.zeros(20)])
@@ -209,7 +207,7 @@ def test_too_few_points_and_points_of_no_bar_are_refused() -> None:
     [
         ({"shape": "cone"}, "expected 'circle' or 'cylinder'; found 'cone'"),
         ({"radius": -1.0}, "expected a positive length; found -1.0"),
-        ({"hold_radius": True}, "expected a radius to hold"),
+        ({"hold_radius": True}, "hold_radius: expected the radius to be fixed"),
         ({"noise": -1.0}, "expected a standard deviation"),
     ],
 )
@@ -220,5 +218,5 @@ def test_wrong_options_are_reported(options: dict, message: str) -> None:
 
 def test_dataset_without_bar_is_refused() -> None:
     raw = datasets.load(TABLE_2 / "scheme1.csv").drop_vars(["bar_distance", "bar_axis"])
-    with pytest.raises(MethodError, match="missing bar_distance, bar_axis"):
+    with pytest.raises(MethodError, match="bar_distance, bar_axis missing"):
         measure_bar(raw, (0, 0, 0), (1, 0, 0))

@@ -1,4 +1,4 @@
-"""The inclination error taken off while the direction is sought."""
+"""Iterative compensation of the inclination error."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ C = expected_covariance(STAGE, 0.1e-6)
 
 @dataclass(frozen=True)
 class Polynomial:
-    """k = c . (1, q1, q1^2, q2^2): the interface of a calibration that the compensation uses."""
+    """Calibration with k = c . (1, q1, q1^2, q2^2), with the interface that the compensation uses."""
 
     coefficients: np.ndarray
     coefficient_covariance: np.ndarray
@@ -54,7 +54,7 @@ PAIR = FOUR[:2]
 
 
 def read_planes(normals=FOUR, calibration=TRUE, rng=None):
-    """What a sensor with the inclination error of a calibration reads on planes through P0 + 3 mm U."""
+    """Return the readings of a sensor with the inclination error of a calibration on planes through P0 + 3 mm U."""
     g = -normals / (normals @ U)[:, None]
     offsets = np.full(len(g), 3e-3)
     k = calibration.slope(tilt(U, T, normals))[0]
@@ -74,7 +74,7 @@ def settled(planes=None, by=None, tolerance=1e-12, most=30):
 
 
 @pytest.mark.parametrize("normals", [PAIR, FOUR])
-def test_a_true_calibration_gives_the_true_direction(normals):
+def test_a_correct_calibration_results_in_the_true_direction(normals):
     planes = read_planes(normals)
     found = settled(planes)
     np.testing.assert_allclose(found.direction.direction, U, atol=1e-11)
@@ -84,15 +84,15 @@ def test_a_true_calibration_gives_the_true_direction(normals):
     assert np.linalg.norm(uncompensated(planes, NOMINAL).direction.direction - U) > 1e-3
 
 
-def test_compensated_offsets_give_the_zero_point():
+def test_compensated_offsets_determine_the_zero_point():
     found = settled()
     points = np.tile(P0 + 3e-3 * U, (4, 1))
     origin = locate(found.direction, found.planes.offsets, found.planes.covariances, points, 1e-7)
     np.testing.assert_allclose(origin.origin, P0, atol=1e-10)
 
 
-def test_calibration_and_mounting_go_through_the_whole_loop():
-    """Each source's influence on direction and zero point is what a run with that source moved gives."""
+def test_calibration_and_mounting_propagate_through_all_iterations():
+    """The influence of a source equals the change of direction and zero point when the source is changed."""
     planes, roll = read_planes(), 5e-3
     points = np.tile(P0 + 3e-3 * U, (4, 1))
 
@@ -136,7 +136,7 @@ def test_noise_and_calibration_are_as_large_as_stated(normals):
     assert nees.mean() == pytest.approx(2, abs=3.5 * np.sqrt(4 / 200))
 
 
-def test_closure_knows_of_the_calibration():
+def test_uncertainty_of_the_closure_includes_the_calibration():
     # Planes miss closing by noise and by the calibration: chi-square counts both, with planes - 2 degrees of freedom.
     rng, chi2 = np.random.default_rng(6), []
     for _ in range(200):
@@ -148,12 +148,13 @@ def test_closure_knows_of_the_calibration():
 
 def test_too_few_iterations_are_refused_with_the_last_change():
     with pytest.raises(
-        MethodError, match=r"after 2 iterations the direction changed by \S+ rad, expected less .*the steps decrease"
+        MethodError,
+        match=r"in the last of 2 iterations the direction changed by \S+ rad; expected less .*the steps decrease",
     ):
         settled(most=2)
 
 
-def test_an_error_that_jumps_with_the_tilt_makes_the_steps_alternate():
+def test_an_error_that_is_too_steep_in_the_tilt_makes_the_steps_alternate():
     class Jump(Polynomial):
         """Small but so steep about the true tilt of the first plane that each step overshoots."""
 
@@ -164,13 +165,13 @@ def test_an_error_that_jumps_with_the_tilt_makes_the_steps_alternate():
     by = sensor(Jump(np.array([0.0, middle, 0.0, 0.0]), np.zeros((4, 4))))
     exact = read_planes(PAIR, Polynomial(np.zeros(4), np.zeros((4, 4))))
     with pytest.raises(
-        MethodError, match=r"does not converge: after 30 iterations .* the steps alternate, .*less inclination"
+        MethodError, match=r"does not converge: in the last of 30 iterations .*the steps alternate.*less inclination"
     ):
         settled(exact, by)
 
 
 def test_a_calibration_of_another_sensor_is_refused():
     with pytest.raises(
-        MethodError, match=r"Plane 1: the inclination error by the calibration .* belongs to this sensor"
+        MethodError, match=r"Plane 1: the inclination error of the calibration .* belongs to this sensor"
     ):
         settled(by=sensor(Polynomial(np.array([0.5, 0, 0, 0]), np.zeros((4, 4)))))

@@ -26,7 +26,7 @@ def test_a_beam_states_its_errors_with_their_expanded_uncertainty(beam):
         assert figure.expanded_uncertainty == pytest.approx(2 * u, rel=1e-12)
 
 
-def test_unknown_freedoms_have_no_figure(beam):
+def test_undetermined_freedoms_have_no_figure(beam):
     unknown = beam.assign(EX=np.nan * beam["EX"])
     assert not any(figure.name.startswith("EX") for figure in BeamDirection.figures(unknown))
 

@@ -27,7 +27,7 @@ def machine():
 
 @pytest.fixture(scope="module")
 def calibration(machine, tmp_path_factory):
-    """All rotations: what is published, with 0 to 10, 90 and 170 to 180 deg alone, leaves holes."""
+    """Return a calibration at all rotations; the published one, at 0 to 10, 90 and 170 to 180 deg only, has holes."""
     file = tmp_path_factory.mktemp("calibrations") / "sensor.nc"
     raw = simulation.raw_inclination(
         machine, np.radians(np.arange(-45, 46, 5.0)), np.radians(np.arange(0, 180, 15.0)), seed=0
@@ -52,7 +52,7 @@ def twist_error(errors, machine):
     return np.asarray(errors.em.twist() - simulation.truth_beam(machine).em.twist())[0]
 
 
-def test_result_follows_its_schema_and_comes_back_from_a_file(machine, tmp_path):
+def test_result_conforms_to_its_schema_and_survives_a_file(machine, tmp_path):
     errors = identify(simulation.raw(machine, FOUR, seed=0, inclination_error=False), beam="X1")
     validate(errors)
     assert errors.attrs["component"] == "beam"
@@ -71,7 +71,7 @@ def test_recovers_the_beam_within_the_stated_uncertainty(machine):
     assert (u[:3] < 5e-6).all()
 
 
-def test_covariance_holds_the_truth_as_often_as_it_says(machine):
+def test_covariance_covers_the_true_value_as_often_as_stated(machine):
     miss, nees = [], []
     for seed in range(120):
         raw = simulation.raw(machine, FOUR, seed=seed, inclination_error=False, speckle=True, count=10)
@@ -86,7 +86,7 @@ def test_covariance_holds_the_truth_as_often_as_it_says(machine):
     assert (inside > 0.95 - 3.5 * np.sqrt(0.95 * 0.05 / 120)).all()
 
 
-def test_direction_is_as_well_known_as_it_can_be(machine):
+def test_direction_reaches_the_lower_bound_of_the_uncertainty(machine):
     raw = simulation.raw(machine, FOUR, seed=1, inclination_error=False, speckle=True)
     errors = identify(raw, noise="stated")
     sensor = machine.point_sensor
@@ -112,7 +112,7 @@ def test_compensation_makes_the_angle_ten_times_better(machine, calibration):
     assert 1e-3 * depth < np.abs(taken.values).max() < 1e-2 * depth
 
 
-def test_planes_stand_as_the_gauge_was_set(machine, calibration):
+def test_planes_have_the_inclination_and_rotation_of_the_gauge(machine, calibration):
     errors = identify(simulation.raw(machine, FOUR, seed=3), compensation=calibration)
     normals = np.array([machine.sine_gauge.plane(*plane, 3)[0] for plane in FOUR])
     np.testing.assert_allclose(errors["normal"], normals, atol=1e-4)
@@ -123,7 +123,7 @@ def test_planes_stand_as_the_gauge_was_set(machine, calibration):
     np.testing.assert_allclose(turned, 0, atol=1e-3)
 
 
-def test_the_calibration_that_was_used_is_in_the_provenance(machine, calibration):
+def test_the_calibration_is_in_the_provenance(machine, calibration):
     raw = simulation.raw(machine, FOUR, seed=3)
     known = InclinationCalibration.load(calibration)
     reported = provenance.of(identify(raw, compensation=calibration))["calibration"]
@@ -137,7 +137,7 @@ def test_the_calibration_that_was_used_is_in_the_provenance(machine, calibration
 
 
 def by(serial, kind="point_lds"):
-    """The attribute with which a campaign states its instruments."""
+    """Return the attribute in which a campaign states its instruments."""
     return {"instruments": json.dumps([{"kind": kind, "identity": {"serial_number": serial}}])}
 
 
@@ -178,7 +178,7 @@ def test_calibration_is_part_of_the_uncertainty(machine, calibration):
     assert np.trace(less["covariance"].values[0]) < np.trace(total)
 
 
-def test_an_unsure_scale_turns_the_beam_and_moves_its_start(machine):
+def test_an_uncertain_scale_contributes_to_direction_and_zero_point(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     scaled = raw.assign(distance=(raw["distance"] * 1.001).assign_attrs(units="m"))
     straight, errors = identify(raw), identify(raw, layout={"scale_uncertainty": 1e-3})
@@ -187,26 +187,26 @@ def test_an_unsure_scale_turns_the_beam_and_moves_its_start(machine):
     np.testing.assert_allclose(np.abs(influence), np.abs(moved), rtol=0.01, atol=1e-9)
 
 
-def test_without_compensation_it_is_said_and_planes_contradict_one_another(machine):
+def test_missing_compensation_is_reported_and_planes_contradict_one_another(machine):
     reported = notes(identify(simulation.raw(machine, FOUR, seed=0)))
     assert "No inclination compensation" in reported
     assert "The planes contradict one another: chi-square" in reported
-    assert "The uncertainties are raised" in reported
-    assert "worst is plane" in reported
+    assert "The uncertainties are increased" in reported
+    assert "most plane" in reported
     reported = notes(identify(simulation.raw(machine, FOUR[:3], seed=0)))
     assert "three planes do not show which of them is wrong" in reported
 
 
 def test_two_planes_state_the_other_direction_and_the_missing_zero_point(machine):
     errors = identify(simulation.raw(machine, FOUR[:2], seed=0, inclination_error=False))
-    assert "Two directions fit the planes; the one nearer to nominal was taken" in notes(errors)
-    assert "2 planes with a known point" in notes(errors)
+    assert "Two directions fit the planes; the one closer to nominal" in notes(errors)
+    assert "found 2 with a known point" in notes(errors)
     assert np.isnan(errors["beam_origin"]).all()
     assert np.isnan([errors[name].values[0] for name in FREEDOMS]).tolist() == [True] * 3 + [False] * 3
     assert (errors["closure_uncertainty"] == 0).all()
 
 
-def test_a_stage_that_carries_the_target_counts_the_other_way(machine):
+def test_a_stage_that_carries_the_target_has_the_opposite_sign(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     straight, carried = identify(raw), raw.assign(stage=-raw["stage"])
     carried["stage"].attrs["units"] = "m"
@@ -226,7 +226,7 @@ def test_planes_may_have_different_numbers_of_readings(machine):
     assert (np.abs(twist_error(errors, machine)) < 4 * u).all()
 
 
-def test_outliers_are_named_by_plane_and_reading(machine):
+def test_outliers_are_reported_by_plane_and_reading(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance"][1, 8] += 20e-6
     raw["distance"][3, 40] -= 5e-6
@@ -236,42 +236,42 @@ def test_outliers_are_named_by_plane_and_reading(machine):
     assert np.argwhere(errors["left_out"].values).tolist() == [[1, 8], [3, 40]]
 
 
-def test_more_scatter_than_stated_raises_the_uncertainty(machine):
+def test_more_scatter_than_stated_increases_the_uncertainty(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     straight = identify(raw)
     raw["distance_noise"] = raw["distance_noise"] / 5
     raw["distance_noise"].attrs["units"] = "m"
-    raised, kept = identify(raw), identify(raw, noise="stated")
-    assert "scatter" in notes(raised)
-    assert "the stated noise was kept (noise = stated)" in notes(kept)
-    assert raised["noise"].values[0] == pytest.approx(machine.point_sensor.noise, rel=0.15)
-    assert float(raised["covariance"][0, 3, 3]) == pytest.approx(float(straight["covariance"][0, 3, 3]), rel=0.3)
+    increased, kept = identify(raw), identify(raw, noise="stated")
+    assert "scatter" in notes(increased)
+    assert "the stated noise is used (noise = stated)" in notes(kept)
+    assert increased["noise"].values[0] == pytest.approx(machine.point_sensor.noise, rel=0.15)
+    assert float(increased["covariance"][0, 3, 3]) == pytest.approx(float(straight["covariance"][0, 3, 3]), rel=0.3)
     np.testing.assert_allclose(kept["gradient_covariance"], straight["gradient_covariance"] / 25, atol=1e-20)
-    # That a stated noise was wrong, planes show as well where they do not close.
+    # A wrong stated noise also appears as planes that do not close.
     assert "The planes contradict one another" in notes(kept)
-    assert "contradict" not in notes(raised)
+    assert "contradict" not in notes(increased)
 
 
-def test_less_scatter_than_stated_is_said(machine):
+def test_less_scatter_than_stated_is_reported(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance_noise"] = raw["distance_noise"] * 3
     raw["distance_noise"].attrs["units"] = "m"
     assert "scatter of the readings is only" in notes(identify(raw))
 
 
-def test_speckle_that_is_not_stated_is_noticed(machine):
+def test_unstated_speckle_is_detected(machine):
     raw = simulation.raw(
         machine, FOUR, seed=0, inclination_error=False, speckle=True, half_length=0.5e-3, count=60
     ).drop_vars(["speckle", "speckle_length"])
     assert "Residuals of neighbouring readings are correlated" in notes(identify(raw))
 
 
-def test_sound_data_raise_no_alarm(machine):
+def test_sound_data_cause_no_warning(machine):
     alarms = [notes(identify(simulation.raw(machine, FOUR, seed=seed, inclination_error=False))) for seed in range(25)]
     assert set(alarms) == {"No inclination compensation: the readings are not corrected for the inclination error."}
 
 
-def test_known_points_without_an_uncertainty_are_said_to_be_taken_as_exact(machine):
+def test_known_points_without_an_uncertainty_are_reported_as_exact(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     reported = "the known points of the planes are assumed to be exact"
     assert reported in notes(identify(raw.drop_vars("plane_point_uncertainty")))
@@ -287,13 +287,13 @@ def test_missing_and_out_of_range_readings_are_counted(machine):
     assert errors["left_out"].values[0, [3, 10]].tolist() == [0, 2]
 
 
-def test_check_bar_is_seen_with_the_beam(machine, calibration):
+def test_check_bar_is_evaluated_with_the_beam(machine, calibration):
     raw = simulation.raw(machine, FOUR, seed=0, check_bar=True)
     errors = identify(raw, compensation=calibration)
     bar = machine.check_bar
     assert float(errors["bar_radius_fitted"]) == pytest.approx(bar.radius, abs=3 * float(errors["bar_radius_u"]) + 1e-7)
     across = np.cross(bar.axis, errors["bar_centre"].values - bar.point)
-    # Along the bar a centre means nothing; across it the beam's own uncertainty is in that of the centre.
+    # Along the bar the centre is undefined; across it its uncertainty includes that of the beam.
     assert np.linalg.norm(across) < 4 * np.linalg.norm(errors["bar_centre_u"].values)
     assert errors["bar_residual"].sizes == {"bar_reading": 20}
 
@@ -306,56 +306,54 @@ def refused(raw, match, kind=MethodError, **settings):
         identify(raw, **settings)
 
 
-def test_parallel_planes(machine):
+def test_parallel_planes_are_refused(machine):
     raw = simulation.raw(machine, [FOUR[0]] * 3, seed=0, inclination_error=False)
     refused(raw, r"The planes are parallel .*but not the rotation of the beam about it")
 
 
-def test_a_stroke_out_of_the_range(machine):
+def test_a_stroke_beyond_the_range_is_refused(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance"][1, 30:] = np.nan
-    refused(
-        raw, r"Plane 2: 30 of 60 readings are missing .*the first of them reading 31: the strokes leave the sensor's"
-    )
+    refused(raw, r"Plane 2: 30 of 60 readings are missing .*the first is reading 31: the strokes leave the sensor's")
 
 
-def test_a_stage_that_steps_back_along_a_stroke(machine):
+def test_a_stage_that_moves_back_along_a_stroke_is_refused(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     order = np.arange(60)
     order[[7, 8]] = order[[8, 7]]
     swapped = raw.assign(stage=raw["stage"].isel(reading=order))
     refused(swapped, r"Plane 1: at reading 9 the stage moves back by .* um along a stroke")
-    # Places and readings that belong together may come in any order, where that is meant.
+    # Corresponding positions and readings may have any order, with ordered = false.
     together = raw.isel(reading=order)
     refused(together, "ordered = false")
     np.testing.assert_allclose(identify(together, ordered=False).em.twist(), identify(raw).em.twist(), rtol=1e-7)
 
 
-def test_a_stage_that_moves_along_two_directions(machine):
+def test_a_stage_that_moves_along_two_directions_is_refused(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False).isel(reading=slice(0, 40))
     refused(raw, r"Plane 1: the stage moves along 2 of three independent directions; along \(0.00, 0.00, 1.00\)")
 
 
-def test_a_direction_that_flips_sign(machine):
+def test_a_direction_of_opposite_sign_is_refused(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
-    refused(raw, r"with the opposite sign.*setting moves", moves="target")
+    refused(raw, r"has the opposite sign.*setting moves", moves="target")
 
 
-def test_readings_in_mm(machine):
+def test_readings_in_mm_are_refused(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance"] = (raw["distance"] * 1e3).assign_attrs(units="m")
     raw["reading_range"] = (raw["reading_range"] * 1e3).assign_attrs(units="m")
     refused(raw, "is it in mm", DatasetError)
 
 
-def test_places_of_the_stage_in_mm(machine):
+def test_stage_positions_in_mm_are_refused(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False, half_length=5e-3)
     home = raw["stage"].mean("reading")
     raw["stage"] = ((raw["stage"] - home) * 1e3).assign_attrs(units="m")
     refused(raw, "Plane 1: .*readings and stage positions have the same unit")
 
 
-def test_a_plane_that_the_beam_grazes(machine):
+def test_a_plane_at_grazing_incidence_is_refused(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     u = machine.point_sensor.true_direction
     side = np.cross(u, [0.0, 1.0, 0.0])
@@ -367,7 +365,7 @@ def test_a_plane_that_the_beam_grazes(machine):
     refused(raw, "Plane 2: grazing incidence")
 
 
-def test_a_hole_in_the_calibration(machine, tmp_path):
+def test_a_plane_in_a_hole_of_the_calibration_is_refused(machine, tmp_path):
     holed = simulation.raw_inclination(machine, seed=0)  # rotations 0 to 10, 90 and 170 to 180 deg, as published
     calibrate(holed).save(tmp_path / "holed.nc")
     raw = simulation.raw(machine, FOUR, seed=0)
@@ -384,24 +382,24 @@ def test_a_hole_in_the_calibration(machine, tmp_path):
     assert np.abs(deviation).max() < 4
 
 
-def test_a_calibration_without_triangulation_plane(machine, calibration):
+def test_a_calibration_requires_the_triangulation_plane(machine, calibration):
     raw = simulation.raw(machine, FOUR, seed=0).drop_vars("triangulation_normal")
-    refused(raw, r"needs triangulation_normal", compensation=calibration)
+    refused(raw, r"Expected triangulation_normal", compensation=calibration)
 
 
-def test_a_calibration_that_is_not_there(machine):
+def test_an_unknown_calibration_is_refused(machine):
     refused(simulation.raw(machine, FOUR, seed=0), "not found", DatasetError, compensation="nowhere")
 
 
-def test_a_noise_of_nothing(machine):
+def test_a_noise_of_zero_is_refused(machine):
     raw = simulation.raw(machine, FOUR, seed=0)
-    refused(raw.assign(distance_noise=((), 0.0, {"units": "m"})), "distance_noise is 0")
+    refused(raw.assign(distance_noise=((), 0.0, {"units": "m"})), "distance_noise: expected .*; found 0")
 
 
-def test_speckle_without_its_length(machine):
+def test_speckle_without_its_length_is_refused(machine):
     raw = simulation.raw(machine, FOUR, seed=0, speckle=True).drop_vars("speckle_length")
     refused(raw, "speckle_length")
 
 
-def test_an_unknown_kind_of_stage(machine):
+def test_an_unknown_kind_of_stage_is_refused(machine):
     refused(simulation.raw(machine, FOUR, seed=0).assign_attrs(moves="table"), "expected 'sensor' or 'target'")

@@ -1,4 +1,4 @@
-"""Where the beam starts."""
+"""Zero point of the beam."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ C = expected_covariance(STAGE, NOISE)
 
 
 def planes(rng=None, normals=NORMALS):
-    """Gradients and offsets that planes through the points give; with a generator, noisy ones."""
+    """Return the gradients and offsets of planes through the points; with noise if a generator is passed."""
     g = -normals / (normals @ U)[:, None]
     points = POINTS[: len(g)]
     y = np.column_stack([g, np.sum(g * (P0 - points), axis=1)])
@@ -44,13 +44,13 @@ def located(found, points=POINTS, point_uncertainty=POINT_U):
     return settled, locate(settled.direction, found.offsets, found.covariances, points, point_uncertainty)
 
 
-def test_exact_planes_give_the_zero_point():
+def test_exact_planes_determine_the_zero_point():
     _, origin = located(planes())
     np.testing.assert_allclose(origin.origin, P0, atol=1e-12)
     assert origin.chi2 < 1e-9
 
 
-def test_points_anywhere_on_the_planes_will_do():
+def test_any_points_on_the_planes_are_accepted():
     aside = POINTS + np.array([np.cross(n, [0.1, 0.7, 0.2]) * 0.02 for n in NORMALS])
     np.testing.assert_allclose(located(planes(), aside)[1].origin, P0, atol=1e-12)
 
@@ -99,7 +99,7 @@ def test_derivatives():
         np.testing.assert_allclose((shifted[0] - shifted[1]) / 2e-6, origin.by_point[:, k], atol=1e-3)
 
 
-def test_a_plane_without_a_known_point_helps_the_direction_alone():
+def test_a_plane_without_a_known_point_contributes_only_to_the_direction():
     points = POINTS.copy()
     points[3] = np.nan
     _, origin = located(planes(), points)
@@ -107,13 +107,13 @@ def test_a_plane_without_a_known_point_helps_the_direction_alone():
     assert np.isnan(origin.misfit).tolist() == [False] * 3 + [True]
 
 
-def test_two_planes_leave_the_zero_point_open():
+def test_two_planes_do_not_determine_the_zero_point():
     points = POINTS.copy()
     points[2:] = np.nan
     assert located(planes(), points)[1] is None
 
 
-def test_normals_in_one_plane_leave_the_zero_point_open():
+def test_coplanar_normals_do_not_determine_the_zero_point():
     normals = np.array([normal(20, 0), normal(20, 180), normal(5, 0)])
     off = np.array([0.3, 0.3, -0.9])
     off /= np.linalg.norm(off)
@@ -123,6 +123,6 @@ def test_normals_in_one_plane_leave_the_zero_point_open():
     assert locate(settled.direction, np.zeros(3), found.covariances, POINTS[:3], POINT_U) is None
 
 
-def test_a_point_that_is_wrong_shows_in_chi2():
+def test_a_wrong_point_increases_chi2():
     points = POINTS + 30 * POINT_U * np.outer(np.arange(4) == 1, NORMALS[1])
     assert located(planes(), points)[1].chi2 > 30

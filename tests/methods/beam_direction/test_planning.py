@@ -1,4 +1,4 @@
-"""Where to put the planes: optimum against brute force, against the limit that theory sets, and within its limits."""
+"""Orientation of the planes: the optimum compared with a grid search and with the theoretical limit, and its limits."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -31,7 +31,7 @@ LIMITS = design.Limits(
     readings=180,
     noise=0.3e-6,
 )
-PAPER = np.radians([[20.0, 0.0], [20.0, 90.0]])
+PUBLISHED = np.radians([[20.0, 0.0], [20.0, 90.0]])
 
 
 def planes(number):
@@ -39,7 +39,7 @@ def planes(number):
 
 
 def expected(found, limits=LIMITS):
-    """Return the worse angle's uncertainty by the Cramer-Rao bound of the places and planes themselves."""
+    """Return the larger uncertainty of the two angles by the Cramer-Rao bound of the positions and planes."""
     return design.worst_angle(
         design.across(limits.beam) @ bound(found.stages(), found.normals, limits.beam, limits.noise)
         @ design.across(limits.beam).T
@@ -48,7 +48,7 @@ def expected(found, limits=LIMITS):
 
 @pytest.fixture(scope="module")
 def two():
-    return design.optimise(LIMITS, PAPER)
+    return design.optimise(LIMITS, PUBLISHED)
 
 
 def test_no_pair_of_planes_on_a_grid_is_better(two):
@@ -56,42 +56,41 @@ def test_no_pair_of_planes_on_a_grid_is_better(two):
     grid = np.radians(angles)
     grid = grid[design.inclinations(design.plane_normals(grid), BEAM) <= LIMITS.max_inclination]
     half = np.array([0.5, 0.5])
-    best = min(
-        design.worst_angle(design.spread(grid[[i, j]], half, LIMITS)) for i, j in combinations(range(len(grid)), 2)
-    )
+    pairs = combinations(range(len(grid)), 2)
+    best = min(design.worst_angle(design.angle_covariance(grid[[i, j]], half, LIMITS)) for i, j in pairs)
     shares = two.readings.sum(axis=1) / LIMITS.readings
-    assert design.worst_angle(design.spread(two.planes, shares, LIMITS)) < best
+    assert design.worst_angle(design.angle_covariance(two.planes, shares, LIMITS)) < best
 
 
-def test_the_limit_of_theory_is_nearly_met_and_never_beaten(two):
+def test_the_theoretical_limit_is_nearly_reached_and_not_exceeded(two):
     # The lower bound over all planes that the docstring of `design` derives.
     limit = np.sqrt(24.0 / LIMITS.readings) * LIMITS.noise / (LIMITS.reach * np.tan(LIMITS.max_inclination))
     for found in (two, design.optimise(LIMITS, planes(3))):
         shares = found.readings.sum(axis=1) / LIMITS.readings
         # Not quite met: the gauge's plane cannot be tilted both ways across the beam with strokes along the axes that
         # all lower the reading as the beam would (see the module), and some readings go to the stroke along Y.
-        assert 1.0 < design.worst_angle(design.spread(found.planes, shares, LIMITS)) / limit < 1.4
+        assert 1.0 < design.worst_angle(design.angle_covariance(found.planes, shares, LIMITS)) / limit < 1.4
 
 
-def test_what_the_search_believes_is_what_the_places_bear_out(two):
+def test_the_uncertainty_of_the_search_agrees_with_that_of_the_positions(two):
     shares = two.readings.sum(axis=1) / LIMITS.readings
-    believed = design.worst_angle(design.spread(two.planes, shares, LIMITS))
-    # n equally spaced places have the variance L^2 (n + 1) / (12 (n - 1)): a little more than L^2 / 12.
-    assert expected(two) == pytest.approx(believed, rel=0.1)
-    assert expected(two) < believed
+    predicted = design.worst_angle(design.angle_covariance(two.planes, shares, LIMITS))
+    # n equally spaced positions have the variance L^2 (n + 1) / (12 (n - 1)): a little more than L^2 / 12.
+    assert expected(two) == pytest.approx(predicted, rel=0.1)
+    assert expected(two) < predicted
 
 
-def test_the_optimum_beats_strokes_of_one_length_with_as_many_readings(two):
-    usual = design.equal_strokes(PAPER, LIMITS)
+def test_the_optimum_is_better_than_equal_strokes_with_as_many_readings(two):
+    usual = design.equal_strokes(PUBLISHED, LIMITS)
     assert usual.readings.sum() == two.readings.sum() == LIMITS.readings
     assert expected(usual) > 3 * expected(two)
 
 
 @pytest.mark.parametrize("number", [2, 3, 4])
-def test_every_place_keeps_to_range_travel_and_plate(number):
+def test_positions_are_within_range_travel_and_plate(number):
     found = design.optimise(LIMITS, planes(number))
     assert found.readings.sum() == LIMITS.readings
-    assert found.readings.min() >= design.LEAST_READINGS
+    assert found.readings.min() >= design.MIN_READINGS
     assert np.all(design.inclinations(found.normals, BEAM) <= LIMITS.max_inclination + 1e-9)
     for places, normal in zip(found.stages(), found.normals, strict=True):
         reading = -(places @ normal) / (normal @ BEAM)
@@ -102,41 +101,42 @@ def test_every_place_keeps_to_range_travel_and_plate(number):
         assert np.linalg.norm(spot, axis=1).max() <= LIMITS.plate / 2 * (1 + 1e-9)
 
 
-def test_a_scale_error_of_the_sensor_needs_planes_all_around_the_beam():
+def test_a_scale_error_of_the_sensor_cancels_with_planes_all_around_the_beam():
     limits = replace(LIMITS, scale_uncertainty=2e-4)
     pair, three = (design.optimise(limits, planes(number)) for number in (2, 3))
 
     def uncertainty(found):
-        return design.worst_angle(design.spread(found.planes, found.readings.sum(axis=1) / limits.readings, limits))
+        shares = found.readings.sum(axis=1) / limits.readings
+        return design.worst_angle(design.angle_covariance(found.planes, shares, limits))
 
     # With two planes at 45 deg the scale error goes into the angle whole; with three it cancels.
     assert uncertainty(pair) > 0.9 * limits.scale_uncertainty
     assert uncertainty(three) < 0.1 * limits.scale_uncertainty
 
 
-def test_an_inclination_error_that_grows_with_the_tilt_makes_the_planes_flatter():
+def test_an_inclination_error_that_increases_with_the_tilt_results_in_flatter_planes():
     limits = replace(LIMITS, slope_uncertainty=lambda q: 1e-6 + 3e-4 * np.sum(q**2, axis=-1) ** 2)
-    steepest = design.inclinations(design.optimise(limits, PAPER).normals, BEAM).max()
+    steepest = design.inclinations(design.optimise(limits, PUBLISHED).normals, BEAM).max()
     assert steepest < np.radians(30)
 
 
-def test_a_gauge_that_turns_a_little_only_is_used_within_what_it_turns():
+def test_the_limits_of_the_gauge_are_respected():
     limits = replace(LIMITS, rotation=np.radians([60.0, 120.0]), inclination=np.radians([10.0, 45.0]))
     found = design.optimise(limits, np.radians([[20.0, 60.0], [20.0, 120.0]]))
     assert np.all(found.planes >= np.radians([10.0, 60.0]) - 1e-12)
     assert np.all(found.planes <= np.radians([45.0, 120.0]) + 1e-12)
 
 
-def test_what_cannot_be_planned_is_refused():
-    with pytest.raises(MethodError, match="expected two or more; found 1"):
-        design.optimise(LIMITS, PAPER[:1])
-    with pytest.raises(MethodError, match="need 18 readings or more; found 12"):
-        design.optimise(replace(LIMITS, readings=12), PAPER)
+def test_impossible_plans_are_refused():
+    with pytest.raises(MethodError, match=r"Expected two planes or more.*; found 1"):
+        design.optimise(LIMITS, PUBLISHED[:1])
+    with pytest.raises(MethodError, match=r"Expected 18 readings or more .*; found 12"):
+        design.optimise(replace(LIMITS, readings=12), PUBLISHED)
     with pytest.raises(MethodError, match="points down to the gauge"):
-        design.optimise(replace(LIMITS, beam=-BEAM), PAPER)
+        design.optimise(replace(LIMITS, beam=-BEAM), PUBLISHED)
 
 
-# What the method says of it
+# Plans of the method
 
 
 def settings(**changes):
@@ -154,13 +154,13 @@ def test_a_plan_is_an_error_dataset_of_zeros_with_the_gain_at_as_many_readings()
     assert float(ds["gain"]) == pytest.approx(published / best)
     assert 3 < published / best < 10
     assert max(pair, best) < own
-    assert any(f"{published / best:.3g} times better" in note for note in ds.attrs["notes"])
-    # The covariance is that of the set-up as the settings name it.
+    assert any(f"smaller by the factor {published / best:.3g}" in note for note in ds.attrs["notes"])
+    # The covariance is that of the set-up of the settings.
     C = ds["covariance"].values[0, 3:, 3:]
     assert np.sqrt(np.linalg.eigvalsh(C)[-1]) == pytest.approx(own)
 
 
-def test_a_measurement_bears_the_plan_out():
+def test_a_measurement_has_the_uncertainty_of_its_plan():
     machine = VirtualMachine("cframe", seed=4)
     sensor = machine.point_sensor
     chosen = settings(layout={"average": 1, "noise": sensor.noise, "nominal_direction": tuple(sensor.true_direction)})
@@ -174,11 +174,11 @@ def test_a_measurement_bears_the_plan_out():
     )
     found = BeamDirection().identify(raw, Settings(noise="stated"))
     u, expected = (np.sqrt(np.diagonal(ds["covariance"].values[0])[3:]) for ds in (found, planned))
-    # Both state turns of their nominal direction, and these are 0.6 deg (1 %) apart.
+    # Both are uncertainties of rotations from the nominal direction; the two differ by 0.6 deg (1 %).
     np.testing.assert_allclose(u, expected, rtol=0.02)
 
 
-def test_an_uncertain_scale_is_a_source_of_its_own():
+def test_an_uncertain_scale_is_a_separate_source():
     ds = BeamDirection().plan(settings(layout={"scale_uncertainty": 1e-4}))
     effect = ds["influence"].sel(source="scale").values[0, 3:]
     C = ds["covariance"].values[0, 3:, 3:]
@@ -187,7 +187,7 @@ def test_an_uncertain_scale_is_a_source_of_its_own():
     assert np.linalg.norm(effect) > 1e-5
 
 
-def test_a_set_up_with_a_path_is_planned_as_it_is():
+def test_a_set_up_with_a_path_is_planned_with_its_positions():
     ring = np.linspace(0, 2 * np.pi, 30, endpoint=False)
     path = [(8e-3 * np.cos(a), 8e-3 * np.sin(a), 5e-3 * np.sin(2 * a)) for a in ring]
     chosen = settings(layout={"path": path})
@@ -215,11 +215,11 @@ def test_the_best_planes_are_those_that_the_calibration_covers(calibration):
     assert InclinationCalibration.load(calibration).supported(q).all()
     assert float(ds["gain"]) > 1.5
     refused = [note for note in ds.attrs["notes"] if "does not cover" in note]
-    assert "strokes of one length, which this calibration does not cover." in refused[0]
+    assert "strokes of the same length, which this calibration does not cover." in refused[0]
     assert "plane 2 of the published set-up" in refused[1]
     assert "would be refused" in refused[1]
 
 
-def test_a_plan_with_a_calibration_needs_to_know_how_the_sensor_is_turned(calibration):
-    with pytest.raises(MethodError, match=r"needs layout\.triangulation_normal"):
+def test_a_plan_with_a_calibration_needs_the_orientation_of_the_sensor(calibration):
+    with pytest.raises(MethodError, match=r"layout\.triangulation_normal: expected"):
         BeamDirection().plan(settings(compensation=str(calibration), layout={"triangulation_normal": None}))

@@ -1,4 +1,4 @@
-"""The chapter of a beam's direction: complete, honest about what is unknown, and readable with whatever is missing."""
+"""Chapter of a beam's direction: sections, unknown quantities, and missing variables."""
 
 import re
 from functools import cache
@@ -26,7 +26,7 @@ NOISE = 0.4e-6
 
 @cache
 def calibration():
-    """A calibration with nothing between the rotations 10 and 90 degrees, and one setting that contradicts it."""
+    """Return a calibration without settings between the rotations 10 and 90 degrees, and with one wrong setting."""
     raw = simulation.raw_inclination(
         VirtualMachine("cframe", seed=3),
         DEGREE * np.arange(-45, 46, 7.5),
@@ -49,14 +49,14 @@ def axes_of(u, t):
 
 
 def rotation_to(nominal, actual):
-    """Smallest rotation vector from one unit vector to another."""
+    """Return the smallest rotation vector from one unit vector to another."""
     across = np.cross(nominal, actual)
     size = np.linalg.norm(across)
     return across / size * np.arctan2(size, nominal @ actual)
 
 
 def solved(gradients, start):
-    """Unit vector with gradients.u = -1 in the least squares sense."""
+    """Return the unit vector with gradients.u = -1 in the least-squares sense."""
     u = start
     for _ in range(20):
         a, b = axes_of(u, np.array([0.0, 1.0, 0.0]))
@@ -68,7 +68,7 @@ def solved(gradients, start):
 
 
 def result(planes=PLANES, *, compensated=True, origin=True, bar=True, left_out=((1, 14),), compensation="lk-h050"):
-    """A beam at 20 degrees found from planes of a sine gauge, each scanned along X, Y and Z."""
+    """Return a beam at 20 degrees, determined from planes of a sine gauge, each scanned along X, Y and Z."""
     rng = np.random.default_rng(1)
     nominal = np.array([np.sin(20 * DEGREE), 0.0, -np.cos(20 * DEGREE)])
     triangulation = np.array([0.0, 1.0, 0.0])
@@ -175,7 +175,7 @@ def result(planes=PLANES, *, compensated=True, origin=True, bar=True, left_out=(
 
 
 def words_of(html):
-    """The text of a page, without drawings and their words."""
+    """Return the text of a page without its drawings and their labels."""
     text = re.sub(r"<svg.*?</svg>|<style.*?</style>|<[^>]+>", " ", html, flags=re.DOTALL)
     return " ".join(text.replace("&#39;", "'").split())
 
@@ -185,20 +185,20 @@ def drawings(html):
 
 
 def table(html, caption):
-    """Rows of the table with this caption, each the texts of its cells."""
+    """Return the rows of the table with this caption, each as the texts of its cells."""
     found = next(t for t in re.findall(r"<table.*?</table>", html, flags=re.DOTALL) if caption in t)
     rows = re.findall(r"<tr.*?</tr>", found.partition("<tbody>")[2], flags=re.DOTALL)
     return [[words_of(cell) for cell in re.findall(r"<t[hd].*?</t[hd]>", row, flags=re.DOTALL)] for row in rows]
 
 
 def number(text):
-    """The value that a cell begins with."""
+    """Return the value at the start of a cell."""
     return float(text.split()[0].replace("−", "-"))
 
 
 @pytest.fixture
 def page(tmp_path, monkeypatch):
-    """Write the report in a folder where the calibration is found by its name."""
+    """Write the report in a folder in which the calibration is found by its name."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "calibrations").mkdir()
     calibration().save(tmp_path / "calibrations" / "lk-h050.nc")
@@ -223,14 +223,14 @@ def test_the_chapter_has_its_sections(html):
         assert f'id="{name}-1"' in html
 
 
-def test_every_figure_is_drawn_and_told_in_words(html):
+def test_every_figure_is_drawn_and_has_a_text_alternative(html):
     assert len(drawings(html)) == 6
     reported = re.findall(r'<figure role="img" aria-label="([^"]+)"', html)
     assert len(reported) == 6
     assert all(len(words) > 60 for words in reported)
 
 
-def test_the_file_stays_small_and_leads_nowhere(html):
+def test_the_file_is_small_and_has_no_external_links(html):
     assert len(html.encode()) < 1_500_000
     assert not re.findall(r"https?:", html)
     assert html.count("<script") == 1  # that of the page
@@ -238,7 +238,7 @@ def test_the_file_stays_small_and_leads_nowhere(html):
     assert re.findall(r"url\((?!#)", html) == []
 
 
-def test_angles_stand_in_three_units_with_their_uncertainty(html):
+def test_angles_are_stated_in_three_units_with_their_uncertainty(html):
     errors = result()
     rows = {row[0]: row[1:] for row in table(html, "Angles from the nominal")}
     u, nominal = errors["beam_direction"].values[0], errors["nominal_direction"].values[0]
@@ -255,7 +255,7 @@ def test_angles_stand_in_three_units_with_their_uncertainty(html):
         assert number(row[0].partition("± ")[2]) == pytest.approx(expanded / ARCSEC, rel=0.06)
 
 
-def test_the_zero_point_stands_in_mm_beside_nominal(html):
+def test_the_zero_point_is_stated_in_mm_with_the_nominal_one(html):
     rows = {row[0]: row[1:] for row in table(html, "Zero point")}
     assert rows["x"] == ["+20.1200 ± 0.0080", "+20.000", "+120.0 ± 8.0"]
 
@@ -272,14 +272,14 @@ def test_every_plane_has_its_tilt_residual_and_closure(html):
         assert number(row[7]) == pytest.approx(1e6 * errors["closure"].values[k], abs=0.51)
 
 
-def test_a_reading_that_was_left_out_is_named_with_its_place(html):
+def test_an_ignored_reading_is_listed_with_its_position(html):
     (row,) = table(html, "Readings that were left out")
     # Reading 15 of the stroke along X: from -3 mm in steps of 0.3 mm.
     assert row[:3] == ["plane 2, reading 15", "X", "X 1.200; Y 0.000; Z 0.000"]
     assert number(row[4]) == pytest.approx(25, abs=1.5)  # the noise, and what the fit makes of it
 
 
-def test_the_direction_stands_before_and_after_compensation(html):
+def test_the_direction_is_stated_before_and_after_compensation(html):
     errors = result()
     rows = {row[0]: row[1:] for row in table(html, "Direction before and after")}
     u, before = errors["beam_direction"].values[0], errors["uncompensated_direction"].values[0]
@@ -293,15 +293,15 @@ def test_the_direction_stands_before_and_after_compensation(html):
         assert [number(cell) for cell in row[3:5]] == pytest.approx([spans.min(), spans.max()], abs=5.1e-3)
 
 
-def test_a_tilt_that_the_calibration_does_not_support_is_said(page):
+def test_a_tilt_that_the_calibration_does_not_cover_is_reported(page):
     supported, bare = (
         page(result(planes)) for planes in (((20, 0), (20, 90), (25, 180)), ((20, 0), (30, 45), (25, 180)))
     )
     reported = [re.search(r'aria-label="(Maps of the inclination error[^"]+)"', html)[1] for html in (supported, bare)]
-    assert "not supported" not in reported[0]
-    assert re.search(r"plane 2 \S+ \(not supported\)", reported[1])
+    assert "not covered" not in reported[0]
+    assert re.search(r"plane 2 \S+ \(not covered\)", reported[1])
     assert "extrapolated" not in supported
-    assert "plane 2 lies outside the settings of the calibration" in words_of(bare)
+    assert "The tilt of plane 2 to the beam is outside the settings of the calibration" in words_of(bare)
 
 
 def test_the_calibration_is_reported_with_its_remaining_error(html):
@@ -313,7 +313,7 @@ def test_the_calibration_is_reported_with_its_remaining_error(html):
     np.testing.assert_allclose([float(number) for number in reported.groups()], expected, rtol=0.06)  # two digits
 
 
-def test_a_calibration_that_is_not_there_is_a_sentence(tmp_path, monkeypatch):
+def test_a_missing_calibration_is_stated(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     html = write_report(result(), tmp_path / "report.html").read_text(encoding="utf-8")
     assert "No map: the calibration 'lk-h050' cannot be shown" in words_of(html)
@@ -324,7 +324,7 @@ def test_a_calibration_of_the_same_name_and_another_content_is_not_shown(page):
     errors = result()
     errors["compensation"] = 1.1 * errors["compensation"]
     html = page(errors)
-    assert "No map: the calibration 'lk-h050' that was found is not the one used for the correction" in words_of(html)
+    assert "No map: the content of the calibration 'lk-h050' is not that used for the correction" in words_of(html)
 
 
 def test_the_calibration_beside_the_campaign_is_found_from_elsewhere(tmp_path, monkeypatch):
@@ -337,18 +337,18 @@ def test_the_calibration_beside_the_campaign_is_found_from_elsewhere(tmp_path, m
     assert "Calibration 'lk-h050': slope k" in words_of(html)
 
 
-def test_the_bar_names_its_point_and_enlarges_residuals(html):
+def test_the_bar_lists_its_outlier_and_enlarges_residuals(html):
     (row,) = table(html, "Points of the bar")
     assert row[0] == "point 9"
     assert number(row[2]) == -60.0
     assert "their distance from the fitted circle enlarged 2 000 times" in words_of(html)
 
 
-def test_without_bar_calibration_and_origin_nothing_is_invented(page):
+def test_missing_bar_calibration_and_origin_are_reported_as_unknown(page):
     html = page(result(compensated=False, origin=False, bar=False, left_out=()))
     text = words_of(html)
     assert 'id="bar-1"' not in html
-    assert "The zero point is unknown: no plane has a known point" in text
+    assert "The zero point is unknown: the known points of the planes do not determine the position" in text
     assert "Not determined: EX, EY and EZ. Reported as unknown, not as zero." in text
     assert "The readings were not compensated for the tilt of the planes (up to 30°)" in text
     assert "No map: the readings were evaluated without an inclination calibration." in text
@@ -368,7 +368,7 @@ def test_whatever_extra_is_missing_the_rest_is_reported(page, part):
     assert "nan" not in words_of(html).lower().split()
 
 
-def test_extras_of_nothing_but_nan_are_no_values(page):
+def test_extras_of_only_nan_are_treated_as_missing(page):
     errors = result()
     for name in extras_of(errors):
         if errors[name].dtype.kind == "f":
@@ -378,26 +378,26 @@ def test_extras_of_nothing_but_nan_are_no_values(page):
     assert "nan" not in words_of(html).lower().split()
 
 
-def test_strokes_are_reported_by_the_raw_dataset_too(page):
+def test_strokes_are_read_from_the_raw_dataset(page):
     errors = result()
     raw = xr.Dataset({"stage": errors["stage"]})
     (row,) = table(page(errors.drop_vars("stage"), raw=raw), "Readings that were left out")
     assert row[1] == "X"
 
 
-def test_two_planes_do_not_check_one_another(page):
+def test_two_planes_have_no_closure(page):
     html = page(result(PLANES[:2]))
-    assert "Two planes always fit a beam exactly: their closures are 0 by construction" in words_of(html)
+    assert "Two planes always fit a beam exactly: their closures are 0 by definition" in words_of(html)
 
 
-def test_planes_that_contradict_one_another_are_a_warning(page):
+def test_contradicting_planes_are_a_warning(page):
     errors = result()
     errors["closure"][2] = 20 * errors["closure_uncertainty"][2]
     html = page(errors)
     assert "plane 3 by 20.0 times its standard uncertainty" in re.search(r'<p class="warning">(.*?)</p>', html)[1]
 
 
-def test_a_turn_about_the_beam_itself_is_unknown_and_says_so(page):
+def test_the_rotation_about_the_beam_is_reported_as_unknown(page):
     errors = result()
     along = np.array([[0.0, 0.0, -1.0]])
     errors["nominal_direction"][:] = along
@@ -410,8 +410,8 @@ def test_a_turn_about_the_beam_itself_is_unknown_and_says_so(page):
 
 
 def test_remarks_of_the_method_are_warnings(page):
-    errors = result().assign_attrs(notes=["The compensation went round 4 times."])
-    assert '<p class="warning">The compensation went round 4 times.</p>' in page(errors)
+    errors = result().assign_attrs(notes=["The compensation took 4 iterations."])
+    assert '<p class="warning">The compensation took 4 iterations.</p>' in page(errors)
 
 
 def test_many_planes_are_reported_and_some_are_drawn(page):
@@ -422,7 +422,7 @@ def test_many_planes_are_reported_and_some_are_drawn(page):
 
 @pytest.fixture(scope="module")
 def measured():
-    """Four faces of a virtual sine gauge and a check bar, with a reading off its plane and one out of range."""
+    """Return readings of a virtual sine gauge and a check bar, with one outlier and one reading out of range."""
     machine = VirtualMachine("cframe", seed=3)
     faces = [(20 * DEGREE, angle * DEGREE) for angle in (0, 90, 180, 270)]
     raw = simulation.raw(machine, faces, seed=1, check_bar=True, count=12)
@@ -431,7 +431,7 @@ def measured():
     return raw
 
 
-def test_a_result_of_the_method_is_reported_whole(page, measured):
+def test_a_result_of_the_method_is_reported_completely(page, measured):
     errors = BeamDirection().identify(measured, Settings(compensation="lk-h050", extrapolate=True, ordered=False))
     html = page(errors, raw=measured)
     text = words_of(html)
@@ -439,7 +439,7 @@ def test_a_result_of_the_method_is_reported_whole(page, measured):
     assert len(drawings(html)) == 6
     assert "nan" not in text.lower().split()
     assert [(row[0], row[1], row[5]) for row in table(html, "Readings that were left out")] == [
-        ("plane 1, reading 5", "X", "off its plane"),
+        ("plane 1, reading 5", "X", "outlier"),
         ("plane 3, reading 1", "X", "out of range"),
     ]
     bar = {row[0]: row[2] for row in table(html, "Check bar measured")}
@@ -451,14 +451,14 @@ def test_a_result_of_the_method_is_reported_whole(page, measured):
     ]
 
 
-def test_a_result_without_compensation_is_reported_with_its_contradiction(page, measured):
+def test_a_result_without_compensation_is_reported_with_contradicting_planes(page, measured):
     html = page(BeamDirection().identify(measured, Settings(ordered=False)), raw=measured)
     assert "The readings were not compensated for the tilt of the planes" in words_of(html)
     assert "The planes contradict one another" in words_of(html)
     assert "the triangulation plane is unknown" in words_of(html)
 
 
-def test_a_plan_keeps_its_plain_chapter(page):
+def test_a_plan_has_no_chapter_of_results(page):
     errors = result()
-    planned = errors.drop_vars(extras_of(errors))  # how well the beam would be known, and nothing of it
+    planned = errors.drop_vars(extras_of(errors))  # only the uncertainty, without results
     assert "Direction of the beam" not in page(planned)

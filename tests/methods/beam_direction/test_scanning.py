@@ -1,4 +1,4 @@
-"""Points from a calibrated beam: where they lie, what is known of them, and the surface's tilt taken off."""
+"""Points from a calibrated beam: positions, covariance, and compensation of the surface's tilt."""
 
 from collections.abc import Callable
 
@@ -74,18 +74,18 @@ def degrees_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1)))
 
 
-def test_reading_puts_a_point_on_the_beam() -> None:
+def test_reading_is_a_point_on_the_beam() -> None:
     found = points(READING, STAGE, ORIGIN, U)
     np.testing.assert_allclose(found.points[[0, 2]], (STAGE + ORIGIN + READING[:, None] * U)[[0, 2]])
     assert np.isnan(found.points[1]).all()
 
 
-def test_stage_that_carries_the_target_counts_the_other_way() -> None:
+def test_stage_that_carries_the_target_has_the_opposite_sign() -> None:
     found = points(READING, STAGE, ORIGIN, U, moves="target")
     np.testing.assert_allclose(found.points[2], ORIGIN - STAGE[2] + READING[2] * U)
 
 
-def test_noise_lies_along_the_beam_and_the_stage_adds_its_own() -> None:
+def test_noise_is_along_the_beam_and_that_of_the_stage_is_added() -> None:
     found = points(READING, STAGE, ORIGIN, U, noise=3e-7, stage_noise=1e-7)
     np.testing.assert_allclose(found.covariance[0], 9e-14 * np.outer(U, U) + 1e-14 * np.eye(3))
 
@@ -121,9 +121,9 @@ def test_normals_of_a_curve_a_surface_and_a_bar() -> None:
     assert off.max() < 0.2
 
 
-def test_neighbours_that_lie_on_one_line_show_no_normal() -> None:
+def test_neighbours_on_one_line_do_not_determine_a_normal() -> None:
     rows = np.array([[x, y, 0.0] for y in (0.0, 1.0) for x in np.linspace(0, 0.01, 30)])
-    with pytest.raises(MethodError, match="lie on one line, where only the tilt along it can be seen"):
+    with pytest.raises(MethodError, match="lie on one line, which determines only the tilt along it"):
         over_surface()(rows)
 
 
@@ -145,7 +145,7 @@ def test_compensated_bar_is_round_and_has_its_radius(
 
 
 @pytest.mark.parametrize("surface", [along_curve, round_bar])
-def test_normals_found_in_turn_with_the_points_are_those_of_the_bar(
+def test_iterated_normals_are_those_of_the_bar(
     machine: VirtualMachine, bar: xr.Dataset, scan: Callable[..., Points], surface: Callable[..., object]
 ) -> None:
     found = scan(surface(bar["bar_axis"].values))
@@ -155,7 +155,7 @@ def test_normals_found_in_turn_with_the_points_are_those_of_the_bar(
     assert fit_bar(found, bar["bar_axis"]).rms < 0.15e-6
 
 
-def test_normals_that_are_given_are_turned_towards_the_sensor(
+def test_given_normals_are_oriented_towards_the_sensor(
     machine: VirtualMachine, bar: xr.Dataset, scan: Callable[..., Points]
 ) -> None:
     free = scan(round_bar(bar["bar_axis"].values))
@@ -169,7 +169,7 @@ def test_scan_along_one_line_reports_the_undetermined_tilt(scan: Callable[..., P
     assert scan(round_bar(bar["bar_axis"].values)).notes == ()
 
 
-def test_scan_of_an_area_finds_the_tilt_both_ways(calibration: InclinationCalibration) -> None:
+def test_scan_of_an_area_determines_the_tilt_in_both_directions(calibration: InclinationCalibration) -> None:
     u, t, N = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0]), np.array([0.3, -0.2, 1.0])
     N = N / np.linalg.norm(N)
     x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-8e-3, 8e-3, 9), np.linspace(-8e-3, 8e-3, 9)))
@@ -199,11 +199,11 @@ def test_uncertainty_of_the_calibration_is_shared(scan: Callable[..., Points], b
     ("change", "message"),
     [
         ({"stage": STAGE[:2]}, r"readings \(n,\) and stage positions \(n, 3\)"),
-        ({"reading": np.full(3, np.nan)}, "found none that is a number"),
-        ({"origin": (np.nan, 0, 0)}, "Give 0 0 0 for form and size alone"),
+        ({"reading": np.full(3, np.nan)}, "found only NaN"),
+        ({"origin": (np.nan, 0, 0)}, "State 0 0 0 for form and size only"),
         ({"direction": (1, 1, 0)}, "a unit vector of three numbers"),
         ({"covariance": np.eye(3)}, "6 x 6 numbers"),
-        ({"covariance": -np.eye(6)}, "negative variance"),
+        ({"covariance": -np.eye(6)}, "negative eigenvalue"),
         ({"moves": "table"}, "expected 'sensor' or 'target'; found 'table'"),
         ({"normals": np.ones((3, 3))}, "Expected unit normals"),
         ({"normals": np.tile(ACROSS, (3, 1))}, "parallel to the surface"),
@@ -215,9 +215,9 @@ def test_wrong_input_is_reported(change: dict, message: str) -> None:
         points(**given)
 
 
-def test_calibration_needs_to_know_how_the_sensor_is_turned(calibration: InclinationCalibration) -> None:
+def test_calibration_requires_the_triangulation_normal(calibration: InclinationCalibration) -> None:
     normals = np.tile(-U, (3, 1))
-    with pytest.raises(MethodError, match="needs the triangulation normal"):
+    with pytest.raises(MethodError, match="Expected triangulation_normal with a calibration"):
         points(READING, STAGE, ORIGIN, U, calibration=calibration, normals=normals)
 
 
@@ -227,7 +227,7 @@ def test_tilt_beyond_the_calibration_is_refused(calibration: InclinationCalibrat
     with pytest.raises(MethodError, match="beyond the steepest calibrated setting"):
         points(READING, STAGE, ORIGIN, (0, 0, -1), **options)
     allowed = points(READING, STAGE, ORIGIN, (0, 0, -1), **options, extrapolate=True)
-    assert "2 of 2 points lie at tilts" in " ".join(allowed.notes)  # the one without a reading is no point
+    assert "2 of 2 points are at tilts" in " ".join(allowed.notes)  # the one without a reading is not counted
 
 
 def test_normals_that_do_not_converge_are_reported(calibration: InclinationCalibration) -> None:
@@ -243,7 +243,7 @@ def test_normals_that_do_not_converge_are_reported(calibration: InclinationCalib
         )
 
 
-def test_stage_that_moves_along_the_beam_shows_no_tilt(calibration: InclinationCalibration) -> None:
+def test_stage_that_moves_along_the_beam_is_refused(calibration: InclinationCalibration) -> None:
     stage = np.outer(np.linspace(0, 1e-3, 5), U)
-    with pytest.raises(MethodError, match="moved along the beam alone"):
+    with pytest.raises(MethodError, match="moved only along the beam"):
         points(np.zeros(5), stage, ORIGIN, U, calibration=calibration, triangulation_normal=ACROSS)

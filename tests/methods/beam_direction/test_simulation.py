@@ -1,4 +1,4 @@
-"""Raw datasets of beam calibrations, made without any wire."""
+"""Simulated raw datasets of beam calibrations."""
 
 import numpy as np
 import pytest
@@ -19,19 +19,19 @@ def machine() -> VirtualMachine:
 
 
 def gradients(distance: np.ndarray, stage: np.ndarray) -> np.ndarray:
-    """Least-squares gradient of each plane's readings, (plane, 3)."""
+    """Return the least-squares gradient of the readings of each plane, (plane, 3)."""
     columns = [np.column_stack([s, np.ones(len(s))]) for s in stage]
     return np.array([np.linalg.lstsq(a, d)[0][:3] for a, d in zip(columns, distance, strict=True)])
 
 
 def direction(g: np.ndarray) -> np.ndarray:
-    """The beam that has g.u = -1 at three planes."""
+    """Return the beam with g.u = -1 at three planes."""
     u = np.linalg.solve(g, -np.ones(3))
     return u / np.linalg.norm(u)
 
 
 @pytest.mark.parametrize("options", [{}, {"speckle": True, "check_bar": True}])
-def test_a_calibration_follows_the_schema(machine: VirtualMachine, options: dict[str, bool]) -> None:
+def test_a_calibration_conforms_to_the_schema(machine: VirtualMachine, options: dict[str, bool]) -> None:
     raw = simulation.raw(machine, seed=1, **options)
     validate(raw)
     assert raw["distance"].shape == (3, 60)
@@ -50,7 +50,7 @@ def test_strokes_keep_within_range_and_travel(seed: int) -> None:
         assert low <= values.min() < values.max() <= high
 
 
-def test_without_inclination_error_the_gradients_give_the_true_beam(machine: VirtualMachine) -> None:
+def test_without_inclination_error_the_gradients_determine_the_true_beam(machine: VirtualMachine) -> None:
     raw = simulation.raw(machine, seed=1, inclination_error=False)
     g = gradients(raw["distance"].values, raw["stage"].values)
     u = machine.point_sensor.true_direction
@@ -59,7 +59,7 @@ def test_without_inclination_error_the_gradients_give_the_true_beam(machine: Vir
     assert np.linalg.norm(direction(g) - u) < 5e-5
 
 
-def test_the_inclination_error_turns_the_beam_and_the_true_slopes_turn_it_back(machine: VirtualMachine) -> None:
+def test_the_inclination_error_rotates_the_beam_and_the_true_slopes_correct_it(machine: VirtualMachine) -> None:
     raw = simulation.raw(machine, seed=1)
     sensor = machine.point_sensor
     u, distance, stage = sensor.true_direction, raw["distance"].values, raw["stage"].values
@@ -70,7 +70,7 @@ def test_the_inclination_error_turns_the_beam_and_the_true_slopes_turn_it_back(m
     assert left < off / 50
 
 
-def test_the_seed_is_that_of_noise_and_setting_alone(machine: VirtualMachine) -> None:
+def test_the_seed_affects_only_noise_and_setting(machine: VirtualMachine) -> None:
     one, again, other = (simulation.raw(machine, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one["distance"], again["distance"])
     np.testing.assert_array_equal(one["stage"], other["stage"])
@@ -86,7 +86,7 @@ def test_noise_is_as_stated(machine: VirtualMachine) -> None:
     assert float(np.sqrt((spread**2).mean())) == pytest.approx(float(raw["distance_noise"]), rel=0.045)
 
 
-def test_points_of_the_planes_are_as_uncertain_as_stated(machine: VirtualMachine) -> None:
+def test_points_of_the_planes_have_the_stated_uncertainty(machine: VirtualMachine) -> None:
     sensor, plane = machine.point_sensor, (0.0, 0.0)
     heights = []
     for seed in range(200):
@@ -107,7 +107,7 @@ def test_speckle_is_in_the_readings_when_it_is_stated(machine: VirtualMachine) -
     assert np.abs(np.diff(texture)).max() < 0.15e-6 < np.abs(texture).max()  # a five-hundredth of the length
 
 
-def test_a_stroke_out_of_range_reads_nothing_there(machine: VirtualMachine) -> None:
+def test_a_stroke_out_of_range_has_no_readings_there(machine: VirtualMachine) -> None:
     stage = machine.home() + np.outer(np.linspace(-0.03, 0.03, 31), [0.0, 0.0, 1.0])
     raw = simulation.raw(machine, stage=stage, seed=1)
     lost = np.isnan(raw["distance"].values)
@@ -116,7 +116,7 @@ def test_a_stroke_out_of_range_reads_nothing_there(machine: VirtualMachine) -> N
     validate(raw)
 
 
-def test_a_face_that_the_beam_does_not_meet_reads_nothing(machine: VirtualMachine) -> None:
+def test_a_face_that_the_beam_does_not_meet_has_no_readings(machine: VirtualMachine) -> None:
     sensor = seeded_point_sensor(np.random.default_rng(0), lean=60 * DEG)
     raw = simulation.raw(machine, [(50 * DEG, 0.0), (50 * DEG, 180 * DEG)], seed=1, sensor=sensor)
     lost = np.isnan(raw["distance"].values)
@@ -125,8 +125,8 @@ def test_a_face_that_the_beam_does_not_meet_reads_nothing(machine: VirtualMachin
 
 
 @pytest.mark.parametrize("shape", [(3,), (4, 2), (2, 5, 3)])
-def test_stage_places_of_another_shape_are_refused(machine: VirtualMachine, shape: tuple[int, ...]) -> None:
-    with pytest.raises(BenchError, match=r"\(reading, 3\) or \(plane, reading, 3\) for 3 planes; found"):
+def test_stage_positions_of_another_shape_are_refused(machine: VirtualMachine, shape: tuple[int, ...]) -> None:
+    with pytest.raises(BenchError, match=r"\(reading, 3\), or \(plane, reading, 3\) for 3 planes; found"):
         simulation.raw(machine, stage=np.zeros(shape), seed=1)
 
 
@@ -140,7 +140,7 @@ def test_a_cold_sensor_drifts_during_the_calibration() -> None:
 # ---------------------------------------------------------------------- the check bar
 
 
-def test_a_bar_is_measured_about_mid_range_from_either_side_of_its_middle(machine: VirtualMachine) -> None:
+def test_a_bar_is_measured_symmetrically_about_mid_range(machine: VirtualMachine) -> None:
     raw = simulation.raw_check_bar(machine, seed=1)
     reading = raw["bar_distance"].values
     assert reading.size == 20
@@ -163,17 +163,17 @@ def test_the_inclination_error_on_a_bar_is_tens_of_micrometres(machine: VirtualM
 
 
 def test_a_stroke_beyond_the_bar_or_a_beam_along_it_is_refused(machine: VirtualMachine) -> None:
-    with pytest.raises(BenchError, match="shorter than the radius of the bar, 25 mm; found 26 mm"):
+    with pytest.raises(BenchError, match="below the radius of the bar, 25 mm; found 26 mm"):
         simulation.raw_check_bar(machine, seed=1, half_width=26e-3)
     along = seeded_point_sensor(np.random.default_rng(0), lean=np.pi / 2, azimuth=np.pi / 2)
-    with pytest.raises(BenchError, match="parallel to the bar"):
+    with pytest.raises(BenchError, match="parallel to it"):
         simulation.raw_check_bar(machine, seed=1, sensor=along)
 
 
 # ---------------------------------------------------------------------- against an interferometer
 
 
-def test_an_inclination_calibration_follows_the_schema_and_holds_about_5000_groups(machine: VirtualMachine) -> None:
+def test_an_inclination_calibration_conforms_to_the_schema_with_about_5000_groups(machine: VirtualMachine) -> None:
     raw = simulation.raw_inclination(machine, seed=1)
     validate(raw)
     assert 5000 < raw.sizes["group"] < 5500

@@ -1,4 +1,4 @@
-"""How the reading changes with the stage on one plane."""
+"""Gradient of the readings on one plane."""
 
 import numpy as np
 import pytest
@@ -30,14 +30,14 @@ def noisy(seed):
     return EXACT + np.random.default_rng(seed).normal(0, NOISE, EXACT.size)
 
 
-def test_exact_readings_give_gradient_and_offset():
+def test_exact_readings_determine_gradient_and_offset():
     fit = fit_plane_readings(EXACT, STAGE, NOISE)
     np.testing.assert_allclose(fit.gradient, G, atol=1e-12)
     assert fit.offset == pytest.approx(OFFSET, abs=1e-12)
     assert np.abs(fit.residual).max() < 1e-15
 
 
-def test_any_path_through_three_directions_will_do():
+def test_any_path_in_three_directions_is_accepted():
     stage = np.random.default_rng(0).uniform(-5e-3, 5e-3, (10, 3))
     np.testing.assert_allclose(fit_plane_readings(stage @ G, stage, NOISE).gradient, G, atol=1e-12)
 
@@ -56,7 +56,7 @@ def test_covariance_is_the_scatter_over_seeds(speckle):
     assert np.mean(chi2) == pytest.approx(freedom, abs=3.5 * np.sqrt(2 * freedom / 800))
 
 
-def test_no_weighting_beats_generalised_least_squares_on_speckle():
+def test_no_weighting_is_better_than_generalised_least_squares_with_speckle():
     # On places closer than the speckle is long, ordinary least squares scatters more than the bound.
     stage = strokes(half=100e-6, count=30)
     A = np.column_stack([stage - PLACE, np.ones(len(stage))])
@@ -73,7 +73,7 @@ def test_expected_covariance_is_that_of_the_fit():
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
-def test_outliers_are_left_out_and_change_nothing(share):
+def test_outliers_are_ignored_without_effect(share):
     clean, spoilt = noisy(2), noisy(2)
     wrong = np.random.default_rng(3).choice(EXACT.size, round(share * EXACT.size), replace=False)
     spoilt[wrong] += np.linspace(5e-6, 4e-3, wrong.size)
@@ -94,7 +94,7 @@ def test_without_robust_all_readings_count():
     assert not fit_plane_readings(spoilt, STAGE, NOISE, robust=False).left_out.any()
 
 
-def test_missing_readings_are_unknown_and_not_zero():
+def test_missing_readings_are_nan():
     some = noisy(4)
     some[[3, 20]] = np.nan
     fit = fit_plane_readings(some, STAGE, NOISE)
@@ -104,13 +104,13 @@ def test_missing_readings_are_unknown_and_not_zero():
 
 
 @pytest.mark.parametrize(("axes", "missing"), [("xy", r"\(0.00, 0.00, 1.00\)"), ("xz", r"\(0.00, 1.00, 0.00\)")])
-def test_a_stage_that_leaves_a_direction_out_is_refused(axes, missing):
+def test_a_stage_without_motion_in_one_direction_is_refused(axes, missing):
     stage = strokes(axes=axes)
     with pytest.raises(MethodError, match=rf"Plane 2: .*2 of three independent directions; along {missing}"):
         fit_plane_readings(stage @ G, stage, NOISE, name="Plane 2")
 
 
-def test_a_stroke_no_longer_than_the_noise_is_no_stroke():
+def test_a_stroke_within_the_noise_is_not_counted():
     stage = strokes()
     stage[24:, 2] = PLACE[2] + (stage[24:, 2] - PLACE[2]) * 1e-4
     with pytest.raises(MethodError, match="2 of three independent directions"):
@@ -122,10 +122,10 @@ def test_too_few_readings_are_refused():
         fit_plane_readings(np.array([1e-3, np.nan, 2e-3, np.nan, 1e-3]), STAGE[:5], NOISE)
 
 
-def test_readings_on_no_plane_are_refused():
+def test_readings_that_fit_no_plane_are_refused():
     two = EXACT.copy()
     two[: EXACT.size // 5 * 2] += 1e-3 * np.random.default_rng(5).normal(size=EXACT.size // 5 * 2)
-    with pytest.raises(MethodError, match="do not fit any plane"):
+    with pytest.raises(MethodError, match="do not fit a plane"):
         fit_plane_readings(two, STAGE, NOISE)
 
 

@@ -12,7 +12,7 @@ EXACT = {"uncertainty": {"length": 0.0, "alignment": 0.0}}
 
 @pytest.fixture
 def raw_of():
-    """Return a function of readings (freedom, run, approach, target) and positions."""
+    """Return a function that builds raw data from readings (freedom, run, approach, target) and positions."""
 
     def make(readings, position, axis="X", freedoms=("EX",), **variables):
         return xr.Dataset(
@@ -30,7 +30,7 @@ def raw_of():
 
 @pytest.fixture
 def identify():
-    """Return a function of raw data and settings, by default of an instrument without uncertainty."""
+    """Return a function that identifies raw data, by default of an instrument without uncertainty."""
 
     def run(raw, **settings):
         return LinearPositioning().identify(raw, Settings(**{**EXACT, "trials": 200, **settings}))

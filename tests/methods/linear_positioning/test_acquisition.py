@@ -1,4 +1,4 @@
-"""Measuring with an interferometer and with a tracker in line, on a machine that does what real ones do."""
+"""Measurement with an interferometer and with a tracker in line, on a machine with backlash and pitch."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_an_interferometer_finds_the_errors_of_the_axis(cycle):
     assert machine.path == [step.place[0] for step in LinearPositioning().motions(settings) if step.place]
 
 
-def test_a_tracker_in_line_finds_the_same():
+def test_a_tracker_in_line_finds_the_errors_of_the_axis():
     machine = Machine()
     settings = Settings(**TEST, uncertainty=EXACT)
     raw = measured(settings, controller=machine, laser_tracker=Tracker(machine))
@@ -50,7 +50,7 @@ def test_a_tracker_in_line_finds_the_same():
     np.testing.assert_allclose(errors["EX"], error(P) - error(P[0]) - BACKLASH / 2, atol=1e-9)
 
 
-def test_a_broken_beam_costs_the_rest_of_its_run():
+def test_readings_are_missing_from_a_broken_beam_to_the_end_of_its_run():
     machine = Machine()
     broken = Interferometer(machine, broken=[25])  # the third target of the second run, two readings at each of 10
     raw = measured(TWO, controller=machine, interferometer=broken)
@@ -71,7 +71,7 @@ def test_a_new_dead_path_of_a_tracker_is_a_broken_beam():
     assert not missing[[0, 2, 3]].any()
 
 
-def test_an_interrupted_run_goes_on_with_the_runs_that_are_missing():
+def test_an_interrupted_test_continues_with_the_missing_runs():
     machine = Machine()
     whole = measured(TWO, controller=machine, interferometer=Interferometer(machine))
     again = Machine()
@@ -98,11 +98,11 @@ def test_temperatures_of_the_axis_are_recorded():
             ("controller", "interferometer"),
             r"length \(m\), pitch \(rad\); found 'pitch'",
         ),
-        ({}, ("controller", "laser_tracker"), "reads EX alone; found EX, EB"),
+        ({}, ("controller", "laser_tracker"), "reads only EX; found EX, EB"),
         ({"limits": (0.0, 0.4)}, ("controller", "interferometer"), "limits: expected X"),
     ],
 )
-def test_what_cannot_be_measured_is_refused_before_anything_moves(changes, kinds, text):
+def test_an_impossible_test_is_refused_before_the_machine_moves(changes, kinds, text):
     machine = Machine()
     every = {"controller": machine, "interferometer": Interferometer(machine), "laser_tracker": Tracker(machine)}
     with pytest.raises(MethodError, match=text):

@@ -1,4 +1,4 @@
-"""Diagonals of a volume after ISO 230-6: squareness with its sign, what cancels, coverage, and measuring."""
+"""Diagonals of a volume after ISO 230-6: squareness and its sign, effects that cancel, coverage, and measurement."""
 
 from dataclasses import replace
 
@@ -58,7 +58,7 @@ def with_errors(kind, locations, slope=0.0):
 
 
 @pytest.mark.parametrize("kind", ["gantry", "cframe"])
-def test_squareness_has_size_and_sign_of_the_machine_whatever_the_axes_scale(kind):
+def test_squareness_is_that_of_the_machine_for_any_scale_of_the_axes(kind):
     true = {"EC0Y": 40e-6, "EA0Z": -25e-6, "EB0Z": 15e-6}
     settings = along(FACES, start=(0.1, 0.2, 0.15))
     errors = METHOD.identify(exact(with_errors(kind, true, slope=30e-6), settings), settings)
@@ -66,7 +66,7 @@ def test_squareness_has_size_and_sign_of_the_machine_whatever_the_axes_scale(kin
     assert found == pytest.approx(true, abs=1e-8)  # second order: 40e-6 of 40e-6, and 1e-12 m of scatter
 
 
-def test_a_diagonal_backwards_shows_the_same_squareness():
+def test_a_reversed_diagonal_shows_the_same_squareness():
     machine = with_errors("gantry", {"EC0Y": 40e-6, "EA0Z": 0.0, "EB0Z": 0.0})
     settings = along(("PP0", "PN0"))
     errors = METHOD.identify(exact(machine, settings), settings)
@@ -74,7 +74,7 @@ def test_a_diagonal_backwards_shows_the_same_squareness():
 
 
 def test_body_diagonals_do_not_separate_scale_and_squareness():
-    """Two different machines give the same four body diagonals: the scales of two axes change places."""
+    """Two machines with exchanged scales of two axes have the same four body diagonals."""
     settings = along(BODIES, diagonals={"names": BODIES, "volume": ((0.0, 0.4), (0.0, 0.4), (0.0, 0.3))})
     seen = []
     for slopes in ((30e-6, 0.0), (0.0, 30e-6)):
@@ -88,7 +88,7 @@ def test_body_diagonals_do_not_separate_scale_and_squareness():
 
 
 def test_coverage_of_deviations_squareness_and_figures():
-    """48 machines: 95 % intervals hold; with n = 8 runs a drift of known size is stated larger by sqrt(7 / 5)."""
+    """48 machines: coverage of 95 % intervals; with n = 8 runs a known drift is stated larger by sqrt(7 / 5)."""
     settings = along(("PP0", "NP0", "P0P", "N0P", "PPP"), runs=8)
     inside, square, largest = [], [], []
     for seed in range(48):
@@ -112,7 +112,7 @@ def test_coverage_of_deviations_squareness_and_figures():
     assert np.mean(largest) > 0.92
 
 
-def test_the_scale_of_the_instrument_is_one_draw_and_does_not_reach_squareness():
+def test_the_scale_of_the_instrument_is_shared_and_has_no_effect_on_squareness():
     settings = along(FACES)
     errors = METHOD.identify(METHOD.simulate(settings, 2)[0], settings)
     k = list(errors["source"].values).index("scale of the lengths")
@@ -149,12 +149,12 @@ def test_stops_lie_on_the_diagonal_and_programs_stop_for_the_instrument():
         ({"volume": ((0.5, 0.0), (0.0, 0.4), (0.0, 0.3))}, "lower end of X first"),
     ],
 )
-def test_settings_that_are_no_diagonals_are_refused(wrong, text):
+def test_settings_without_valid_diagonals_are_refused(wrong, text):
     with pytest.raises(ValueError, match=text):
         Settings(diagonals=wrong)
 
 
-def test_positions_that_are_no_line_are_refused():
+def test_positions_off_a_line_are_refused():
     settings = along(("PP0", "NP0"))
     raw, _ = METHOD.simulate(settings, 0)
     beside = raw.copy(deep=True)
@@ -162,7 +162,7 @@ def test_positions_that_are_no_line_are_refused():
     with pytest.raises(MethodError, match="stop_point of PP0"):
         METHOD.identify(beside, settings)
     twice = raw.assign_coords(diagonal=["PP0", "PP0"])
-    with pytest.raises(MethodError, match="a name of each diagonal"):
+    with pytest.raises(MethodError, match="a different name for each diagonal"):
         METHOD.identify(twice, settings)
     with pytest.raises(DatasetError, match="stop_point"):
         METHOD.identify(raw.drop_vars("stop_point"), settings)
@@ -210,7 +210,7 @@ def measured(settings, address, done=None, asked=None):
     return raw
 
 
-def test_an_interferometer_at_the_wire_finds_the_errors_along_the_diagonals():
+def test_an_interferometer_finds_the_errors_along_the_diagonals():
     asked = []
     raw = measured(MEASURED, WIRE, asked=asked)
     assert [text.partition(",")[0] for text in asked] == [
@@ -231,7 +231,7 @@ def test_an_interferometer_at_the_wire_finds_the_errors_along_the_diagonals():
     np.testing.assert_allclose(errors["deviation"], true, atol=1e-9)  # 1 um beside the line, and whole picometres
 
 
-def test_a_broken_beam_costs_the_rest_of_its_run_and_a_run_goes_on_with_the_next_diagonal():
+def test_a_broken_beam_affects_one_run_and_an_interrupted_test_continues_with_the_next_diagonal():
     raw = measured(MEASURED, f"{WIRE}&fault=beam_broken&fault_at=15&fault_for=1&broken=1")
     missing = np.isnan(raw["diagonal_deviation"].values)
     assert missing[0, 1].any()
@@ -240,7 +240,7 @@ def test_a_broken_beam_costs_the_rest_of_its_run_and_a_run_goes_on_with_the_next
     assert rest["diagonal"].values.tolist() == ["NP0"]
 
 
-def test_a_diagonal_needs_a_channel_of_its_own():
+def test_a_diagonal_needs_a_channel():
     wrong = MEASURED.model_copy(update={"diagonals": MEASURED.diagonals.model_copy(update={"channels": {}})})
     with pytest.raises(MethodError, match=r"diagonals\.channels\.PP0: expected a channel in m .*axis1 \(m\), axis2"):
         measured(wrong, WIRE)

@@ -1,4 +1,4 @@
-"""The example, shortened, from the tracker's wire to errors with the truth in them."""
+"""The example, shortened, from the tracker's protocol to errors whose intervals contain the truth."""
 
 from pathlib import Path
 

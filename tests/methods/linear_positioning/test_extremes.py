@@ -41,7 +41,7 @@ def compared(name):
 
 
 @pytest.mark.parametrize("name", BEHAVIOURS)
-def test_intervals_hold_the_true_figures(name):
+def test_intervals_contain_the_true_figures(name):
     error, bias, u = compared(name)
     held = (np.abs(error - bias) <= 2.0 * u).sum(axis=0)
     # 95 % of intervals, less what a binomial with one of a thousand may miss, by 12 figures
@@ -49,8 +49,8 @@ def test_intervals_hold_the_true_figures(name):
     assert not {name: count for name, count in zip(FIGURES, held, strict=True) if count < fewest}
 
 
-def test_the_excess_of_extreme_values_is_found():
-    """Scatter makes the repeatabilities of a usual axis too large; what remains is a small part of it."""
+def test_the_excess_of_extreme_values_is_estimated():
+    """Scatter increases the repeatabilities of a typical axis; after the correction, a small part of it remains."""
     error, bias, _ = compared("usual")
     k = FIGURES.index("R_forward")
     assert error[:, k].mean() > 0.4e-6

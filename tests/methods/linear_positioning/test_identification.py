@@ -1,4 +1,4 @@
-"""Errors over the position with their covariance, and what the data must hold."""
+"""Errors over the position with their covariance, and requirements on the data."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_value_is_the_mean_of_both_approaches(raw_of, identify):
     assert np.isnan(errors["EX"]).all()
 
 
-def test_targets_may_come_in_any_order(raw_of, identify):
+def test_targets_may_be_in_any_order(raw_of, identify):
     readings, order = noisy(), np.random.default_rng(1).permutation(P.size)
     straight, mixed = identify(raw_of(readings, P)), identify(raw_of(readings[..., order], P[order]))
     np.testing.assert_allclose(mixed["EX"], straight["EX"], atol=1e-18)
@@ -30,7 +30,7 @@ def test_targets_may_come_in_any_order(raw_of, identify):
 
 
 def test_covariance_of_the_means_is_the_cramer_rao_bound_of_the_model(raw_of, identify):
-    """Where all readings are there, the mean is the weighted least-squares estimate of the model of the scatter."""
+    """If no reading is missing, the mean is the weighted least-squares estimate of the model of the scatter."""
     readings = noisy() + 1e-6 * np.random.default_rng(1).normal(size=(1, 5, 1, 1))
     errors = identify(raw_of(readings, P))
     found = scatter.scatter(readings[0].transpose(1, 0, 2), P, kind="auto", drift=None, stated=None)
@@ -100,7 +100,7 @@ def test_missing_readings_are_counted_and_enlarge_the_uncertainty_there(raw_of, 
     assert np.isnan(identify(raw_of(readings, P))["EX"][7])
 
 
-def test_one_run_needs_what_it_does_not_show(raw_of, identify):
+def test_one_run_needs_stated_scatter_and_drift(raw_of, identify):
     readings = noisy(runs=1)
     with pytest.raises(MethodError, match=r"uncertainty\.scatter"):
         identify(raw_of(readings, P))
@@ -110,7 +110,7 @@ def test_one_run_needs_what_it_does_not_show(raw_of, identify):
     assert np.isnan(float(errors["R"]))
 
 
-def test_three_runs_need_the_drift(raw_of, identify):
+def test_three_runs_need_a_stated_drift(raw_of, identify):
     with pytest.raises(MethodError, match=r"uncertainty\.drift"):
         identify(raw_of(noisy(runs=3), P))
 
@@ -122,11 +122,11 @@ def test_three_runs_need_the_drift(raw_of, identify):
         (lambda raw: raw.assign_coords(approach=["up", "down"]), "forward, backward; found up, down"),
         (lambda raw: raw.assign_coords(freedom=["EXY"]), "for axis X; found EXY"),
         (lambda raw: raw.isel(target=slice(2)), "3 targets or more; found 2"),
-        (lambda raw: raw.assign(target_position=0.0 * raw["target_position"]), "found one twice"),
-        (lambda raw: raw.assign(deviation=raw["deviation"] * np.nan), "one or more with none"),
+        (lambda raw: raw.assign(target_position=0.0 * raw["target_position"]), "found one of them twice"),
+        (lambda raw: raw.assign(deviation=raw["deviation"] * np.nan), "found none for one or more"),
     ],
 )
-def test_what_is_wrong_with_the_data_is_said(raw_of, identify, change, text):
+def test_invalid_data_are_refused_with_the_reason(raw_of, identify, change, text):
     with pytest.raises(MethodError, match=text):
         identify(change(raw_of(noisy(), P)))
 

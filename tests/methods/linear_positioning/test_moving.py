@@ -19,11 +19,11 @@ from errormotion.report.document import Source
 METHOD = LinearPositioning()
 SETTINGS = Settings(moving=Moving(cold=5, duration=7200.0, cooling=1800.0, interval=120.0))
 GROWTH_OF_A_METRE = 1e-6
-"""Of the test's machine, for each metre that it has moved fast."""
+"""Relative expansion of the screw for each metre of fast motion."""
 
 
 class Screw(Machine):
-    """An axis whose screw grows with the way that it has moved, fast, and that has no other error."""
+    """An axis whose screw expands with the distance of fast motion, and that has no other error."""
 
     def __init__(self):
         super().__init__()
@@ -45,7 +45,7 @@ def true_ranges(truth):
     return np.ptp(both, axis=0)
 
 
-def test_ranges_hold_the_true_ones_within_their_uncertainty():
+def test_true_ranges_lie_within_the_uncertainty():
     seeds, held, noise = 40, np.zeros(3), []
     for seed in range(seeds):
         raw, truth = simulate(SETTINGS, seed)
@@ -72,7 +72,7 @@ def test_the_cold_state_is_the_reference():
     assert float(changed) == pytest.approx(2.0 * noise**2, rel=1e-6)
 
 
-def test_figures_and_report_name_both_ends():
+def test_figures_and_report_contain_both_ends():
     errors = METHOD.identify(simulate(SETTINGS, 1)[0], SETTINGS)
     names = [figure.name for figure in figures_of(errors)]
     assert "EXX at P2 - P1 within the first 60 min, range (ISO 230-3)" in names
@@ -84,7 +84,7 @@ def test_figures_and_report_name_both_ends():
     assert shown == pytest.approx(1e6 * float(errors["distortion"][0, 1, 1]), abs=0.05)
 
 
-def test_a_machine_that_warms_up_is_measured_and_stays_within_its_stroke():
+def test_the_expansion_of_a_screw_is_measured_within_the_stroke():
     settings = Settings(
         travel=(0.0, 0.4),
         dwell=0.5,
@@ -116,7 +116,7 @@ def test_a_machine_that_warms_up_is_measured_and_stays_within_its_stroke():
 
 def test_an_interrupted_warm_up_is_not_continued():
     raw, _ = simulate(SETTINGS, 0)
-    with pytest.raises(MethodError, match="the axis has cooled down meanwhile"):
+    with pytest.raises(MethodError, match="the axis has cooled down in the meantime"):
         next(measure_moving(Bench(), SETTINGS, raw))
 
 
@@ -126,9 +126,9 @@ def test_an_interrupted_warm_up_is_not_continued():
         (lambda raw: raw.assign(reading_time=raw["reading_time"] + 1e4), "a cold state at times of 0 or less"),
         (lambda raw: raw.assign(reading_time=-raw["reading_time"]), "increasing times"),
         (lambda raw: raw.isel(cycle=slice(8)), "6 cycles or more after the cold state; found 3"),
-        (lambda raw: raw.assign(end_position=0.0 * raw["end_position"]), "two positions that differ"),
+        (lambda raw: raw.assign(end_position=0.0 * raw["end_position"]), "two different positions"),
     ],
 )
-def test_what_is_wrong_with_the_data_is_said(change, text):
+def test_invalid_data_are_refused_with_the_reason(change, text):
     with pytest.raises(MethodError, match=text):
         METHOD.identify(change(simulate(SETTINGS, 0)[0]), SETTINGS)

@@ -15,8 +15,8 @@ METHOD = LinearPositioning()
 
 
 @pytest.mark.parametrize(("length", "count"), [(0.5, 11), (2.0, 11), (1.99, 11), (3.0, 13), (10.0, 41)])
-def test_as_many_targets_as_the_standard_asks_for(length, count):
-    assert targets.needed(length) == count
+def test_as_many_targets_as_the_standard_requires(length, count):
+    assert targets.standard_count(length) == count
 
 
 def test_targets_have_a_random_part_and_stay_within_the_travel():
@@ -32,21 +32,21 @@ def test_targets_have_a_random_part_and_stay_within_the_travel():
 
 
 @pytest.mark.parametrize("cycle", ["linear", "pendulum"])
-def test_every_target_is_approached_from_its_side_by_the_overrun(cycle):
+def test_every_target_is_approached_over_the_overrun(cycle):
     settings = Settings(cycle=cycle, runs=3, count=5, targets=())
-    P, visits, place = targets.positions(settings), [], None
+    P, visits, position = targets.positions(settings), [], None
     for approach in targets.sequence(settings):
-        place = approach.before if approach.before is not None else place
-        way = approach.place - place
-        assert (way > 0) == (approach.approach == 0)
-        assert abs(way) >= settings.overrun - 1e-12
-        assert approach.place == P[approach.target]
-        place = approach.place
-        visits.append((approach.run, approach.approach, approach.target))
+        position = approach.before if approach.before is not None else position
+        distance = approach.position - position
+        assert (distance > 0) == (approach.direction == 0)
+        assert abs(distance) >= settings.overrun - 1e-12
+        assert approach.position == P[approach.target]
+        position = approach.position
+        visits.append((approach.run, approach.direction, approach.target))
     assert sorted(visits) == [(run, way, i) for run in range(3) for way in range(2) for i in range(5)]
 
 
-def test_motions_are_those_of_the_program_and_stay_within_the_limits():
+def test_motions_are_those_of_the_program_within_the_limits():
     settings = Settings(axis="Y", travel=(0.0, 0.4), limits=(-0.01, 0.41), start=(0.1, 0.0, 0.2))
     steps = METHOD.motions(settings)
     places = [step.place for step in steps if step.place is not None]
@@ -63,15 +63,17 @@ def test_motions_are_those_of_the_program_and_stay_within_the_limits():
 
 def test_a_test_beyond_the_limits_is_refused():
     settings = Settings(travel=(0.0, 0.4), limits=(0.0, 0.4), overrun=0.1)
-    with pytest.raises(MethodError, match=r"expected X from 0\.000 to 400\.000 mm; with an overrun of 100 mm"):
+    with pytest.raises(
+        MethodError, match=r"expected X from 0\.000 to 400\.000 mm; .*, with an overrun of 100 mm"
+    ):
         motions.steps(settings)
     machine = MachineDescription("C-frame", "workpiece-X-Y-bed-Z-spindle-tool", dict.fromkeys("XYZ", (0.0, 0.3)))
     assert "travel" in METHOD.check_machine(settings, machine)
     assert METHOD.check_machine(Settings(travel=(0.1, 0.2)), machine) == {}
 
 
-def test_the_plan_states_what_a_test_of_such_an_axis_gives():
-    """Scatter and drift as assumed by the plan, measured: the stated uncertainty is that of the plan on average."""
+def test_the_plan_states_the_uncertainty_of_a_simulated_test():
+    """With the scatter and drift assumed by the plan, the mean stated uncertainty is that of the plan."""
     stated = {"scatter": 0.5e-6, "drift": np.sqrt(12.0) * 0.6e-6}
     settings = Settings(runs=12, trials=200, uncertainty=stated)
     plan = METHOD.plan(settings)
@@ -88,6 +90,6 @@ def test_the_plan_states_what_a_test_of_such_an_axis_gives():
     assert np.sqrt(np.mean(measured, axis=0)) == pytest.approx(planned, rel=0.2)
 
 
-def test_targets_are_not_measured_twice():
-    with pytest.raises(ValueError, match="three or more positions that differ"):
+def test_duplicate_targets_are_refused():
+    with pytest.raises(ValueError, match="three or more different positions"):
         Settings(targets=(0.1, 0.1, 0.2))

@@ -29,7 +29,7 @@ def blocks(part, kind):
     return [block for section in part.sections for block in section.blocks if isinstance(block, kind)]
 
 
-def test_the_positioning_comes_first_and_each_freedom_has_its_graph(part):
+def test_positioning_is_first_and_each_freedom_has_a_graph(part):
     assert part.key_figures[0].label == "A of EXX"
     titles = [section.title for section in part.sections]
     assert [t for t in titles if t.split()[-1] in ("EXX", "EYX", "EBX")] == [
@@ -38,7 +38,7 @@ def test_the_positioning_comes_first_and_each_freedom_has_its_graph(part):
     assert len(blocks(part, Figure)) == 4  # and the bars of the limits
 
 
-def test_the_table_by_target_holds_the_statistics_of_the_standard(part, errors):
+def test_the_table_by_target_contains_the_statistics_of_the_standard(part, errors):
     tables = [each for each in blocks(part, Table) if each.caption.startswith("EXX by target")]
     rows = {
         str(row[0]): [cell for table in tables for cell in table.rows[i][1:]] for i, row in enumerate(tables[0].rows)

@@ -1,4 +1,4 @@
-"""Files .rtl: the layout that published programs agree on, and what is not of this layout."""
+"""Files .rtl: the layout on which published programs agree, and files with another layout."""
 
 import random
 
@@ -79,7 +79,7 @@ def test_units_scale_and_freedom_are_those_of_the_map(imported):
     assert float(raw["deviation"][0, 0, 0, 0]) == pytest.approx(-deviation(1, 1) * np.pi / 648000)
 
 
-def test_a_run_that_was_broken_off_leaves_unknown_values(imported):
+def test_targets_that_a_run_has_not_reached_are_unknown(imported):
     content = text().replace(f"   8    1    {deviation(8, 1)}\r\n", "")
     raw = imported(content)
     assert np.isnan(raw["deviation"].values).sum() == 1
@@ -92,25 +92,25 @@ def test_a_run_that_was_broken_off_leaves_unknown_values(imported):
         ("Target-count: 7", "Target-count: 8", "Target-count: expected the number of targets, 7"),
         ("Run-count:8", "Run-count:9", "Run-count: expected the number of runs with deviations, 8"),
         ("10.500000", "10,5", "expected positions in mm; found '10,5'"),
-        ("10.500000", "0.000000", "positions that differ"),
+        ("10.500000", "0.000000", "different positions"),
         ("   1    1    0.11", "   1    9    0.11", "a target from 1 to 7; found 1 and 9"),
         ("   1    1    0.11", "   1    1    nan", "expected a deviation; found 'nan'"),
-        ("   1    1    0.11", "   1    2    0.11", "run 1 has target 2 twice"),
+        ("   1    1    0.11", "   1    2    0.11", "run 1: expected each target once; found target 2 twice"),
         ("   1    1    0.11", "   1    1", "expected run, target and deviation"),
         ("Run Target Data:", "Other:", "found none"),
         ("TARGET DATA::", "TARGETS::", "found 0"),
     ],
 )
-def test_a_file_of_another_layout_is_refused_with_what_is_wrong(imported, old, new, message):
+def test_a_file_with_another_layout_is_refused_with_its_mistakes(imported, old, new, message):
     content = text()
     assert old in content
     with pytest.raises(DatasetError, match=message):
         imported(content.replace(old, new, 1))
 
 
-def test_a_run_in_no_order_is_refused(imported):
+def test_a_run_with_unordered_positions_is_refused(imported):
     a, b = f"   1    3    {deviation(1, 3)}\r\n", f"   1    4    {deviation(1, 4)}\r\n"
-    with pytest.raises(DatasetError, match="run 1: expected positions that rise or fall"):
+    with pytest.raises(DatasetError, match="run 1: expected positions that all increase or all decrease"):
         imported(text().replace(a + b, b + a))
 
 

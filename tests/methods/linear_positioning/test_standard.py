@@ -1,4 +1,4 @@
-"""The figures of ISO 230-2 against a calculation by hand, and against a second one in plain Python."""
+"""The figures of ISO 230-2 against a manual calculation, and against a second implementation in plain Python."""
 
 import statistics
 
@@ -59,12 +59,12 @@ def second_implementation(readings):
     }
 
 
-def test_figures_are_those_calculated_by_hand():
+def test_figures_agree_with_a_manual_calculation():
     assert of([FORWARD, BACKWARD]) == pytest.approx(BY_HAND, abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_figures_are_those_of_a_second_implementation(seed):
+def test_figures_agree_with_a_second_implementation(seed):
     generator = np.random.default_rng(seed)
     runs, targets = generator.integers(2, 8), generator.integers(2, 30)
     curve, reversal = 5.0 * generator.normal(size=targets), generator.normal(size=(2, 1, targets))
@@ -78,7 +78,7 @@ def test_figures_of_both_directions_are_unknown_where_one_was_not_measured():
     assert known == {"A_forward", "E_forward", "R_forward"}
 
 
-def test_a_missing_reading_leaves_mean_and_deviation_of_the_others():
+def test_mean_and_deviation_are_those_of_the_readings_that_are_not_missing():
     readings = np.array([FORWARD, BACKWARD])
     readings[0, 2, 1] = np.nan  # the target has 2 and 4 left
     found = standard.statistics(readings)

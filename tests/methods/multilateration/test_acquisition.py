@@ -1,4 +1,4 @@
-"""Measuring from several stations, with a machine and a tracker that do what real ones do."""
+"""Measurement from several stations, with a simulated machine and tracker."""
 
 from types import SimpleNamespace
 
@@ -25,13 +25,13 @@ def settings(**changes):
 
 
 def true_place(position):
-    """Return where the reflector is: the commanded place, and errors that no rigid motion takes away."""
+    """Return the position of the reflector: the commanded one, with errors that are not a rigid motion."""
     x, y, z = position
     return np.array(position) + REFLECTOR + BULGE * np.array([x * y, y * z, x * x])
 
 
 class Machine:
-    """Goes to the commanded place, with a clock of its own."""
+    """Machine that moves to the commanded position, with its own clock."""
 
     def __init__(self):
         self.place, self.time, self.path = np.zeros(3), 0.0, []
@@ -49,7 +49,7 @@ class Machine:
 
 
 class Tracker:
-    """An interferometer that follows its reflector, upright at a station and turned by any angle.
+    """Interferometer that follows its reflector, upright at a station and rotated by any angle.
 
     ``broken`` lists the measurements, counted from 0, before which the beam breaks; ``shadow`` the targets (as
     commanded, by set-up) that it never sees.
@@ -131,7 +131,7 @@ def position_of(k):
     return tuple(np.round(layout.grid(settings().layout)[0][k], 6))
 
 
-def test_each_station_gives_a_dataset_and_together_they_tell_the_errors():
+def test_stations_return_one_dataset_each_and_determine_the_errors():
     bench = Bench()
     chunks = measured(bench)
     assert [list(chunk["station"].values) for chunk in chunks] == [["S1"], ["S2"], ["S3"], ["S4"]]
@@ -155,14 +155,14 @@ def test_each_station_gives_a_dataset_and_together_they_tell_the_errors():
     assert np.abs(error).max() > 20 * spread.max()
 
 
-def test_operator_is_asked_for_every_station_with_the_machine_at_its_first_target():
+def test_operator_is_prompted_for_every_station_with_the_machine_at_the_first_target():
     bench = Bench()
     measured(bench)
     assert len(bench.messages) == 4
     assert "S2: set up the tracker near (350, -300, 50) mm" in bench.messages[1]
 
 
-def test_a_control_that_can_place_the_tracker_does_and_nobody_is_asked():
+def test_a_control_that_can_position_the_tracker_is_used_without_prompts():
     bench = Bench()
     bench.machine_.set_station = lambda place: (bench.tracker.place_at(place), setattr(bench, "asked_for", 1))
     chunks = measured(bench)
@@ -170,7 +170,7 @@ def test_a_control_that_can_place_the_tracker_does_and_nobody_is_asked():
     assert not bench.messages
 
 
-def test_machine_rests_before_it_is_measured_and_goes_to_neighbours():
+def test_machine_settles_before_a_reading_and_moves_between_neighbours():
     bench = Bench()
     raw = measured(bench)[0]
     times = np.sort(raw["reading_time"].values[0])
@@ -179,7 +179,7 @@ def test_machine_rests_before_it_is_measured_and_goes_to_neighbours():
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() <= 0.2 + 1e-12
 
 
-def test_targets_are_visited_again_at_the_end():
+def test_targets_are_measured_again_at_the_end():
     raw = measured(Bench())[0]
     nominal, times = raw["target_nominal"].values, raw["reading_time"].values[0]
     for k in (18, 19):
@@ -188,7 +188,7 @@ def test_targets_are_visited_again_at_the_end():
         assert times[k] > times[:18].max() > times[first[0]]
 
 
-def test_air_is_recorded_where_the_tracker_tells_it():
+def test_air_is_recorded_if_the_tracker_reports_it():
     raw = measured(Bench())[0]
     assert float(raw["relative_humidity"][0, 0]) == pytest.approx(0.43)
     assert float(raw["refractive_index"][0, 0]) == pytest.approx(1.00027)
@@ -197,7 +197,7 @@ def test_air_is_recorded_where_the_tracker_tells_it():
     assert "refractive_index" not in without
 
 
-def test_a_weather_station_that_falls_silent_stops_the_measurement():
+def test_a_failed_weather_station_stops_the_measurement():
     bench = Bench()
     chunks = measure_stations(bench, settings(), {}, None, QUICK)
     next(chunks)
@@ -206,7 +206,7 @@ def test_a_weather_station_that_falls_silent_stops_the_measurement():
         next(chunks)
 
 
-def test_after_a_broken_beam_the_count_is_one_again_for_all_targets():
+def test_a_broken_beam_restarts_the_count_for_all_targets():
     bench = Bench(broken=[6])
     raw = measured(bench)[0]
     d = raw["displacement"].values[0]
@@ -218,7 +218,7 @@ def test_after_a_broken_beam_the_count_is_one_again_for_all_targets():
     assert np.ptp(d - true) < 10 * NOISE  # dead paths differ by millimetres
 
 
-def test_a_target_that_is_never_seen_is_nan_and_says_why():
+def test_a_target_that_is_never_visible_is_nan_with_its_reason():
     bench = Bench(shadow=[(1, position_of(5))])
     raw = measured(bench)[0]
     d = raw["displacement"].values[0]
@@ -228,7 +228,7 @@ def test_a_target_that_is_never_seen_is_nan_and_says_why():
     assert raw.attrs["invalid"] == {"beam broken": int(np.count_nonzero(lost))}
 
 
-def test_a_beam_that_breaks_all_the_time_leaves_the_longest_count():
+def test_with_repeatedly_broken_beams_the_longest_count_is_kept():
     bench = Bench(broken=[5, 9, 20, 40])
     raw = measured(bench, Measuring(settle=0.0, returns=0, renewals=0, repeats=0))[0]
     d = raw["displacement"].values[0]
@@ -241,7 +241,7 @@ def test_a_beam_that_breaks_all_the_time_leaves_the_longest_count():
     assert np.ptp((d - true)[kept]) < 10 * NOISE
 
 
-def test_a_poor_set_up_is_repeated_and_the_last_one_counts():
+def test_a_poor_set_up_is_repeated_and_replaced():
     class Awkward(Bench):
         def ask(self, message):
             super().ask(message)
@@ -257,7 +257,7 @@ def test_a_poor_set_up_is_repeated_and_the_last_one_counts():
     assert np.isnan(chunks[1]["displacement"].values).sum() >= 8
 
 
-def test_a_station_may_come_again_and_replaces_the_earlier():
+def test_a_repeated_station_replaces_the_earlier_one():
     chunks = measured(Bench(), Measuring(settle=0.0, returns=0, sequence=(1, 2, 3, 4, 2)))
     raw = joined(chunks)
     assert list(raw["station"].values) == ["S1", "S2", "S3", "S4", "S2"]
@@ -266,7 +266,7 @@ def test_a_station_may_come_again_and_replaces_the_earlier():
         measured(Bench(), Measuring(sequence=(1, 5)))
 
 
-def test_an_interrupted_run_goes_on_behind_what_it_holds():
+def test_an_interrupted_run_continues_after_its_last_set_up():
     chunks = measured(Bench())
     bench = Bench()
     rest = measured(bench, done=joined(chunks[:2]))
@@ -277,7 +277,7 @@ def test_an_interrupted_run_goes_on_behind_what_it_holds():
         measured(Bench(), Measuring(sequence=(2, 1)), done=joined(chunks[:1]))
 
 
-def test_a_poor_set_up_at_the_end_of_what_is_held_is_repeated():
+def test_a_poor_last_set_up_of_an_interrupted_run_is_repeated():
     chunks = measured(Bench(), Measuring(settle=0.0, returns=0))
     poor = chunks[1].copy(deep=True)
     poor["displacement"][:, :9] = np.nan
@@ -285,19 +285,19 @@ def test_a_poor_set_up_at_the_end_of_what_is_held_is_repeated():
     assert [str(chunk["station"].values[0]) for chunk in rest] == ["S2", "S3", "S4"]
 
 
-def test_a_tracker_that_was_not_moved_is_found_out():
+def test_a_tracker_that_was_not_moved_is_detected():
     with pytest.raises(MethodError, match=r"Set-up S2: the tracker is near \(-0\.3., -0\.3., .*position of S1"):
         measured(Bench(moved=False))
 
 
-def test_a_machine_that_does_not_arrive_is_named():
+def test_a_machine_that_does_not_reach_the_target_is_reported():
     bench = Bench()
     bench.machine_.move_to = lambda position, feed=None: None
     with pytest.raises(MethodError, match=r"Target 1: the control is \d+ mm off after 0\.1 s"):
         measured(bench, Measuring(timeout=0.1))
 
 
-def test_instruments_that_cannot_do_it_are_refused_before_anything_moves():
+def test_unsuitable_instruments_are_refused_before_any_motion():
     bench = Bench()
     bench.has_kind = lambda kind: kind == "laser_tracker"
     with pytest.raises(MethodError, match="kind 'controller'"):
@@ -309,7 +309,7 @@ def test_instruments_that_cannot_do_it_are_refused_before_anything_moves():
     assert bench.machine_.path == []
 
 
-def test_absolute_distances_need_no_renewal():
+def test_absolute_distances_require_no_repetition():
     bench = Bench(broken=[6])
     bench.tracker.distance_is_displacement = False
     rise = bench.tracker.rise
@@ -325,7 +325,7 @@ def test_absolute_distances_need_no_renewal():
 
 
 class Warm(Bench):
-    """A bench with a thermometer; the scales become warmer by 0.01 K with every reading."""
+    """Return a bench with a thermometer; the scales warm up by 0.01 K with every reading."""
 
     def __init__(self, failing=()):
         super().__init__()
@@ -344,7 +344,7 @@ class Warm(Bench):
         return {"x": 20.0 + 0.01 * self.count, "y": 21.0, "z": np.nan, "ambient": 19.0}
 
 
-def test_temperatures_of_the_scales_are_recorded_at_the_beginning_and_end_of_a_set_up():
+def test_temperatures_of_the_scales_are_recorded_at_start_and_end_of_a_set_up():
     sensors = QUICK.model_copy(update={"scale_sensors": ("x", "y", "z")})
     raw = joined(measured(Warm(failing=(4, 5)), sensors))
     datasets.validate(raw)
@@ -356,7 +356,7 @@ def test_temperatures_of_the_scales_are_recorded_at_the_beginning_and_end_of_a_s
     assert "scale_temperature" not in joined(measured(Warm()))
 
 
-def test_sensors_that_are_not_there_are_refused_before_anything_moves():
+def test_unknown_sensors_are_refused_before_any_motion():
     sensors = QUICK.model_copy(update={"scale_sensors": ("x", "y", "scale of Z")})
     bench = Warm()
     with pytest.raises(MethodError, match=r"no scale of Z; expected names from x, y, z, ambient"):
@@ -366,7 +366,7 @@ def test_sensors_that_are_not_there_are_refused_before_anything_moves():
         measured(Bench(), sensors)
 
 
-def test_the_targets_of_a_plan_are_visited_by_a_tour_and_returned_to():
+def test_the_targets_of_a_plan_are_visited_in_order_and_again():
     chosen = ((0.0, 0.0, 0.0), (0.1, 0.1, 0.2), (0.0, 0.1, 0.0), (0.1, 0.0, 0.2), (-0.1, 0.0, 0.1), (0.1, 0.1, 0.0))
     bench = Bench()
     chunk = next(measure_stations(bench, settings(targets=chosen), {}, None, QUICK))

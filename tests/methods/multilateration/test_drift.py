@@ -1,4 +1,4 @@
-"""Places visited again: drift of a set-up, repeatability, and what is not there."""
+"""Repeated visits to positions: drift of a set-up, repeatability, and missing data."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ TARGETS, RETURNS = 30, 12
 
 
 def a_record(seed, rate, repeatability=0.0, stations=2):
-    """Return displacement, time, place, directions, noise of set-ups that end with returns."""
+    """Return displacement, time, position, directions and noise of set-ups that end with returns."""
     rng = np.random.default_rng(seed)
     target = rng.uniform(-0.2, 0.2, (TARGETS, 3))
     nominal = np.concatenate([target, target[:RETURNS]])
@@ -27,13 +27,13 @@ def a_record(seed, rate, repeatability=0.0, stations=2):
     return d, time, positions(nominal), e, noise, true
 
 
-def test_targets_of_one_place_share_a_number():
+def test_targets_at_one_position_have_the_same_number():
     nominal = np.array([(0.1, 0.2, 0.3), (0.0, 0.0, 0.0), (0.1, 0.2, 0.3)])
     number = positions(nominal)
     assert number[0] == number[2] != number[1]
 
 
-def test_drift_of_the_dead_path_is_found_and_taken_off():
+def test_drift_of_the_dead_path_is_estimated_and_subtracted():
     rate = np.array([(2e-8, 0, 0, 0), (0, 0, 0, 0)])  # 8 um in 400 s
     d, time, place, e, noise, true = a_record(1, rate)
     notes = []
@@ -56,7 +56,7 @@ def test_drift_of_the_machine_has_a_direction():
     assert np.abs(left).max() < 0.3 * np.abs(true).max()
 
 
-def test_no_drift_is_taken_off_where_there_is_none():
+def test_no_drift_is_subtracted_if_there_is_none():
     taken = []
     for seed in range(20):
         d, time, place, e, noise, _ = a_record(seed, np.zeros((2, 4)))
@@ -64,7 +64,7 @@ def test_no_drift_is_taken_off_where_there_is_none():
     assert np.mean(taken) <= 0.1  # of 40 set-ups, 2 % by the test
 
 
-def test_repeatability_is_what_returns_scatter_beyond_the_noise():
+def test_repeatability_is_the_scatter_of_returns_beyond_the_noise():
     d, time, place, e, noise, _ = a_record(3, np.zeros((2, 4)), repeatability=3e-6)
     notes = []
     drift = estimate_drift(d, time, place, e, noise, ["A", "B"], notes)
@@ -73,7 +73,7 @@ def test_repeatability_is_what_returns_scatter_beyond_the_noise():
     assert "repeatability" in notes[0]
 
 
-def test_without_returns_it_says_so():
+def test_missing_returns_are_noted():
     d, time, place, e, noise, _ = a_record(4, np.zeros((2, 4)))
     notes = []
     once = slice(0, TARGETS)

@@ -1,4 +1,4 @@
-"""Where to put the tracker: against brute force, within boxes and lines of sight, and as published."""
+"""Positions of the tracker: compared with brute force and publications, within boxes and lines of sight."""
 
 import itertools
 
@@ -35,7 +35,7 @@ def brute(low, high, sight=OPEN, points=7):
 
 
 @pytest.mark.parametrize("low", [(-0.4, -0.4, -0.2), (-0.4, -0.4, 0.1)])
-def test_no_place_on_a_grid_is_better(low):
+def test_no_position_on_a_grid_is_better(low):
     high = (-0.2, 0.4, 0.6)
     found = layout.optimise(CUBE, one_free(low, high), OPEN, noise=1e-6)
     np.testing.assert_array_equal(found[1:], FIXED)
@@ -45,7 +45,7 @@ def test_no_place_on_a_grid_is_better(low):
     assert largest(found) <= brute(low, high) * (1 + 1e-6)
 
 
-def test_behind_an_obstacle_no_place_on_a_grid_is_better_either():
+def test_with_an_obstacle_no_position_on_a_grid_is_better():
     low, high = (-0.4, -0.4, -0.2), (-0.2, 0.4, 0.6)
     wall = Box(low=(-0.15, -0.5, 0.0), high=(-0.1, 0.0, 0.5))
     sight = Sight.of(Planning(obstacles=(wall,), acceptance=np.pi))
@@ -56,7 +56,7 @@ def test_behind_an_obstacle_no_place_on_a_grid_is_better_either():
     assert largest(found, sight) >= largest(layout.optimise(CUBE, one_free(low, high), OPEN, noise=1e-6)) * (1 - 1e-6)
 
 
-def test_all_four_may_be_free_and_the_answer_is_better_than_the_start():
+def test_all_four_may_be_free_and_the_result_is_better_than_the_start():
     corners = np.tile([(-0.4, -0.4, -0.1), (0.4, 0.4, 0.5)], (4, 1, 1))
     start = np.array([(-0.35, -0.3, 0.0), *FIXED])
     found = layout.optimise(CUBE, corners, OPEN, noise=1e-6, start=start)
@@ -75,13 +75,13 @@ def test_the_mean_may_be_minimised_instead():
     assert largest(by_largest) <= largest(by_mean) * (1 + 1e-6)
 
 
-def test_noise_scales_the_answer_and_does_not_move_it():
+def test_noise_scales_the_uncertainty_and_does_not_change_the_positions():
     corners = one_free((-0.4, -0.4, -0.2), (-0.2, 0.4, 0.6))
     a, b = (layout.optimise(CUBE, corners, OPEN, noise=noise) for noise in (1e-6, 1e-5))
     assert largest(a) == pytest.approx(largest(b), rel=1e-3)
 
 
-def test_spread_across_x_and_y_is_worth_far_more_than_a_change_in_z_alone():
+def test_positions_along_x_and_y_have_more_effect_than_those_along_z():
     # As published: a cube of 100 mm with 1 um noise; three stations close together, moved in Z, spread wide in X and Y.
     # Stations and dead paths are free here, so the fourth place (overhead) is needed in every case.
     overhead = (0.0, 0.05, 0.5)
@@ -95,16 +95,16 @@ def test_spread_across_x_and_y_is_worth_far_more_than_a_change_in_z_alone():
     assert sigma[1] > 3 * sigma[2]
 
 
-def test_boxes_without_any_view_are_refused_with_what_to_do():
+def test_boxes_without_line_of_sight_are_refused_with_a_remedy():
     box = Box(low=(-0.15, -0.15, -0.15), high=(0.15, 0.15, 0.15))
     sight = Sight.of(Planning(obstacles=(box,), acceptance=np.pi))
-    with pytest.raises(MethodError, match=r"found none in the search.*Enlarge the boxes"):
+    with pytest.raises(MethodError, match=r"found none: the best ones lack .*Enlarge the boxes"):
         layout.optimise(CUBE, one_free((-0.4, -0.4, -0.2), (-0.2, 0.4, 0.6)), sight, noise=1e-6)
     with pytest.raises(MethodError, match="at least 4 stations; found 3"):
         layout.optimise(CUBE, one_free((-0.4, -0.4, -0.2), (-0.2, 0.4, 0.6))[:3], OPEN, noise=1e-6)
 
 
-def test_a_grid_is_visited_by_neighbours_once_each():
+def test_a_grid_is_visited_in_steps_between_neighbours():
     made = Layout(count=(3, 4, 5), low=(0, 0, 0), high=(0.2, 0.3, 0.4), reflector=(0.0, 0.0, -0.1))
     position, target = layout.grid(made)
     order = layout.serpentine(made.count)
@@ -130,7 +130,7 @@ def test_a_grid_is_visited_by_neighbours_once_each():
         ((-1.0, 0.0, 0.1), True),  # along its surface
     ],
 )
-def test_a_box_blocks_what_passes_its_inside(station, seen):
+def test_a_box_blocks_lines_that_intersect_it(station, seen):
     low, high = np.array([-0.6, -0.1, -0.1]), np.array([-0.4, 0.1, 0.1])
     target = np.array([[0.0, 0.0, 0.0 if station[2] == 0 else 0.1]])
     assert blocked(target, np.array(station)[None, None] - target, low, high)[0, 0] == (not seen)
@@ -149,25 +149,25 @@ def test_blocked_lines_are_those_with_points_inside():
     assert np.count_nonzero(found & ~inside) <= 2
 
 
-def test_a_reflector_that_looks_one_way_is_seen_within_its_acceptance_only():
+def test_a_fixed_reflector_is_visible_only_within_its_acceptance_angle():
     planning = Planning(reflector_axis=(0.0, 0.0, -2.0), acceptance=np.radians(60), nearest=0.0)
     below = np.array([(np.tan(np.radians(a)), 0.0, -1.0) for a in (0, 59, 61)])
     assert Sight.of(planning).sees(below, np.zeros((1, 3))).ravel().tolist() == [True, True, False]
 
 
-def test_a_reflector_that_is_turned_to_the_station_has_to_serve_all_targets_so():
+def test_a_reflector_turned_to_the_station_has_one_direction_for_all_targets():
     target = np.array([(-0.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.5, 0.0, 0.0)])
     sight = Sight.of(Planning(acceptance=np.radians(40)))
     assert sight.sees(np.array([(0.0, 1.0, 0.0)]), target).all()  # 27 deg to either side
     assert sight.sees(np.array([(0.0, 0.5, 0.0)]), target).tolist() == [[False, True, False]]  # 45 deg
 
 
-def test_a_tracker_is_not_nearer_than_it_can_measure():
+def test_a_tracker_has_a_minimum_distance():
     sight = Sight.of(Planning(acceptance=np.pi, nearest=0.3))
     assert sight.sees(np.array([(0.2, 0, 0), (0.31, 0, 0)]), np.zeros((1, 3))).ravel().tolist() == [False, True]
 
 
-def test_a_box_with_its_corners_swapped_and_a_reflector_that_looks_nowhere_are_refused():
+def test_swapped_corners_and_a_reflector_axis_of_zero_are_refused():
     with pytest.raises(ValueError, match="expected low <= high"):
         Box(low=(0.1, 0, 0), high=(0, 0, 0))
     with pytest.raises(ValueError, match="reflector_axis: expected a direction"):

@@ -29,7 +29,7 @@ assert "numba" not in sys.modules, "numba was imported"
 
 
 def network(m, n):
-    """Return displacements with noise, missing readings and one wrong by 1 mm, and the nominal targets."""
+    """Return displacements with noise, missing readings and one outlier of 1 mm, and the nominal targets."""
     rng = np.random.default_rng(m + n)
     u = rng.uniform(-0.2, 0.2, (m, 3)) + np.array([0.0, 0.0, 0.15])
     stations = Stations(STATIONS[:n], rng.uniform(0, 0.3, n), np.zeros(0))
@@ -41,14 +41,14 @@ def network(m, n):
 
 
 def compile_always(monkeypatch):
-    """Let networks of any size use the compiled loops."""
+    """Use the compiled loops for networks of any size."""
     for module in (loops, outliers):
         monkeypatch.setattr(module, "COMPILED_FROM", 0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("n", "further"), [(4, 0), (4, 1), (5, 0), (5, 2)])
-def test_both_loops_give_the_same_result_within_a_billionth_of_its_uncertainty(monkeypatch, n, further):
+def test_both_implementations_agree_within_1e_9_of_the_uncertainty(monkeypatch, n, further):
     d, u = network(200, n)
     extra = np.random.default_rng(3).normal(0, 1.0, (further, *d.shape)) if further else None
     prior = np.full(further, 5e-6) if further else None
@@ -81,7 +81,7 @@ def test_both_loops_give_the_same_result_within_a_billionth_of_its_uncertainty(m
 
 
 @pytest.mark.slow
-def test_a_large_network_has_the_same_bits_on_any_number_of_threads():
+def test_a_large_network_is_identical_with_any_number_of_threads():
     d, u = network(25_000, 4)
     threads, found = numba.get_num_threads(), []
     try:
@@ -95,7 +95,7 @@ def test_a_large_network_has_the_same_bits_on_any_number_of_threads():
 
 
 @pytest.mark.slow
-def test_the_compiled_elimination_of_four_stations_is_the_general_one(monkeypatch):
+def test_the_loops_for_four_stations_agree_with_the_general_ones(monkeypatch):
     # A further parameter that is held at 0 makes the general elimination do the work.
     compile_always(monkeypatch)
     d, u = network(200, 4)

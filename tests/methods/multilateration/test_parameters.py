@@ -1,4 +1,4 @@
-"""From the errors of targets to those of the axes, and from there to any other place of the volume."""
+"""From the errors of targets to those of the axes, and to any other position of the volume."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def targets(seed, count=(6, 6, 5), noise=NOISE, reflectors=(REFLECTOR,), kind="c
 
 
 def true_curve(machine, name, position, reference):
-    """Return an error motion at a reference, less the mean and, of a straightness, the slope over its range."""
+    """Return an error motion at a reference, minus its mean and, for a straightness, its slope over the range."""
     axis, k = name[2], DOF.index(name[:2])
     low, high = position[0], position[-1]
     x, w = leggauss(40)
@@ -44,7 +44,7 @@ def true_curve(machine, name, position, reference):
 
 
 @pytest.mark.parametrize("kind", ["cframe", "gantry"])
-def test_curves_hold_the_truth_within_their_uncertainty(kind):
+def test_curves_agree_with_the_true_ones_within_their_uncertainty(kind):
     held = []
     for seed in range(4):
         machine, q, at, error, own, none = targets(seed, kind=kind)
@@ -52,7 +52,7 @@ def test_curves_hold_the_truth_within_their_uncertainty(kind):
         for k, axis in enumerate("XYZ"):
             position = np.linspace(axes.chain.low[k], axes.chain.high[k], 21)
             for name in (dof + axis for dof in DOF):
-                if name not in axes.unseen:
+                if name not in axes.undetermined:
                     value, u = axes.curve(name, position)
                     held.append(np.abs(value - true_curve(machine, name, position, REFLECTOR)) <= 2 * u)
     # Some 56 curves of some 4 independent values each: 95 % to 1.5 %, and the prior is not the machine's.
@@ -71,7 +71,7 @@ def test_squareness_is_that_of_the_mean_lines():
         assert 0 < u < 1e-6
 
 
-def test_a_single_squareness_is_found_and_nothing_else():
+def test_a_single_squareness_is_determined_without_other_errors():
     machine, q, at, _, own, none = targets(0)
     wanted = dict.fromkeys(machine.geometry.machine.error_names, 0.0) | {"EA0Z": 20e-6}
     errors = np.array(list(wanted.values()))
@@ -84,22 +84,22 @@ def test_a_single_squareness_is_found_and_nothing_else():
     assert np.abs(axes.curve("EYX", x)[0]).max() < 1e-9
 
 
-def test_one_reflector_does_not_see_the_rotations_of_the_axis_that_carries_it():
+def test_one_reflector_does_not_determine_the_rotations_of_its_axis():
     machine, q, at, error, own, none = targets(1)
     axes = fit_machine(machine.chain, q, error, own, none, reflector=at)
-    assert set(axes.unseen) == {"ECY", "EAZ", "EBZ", "ECZ"}
-    assert axes.unseen["ECY"].like == ("EXY",)
-    assert axes.unseen["EAZ"].reason == "it moves no reflector"
+    assert set(axes.undetermined) == {"ECY", "EAZ", "EBZ", "ECZ"}
+    assert axes.undetermined["ECY"].like == ("EXY",)
+    assert axes.undetermined["EAZ"].reason == "no effect on the reflector"
     value, u = axes.curve("EAZ", np.array([0.2]))
     assert np.isnan(value).all()
     assert np.isnan(u).all()
 
 
-def test_three_reflectors_see_all_21():
+def test_three_reflectors_determine_all_21():
     reflectors = [(0.0, 0.0, -0.1), (0.1, 0.0, -0.1), (0.0, 0.1, -0.2)]
     machine, q, at, error, own, none = targets(2, (5, 5, 4), reflectors=reflectors)
     axes = fit_machine(machine.chain, q, error, own, none, reflector=at)
-    assert not axes.unseen
+    assert not axes.undetermined
     assert len({term.error for term in axes.terms}) == 21
     z = np.linspace(axes.chain.low[2], axes.chain.high[2], 9)
     value, u = axes.curve("ECZ", z)
@@ -108,7 +108,7 @@ def test_three_reflectors_see_all_21():
     assert np.ptp(truth) > 4 * u.mean()
 
 
-def test_motions_of_the_whole_change_nothing():
+def test_rigid_motions_have_no_effect():
     machine, q, at, error, own, none = targets(4)
     G = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -cross_matrix(q)], axis=2)
     moved = error + G @ np.array([1e-5, -2e-5, 3e-5, 1e-5, 2e-5, -3e-5])
@@ -117,7 +117,7 @@ def test_motions_of_the_whole_change_nothing():
     np.testing.assert_allclose(other.coefficient, one.coefficient, atol=1e-11)
 
 
-def test_an_unknown_scale_is_in_the_positioning_and_not_in_straightness():
+def test_the_uncertainty_of_the_scale_affects_positioning_but_not_straightness():
     machine, q, at, error, own, _ = targets(5)
     scale = 5e-6 * (q - q.mean(axis=0))[None]
     plain = fit_machine(machine.chain, q, error, own, np.zeros((0, len(q), 3)), reflector=at)
@@ -131,7 +131,7 @@ def test_an_unknown_scale_is_in_the_positioning_and_not_in_straightness():
     assert end(unsure, "EYX") == pytest.approx(end(plain, "EYX"), rel=0.05)
 
 
-def test_what_no_axis_can_do_raises_the_uncertainty():
+def test_errors_that_no_axis_explains_increase_the_uncertainty():
     machine, q, at, error, own, none = targets(6)
     odd = error.copy()
     odd[:, 0] += 5e-6 * np.sign(np.sin(97 * q @ np.array([1.0, 2.0, 3.0])))  # no chain of axes does this
@@ -142,19 +142,19 @@ def test_what_no_axis_can_do_raises_the_uncertainty():
     assert bent.squareness()["EC0Y"][1] > 3 * plain.squareness()["EC0Y"][1]
 
 
-def test_unknown_targets_are_passed_over():
+def test_unknown_targets_are_ignored():
     machine, q, at, error, own, none = targets(7)
     error[:20] = np.nan
     axes = fit_machine(machine.chain, q, error, own, none, reflector=at)
     assert np.isfinite(axes.coefficient).all()
 
 
-def test_one_level_of_an_axis_says_nothing_of_it():
+def test_one_position_of_an_axis_does_not_determine_its_errors():
     machine, q, at, error, own, none = targets(8, (6, 6, 1))
     axes = fit_machine(machine.chain, q, error, own, none, reflector=at)
-    assert axes.unseen["EZZ"].reason == "too few positions of Z"
-    assert axes.unseen["EA0Z"].reason == "too few positions of Z"
-    assert "EXX" not in axes.unseen
+    assert axes.undetermined["EZZ"].reason == "too few positions of Z"
+    assert axes.undetermined["EA0Z"].reason == "too few positions of Z"
+    assert "EXX" not in axes.undetermined
 
 
 @pytest.mark.parametrize("chain", ["workpiece-X-Y-bed-C-Z-tool", "X-Y-Z", "workpiece-X-bed-Z-tool"])

@@ -1,4 +1,4 @@
-"""Refraction after Ciddor: published values, derivatives, and air that cannot be."""
+"""Refraction after Ciddor: published values, derivatives, and impossible states of the air."""
 
 import numpy as np
 import pytest
@@ -23,12 +23,12 @@ RED = 633e-9  # the wavelength of the published values, in vacuum
         (20.0, 0.0, 1.0002718, 7),  # published to seven digits
     ],
 )
-def test_published_values_are_met_to_1e_8(temperature, humidity, published, digits):
+def test_published_values_agree_within_1e_8(temperature, humidity, published, digits):
     found = float(refractive_index(temperature, 101325.0, humidity, wavelength=RED))
     assert abs(found - published) < max(1e-8, 0.5 * 10**-digits)
 
 
-def test_the_usual_rules_of_thumb_hold():
+def test_the_usual_rules_of_thumb_are_met():
     # 1 K is 1 um/m, 4 hPa is 1 um/m, humidity hardly matters.
     d = sensitivities(20.0, 101325.0, 0.5)
     assert d["temperature"] == pytest.approx(-0.95e-6, rel=0.03)
@@ -48,14 +48,14 @@ def test_derivatives_are_those_of_the_index():
         assert found[name] == pytest.approx(float(slope), rel=1e-4)
 
 
-def test_arrays_are_broadcast_and_unknown_stays_unknown():
+def test_arrays_are_broadcast_and_nan_is_kept():
     n = refractive_index([[20.0], [np.nan]], [101325.0, 90e3, 80e3], 0.5)
     assert n.shape == (2, 3)
     assert np.isnan(n[1]).all()
     assert np.all(np.diff(n[0]) < 0)
 
 
-def test_the_uncertainty_of_the_equations_is_always_there():
+def test_the_uncertainty_of_the_equations_is_always_included():
     found = index_uncertainty(sensitivities(20.0, 101325.0, 0.5), {"temperature": 0.1, "pressure": 0.0})
     assert set(found) == {"temperature", "equations"}
     assert float(found["equations"]) == MODEL_UNCERTAINTY
@@ -70,6 +70,6 @@ def test_the_uncertainty_of_the_equations_is_always_there():
         ((20.0, 101325.0, 50.0), "humidity"),  # per cent
     ],
 )
-def test_another_unit_is_named(wrong, named):
+def test_another_unit_is_reported(wrong, named):
     with pytest.raises(MethodError, match=f"expected {named} from .* found"):
         refractive_index(*wrong)

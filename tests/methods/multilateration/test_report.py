@@ -1,4 +1,4 @@
-"""The chapter of a multilateration: complete, honest about what is not seen, readable with whatever is missing."""
+"""Chapter of a multilateration: sections, undetermined freedoms, and missing variables."""
 
 import re
 from functools import cache
@@ -22,7 +22,7 @@ UM = 1e-6
 WRONG = 320 * UM
 HEADINGS = [
     "Errors of the volume",
-    "What is not seen",
+    "Undetermined freedoms",
     "Stations",
     "Uncertainty",
     "Errors of the axes",
@@ -33,7 +33,7 @@ HEADINGS = [
 
 @cache
 def measured():
-    """A real result with its raw data: some readings missing, one wrong by 0.32 mm."""
+    """Return a result with its raw data, with missing readings and an outlier of 0.32 mm."""
     machine = VirtualMachine("cframe", seed=3)
     raw = simulation.raw(machine, simulation.target_grid(machine, (4, 4, 3)), seed=1, missing=0.02)
     raw["displacement"][1, 20] += WRONG
@@ -41,7 +41,7 @@ def measured():
 
 
 def bare(m=12, **extras):
-    """A result with nothing beyond the errors of targets whose places are not known."""
+    """Return a result with only the errors of targets at unknown positions."""
     rng = np.random.default_rng(4)
     values = np.full((m, 6), np.nan)
     values[:, :3] = 5 * UM * rng.normal(size=(m, 3))
@@ -78,63 +78,63 @@ def html(tmp_path_factory):
     return page(errors, tmp_path_factory.mktemp("report"), raw=raw)
 
 
-def test_every_section_is_there_in_order(html):
+def test_all_sections_are_in_order(html):
     places = [html.index(f"<h2>{title}</h2>") for title in HEADINGS]
     assert places == sorted(places)
     assert html.count("<figure") == 7
 
 
-def test_page_needs_no_network_and_runs_no_script(html):
+def test_page_requires_no_network_and_no_script(html):
     assert html.count("<script") == 1  # that of the page
     assert not re.search(r"(?:src|href)=[\"']https?:", html)
     assert "<image" not in html  # a picture in the picture would not pass the page's own policy
 
 
-def test_numbers_drawn_are_numbers(html):
+def test_drawn_coordinates_are_finite(html):
     drawn = re.findall(r" (?:d|transform|rx|ry|cx|cy)=['\"]([^'\"]*)['\"]", html)
     assert drawn
     assert not [text for text in drawn if re.search(r"nan|inf", text, re.I)]
 
 
-def test_reading_that_was_left_out_is_named_with_how_wrong_it_is(html):
-    found = re.search(r"the others contradict them: S2 to T021 \(\+(\d+\.\d) µm\)\.", words(html))
+def test_ignored_reading_is_listed_with_its_residual(html):
+    found = re.search(r"Outliers, ignored: S2 to T021 \(\+(\d+\.\d) µm\)\.", words(html))
     # Three readings are left of that target and place it to some micrometres along the line of sight.
     assert float(found[1]) == pytest.approx(WRONG / UM, abs=30)
 
 
-def test_reading_that_was_left_out_is_named_without_raw_data_too(tmp_path):
-    assert "the others contradict them: S2 to T021" in words(page(measured()[0], tmp_path))
+def test_ignored_reading_is_listed_without_raw_data(tmp_path):
+    assert "Outliers, ignored: S2 to T021" in words(page(measured()[0], tmp_path))
 
 
-def test_result_stays_as_it_is():
+def test_result_is_not_changed():
     errors, raw = measured()
     before = errors.copy(deep=True)
     network(errors, raw)
     xr.testing.assert_identical(errors, before)
 
 
-def test_missing_readings_are_counted_and_the_wrong_one_is_not_among_them(html):
+def test_missing_readings_are_counted_without_the_outlier(html):
     lost = int(np.isnan(measured()[1]["displacement"]).sum())
     assert f"{lost} of 192 readings are missing" in words(html)
 
 
-def test_six_rigid_freedoms_are_said_not_to_be_seen(html):
-    said = words(html)
-    assert "three shifts and three rotations of all targets together" in said
-    assert "rotations of the tool at a target, EA to EC, are unknown and not zero" in said
+def test_six_rigid_motions_are_reported_as_undetermined(html):
+    text = words(html)
+    assert "The six rigid motions of the volume, three translations and three rotations, are not determined" in text
+    assert "rotations of the tool at a target, EA to EC, are unknown, not zero" in text
 
 
 def test_longest_vector_is_that_of_the_data(html):
     net = network(measured()[0])
     longest = net.length[net.worst]
-    assert f"which is {longest / UM:.2f} µm at {net.targets[net.worst]}" in words(html)
+    assert f"third of the longest, {longest / UM:.2f} µm at {net.targets[net.worst]}" in words(html)
 
 
-def test_error_motions_that_are_not_seen_are_unknown_with_the_reason(html):
+def test_undetermined_error_motions_are_unknown_with_the_reason(html):
     assert html.count("not determined</text>") == sum(
         np.isnan(v.values).all() for name, v in measured()[0].data_vars.items() if re.fullmatch(r"E[XYZABC][XYZ]", name)
     )
-    assert "EAZ: it moves no reflector" in words(html)
+    assert "EAZ: no effect on the reflector" in words(html)
 
 
 def test_rotations_in_the_budget_are_dashes_and_never_zero(html):
@@ -161,54 +161,54 @@ def test_rotations_in_the_budget_are_dashes_and_never_zero(html):
         ["target_nominal", "target_place", "noise", "sigma0", "freedom", "iterations", "condition"],
     ],
 )
-def test_nothing_breaks_when_something_is_missing(tmp_path, lost):
+def test_missing_variables_are_accepted(tmp_path, lost):
     html = page(measured()[0].drop_vars(lost), tmp_path, raw=measured()[1])
     assert [title for title in HEADINGS if f"<h2>{title}</h2>" not in html] == []
     assert "nan" not in words(html).lower().split()
 
 
-def test_bare_errors_have_a_chapter_that_says_what_is_missing(tmp_path):
-    said = words(page(bare(), tmp_path))
+def test_a_chapter_of_only_errors_states_what_is_missing(tmp_path):
+    text = words(page(bare(), tmp_path))
     for sentence in ("There are no error vectors to draw", "The result holds no stations", "holds no residuals"):
-        assert sentence in said
+        assert sentence in text
 
 
-def test_alternating_scheme_is_reported_beside_ours_where_it_was_run(tmp_path):
+def test_alternating_scheme_is_reported_if_it_was_applied(tmp_path):
     html = words(
         page(bare(alternating_iterations=((), 715), alternating_left=((), 0.25e-6), iterations=((), 4)), tmp_path)
     )
     assert "iterations 4" in html
-    assert "iterations of the alternating scheme 715 its estimated remaining distance / µm 0.250" in html
+    assert "iterations of the alternating scheme 715 its estimated remaining error / µm 0.250" in html
 
 
-def test_targets_that_are_unknown_are_counted(tmp_path):
+def test_unknown_targets_are_counted(tmp_path):
     errors = measured()[0].copy(deep=True)
     for name in ("EX", "EY", "EZ", "covariance", "influence"):
         errors[name][{"target": [3, 4]}] = np.nan
     assert "The errors of 2 targets are unknown" in words(page(errors, tmp_path))
 
 
-def test_result_without_any_known_target_is_no_crash(tmp_path):
+def test_result_without_known_targets_is_reported(tmp_path):
     errors = bare()
     for name in ("EX", "EY", "EZ", "covariance"):
         errors[name] = np.nan * errors[name]
-    assert "The uncertainty of no target is known" in words(page(errors, tmp_path))
+    assert "the uncertainties of the targets are unknown" in words(page(errors, tmp_path))
 
 
-def test_given_up_target_is_named(tmp_path):
+def test_excluded_target_is_listed(tmp_path):
     errors = measured()[0].copy(deep=True)
     errors["left_out"][{"target": 5}] = 2
     assert "the wrong one is not determined: T006." in words(page(errors, tmp_path))
 
 
-def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
+def test_names_with_markup_are_escaped(tmp_path):
     errors = measured()[0]
     names = ["<b>&'S1", *errors["station"].values[1:].tolist()]
     html = page(errors.assign_coords(station=names), tmp_path)
     assert "<b>&'" not in html
 
 
-def test_plan_states_what_to_expect_and_no_errors(tmp_path):
+def test_plan_states_the_expected_uncertainty_and_no_errors(tmp_path):
     planned = bare(target_uncertainty=(("target",), np.full(12, UM)))
     html = page(planned, tmp_path)
     assert "The plan contains no better positions" in html
@@ -216,15 +216,15 @@ def test_plan_states_what_to_expect_and_no_errors(tmp_path):
     assert "Errors of the volume" not in html
 
 
-def test_plan_shows_the_best_places_beside_those_that_were_set(tmp_path):
+def test_plan_lists_best_and_set_positions(tmp_path):
     places = (("station", "direction"), 0.1 * np.arange(12.0).reshape(4, 3))
     best = (("station", "direction"), 0.1 * np.arange(12.0).reshape(4, 3) + 0.005)
     planned = bare(target_uncertainty=(("target",), np.full(12, UM)), station_place=places, best_place=best)
     assert "4 900 1000 1100 905 1005 1105" in words(page(planned, tmp_path))
 
 
-def test_view_turns_with_the_buttons():
-    """Each button shows its own picture; all pictures are of one scale, and every one is well-formed."""
+def test_view_is_selected_by_the_buttons():
+    """Each button shows one picture; all pictures have the same scale and are well-formed."""
     ends = np.array([[[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 2, 0]]], float)
     html = str(draw(Scene([Lines(ends, "#000000")]), "k"))
     pictures = re.findall(r"<svg id='(k-p\d+)'.*?</svg>", html)
@@ -257,7 +257,7 @@ def test_enlargement_is_a_round_number_and_never_reduces():
     assert enlargement(np.nan, 1.0) == 1
 
 
-def test_thinned_targets_are_distinct_and_hold_the_worst():
+def test_thinned_targets_are_distinct_and_include_the_worst():
     kept = thinned(np.arange(1000), 50, always=777)
     assert 777 in kept
     assert len(set(kept.tolist())) == kept.size <= 51
@@ -277,10 +277,10 @@ def test_a_plan_draws_its_map_and_lists_the_targets_to_measure(tmp_path):
     text = words(html)
     assert "Predicted uncertainty" in html
     assert "<image" not in html  # the colour bar is drawn in lines
-    assert "The gain in what was minimised is 3.00" in text
+    assert "Gain (minimised uncertainty as set / best): 3.00" in text
     assert "as set 3.00 2.00 1.00" in text
     assert "best, Z = 100 mm" in text
-    assert "3 100.0 0.0 200.0" in text  # the ninth of the places
+    assert "3 100.0 0.0 200.0" in text  # the ninth of the positions
     (tmp_path / "other").mkdir()
     assert "Predicted uncertainty" not in page(bare(), tmp_path / "other")
 

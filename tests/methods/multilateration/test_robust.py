@@ -1,4 +1,4 @@
-"""Wrong readings are found and named, or the target is given up; right ones are kept."""
+"""Outliers are found, or their target is excluded; correct readings are kept."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ FRINGE = 632.8e-9 / 2
 
 
 def readings(n, m=60, noise=1e-6, seed=0):
-    """Nominal targets, true ones (a machine with 5 um), and displacements."""
+    """Return nominal targets, true ones (errors of 5 um), and displacements."""
     rng = np.random.default_rng([3, seed])
     nominal = rng.uniform(-0.05, 0.05, (m, 3))
     true = nominal + rng.normal(0, 5e-6, (m, 3))
@@ -30,12 +30,12 @@ def readings(n, m=60, noise=1e-6, seed=0):
 
 @pytest.mark.parametrize("n", [4, 6])
 @pytest.mark.parametrize("by", [100e-6, -3e-3, 1.0])
-@pytest.mark.parametrize("rough", [True, False])
-def test_one_wrong_distance_is_named(n, by, rough):
+@pytest.mark.parametrize("approximate", [True, False])
+def test_one_wrong_distance_is_found(n, by, approximate):
     u, d = readings(n)
     right = solve(d, u, noise=1e-6)
     d[1, 7] += by
-    network = solve(d, u, STATION[:n] if rough else None, noise=1e-6)
+    network = solve(d, u, STATION[:n] if approximate else None, noise=1e-6)
     assert network.left_out == ((1, 7),)
     assert network.undecided == ()
     assert any("station 2 of target 8" in note for note in notes_of(network))
@@ -46,7 +46,7 @@ def test_one_wrong_distance_is_named(n, by, rough):
     assert right.left_out == ()
 
 
-def test_a_fringe_is_named_where_the_noise_is_below_it():
+def test_a_fringe_is_found_with_noise_below_it():
     # lambda / 2 of He-Ne; an interferometer with 30 nm and six stations.
     u, d = readings(6, noise=30e-9)
     d[2, 9] += FRINGE
@@ -54,7 +54,7 @@ def test_a_fringe_is_named_where_the_noise_is_below_it():
     assert network.left_out == ((2, 9),)
 
 
-def test_a_fringe_is_not_seen_in_a_micrometre_of_noise():
+def test_a_fringe_is_not_found_with_noise_of_one_micrometre():
     u, d = readings(4)
     d[2, 9] += FRINGE
     network = solve(d, u, noise=1e-6)
@@ -62,17 +62,17 @@ def test_a_fringe_is_not_seen_in_a_micrometre_of_noise():
     assert network.undecided == ()
 
 
-def test_a_target_is_given_up_where_nothing_tells_which_reading_is_wrong():
+def test_a_target_is_excluded_if_the_wrong_reading_is_not_determined():
     # Four stations: all four residuals of the target are alike, and the machine itself is off by more than a fringe.
     u, d = readings(4, noise=30e-9)
     d[2, 9] += FRINGE
     network = solve(d, u, noise=30e-9)
     assert network.undecided == (9,)
     assert np.isnan(network.target[9]).all()
-    assert any("it is not determined which: 10" in note for note in notes_of(network))
+    assert any("the wrong one is not determined (1): 10" in note for note in notes_of(network))
 
 
-def test_many_wrong_distances_of_all_sizes_are_named():
+def test_many_wrong_distances_of_all_sizes_are_found():
     u, d = readings(6)
     rng = np.random.default_rng(4)
     wrong = sorted((int(rng.integers(6)), int(i)) for i in rng.choice(60, 10, replace=False))
@@ -83,14 +83,14 @@ def test_many_wrong_distances_of_all_sizes_are_named():
     assert network.sigma0 == pytest.approx(1.0, abs=4 / np.sqrt(2 * network.freedom))
 
 
-def test_two_wrong_readings_of_one_target_are_named():
+def test_two_wrong_readings_of_one_target_are_found():
     u, d = readings(6)
     d[1, 7] += 200e-6
     d[4, 7] -= 90e-6
     assert sorted(solve(d, u, noise=1e-6).left_out) == [(1, 7), (4, 7)]
 
 
-def test_right_readings_are_kept():
+def test_correct_readings_are_kept():
     # One network in a hundred may lose one: three in forty would be a chance of 1e-2 of 1 %.
     lost = 0
     for seed in range(40):
@@ -99,7 +99,7 @@ def test_right_readings_are_kept():
     assert lost < 3
 
 
-def test_noise_stated_too_small_is_no_reason_to_leave_readings_out():
+def test_with_noise_stated_too_small_no_reading_is_ignored():
     u, d = readings(4, noise=5e-6)
     network = solve(d, u, noise=1e-6)
     assert network.left_out == ()
@@ -108,7 +108,7 @@ def test_noise_stated_too_small_is_no_reason_to_leave_readings_out():
 
 
 @pytest.mark.parametrize("n", [4, 6])
-def test_a_residual_is_reading_minus_model_left_out_or_not(n):
+def test_a_residual_is_reading_minus_model_also_of_outliers(n):
     u, d = readings(n)
     d[1, 7] += 100e-6
     d[0, 12] = np.nan
@@ -124,7 +124,7 @@ def test_a_residual_is_reading_minus_model_left_out_or_not(n):
     assert network.weight[1, 7] == 0
 
 
-def test_without_robust_all_count():
+def test_without_robust_all_readings_are_used():
     u, d = readings(4)
     d[1, 7] += 100e-6
     network = solve(d, u, noise=1e-6, robust=False)

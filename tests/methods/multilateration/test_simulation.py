@@ -1,4 +1,4 @@
-"""The tracker beside the virtual machine: what it reads, and the truth less the motion that distances do not see."""
+"""Tracker of the virtual machine: its readings, and the true errors without the undetermined rigid motion."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def machine():
     return VirtualMachine("cframe", seed=2)
 
 
-def test_readings_are_distances_less_the_dead_path(machine):
+def test_readings_are_distances_minus_the_dead_path(machine):
     q, U, L = simulation.target_grid(machine), simulation.stations(machine), np.array([0.1, 0.0, 0.2, 0.3])
     raw = simulation.raw(machine, q, U, seed=1, dead_path=L)
     datasets.validate(raw)
@@ -26,19 +26,19 @@ def test_readings_are_distances_less_the_dead_path(machine):
     assert abs(left.mean()) < 4 * NOISE / 20
 
 
-def test_one_seed_gives_one_dataset(machine):
+def test_a_seed_is_reproducible(machine):
     assert simulation.raw(machine, seed=1).identical(simulation.raw(machine, seed=1))
     assert not simulation.raw(machine, seed=1).identical(simulation.raw(machine, seed=2))
 
 
-def test_the_reflector_is_where_the_volume_error_takes_it(machine):
+def test_the_reflector_is_displaced_by_the_volumetric_error(machine):
     q = np.array([(0.1, -0.1, 0.2)])
     moved = machine.volumetric_truth(q).em.at(REFLECTOR)
     found = simulation.reflector_positions(machine, q)[0] - q[0] - REFLECTOR
     np.testing.assert_allclose(found, [float(moved[name].item()) for name in ("EX", "EY", "EZ")], atol=1e-18)
 
 
-def test_the_truth_has_no_motion_of_the_whole(machine):
+def test_the_true_errors_have_no_rigid_motion(machine):
     q = simulation.target_grid(machine, (4, 3, 3))
     truth = simulation.true_errors(machine, q)
     error = np.stack([truth[name].values for name in ("EX", "EY", "EZ")], axis=-1)
@@ -47,7 +47,7 @@ def test_the_truth_has_no_motion_of_the_whole(machine):
     assert error.std() > 1e-6
 
 
-def test_broken_beams_and_drift_are_as_asked(machine):
+def test_broken_beams_and_drift_are_as_stated(machine):
     still, broken = (simulation.raw(machine, seed=3, missing=share) for share in (0.0, 0.3))
     assert not np.isnan(still["displacement"]).any()
     assert float(np.isnan(broken["displacement"]).mean()) == pytest.approx(0.3, abs=0.1)
@@ -59,11 +59,11 @@ def test_broken_beams_and_drift_are_as_asked(machine):
 
 
 def test_targets_out_of_the_travel_are_refused(machine):
-    with pytest.raises(BenchError, match=r"Axis Z travels from 0 to 0\.46 m"):
+    with pytest.raises(BenchError, match=r"Axis Z: expected targets within the travel, 0 to 0\.46 m"):
         simulation.raw(machine, [[0.0, 0.0, 0.5]], seed=1)
 
 
-def test_the_layout_of_the_settings_is_simulated_with_its_truth():
+def test_the_layout_of_the_settings_is_simulated_with_its_true_errors():
     settings = Settings(layout={"count": (4, 4, 3), "reflector": ("20 mm", "0 mm", "-80 mm")})
     raw, truth = Multilateration.simulate(settings, 4)
     datasets.validate(raw)

@@ -1,4 +1,4 @@
-"""Targets and stations from displacements: exact on exact ones, best on noisy ones, honest about their worth."""
+"""Targets and stations from displacements: exact, optimal with noise, and with a correct uncertainty."""
 
 import numpy as np
 import pytest
@@ -35,8 +35,8 @@ def measured(target, station, noise=0.0, seed=0, dead_path=0.3):
     return d + np.random.default_rng([7, seed]).normal(0.0, 1.0, d.shape) * noise
 
 
-def dense_covariance(target, station, weight, carries):
-    """Covariance of (targets, stations) under inner constraints on some targets, from the full bordered system."""
+def dense_covariance(target, station, weight, in_datum):
+    """Return the covariance of (targets, stations) with inner constraints on targets, from the full bordered system."""
     m, n = len(target), len(station)
     known = weight > 0
     stations = Stations(station, np.zeros(n), np.zeros(0))
@@ -45,7 +45,7 @@ def dense_covariance(target, station, weight, carries):
     size = np.sqrt(np.mean((target - centre) ** 2))
     G = np.zeros((3 * m + 4 * n, 6))
     G[: 3 * m] = motions(target, centre).reshape(3 * m, 6) / [1, 1, 1, size, size, size]
-    G[: 3 * m][np.repeat(~carries, 3)] = 0.0
+    G[: 3 * m][np.repeat(~in_datum, 3)] = 0.0
     # Scaled to one, so that the bordered matrix loses no digits.
     s = np.linalg.norm(J)
     N = np.block([[J.T @ J / s**2, G], [G.T, np.zeros((6, 6))]])
@@ -53,7 +53,7 @@ def dense_covariance(target, station, weight, carries):
 
 
 @pytest.mark.parametrize("n", [4, 5, 6])
-def test_exact_distances_give_exact_places(n):
+def test_exact_distances_determine_exact_positions(n):
     u = nominal_targets(25)
     shifted = u + np.random.default_rng(1).normal(0, 20e-6, u.shape)
     network = solve(measured(shifted, NEAR[:n]), u, NEAR[:n] + 5e-3, noise=NOISE)
@@ -93,10 +93,10 @@ def test_agrees_with_a_dense_least_squares_solver(n):
     assert np.abs(between - np.linalg.norm(target[:, None] - target, axis=-1)).max() < 1e-11
     assert network.sigma0 == pytest.approx(np.sqrt(2 * found.cost / network.freedom), rel=1e-9)
     assert network.freedom == 15 * (n - 3) - (4 * n - 6)
-    assert stations.place.shape == network.station.shape
+    assert stations.position.shape == network.station.shape
 
 
-def test_a_free_network_lies_on_the_nominal_targets():
+def test_a_free_network_is_fitted_to_the_nominal_targets():
     u = nominal_targets(40)
     true = u + np.random.default_rng(1).normal(0, 20e-6, u.shape)
     # Where the whole stands and how it is turned cannot be seen in distances.
@@ -120,7 +120,7 @@ def test_covariances_are_those_of_the_full_system(n, missing):
     for i in rng.choice(20, missing, replace=False):
         seen[rng.integers(n), i] = False
     network = bound(u, NEAR[:n], noise=noise, seen=seen)
-    C = dense_covariance(u, NEAR[:n], np.where(seen, 1 / noise, 0.0), network.carries)
+    C = dense_covariance(u, NEAR[:n], np.where(seen, 1 / noise, 0.0), network.in_datum)
     scale = np.abs(C[:60, :60]).max()
     blocks = C[:60, :60].reshape(20, 3, 20, 3)[np.arange(20), :, np.arange(20)]
     # Eight digits: the condition of the bordered system is its square.
@@ -133,12 +133,12 @@ def test_redundancies_are_those_of_the_hat_matrix():
     u = nominal_targets(14)
     network = bound(u, NEAR[:5], noise=NOISE)
     J = jacobian(u, network.stations, np.ones((5, 14), dtype=bool)).toarray() / NOISE
-    hat = J @ dense_covariance(u, NEAR[:5], np.full((5, 14), 1 / NOISE), network.carries) @ J.T
+    hat = J @ dense_covariance(u, NEAR[:5], np.full((5, 14), 1 / NOISE), network.in_datum) @ J.T
     assert np.abs(network.redundancy.T.ravel() - (1 - np.diag(hat))).max() < 1e-6
     assert network.redundancy.sum() == pytest.approx(network.freedom, rel=1e-8)
 
 
-def test_influence_and_own_parts_make_the_covariance_of_many_targets():
+def test_influence_and_independent_parts_sum_to_the_covariance():
     u = nominal_targets(2000)
     network = bound(u, NEAR[:4], noise=NOISE)
     F = network.influence()
@@ -149,7 +149,7 @@ def test_influence_and_own_parts_make_the_covariance_of_many_targets():
     assert np.abs(joint[0, :, 1] - between).max() < 6 / (3 * 2000) * 5 * np.abs(joint[0, :, 0]).max()
 
 
-def test_states_what_it_is_worth():
+def test_stated_uncertainty_is_correct():
     u, seeds = nominal_targets(40), 60
     truth = bound(u, NEAR[:4], noise=NOISE)
     targets, stations, squares = [], [], []
@@ -176,7 +176,7 @@ def test_states_what_it_is_worth():
     assert abs(np.mean(np.abs(places) < norm.isf(0.025)) - 0.95) < 4 * np.sqrt(0.95 * 0.05 / (seeds * 4))
 
 
-def test_the_relative_formulation_costs_what_it_says():
+def test_the_relative_formulation_has_the_predicted_covariance():
     u, seeds = nominal_targets(40), 60
     covariance, _, stated = relative_bound(u, NEAR[:4], noise=NOISE)
     free = bound(u, NEAR[:4], noise=NOISE)
@@ -195,7 +195,7 @@ def test_the_relative_formulation_costs_what_it_says():
 
 
 @pytest.mark.parametrize("off", [1e-6, 300e-6, 1e-3])
-def test_a_sample_first_leads_where_all_targets_lead(off):
+def test_the_start_from_a_sample_has_the_same_solution(off):
     # 3000 targets are preceded by a sample; with a further parameter that is held at 0 they are not.
     u = nominal_targets(3000)
     true = u + np.random.default_rng(1).normal(0, off, u.shape)
@@ -208,7 +208,7 @@ def test_a_sample_first_leads_where_all_targets_lead(off):
     assert np.nanmax(np.abs(sampled.target - whole.target)) < 1e-12
 
 
-def test_what_follows_is_the_same_whenever_it_is_asked_for():
+def test_cached_quantities_do_not_depend_on_the_order_of_access():
     # Readings may change hands after a solution: what it is asked for later is of the readings that it had.
     u = nominal_targets(40)
     d = measured(u, NEAR[:4], NOISE)
@@ -220,7 +220,7 @@ def test_what_follows_is_the_same_whenever_it_is_asked_for():
     assert np.array_equal(late.target_covariance, early.target_covariance)
 
 
-def test_missing_distances_cost_what_the_bound_says():
+def test_missing_distances_increase_the_uncertainty_as_predicted():
     u = nominal_targets(30)
     d = measured(u, NEAR[:4], NOISE)
     d[:2, 4], d[3, 11], d[0, 20] = np.nan, np.nan, np.nan
@@ -231,10 +231,10 @@ def test_missing_distances_cost_what_the_bound_says():
     # Three distances give a place, but say nothing about the stations.
     assert network.freedom == 30 - 3 - 10
     assert network.uncertainty[11] > np.nanmedian(network.uncertainty)
-    assert any("no place (1 of them): 5" in note for note in notes_of(network))
+    assert any("without a position (1): 5" in note for note in notes_of(network))
 
 
-def test_a_worse_station_counts_less():
+def test_a_less_accurate_station_has_less_weight():
     u = nominal_targets(60)
     sigma = np.array([1e-6, 1e-6, 1e-6, 1e-6, 20e-6])
     d = measured(u, NEAR[:5], sigma[:, None])
@@ -245,7 +245,7 @@ def test_a_worse_station_counts_less():
     assert (network.uncertainty > bound(u, NEAR[:5], noise=NOISE).uncertainty).all()
 
 
-def test_known_dead_paths_make_better_targets():
+def test_known_dead_paths_reduce_the_uncertainty():
     u = nominal_targets(40)
     d = measured(u, NEAR[:4], NOISE)
     true = 0.3 + 0.01 * np.arange(4)
@@ -259,7 +259,7 @@ def test_known_dead_paths_make_better_targets():
     assert fixed.freedom == free.freedom + 4 == roughly.freedom
 
 
-def test_a_further_parameter_is_found_with_its_uncertainty():
+def test_a_further_parameter_is_estimated_with_its_uncertainty():
     u = nominal_targets(80)
     # One station's displacements are off in proportion to the time of the reading.
     time = np.zeros((1, 4, 80))
@@ -272,7 +272,7 @@ def test_a_further_parameter_is_found_with_its_uncertainty():
     assert 1e-4 < chi2.cdf(np.sum(np.square(found)), 40) < 1 - 1e-4
 
 
-def test_response_foretells_what_a_change_of_readings_does():
+def test_response_predicts_the_effect_of_a_change_of_readings():
     u = nominal_targets(40)
     d = measured(u, NEAR[:4], NOISE)
     d[1, 3] = np.nan
@@ -286,7 +286,7 @@ def test_response_foretells_what_a_change_of_readings_does():
     assert np.abs(moved - parameters.reshape(4, 4)[:, :3].ravel()).max() < 2e-3 * np.abs(moved).max()
 
 
-def test_far_off_rough_places_do_no_harm():
+def test_inaccurate_approximate_positions_have_no_effect():
     u = nominal_targets(30)
     d = measured(u, NEAR[:4], NOISE)
     near = solve(d, u, NEAR[:4], noise=NOISE)
@@ -297,14 +297,14 @@ def test_far_off_rough_places_do_no_harm():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"target": np.zeros((9, 3))}, r"expected displacements \(station, target\)"),
-        ({"noise": 0.0}, "expected a positive standard deviation"),
-        ({"noise": np.ones(3)}, "expected noise as one value"),
-        ({"station": np.zeros((3, 3))}, "expected approximate positions"),
-        ({"extra": np.zeros((1, 4, 3))}, "expected further parameters"),
+        ({"target": np.zeros((9, 3))}, r"Expected displacements \(station, target\)"),
+        ({"noise": 0.0}, "Expected a positive standard deviation"),
+        ({"noise": np.ones(3)}, "Expected the noise as one value"),
+        ({"station": np.zeros((3, 3))}, "Expected approximate positions"),
+        ({"extra": np.zeros((1, 4, 3))}, "Expected further parameters"),
     ],
 )
-def test_refuses_shapes_that_do_not_fit(change, message):
+def test_wrong_shapes_are_refused(change, message):
     u = nominal_targets(12)
     given = {"target": u, "station": NEAR[:4], "noise": NOISE} | change
     with pytest.raises(MethodError, match=message):

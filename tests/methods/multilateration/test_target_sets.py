@@ -1,4 +1,4 @@
-"""Which targets to measure: against chance, against what is then measured, within lines of sight, and wrong input."""
+"""Choice of targets: compared with random ones and simulated measurements, lines of sight, and wrong input."""
 
 import tomllib
 
@@ -39,7 +39,7 @@ def cost(worth, minimise):
 
 @pytest.mark.parametrize("kind", ["target", "axes"])
 @pytest.mark.parametrize("minimise", ["largest", "mean"])
-def test_the_chosen_set_is_better_than_the_best_of_many_drawn_by_chance(kind, minimise):
+def test_the_chosen_set_is_better_than_the_best_of_many_random_ones(kind, minimise):
     v = volume(kind)
     chosen = v.choose(20, minimise)
     assert len(set(chosen)) == 20
@@ -51,7 +51,7 @@ def test_the_chosen_set_is_better_than_the_best_of_many_drawn_by_chance(kind, mi
     assert found < 0.8 * np.mean([cost(each, minimise) for each in drawn])
 
 
-def test_no_exchange_of_one_target_for_another_helps_any_more():
+def test_no_exchange_of_one_target_improves_the_choice():
     v = volume("target")
     chosen = v.choose(12, "mean")
     found = np.mean(v.worth(chosen))
@@ -61,7 +61,7 @@ def test_no_exchange_of_one_target_for_another_helps_any_more():
             assert np.mean(v.worth([*chosen[:out], *chosen[out + 1 :], new])) > found * (1 - 1e-4)
 
 
-def test_with_all_candidates_measured_a_target_is_worth_what_the_bound_says_of_it():
+def test_with_all_candidates_measured_the_uncertainty_is_that_of_the_bound():
     place = GRID + REFLECTOR
     everything = bound(place, STATIONS, noise=NOISE)
     own = np.sqrt(np.trace(everything.target_covariance, axis1=1, axis2=2))
@@ -69,7 +69,7 @@ def test_with_all_candidates_measured_a_target_is_worth_what_the_bound_says_of_i
     np.testing.assert_allclose(volume("target").worth(range(len(place))), own, rtol=0.04)
 
 
-def test_the_prediction_for_a_further_target_is_the_scatter_of_what_is_measured():
+def test_the_prediction_for_a_further_target_is_the_scatter_of_measurements():
     v = volume("target")
     chosen = np.array(v.choose(20, "largest"))
     place = GRID + REFLECTOR
@@ -96,7 +96,7 @@ def test_the_prediction_for_a_further_target_is_the_scatter_of_what_is_measured(
     assert np.mean(scatter / v.worth(chosen)) == pytest.approx(1.0, abs=0.05)
 
 
-def test_the_prediction_of_the_axes_is_the_scatter_of_what_is_fitted():
+def test_the_prediction_for_the_axes_is_the_scatter_of_fits():
     v = volume("axes")
     chosen = np.array(v.choose(40, "mean"))
     expected = Expected.of(CHAIN, GRID, REFLECTOR, 4, 10e-6, 20e-6)
@@ -123,7 +123,7 @@ def test_the_prediction_of_the_axes_is_the_scatter_of_what_is_fitted():
     assert scatter == pytest.approx(np.sqrt(np.mean(v.worth(chosen) ** 2)), rel=0.2)
 
 
-def test_targets_that_are_not_seen_are_not_chosen():
+def test_targets_that_are_not_visible_are_not_chosen():
     place = GRID + REFLECTOR
     sight = Sight.of(Planning(obstacles=({"low": (-0.5, -0.45, -0.4), "high": (-0.3, 0.0, 0.9)},), acceptance=np.pi))
     sees = sight.sees(STATIONS, place)
@@ -163,7 +163,7 @@ def made():
     return planned()
 
 
-def test_a_plan_shows_the_volume_the_gain_and_the_targets(made):
+def test_a_plan_states_the_volume_the_gain_and_the_targets(made):
     settings, ds = made
     datasets.validate(ds)
     assert ds["map_uncertainty"].shape == (2, 64)
@@ -172,8 +172,8 @@ def test_a_plan_shows_the_volume_the_gain_and_the_targets(made):
     assert float(ds["gain"]) == pytest.approx(own / best)
     assert best < own
     text = "\n".join(ds.attrs["notes"])
-    assert "Of 64 candidates 27 targets are chosen" in text
-    assert "times smaller. Stations at (mm)" in text
+    assert "27 of 64 candidates are chosen as targets" in text
+    assert "smaller by the factor" in text
     assert "Uncertainty over the volume, um, as set | best" in text
     station = ds["best_place"].values
     for U, box in zip(station, settings.planning.boxes, strict=True):
@@ -181,7 +181,7 @@ def test_a_plan_shows_the_volume_the_gain_and_the_targets(made):
         assert np.all(np.array(box.high) + 1e-12 >= U)
 
 
-def test_what_was_chosen_is_seen_within_the_acceptance_of_the_reflector(made):
+def test_chosen_targets_are_within_the_acceptance_angle_of_the_reflector(made):
     _, ds = made
     place = ds["map_position"].values + REFLECTOR
     chosen = ds["chosen"].values == 1
@@ -193,7 +193,7 @@ def test_what_was_chosen_is_seen_within_the_acceptance_of_the_reflector(made):
     assert (seen.sum(axis=0)[chosen] >= 3).all()
 
 
-def test_a_campaign_measures_what_the_plan_chose(made, tmp_path):
+def test_a_campaign_measures_the_chosen_targets(made, tmp_path):
     _, ds = made
     text = tomllib.loads(ds.attrs["best_layout"])["test"]["settings"]["layout"]
     again = Settings(layout=text)
@@ -217,23 +217,23 @@ def test_a_campaign_measures_what_the_plan_chose(made, tmp_path):
 
 def test_a_budget_of_time_is_a_number_of_targets():
     assert Choosing(time="10 min", time_per_target="15 s").wanted == 40
-    with pytest.raises(ValueError, match="one of both"):
+    with pytest.raises(ValueError, match="either count"):
         Choosing(time="10 min", count=3)
-    with pytest.raises(ValueError, match="one of both"):
+    with pytest.raises(ValueError, match="either count"):
         Choosing()
 
 
-def test_wrong_wishes_are_refused_with_what_to_do():
-    with pytest.raises(MethodError, match=r"expected at most 64 targets.*found 65. Choose fewer"):
+def test_wrong_settings_are_refused_with_a_remedy():
+    with pytest.raises(MethodError, match=r"Expected at most 64 targets.*found 65. Choose fewer"):
         planned(count=65)
-    with pytest.raises(MethodError, match=r"at least 10 targets, which 4 stations.*found 9. Choose more"):
+    with pytest.raises(MethodError, match=r"at least 10 targets for 4 stations.*found 9. Choose more"):
         planned(count=9)
     travel = {"low": (-0.3, -0.2, 0.1), "high": (0.3, 0.2, 0.5)}
-    with pytest.raises(MethodError, match=r"reaches beyond the travel from \(-300, -200, 100\) mm"):
+    with pytest.raises(MethodError, match=r"expected a box within the travel, \(-300, -200, 100\) mm"):
         planned(travel=travel)
-    with pytest.raises(ValueError, match="both corners"):
+    with pytest.raises(ValueError, match="both low and high, the corners"):
         Choosing(count=12, low=(0, 0, 0))
-    with pytest.raises(MethodError, match="chain of the machine is needed"):
+    with pytest.raises(MethodError, match="chain: expected the chain of the machine"):
         plan(
             Multilateration.info,
             Settings(layout=SETTINGS["layout"], planning={"targets": {"count": 20, "candidates": (3, 3, 3)}}),
@@ -241,7 +241,7 @@ def test_wrong_wishes_are_refused_with_what_to_do():
 
 
 @pytest.mark.parametrize(("stations", "least"), [(4, 10), (5, 7), (6, 6), (8, 6)])
-def test_the_least_number_of_targets_is_that_of_the_unknowns(stations, least):
+def test_the_minimum_number_of_targets_is_that_of_the_unknowns(stations, least):
     # n m readings for 3 m + 4 n - 6 unknowns.
     assert stations * least >= 3 * least + 4 * stations - 6
     assert stations * (least - 1) < 3 * (least - 1) + 4 * stations - 6

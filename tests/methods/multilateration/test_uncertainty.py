@@ -1,4 +1,4 @@
-"""Results of many targets, put together in blocks: the same as in one piece."""
+"""Results of many targets, calculated in blocks, agree with those in one piece."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def raw():
     return simulation.raw(machine, np.concatenate([q, q[::4]]), seed=1, missing=0.04, repeatability=1e-6)
 
 
-def test_blocks_make_no_difference(raw, monkeypatch):
+def test_the_block_size_has_no_effect(raw, monkeypatch):
     settings = Settings(scale_uncertainty="1 um/m", expansion={"coefficient": 11.5e-6, "temperature": 23.0})
     whole = Multilateration().identify(raw, settings)
     monkeypatch.setattr(uncertainty, "BLOCK", 7)

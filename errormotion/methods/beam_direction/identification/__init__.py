@@ -1,1 +1,1 @@
-"""Identification: beam direction, from raw data to errors with covariance."""
+"""Identification of the direction of a beam: from raw data to errors with covariance."""

@@ -3,7 +3,7 @@
 A reading r of a plane with the tilt q is r = d + (d - m) k(q). On one plane q is the same for all readings, so that the
 compensated gradient is g / (1 + k) and the compensated offset m + (offset - m) / (1 + k): no second
 fit is needed. The normal is N = g / |g| for any k. The tilt depends on the beam and the beam on the gradients: both are
-found in turn until the direction converges. Source: Lu et al., section 3.3, whose iteration is over the readings.
+determined alternately until the direction converges. Source: Lu et al., section 3.3, where the readings are iterated.
 
 Uncertainties are propagated through the iteration. With du = M dk the effect of the slopes on the direction and
 H = dk/du that of the direction on the slopes, any other change is multiplied by (1 - M H)^-1.
@@ -31,10 +31,11 @@ if TYPE_CHECKING:
 CALIBRATION, TRIANGULATION, SCALE = "inclination calibration", "triangulation plane", "scale of the sensor"
 """Sources common to all planes: the first two with compensation of the inclination error, the last one without."""
 _STEP = 1e-5
-_LARGEST = 0.2
+"""Change of the direction for numerical derivatives, rad."""
+_MAX_SLOPE = 0.2
 _NEGLIGIBLE = 1e-12
 SAME_TILT = 0.01
-"""Difference of tilts, rad, up to which a part of the calibration has the same effect in two datasets."""
+"""Difference of tilts up to which a component of the calibration has the same effect in two datasets, rad."""
 
 
 @dataclass(frozen=True)
@@ -116,11 +117,11 @@ class Converged:
     planes : Planes
         Compensated.
     tilt : ndarray (k, 2) or None
-        Of each plane to the beam; None where nothing was compensated.
+        Of each plane to the beam; None without compensation.
     slope : ndarray (k,)
         Of the inclination error on each plane.
     slope_by_direction : ndarray (k, 3)
-        Its change with the direction.
+        Its derivative by the direction.
     sources, groups : tuple of str
         Sources common to the slopes, and their groups in the budget.
     slope_by_source : ndarray (source, k)
@@ -128,7 +129,7 @@ class Converged:
     mid_range : float
         m.
     iterations : int
-        0 where nothing was compensated.
+        0 without compensation.
     """
 
     direction: Direction
@@ -144,13 +145,13 @@ class Converged:
 
 
 def uncompensated(planes: Planes, nominal: Array, scale_uncertainty: float = 0.0, mid_range: float = 0.0) -> Converged:
-    """Return the direction from the readings as they are.
+    """Return the direction without compensation of the readings.
 
     Parameters
     ----------
     planes : Planes
     nominal : ndarray (3,)
-        Rough direction.
+        Approximate direction.
     scale_uncertainty : float
         Relative standard uncertainty of the readings' scale about ``mid_range`` (m), common to all planes.
     """
@@ -171,14 +172,14 @@ def uncompensated(planes: Planes, nominal: Array, scale_uncertainty: float = 0.0
 
 
 def converge(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, max_iterations: int) -> Converged:
-    """Compensate and solve in turn until the direction converges.
+    """Compensate and solve alternately until the direction converges.
 
     Parameters
     ----------
     planes : Planes
         As read.
     nominal : ndarray (3,)
-        Rough direction.
+        Approximate direction.
     sensor : Sensor
     tolerance : float
         Change of the direction at convergence, rad.
@@ -196,8 +197,8 @@ def converge(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, m
     while True:
         slope = sensor.slopes(u, normals)
         _check_slopes(slope, planes.names)
-        now = planes.compensated(slope, sensor.mid_range)
-        direction = now.direction(nominal)
+        compensated = planes.compensated(slope, sensor.mid_range)
+        direction = compensated.direction(nominal)
         steps.append(direction.direction - u)
         u = direction.direction
         if np.linalg.norm(steps[-1]) < tolerance:
@@ -210,7 +211,9 @@ def converge(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, m
     for e in np.eye(2):
         ahead, behind = (sensor.slopes(turned(u, sign * _STEP * e), normals) for sign in (1, -1))
         by_direction += np.outer((ahead - behind) / (2 * _STEP), e @ across(u))
-    return Converged(direction, now, q, slope, by_direction, sources, groups, by_source, sensor.mid_range, len(steps))
+    return Converged(
+        direction, compensated, q, slope, by_direction, sources, groups, by_source, sensor.mid_range, len(steps)
+    )
 
 
 def _slope_sources(sensor: Sensor, q: Array) -> tuple[tuple[str, ...], tuple[str, ...], Array]:
@@ -232,35 +235,35 @@ def _slope_sources(sensor: Sensor, q: Array) -> tuple[tuple[str, ...], tuple[str
 
 
 def identities(converged: Converged, sensor: Sensor | None) -> dict[str, str]:
-    """Return the identity of each source that is a part of the sensor's calibration, by its name.
+    """Return the identity of each source that is a component of the sensor's calibration, by its name.
 
-    Part i is a combination of the calibrated coefficients that depends on the tilts of the planes. It is the same draw
-    in two datasets with the same calibration and the same tilts, to `SAME_TILT`, if it has the same sense on the plane
-    that it moves most.
+    Component i is a combination of the calibrated coefficients that depends on the tilts of the planes. Its error is
+    the same in two datasets with the same calibration and the same tilts, to `SAME_TILT`, if it has the same sign on
+    the plane with the largest effect.
     """
     if sensor is None or converged.tilt is None:
         return {}
     tilts = np.round(converged.tilt / SAME_TILT) + 0.0
     reference = sensor.calibration.reference()["hash"]
-    found = {}
+    result = {}
     for i, (name, row) in enumerate(zip(converged.sources, converged.slope_by_source, strict=True)):
         if name.startswith(CALIBRATION):
-            most = int(np.argmax(np.abs(row)))
-            along = (most, np.sign(row[most]))
-            found[name] = identity(reference, tilts, part=f"part {i + 1}", along=along)
-    return found
+            largest = int(np.argmax(np.abs(row)))
+            along = (largest, np.sign(row[largest]))
+            result[name] = identity(reference, tilts, part=f"part {i + 1}", along=along)
+    return result
 
 
 def _check_slopes(slope: Array, names: Sequence[str]) -> None:
     for name, k in zip(names, slope, strict=True):
         if np.isnan(k):
             raise MethodError(
-                f"{name}: during the compensation, the beam met its back. Check the nominal direction and that the "
-                "calibration belongs to this sensor."
+                f"{name}: during the compensation, the beam met the back of the plane. Check the nominal direction, "
+                "and that the calibration belongs to this sensor."
             )
-        if abs(k) > _LARGEST:
+        if abs(k) > _MAX_SLOPE:
             raise MethodError(
-                f"{name}: the inclination error by the calibration is {k:.0%} of the depth; expected a few per cent at "
+                f"{name}: the inclination error of the calibration is {k:.0%} of the depth; expected a few per cent at "
                 "most. Check that the calibration belongs to this sensor and covers this inclination."
             )
 
@@ -269,18 +272,15 @@ def _not_converged(steps: list[Array], tolerance: float) -> str:
     size = np.linalg.norm(steps, axis=1)
     back = float(steps[-1] @ steps[-2]) / max(size[-1] * size[-2], 1e-300) if len(steps) > 1 else 0.0
     factor = size[-1] / size[-2] if len(steps) > 1 else np.nan
-    if back < -0.5:
-        how = f"the steps alternate, each {factor:.2g} times the previous one"
-    elif factor >= 1:
-        how = f"the steps increase, each {factor:.2g} times the previous one"
+    trend = "alternate" if back < -0.5 else "increase" if factor >= 1 else "decrease"
+    rate = f"; the steps {trend}, each {factor:.2g} times the previous one" if len(steps) > 1 else ""
+    if 0 < factor < 0.9:
+        more = int(np.ceil(np.log(tolerance / size[-1]) / np.log(factor)))
+        action = f"At this rate {more} more iterations are needed: increase max_iterations."
     else:
-        how = f"the steps decrease, each {factor:.2g} times the previous one" if len(steps) > 1 else "after one step"
-    needs = (
-        f" At this rate {int(np.ceil(np.log(tolerance / size[-1]) / np.log(factor)))} more are needed (max_iterations)."
-        if 0 < factor < 0.9
-        else " The inclination error depends too strongly on the tilt: use planes with less inclination."
-    )
+        action = "The inclination error depends too strongly on the tilt: use planes with less inclination."
+    count = f"{len(steps)} iteration{'s' if len(steps) > 1 else ''}"
     return (
-        f"The compensation of the inclination error does not converge: after {len(steps)} iterations the direction "
-        f"changed by {size[-1]:.2g} rad, expected less than {tolerance:.2g} rad; {how}.{needs}"
+        f"The compensation of the inclination error does not converge: in the last of {count} the direction changed by "
+        f"{size[-1]:.2g} rad; expected less than {tolerance:.2g} rad{rate}. {action}"
     )

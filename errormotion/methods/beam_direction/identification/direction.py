@@ -1,16 +1,17 @@
-"""Direction of a beam from the change of its readings on planes.
+"""Direction of a beam from the gradients of its readings on planes.
 
-The zero point of the sensor is at p0 + s, s the stage position, and reads d along the unit vector u until the plane
-N . (x - P) = 0 is met: N . (p0 + s + u d - P) = 0. So the gradient of the reading is g = -N / (N . u), and each plane,
-whatever its normal, sets one condition: g . u = -1. With N towards the sensor N . u < 0, so that N = g / |g|.
+With the zero point of the sensor at p0 + s, where s is the stage position, the reading d along the unit vector u of the
+beam ends at the plane N . (x - P) = 0: N . (p0 + s + u d - P) = 0. The gradient of the reading is therefore
+g = -N / (N . u), and each plane, with any normal, is one condition g . u = -1. With N towards the sensor N . u < 0, so
+that N = g / |g|.
 
-Measured gradients g_k have covariances S_k. Over all true gradients gamma_k that meet their condition the likelihood is
-greatest at gamma_k = g_k - S_k u c_k / (u . S_k u), with c_k = g_k . u + 1; it remains to minimise
+Measured gradients g_k have covariances S_k. Over all true gradients gamma_k that meet their condition, the maximum of
+the likelihood is at gamma_k = g_k - S_k u c_k / (u . S_k u), with c_k = g_k . u + 1; it remains to minimise
 
     chi2(u) = sum_k c_k^2 / (u . S_k u)    under |u| = 1,
 
-the exact profile likelihood: nothing is linearised and no prior knowledge of the planes is used. The information about
-u is sum_k gamma_k gamma_k^T / (u . S_k u), across u; its inverse is both the covariance and the Cramer-Rao bound.
+the exact profile likelihood, without linearisation and without prior knowledge of the planes. The information about u
+is sum_k gamma_k gamma_k^T / (u . S_k u), across u; its inverse is both the covariance and the Cramer-Rao bound.
 
 A step by the angle w across u changes each c_k by gamma_k . w + w^2 / 2 to second order, since gamma_k . u = -1. The
 ratio of the second part to one standard deviation is the ``curvature``: with two planes it is the standard uncertainty
@@ -33,16 +34,17 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-GRAZING = 10.0
-"""Largest gradient: the beam meets the plane at 6 degrees, and a micrometre across it is ten along the beam."""
-LEAST_GRADIENT = 0.8
-"""Least gradient: -N / (N . u) is 1 or more, whatever the plane; a sensor's inclination error is a few per cent."""
-AS_CLOSE = 0.8
-"""Two roots whose angles to the nominal direction have at least this ratio are not distinguished by it."""
+MAX_GRADIENT = 10.0
+"""At larger gradients the beam grazes the plane, at less than 6 degrees: 1 um across it is 10 um along the beam."""
+MIN_GRADIENT = 0.8
+"""-N / (N . u) is 1 or more for any plane; a sensor's inclination error is a few per cent."""
+SAME_ANGLE = 0.8
+"""Ratio of the angles of two roots to the nominal direction, from which on it does not distinguish them."""
 EXCLUDED = 25.0
-"""A root whose chi2 is greater by this is no root of the same data (5 standard deviations)."""
-_STRONGLY_CURVED = 1 / 6
+"""Difference of chi2 from which on a root is excluded by the data (5 standard deviations)."""
+_MAX_CURVATURE = 1 / 6
 _PARALLEL = 5.0
+"""Standard deviations below which an angle between normals is not significant."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +56,13 @@ class Direction:
     direction : ndarray (3,)
         Unit vector towards the target.
     covariance : ndarray (3, 3)
-        Of it; rank 2, since it keeps its length.
+        Of the direction; rank 2, since its length is 1.
     by_gradient : ndarray (3, k, 3)
-        Change of the direction with each gradient.
+        Derivative of the direction by each gradient.
     discrepancy : ndarray (k,)
-        g . u + 1 of the gradients as measured.
+        g . u + 1 of the measured gradients.
     closure, closure_u : ndarray (k,)
-        The same, and its standard deviation by the noise; both 0 where two planes meet the condition exactly.
+        The same, and its standard deviation by the noise; both 0 for two planes, which meet the condition exactly.
     other_root : ndarray (3,) or None
         Another direction that fits equally well.
     gradients_fitted : ndarray (k, 3)
@@ -96,7 +98,7 @@ def solve(gradients: Array, covariances: Array, nominal: Array, names: Sequence[
     covariances : ndarray (k, 3, 3)
         Of each gradient; planes are independent.
     nominal : ndarray (3,)
-        Rough direction, from sensor to target: decides between two roots.
+        Approximate direction, from sensor to target, which selects one of two roots.
     names : sequence of str, optional
         Names of the planes in messages.
 
@@ -114,20 +116,19 @@ def solve(gradients: Array, covariances: Array, nominal: Array, names: Sequence[
     others = [root for root in roots[1:] if root[0] < chi2 + EXCLUDED]
     if u @ nominal < 0:
         raise MethodError(
-            f"The beam has the direction {_vector(u)}, {_degrees(_angle(u, nominal))} off the nominal direction "
-            f"{_vector(nominal)}, with the opposite sign. Check that the nominal direction points from the sensor to "
-            "the "
-            "target, that readings increase with the distance, and whether the stage carries the sensor or the target "
-            "(setting moves)."
+            f"The direction of the beam {_vector(u)} differs by {_degrees(_angle(u, nominal))} from the nominal "
+            f"direction {_vector(nominal)} and has the opposite sign. Check that the nominal direction points from the "
+            "sensor to the target, that readings increase with the distance, and whether the stage carries the sensor "
+            "or the target (setting moves)."
         )
     other = others[0][1] if others else None
-    if other is not None and _angle(u, nominal) > AS_CLOSE * _angle(other, nominal):
+    if other is not None and _angle(u, nominal) > SAME_ANGLE * _angle(other, nominal):
         better = others[0][0] < chi2 - EXCLUDED
         if not better and _angle(u, other) > 1e-6:
             raise MethodError(
-                f"Two directions fit: {_vector(u)} and {_vector(other)}, {_degrees(_angle(u, nominal))} and "
-                f"{_degrees(_angle(other, nominal))} off the nominal direction, which does not distinguish them. "
-                "Give a better nominal direction, or measure a third plane that is tilted about another axis."
+                f"Two directions fit the planes: {_vector(u)} and {_vector(other)}, {_degrees(_angle(u, nominal))} and "
+                f"{_degrees(_angle(other, nominal))} from the nominal direction, which does not distinguish them. "
+                "State a more accurate nominal direction, or measure a third plane that is tilted about another axis."
             )
         if better:
             (chi2, u), other = others[0], None
@@ -138,10 +139,10 @@ def solve(gradients: Array, covariances: Array, nominal: Array, names: Sequence[
     if np.linalg.cond(reduced) < 1e14:
         small = np.linalg.inv(reduced)
         curvature = 0.5 * float(np.linalg.eigvalsh(small)[-1]) * float(np.sqrt(np.sum(1 / sigma2)))
-    if not curvature < _STRONGLY_CURVED:
+    if not curvature < _MAX_CURVATURE:
         raise MethodError(
-            f"The beam is in the plane of the normals of the planes within its uncertainty, near {_vector(u)}: there "
-            "the two possible directions coincide and noise decides between them. Measure a plane that is tilted "
+            f"Within its uncertainty, the beam lies in the plane of the normals of the planes, near {_vector(u)}, "
+            "where the two possible directions coincide and are not distinguished. Measure a plane that is tilted "
             "about another axis."
         )
     covariance = basis.T @ small @ basis
@@ -171,7 +172,7 @@ def bound(
     speckle: float = 0.0,
     speckle_length: float = 0.0,
 ) -> Array:
-    """Return the Cramer-Rao bound (3, 3) of a beam's direction u (3,) when the planes are unknown.
+    """Return the Cramer-Rao bound (3, 3) of a beam's direction u (3,) with unknown planes.
 
     Parameters
     ----------
@@ -210,18 +211,18 @@ def _information(gradients: Array, covariances: Array, u: Array) -> tuple[Array,
 
 
 def _minima(gradients: Array, covariances: Array, nominal: Array) -> list[tuple[float, Array]]:
-    """Return the directions at which chi2 is least, one or two, each with its chi2."""
+    """Return the directions of minimum chi2, one or two, each with its chi2."""
     weight = 1 / np.sqrt(np.einsum("i,kij,j->k", nominal, covariances, nominal))
     U, s, V = np.linalg.svd(gradients * weight[:, None], full_matrices=True)
     foot = V[:2].T @ (U.T[:2] @ -weight / s[:2])
     height = np.sqrt(max(1 - float(foot @ foot), 0.0))
-    found: list[tuple[float, Array]] = []
+    roots: list[tuple[float, Array]] = []
     for sign in (1.0, -1.0):
         start = foot + sign * height * V[2]
         root = _descend(gradients, covariances, start / np.linalg.norm(start))
-        if all(_angle(root[1], other) > 1e-7 for _, other in found):
-            found.append(root)
-    return found
+        if all(_angle(root[1], other) > 1e-7 for _, other in roots):
+            roots.append(root)
+    return roots
 
 
 def _descend(gradients: Array, covariances: Array, u: Array) -> tuple[float, Array]:
@@ -239,16 +240,16 @@ def _descend(gradients: Array, covariances: Array, u: Array) -> tuple[float, Arr
         size = float(np.linalg.norm(step))
         step *= min(1.0, 0.3 / size) if size > 0 else 1.0
         for _ in range(30):
-            there = turned(u, step)
-            r_there, J_there = misfit(there)
-            if r_there @ r_there <= r @ r or size < 1e-12:
+            new_u = turned(u, step)
+            new_r, new_J = misfit(new_u)
+            if new_r @ new_r <= r @ r or size < 1e-12:
                 break
             step = step / 2
         else:
             break
-        gained = float(r @ r - r_there @ r_there)
-        u, r, J = there, r_there, J_there
-        if size < 1e-13 or (size < 1e-5 and gained < 1e-14 * float(r @ r)):
+        decrease = float(r @ r - new_r @ new_r)
+        u, r, J = new_u, new_r, new_J
+        if size < 1e-13 or (size < 1e-5 and decrease < 1e-14 * float(r @ r)):
             break
     return float(r @ r), u
 
@@ -256,21 +257,20 @@ def _descend(gradients: Array, covariances: Array, u: Array) -> tuple[float, Arr
 def _check_gradients(gradients: Array, covariances: Array, names: Sequence[str]) -> None:
     if len(gradients) < 2:
         raise MethodError(
-            f"{len(gradients)} plane; expected two or more that are not parallel. One plane fixes only the angle "
-            "between the beam and its normal."
+            f"Expected two or more planes that are not parallel; found {len(gradients)}. One plane determines only the "
+            "angle between the beam and its normal."
         )
     size = np.linalg.norm(gradients, axis=1)
     for name, g in zip(names, size, strict=True):
-        if g > 50 * GRAZING or g < LEAST_GRADIENT:
+        if g > 50 * MAX_GRADIENT or g < MIN_GRADIENT:
             raise MethodError(
-                f"{name}: along the steepest direction the reading changes by {g:.3g} m for each metre of the stage; "
-                "expected 1 to 10. Check that readings and stage positions have the same unit, and that the plane "
-                "is at rest."
+                f"{name}: the gradient of the reading with the stage position is {g:.3g} m/m; expected 1 to 10. Check "
+                "that readings and stage positions have the same unit, and that the plane is at rest."
             )
-        if g > GRAZING:
+        if g > MAX_GRADIENT:
             raise MethodError(
-                f"{name}: grazing incidence, at {_degrees(np.arcsin(1 / g))} to the surface; expected at least "
-                f"{_degrees(np.arcsin(1 / GRAZING))}. Tilt the plane towards the sensor."
+                f"{name}: grazing incidence at {_degrees(np.arcsin(1 / g))} to the surface; expected at least "
+                f"{_degrees(np.arcsin(1 / MAX_GRADIENT))}. Tilt the plane towards the sensor."
             )
     normals = gradients / size[:, None]
     noise = float(np.sqrt(np.max(np.linalg.eigvalsh(covariances)[:, -1] / size**2)))
@@ -281,8 +281,7 @@ def _check_gradients(gradients: Array, covariances: Array, names: Sequence[str])
         raise MethodError(
             f"The planes are parallel to within {_degrees(spread)}, with a noise of {_degrees(noise)}: they "
             f"determine the angle between the beam and their common normal {_vector(axis)}, but not the rotation of "
-            "the "
-            "beam about it. Expected planes with different normals, such as a sine gauge turned by 90 deg."
+            "the beam about it. Expected planes with different normals, such as a sine gauge turned by 90 deg."
         )
 
 

@@ -1,11 +1,11 @@
 """Zero point of the beam, from planes with known points.
 
 With the reading d = offset + g . s on a plane through the point P, and g . u = -1, the zero point p0 of the sensor (the
-stage at 0) meets
+stage at 0) fulfils
 
     offset = g . (p0 - P),
 
-one condition a plane: three planes with independent normals determine it. Gradients and offsets are corrected for
+one condition per plane: three planes with independent normals determine it. Gradients and offsets are corrected for
 g . u = -1. The estimate is by generalised least squares; its derivatives by every gradient, offset and known point are
 returned for the propagation of uncertainty.
 """
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from errormotion.methods.beam_direction.identification.direction import Direction
 
 
-INDEPENDENT = 0.02
-"""Least singular value of the normals, over the root of their number, at which they determine a point."""
+MIN_SINGULAR_VALUE = 0.02
+"""Of the normals, divided by the root of their number, for which they determine a point."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class Origin:
     origin : ndarray (3,)
         m, while the stage is at 0.
     by_reading : ndarray (3, k, 4)
-        Change with the gradient and the offset of each plane; m, 1.
+        Derivatives by the gradient and the offset of each plane; m, 1.
     by_point : ndarray (3, k)
-        Change with a shift of each plane along its normal.
+        Derivatives by the displacement of each plane along its normal.
     misfit : ndarray (k,)
         Distance of each plane from its known point, along the reading, m.
     chi2 : float
-        Of these misfits; their freedom is k - 3.
+        Of these misfits, with k - 3 degrees of freedom.
     """
 
     origin: Array
@@ -55,7 +55,7 @@ class Origin:
 def locate(
     direction: Direction, offsets: Array, covariances: Array, points: Array, point_uncertainty: float
 ) -> Origin | None:
-    """Return the zero point of a beam whose direction is known, None where the planes do not determine it.
+    """Return the zero point of a beam with known direction; None if the planes do not determine it.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def locate(
     covariances : ndarray (k, 4, 4)
         Of (gradient, offset), SI.
     points : ndarray (k, 3)
-        A point of each plane, m; NaN where none is known.
+        A point of each plane, m; NaN if unknown.
     point_uncertainty : float
         Standard uncertainty of the points along the normals, m; independent by plane.
     """
@@ -74,10 +74,10 @@ def locate(
     fitted, u = direction.gradients_fitted, direction.direction
     size = np.linalg.norm(fitted, axis=1)
     normals = (fitted / size[:, None])[known]
-    if len(normals) < 3 or np.linalg.svd(normals, compute_uv=False)[2] < INDEPENDENT * np.sqrt(len(normals)):
+    if len(normals) < 3 or np.linalg.svd(normals, compute_uv=False)[2] < MIN_SINGULAR_VALUE * np.sqrt(len(normals)):
         return None
     S, cross = covariances[:, :3, :3], covariances[:, :3, 3]
-    # The correction to g.u = -1 takes the offset along: d(g, offset) = d - G (u . dg + g . du).
+    # The correction to g.u = -1 also changes the offset: d(g, offset) = d - G (u . dg + g . du).
     gain = np.concatenate([S @ u, (cross @ u)[:, None]], axis=1) / np.einsum("i,kij,j->k", u, S, u)[:, None]
     corrected = offsets - gain[:, 3] * direction.discrepancy
     correct = np.broadcast_to(np.eye(4), (len(gain), 4, 4)).copy()
@@ -96,7 +96,7 @@ def locate(
     misfit = np.full(len(points), np.nan)
     misfit[known] = b - A @ p0
 
-    # d misfit_k = arm . d(g, offset)_corrected + |g| d(point) - g . dp0, and the corrected ones follow g, offset and u.
+    # d misfit_k = arm . d(g, offset)_corrected + |g| d(point) - g . dp0; the corrected ones depend on g, offset and u.
     k = len(points)
     by_own = np.einsum("ki,kij->kj", arm, correct)
     by_direction = -np.einsum("ki,ki->k", arm, gain)[:, None] * fitted

@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 FALSE_ALARM = 1e-3
 """Probability that correct data are reported as noisier than stated, correlated, or not closing."""
-_BARELY_LINEAR = 0.05
+_NOTED_CURVATURE = 0.05
 
 
 def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
@@ -54,24 +54,21 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
     """
     notes: list[str] = []
     beam = determine(raw, settings, notes)
-    data, fits, factor, sensor = beam.data, beam.fits, beam.factor, beam.sensor
-    converged, plain, origin, found = beam.converged, beam.plain, beam.origin, beam.found
-    found_covariance = found.covariance * beam.closure_factor**2
-    influence = found.influence
-    total = found_covariance + influence.T @ influence
+    data, sensor, converged, influence = beam.data, beam.sensor, beam.converged, beam.propagated.influence
+    total = beam.propagated.covariance * beam.closure_factor**2 + influence.T @ influence
     p0, u0 = data.nominal_origin, data.nominal_direction
-    p = origin.origin if origin is not None else np.full(3, np.nan)
+    p = beam.origin.origin if beam.origin is not None else np.full(3, np.nan)
     u = converged.direction.direction
     errors, covariance = beam_errors(p0[None], u0[None], p[None], u[None], total[None])
     chart = error_jacobian(u0[None], u[None])[0]
     by_source = np.nan_to_num(influence) @ chart.T
     steps = ["gradients by generalised least squares", "maximum likelihood of the direction"]
     steps += [f"inclination compensation, {converged.iterations} iterations"] if sensor is not None else []
-    extras = _extras(data, fits, converged, plain, found, total, beam.corrected, factor, p, settings.beam)
+    extras = _extras(beam, total, p, settings.beam)
     if "bar_distance" in raw:
         if not np.isfinite(p).all():
             notes.append(
-                "Check bar: its centre is relative to the nominal zero point, because the actual one is unknown."
+                "Check bar: the centre is relative to the nominal zero point, because the actual one is unknown."
             )
         position = p if np.isfinite(p).all() else np.nan_to_num(p0)
         calibration = sensor.calibration if sensor is not None else None
@@ -106,39 +103,39 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
 
 @dataclass(frozen=True)
 class Determined:
-    """A beam from readings on planes, and what it was determined from.
+    """A beam determined from readings on planes, with the intermediate results.
 
     Attributes
     ----------
     data, fits : Readings, list of PlaneFit
-    factor : float
-        Of the stated noise.
+    noise_factor : float
+        Applied to the stated noise.
     sensor : Sensor or None
         None without compensation.
-    converged, plain : Converged
+    converged, uncompensated : Converged
         With and without compensation.
     corrected : ndarray (plane, reading)
         Compensated readings, m.
     origin : Origin or None
-    found : Propagated
+    propagated : Propagated
     closure_factor : float
-        Of the uncertainties, where planes contradict one another.
+        Applied to the uncertainties; above 1 if planes contradict one another.
     """
 
     data: Readings
     fits: list[PlaneFit]
-    factor: float
+    noise_factor: float
     sensor: Sensor | None
     converged: Converged
-    plain: Converged
+    uncompensated: Converged
     corrected: Array
     origin: Origin | None
-    found: Propagated
+    propagated: Propagated
     closure_factor: float
 
 
 def determine(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Determined:
-    """Return the beam; ``notes`` are extended. See `identify_beam` for the errors raised."""
+    """Return the beam; remarks are appended to ``notes``. Raises as `identify_beam`."""
     data = read(raw, settings, notes)
     fits = [
         fit_plane_readings(d, s, data.noise, data.speckle, data.speckle_length, settings.robust, name)
@@ -161,13 +158,15 @@ def determine(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Determin
         notes += sensor.notes
         converged = converge(planes, data.nominal_direction, sensor, settings.tolerance, settings.max_iterations)
     corrected = _corrected(data, converged, sensor, settings, notes)
-    origin = locate(converged.direction, converged.planes.offsets, converged.planes.covariances, data.points,
-                    data.point_uncertainty)  # fmt: skip
-    found = propagate(converged, origin, data.point_uncertainty)
-    closure_factor = _closure_factor(data, converged, found, notes)
+    compensated = converged.planes
+    origin = locate(
+        converged.direction, compensated.offsets, compensated.covariances, data.points, data.point_uncertainty
+    )
+    propagated = propagate(converged, origin, data.point_uncertainty)
+    closure_factor = _closure_factor(data, converged, propagated, notes)
     _note_roots(converged, data, notes)
     _note_origin(data, origin, notes)
-    return Determined(data, fits, factor, sensor, converged, plain, corrected, origin, found, closure_factor)
+    return Determined(data, fits, factor, sensor, converged, plain, corrected, origin, propagated, closure_factor)
 
 
 def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
@@ -178,16 +177,16 @@ def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
     MethodError
         The data do not state the orientation of the sensor.
     DatasetError
-        No such calibration, or one that belongs to another sensor.
+        The calibration is not found, or belongs to another sensor.
     """
     if settings.compensation is None:
         return None
-    given = getattr(settings, "calibration", None)  # drawn anew
-    calibration = InclinationCalibration.find(settings.compensation) if given is None else given
+    drawn = getattr(settings, "calibration", None)  # of a Monte Carlo trial
+    calibration = InclinationCalibration.find(settings.compensation) if drawn is None else drawn
     if "triangulation_normal" not in raw:
         raise MethodError(
-            "The inclination compensation needs triangulation_normal(direction) in the raw dataset: the normal of the "
-            "plane of the emitted and the received beam. Add it, or identify without compensation."
+            "Expected triangulation_normal(direction) in the raw dataset, for the inclination compensation: the normal "
+            "of the plane of the emitted and the received beam. Add it, or identify without compensation."
         )
     t = np.asarray(raw["triangulation_normal"].values, np.float64)
     name = "triangulation_normal_uncertainty"
@@ -208,12 +207,12 @@ def _chi2_quantile(p: float, degrees: int) -> float:
 
 
 def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, notes: list[str]) -> float:
-    """Return the factor to the stated noise; note outliers, deviating scatter, and correlation."""
+    """Return the factor for the stated noise; note outliers, deviating scatter, and correlation."""
     for name, fit in zip(data.names, fits, strict=True):
         if fit.left_out.any():
-            positions = ", ".join(str(i + 1) for i in np.flatnonzero(fit.left_out)[:8])
+            numbers = ", ".join(str(i + 1) for i in np.flatnonzero(fit.left_out)[:8])
             notes.append(
-                f"{name}: {int(fit.left_out.sum())} readings are outliers and were ignored: reading {positions}."
+                f"{name}: {int(fit.left_out.sum())} readings are outliers and were ignored: reading {numbers}."
             )
     used: list[Array] = [fit.whitened[np.isfinite(fit.whitened)] for fit in fits]
     freedom = sum(len(w) - UNKNOWNS for w in used)
@@ -222,72 +221,71 @@ def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, note
     chi2 = float(sum(w @ w for w in used))
     factor = 1.0
     low, high = (_chi2_quantile(p, freedom) for p in (FALSE_ALARM, 1 - FALSE_ALARM))
-    times = float(np.sqrt(chi2 / freedom))
+    ratio = float(np.sqrt(chi2 / freedom))
     if chi2 > high:
-        raised = settings.noise == "auto"
-        factor = times if raised else 1.0
-        what = "the uncertainties are raised accordingly" if raised else "the stated noise was kept (noise = stated)"
-        notes.append(f"The scatter of the readings about their planes is {times:.3g} times the stated noise; {what}.")
+        increased = settings.noise == "auto"
+        factor = ratio if increased else 1.0
+        action = (
+            "the uncertainties are increased accordingly" if increased else "the stated noise is used (noise = stated)"
+        )
+        notes.append(f"The scatter of the readings about their planes is {ratio:.3g} times the stated noise; {action}.")
     elif chi2 < low:
         notes.append(
-            f"The scatter of the readings is only {times:.3g} times the stated noise; the stated noise was kept."
+            f"The scatter of the readings is only {ratio:.3g} times the stated noise; the stated noise is used."
         )
     pairs = sum(float(w[1:] @ w[:-1]) for w in used) / (chi2 / sum(len(w) for w in used) or 1.0)
     count = sum(len(w) - 1 for w in used)
     if pairs / np.sqrt(count) > ndtri(1 - FALSE_ALARM):
         notes.append(
             f"Residuals of neighbouring readings are correlated (correlation {pairs / count:.2f}), so that the "
-            "uncertainties are too small: speckle that is not stated (speckle, speckle_length), a plane that is not "
-            "flat, or a stage that is not straight."
+            "uncertainties are too small. Possible causes: speckle that is not stated (speckle, speckle_length), a "
+            "plane that is not flat, or a stage that is not straight."
         )
     return factor
 
 
-def _closure_factor(data: Readings, converged: Converged, found: Propagated, notes: list[str]) -> float:
-    """Return the factor to the uncertainties where planes do not close; note the plane that closes worst."""
+def _closure_factor(data: Readings, converged: Converged, propagated: Propagated, notes: list[str]) -> float:
+    """Return the factor for the uncertainties of planes that do not close; note the plane with the largest closure."""
     freedom = len(data.names) - 2
     if freedom < 1:
         return 1.0
-    chi2 = closure_chi2(found)
+    chi2 = closure_chi2(propagated)
     if chi2 <= _chi2_quantile(1 - FALSE_ALARM, freedom):
         return 1.0
-    times = float(np.sqrt(chi2 / freedom))
+    factor = float(np.sqrt(chi2 / freedom))
     cause = "an invalid calibration" if converged.iterations else "the uncompensated inclination error of the sensor"
     notes.append(
         f"The planes contradict one another: chi-square {chi2:.4g} with {freedom} degrees of freedom; "
-        f"{_worst(data, found)}. Possible causes: {cause}, or a plane that moved. "
-        f"The uncertainties are raised {times:.3g} times."
+        f"{_largest_closure(data, propagated)}. Possible causes: {cause}, or a plane that moved. "
+        f"The uncertainties are increased by the factor {factor:.3g}."
     )
-    return times
+    return factor
 
 
-def _worst(data: Readings, found: Propagated) -> str:
-    """Describe the plane that closes worst. Three planes have one contradiction, of the same size for each."""
-    z = np.abs(found.closure) / np.sqrt(np.diag(found.closure_covariance))
-    worst = int(np.argmax(z))
+def _largest_closure(data: Readings, propagated: Propagated) -> str:
+    """Return the plane with the largest closure as text. Three planes have one contradiction, the same for each."""
+    z = np.abs(propagated.closure) / np.sqrt(np.diag(propagated.closure_covariance))
+    k = int(np.argmax(z))
     if len(z) == 3:
-        return f"all by {z[worst]:.1f} standard uncertainties, because three planes do not show which of them is wrong"
-    return (
-        f"worst is {data.names[worst].lower()}, off by {found.closure[worst]:.2g}, "
-        f"{z[worst]:.1f} standard uncertainties"
-    )
+        return f"all by {z[k]:.1f} standard uncertainties, because three planes do not show which of them is wrong"
+    return f"most {data.names[k].lower()}, by {propagated.closure[k]:.2g}, {z[k]:.1f} standard uncertainties"
 
 
 def _note_roots(converged: Converged, data: Readings, notes: list[str]) -> None:
-    found = converged.direction
-    if found.other_root is not None:
-        other, u0 = found.other_root, data.nominal_direction
-        angles = [float(np.degrees(np.arccos(np.clip(v @ u0, -1, 1)))) for v in (found.direction, other)]
+    direction = converged.direction
+    if direction.other_root is not None:
+        other, u0 = direction.other_root, data.nominal_direction
+        angles = [float(np.degrees(np.arccos(np.clip(v @ u0, -1, 1)))) for v in (direction.direction, other)]
         notes.append(
-            "Two directions fit the planes; the one nearer to nominal was taken. The other one is "
-            "({:.5f}, {:.5f}, {:.5f}), ".format(*other)
-            + f"{angles[1]:.3g} deg off nominal; the one taken is {angles[0]:.3g} deg off."
+            f"Two directions fit the planes; the one closer to nominal, at {angles[0]:.3g} deg, is used. The other one "
+            "is ({:.5f}, {:.5f}, {:.5f}), at ".format(*other)
+            + f"{angles[1]:.3g} deg."
         )
-    if found.curvature > _BARELY_LINEAR:
+    if direction.curvature > _NOTED_CURVATURE:
         notes.append(
             "The beam is near the plane of the normals of the planes: its uncertainty is large compared with the "
-            "distance "
-            "of the two possible directions, and intervals are approximate. Measure a plane tilted about another axis."
+            "distance of the two possible directions, and intervals are approximate. Measure a plane tilted about "
+            "another axis."
         )
 
 
@@ -295,59 +293,49 @@ def _note_origin(data: Readings, origin: Origin | None, notes: list[str]) -> Non
     known = int(np.isfinite(data.points).all(axis=1).sum())
     if origin is None:
         notes.append(
-            f"The zero point is unknown: {known} planes with a known point (plane_point); expected three or more "
-            "with independent normals."
+            "The zero point is unknown: expected three or more planes with a known point (plane_point) and independent "
+            f"normals; found {known} with a known point."
         )
         return
     if not data.point_uncertainty > 0:
         notes.append("No plane_point_uncertainty in the data: the known points of the planes are assumed to be exact.")
     if not np.isfinite(data.nominal_origin).all():
-        notes.append("No nominal_origin in the data: the zero point is in beam_origin, its error is unknown.")
+        notes.append("No nominal_origin in the data: the zero point is stated as beam_origin, its error is unknown.")
     if known > 3 and origin.chi2 > _chi2_quantile(1 - FALSE_ALARM, known - 3):
         worst = int(np.nanargmax(np.abs(origin.misfit)))
         notes.append(
             f"The known points of the planes contradict one another: chi-square {origin.chi2:.4g} with {known - 3} "
-            f"degrees of freedom; {data.names[worst].lower()} is {origin.misfit[worst] * 1e6:.3g} um off its point."
+            f"degrees of freedom; {data.names[worst].lower()} is {origin.misfit[worst] * 1e6:.3g} um from its point."
         )
 
 
 def _corrected(
     data: Readings, converged: Converged, sensor: Sensor | None, settings: Settings, notes: list[str]
 ) -> Array:
-    """Return the compensated readings (plane, reading), m; uncalibrated tilts are refused, or noted."""
+    """Return the compensated readings (plane, reading), m; tilts that are not calibrated are refused, or noted."""
     if sensor is None or converged.tilt is None:
         return data.raw
     values = []
-    for name, reading, at in zip(data.names, data.distance, converged.tilt, strict=True):
+    for name, reading, tilt in zip(data.names, data.distance, converged.tilt, strict=True):
         try:
-            value = sensor.calibration.compensate(reading, at, sensor.mid_range).value
+            value = sensor.calibration.compensate(reading, tilt, sensor.mid_range).value
         except MethodError as error:
             if not settings.extrapolate:
                 raise MethodError(f"{name}: {error}") from error
-            value = sensor.calibration.compensate(reading, at, sensor.mid_range, extrapolate=True).value
+            value = sensor.calibration.compensate(reading, tilt, sensor.mid_range, extrapolate=True).value
             notes.append(
-                f"{name}: extrapolated. Calibration '{sensor.calibration.name}' does not cover {tilt_text(at)}, or "
+                f"{name}: extrapolated. Calibration '{sensor.calibration.name}' does not cover {tilt_text(tilt)}, or "
                 "not all of the readings there."
             )
         values.append(value)
     return np.array(values)
 
 
-def _extras(
-    data: Readings,
-    fits: list[PlaneFit],
-    converged: Converged,
-    plain: Converged,
-    found: Propagated,
-    covariance: Array,
-    corrected: Array,
-    factor: float,
-    origin: Array,
-    beam: str,
-) -> dict[str, xr.DataArray]:
+def _extras(beam: Determined, covariance: Array, origin: Array, name: str) -> dict[str, xr.DataArray]:
+    data, fits, converged, corrected = beam.data, beam.fits, beam.converged, beam.corrected
     direction, planes = converged.direction, converged.planes
     coords: dict[str, Any] = {
-        "beam": [beam],
+        "beam": [name],
         "direction": list("xyz"),
         "direction_": list("xyz"),
         "p": ["px", "py", "pz", "ux", "uy", "uz"],
@@ -366,7 +354,7 @@ def _extras(
     out_of_range = np.isfinite(data.raw) & np.isnan(data.distance)
     left_out = np.array([fit.left_out for fit in fits]).astype(np.int8) + 2 * out_of_range.astype(np.int8)
     residual = np.array([fit.residual for fit in fits]) / (1 + converged.slope)[:, None]
-    taken = data.raw - corrected if converged.iterations else np.full(data.raw.shape, np.nan)
+    correction = data.raw - corrected if converged.iterations else np.full(data.raw.shape, np.nan)
     return {
         "beam_origin": array(origin[None], vector, "m"),
         "beam_direction": array(direction.direction[None], vector, "1"),
@@ -378,20 +366,22 @@ def _extras(
         "normal": array(planes.normals, by_plane, "1", "towards the sensor"),
         "inclination": array(alpha, ("plane",), "rad"),
         "rotation": array(beta, ("plane",), "rad"),
-        "closure": array(found.closure, ("plane",), "1", "g.u + 1"),
+        "closure": array(beam.propagated.closure, ("plane",), "1", "g.u + 1"),
         "closure_uncertainty": array(
-            np.sqrt(np.maximum(np.diag(found.closure_covariance), 0.0)),
+            np.sqrt(np.maximum(np.diag(beam.propagated.closure_covariance), 0.0)),
             ("plane",),
             "1",
-            "0 where two planes must close",
+            "0 for two planes, which always close",
         ),
         "residual": array(residual, by_reading, "m"),
         "left_out": array(left_out, by_reading, "", "1: outlier; 2: out of the sensor's range"),
-        "compensation": array(taken, by_reading, "m", "correction that was subtracted from the reading"),
+        "compensation": array(correction, by_reading, "m", "correction that was subtracted from the reading"),
         "distance_raw": array(data.raw, by_reading, "m"),
         "distance_compensated": array(corrected, by_reading, "m"),
         "stage": array(data.stage, (*by_reading, "direction"), "m", "of the sensor relative to the target"),
-        "uncompensated_direction": array(plain.direction.direction[None], vector, "1"),
+        "uncompensated_direction": array(beam.uncompensated.direction.direction[None], vector, "1"),
         "iterations": array([converged.iterations], ("beam",), ""),
-        "noise": array([data.noise * factor], ("beam",), "m", "as stated, or by the residuals where these are larger"),
+        "noise": array(
+            [data.noise * beam.noise_factor], ("beam",), "m", "stated, or of the residuals where it is larger"
+        ),
     }

@@ -28,7 +28,7 @@ class Propagated:
     covariance : ndarray (6, 6)
         Of (origin, direction) from the noise and the known point of each plane; SI. NaN without an origin.
     influence : ndarray (source, 6)
-        Change of (origin, direction) with one standard uncertainty of each shared source.
+        Effect on (origin, direction) of one standard uncertainty of each shared source.
     closure : ndarray (k,)
         g . u + 1 by plane.
     closure_covariance : ndarray (k, k)
@@ -49,13 +49,13 @@ def propagate(converged: Converged, origin: Origin | None, point_uncertainty: fl
     converged : Converged
         Direction and compensation.
     origin : Origin, optional
-        Zero point, where it is known.
+        Zero point, if it is known.
     point_uncertainty : float
         Standard uncertainty of the known points along the normals, m.
     """
     direction, planes = converged.direction, converged.planes
     k = len(planes.offsets)
-    # Change of (gradient, offset) of a plane with its slope.
+    # Derivative of (gradient, offset) of a plane by its slope.
     by_slope = (
         -np.column_stack([planes.gradients, planes.offsets - converged.mid_range]) / (1 + converged.slope)[:, None]
     )
@@ -77,13 +77,13 @@ def propagate(converged: Converged, origin: Origin | None, point_uncertainty: fl
     slopes = converged.slope_by_source + influence[:, 3:] @ H.T
     closes = slopes * (by_slope[:, :3] @ u) + influence[:, 3:] @ fitted.T
     closing = np.diag(sigma2) - fitted @ direction.covariance @ fitted.T + closes.T @ closes
-    if k == 2:  # met exactly, within rounding
+    if k == 2:  # conditions met exactly, except for rounding
         return Propagated(covariance, influence, np.zeros(2), np.zeros((2, 2)))
     return Propagated(covariance, influence, direction.discrepancy, closing)
 
 
 def closure_chi2(propagated: Propagated) -> float:
-    """Return chi-square of the closure; its degrees of freedom are the number of planes minus 2."""
+    """Return chi-square of the closure, with as many degrees of freedom as planes less 2."""
     k = len(propagated.closure)
     size = np.sqrt(np.diag(propagated.closure_covariance))
     if k < 3:
@@ -131,7 +131,7 @@ def expected_beam(
     Returns
     -------
     Propagated
-        NaN for the origin where ``origin`` or ``points`` is not given, or the planes do not determine it.
+        NaN for the origin if ``origin`` or ``points`` is not given, or the planes do not determine it.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def expected_beam(
     C = np.stack([expected_covariance(stage, noise, speckle, speckle_length) for stage in stages])
     names = tuple(f"Plane {i + 1}" for i in range(k))
     converged = uncompensated(Planes(names, gradients, offsets, C), direction)
-    found = locate(converged.direction, offsets, C, P, point_uncertainty)
+    located = locate(converged.direction, offsets, C, P, point_uncertainty)
     if slope_by_source is not None:
         converged = replace(converged, slope_by_source=slope_by_source)
-    return propagate(converged, found, point_uncertainty)
+    return propagate(converged, located, point_uncertainty)

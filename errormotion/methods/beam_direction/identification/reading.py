@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     from errormotion.methods.beam_direction.settings import Settings
 
 
-LOST = 0.3
-"""Largest share of a plane's readings that may be missing."""
-_STRAIGHT = 0.999
-_REST = 1e-3
+MAX_MISSING = 0.3
+"""Largest share of missing readings of a plane."""
+_REVERSAL_COSINE = 0.999
+_MIN_STEP = 1e-3
+"""Share of the longest step below which the stage is at rest."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,9 @@ class Readings:
     names : tuple of str
         Of the planes, counted from 1.
     raw, distance : ndarray (plane, reading)
-        As read, and without readings out of the range of the sensor.
+        Recorded readings, and those within the range of the sensor.
     stage : ndarray (plane, reading, 3)
-        Motion of the sensor; reversed where the stage carries the target.
+        Position of the sensor relative to the target.
     moves : {"sensor", "target"}
     nominal_direction : ndarray (3,)
     nominal_origin : ndarray (3,)
@@ -59,12 +60,12 @@ class Readings:
 
 
 def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
-    """Return the readings of a raw dataset; ``notes`` are extended.
+    """Return the readings of a raw dataset; remarks are appended to ``notes``.
 
     Raises
     ------
     MethodError
-        A stroke out of the sensor's range, a stage that turns back along a stroke, a noise of 0, speckle without its
+        A stroke out of the sensor's range, a stage that reverses along a stroke, a noise of 0, speckle without its
         length.
     """
     moves = raw.attrs.get("moves", settings.moves)
@@ -75,9 +76,9 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     names = tuple(f"Plane {i + 1}" for i in range(len(distance)))
     noise, speckle, length = float(raw["distance_noise"]), _scalar(raw, "speckle"), _scalar(raw, "speckle_length")
     if not noise > 0:
-        raise MethodError("distance_noise is 0: expected the standard deviation of one reading at rest, m.")
+        raise MethodError("distance_noise: expected the standard deviation of one reading at rest, m; found 0.")
     if speckle > 0 and "speckle_length" not in raw:
-        raise MethodError("The data state speckle but no speckle_length; expected the correlation length, m.")
+        raise MethodError("speckle_length: expected the correlation length of the speckle, m; found none.")
     low, high = raw["reading_range"].values if "reading_range" in raw else (-np.inf, np.inf)
     within = distance.copy()
     for i, name in enumerate(names):
@@ -115,7 +116,7 @@ def _scalar(raw: xr.Dataset, name: str) -> float:
 def _in_range(
     name: str, distance: Array, placed: NDArray[np.bool_], low: float, high: float, notes: list[str]
 ) -> Array:
-    """Return the readings without those out of range; MethodError for a stroke that leaves it."""
+    """Return the readings with NaN for those out of range; MethodError if too many are missing."""
     out = (distance < low) | (distance > high)
     missing = placed & (out | np.isnan(distance))
     if not missing.any():
@@ -123,34 +124,33 @@ def _in_range(
     first, empty = int(np.argmax(missing)) + 1, int((placed & np.isnan(distance)).sum())
     text = (
         f"{name}: {int(missing.sum())} of {int(placed.sum())} readings are missing ({empty} without value, "
-        f"{int(out.sum())} out of the sensor's range), the first of them reading {first}"
+        f"{int(out.sum())} out of the sensor's range), the first is reading {first}"
     )
-    if missing.sum() > LOST * placed.sum():
+    if missing.sum() > MAX_MISSING * placed.sum():
         limits = f" of {low * 1e3:g} to {high * 1e3:g} mm" if np.isfinite(low) else ""
         raise MethodError(
-            f"{text}: the strokes leave the sensor's range{limits}. Shorten them, start nearer to mid-range, or tilt "
-            "the plane less."
+            f"{text}: the strokes leave the sensor's range{limits}. Shorten them, start closer to mid-range, or reduce "
+            "the tilt of the plane."
         )
-    notes.append(f"{text}; they were not used.")
+    notes.append(f"{text}; the others are used.")
     return np.where(out, np.nan, distance)
 
 
 def _check_order(name: str, stage: Array) -> None:
-    """Refuse a step back along a straight stroke: rows in wrong order, lost counts, backlash."""
+    """Raise MethodError for a reversed step along a straight stroke: rows in wrong order, lost counts, backlash."""
     rows = np.flatnonzero(np.isfinite(stage).all(axis=1))
     steps = np.diff(stage[rows], axis=0)
     size = np.linalg.norm(steps, axis=1)
-    moving = np.flatnonzero(size > _REST * size.max(initial=0.0))
+    moving = np.flatnonzero(size > _MIN_STEP * size.max(initial=0.0))
     if len(moving) < 3:
         return
     d, size = steps[moving] / size[moving, None], size[moving]
-    turns = np.sum(d[1:] * d[:-1], axis=1) < -_STRAIGHT
+    turns = np.sum(d[1:] * d[:-1], axis=1) < -_REVERSAL_COSINE
     wrong = turns[:-1] & turns[1:] & (size[1:-1] < 0.9 * np.minimum(size[:-2], size[2:]))
     if wrong.any():
         at = int(np.argmax(wrong)) + 1
         raise MethodError(
             f"{name}: at reading {rows[moving[at]] + 2} the stage moves back by {size[at] * 1e6:.4g} um along a "
-            "stroke. "
-            "Expected strokes in one direction: check that positions and readings belong together, and the stage for "
-            "backlash. For positions in any order set ordered = false."
+            "stroke; expected strokes in one direction. Check that positions and readings correspond, and check the "
+            "stage for backlash. For positions in any order, set ordered = false."
         )

@@ -1,9 +1,9 @@
-"""Change of the reading with the stage position on each plane.
+"""Gradient of the reading with the stage position on each plane.
 
-On a plane the reading is d = offset + g . s, s the stage position. Readings carry white noise and, along a stroke,
-speckle: errors whose correlation falls off with the distance of the positions, speckle^2 exp(-|s_i - s_j| / length).
-Gradient and offset are estimated by generalised least squares, which is maximum likelihood for this model. Readings
-that do not fit a plane are found by a fit of least absolute deviations; they are ignored and reported.
+On a plane the reading is d = offset + g . s, with the stage position s. Readings contain white noise and, along a
+stroke, speckle: errors whose correlation decreases with the distance of the positions,
+speckle^2 exp(-|s_i - s_j| / length). Gradient and offset are estimated by generalised least squares, which is maximum
+likelihood for this model. Outliers are detected by a fit of least absolute deviations; they are ignored and reported.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ UNKNOWNS = 4
 """Gradient (3) and offset."""
 OUTLIER = 6.0
 """Robust standard deviations from which on a reading is an outlier."""
-LEAST_USED = 0.7
-"""Smallest share of the readings that must be on a plane."""
-WEAKEST = 0.03
+MIN_USED = 0.7
+"""Smallest share of readings that fit the plane."""
+MAX_GRADIENT_U = 0.03
 """Largest standard uncertainty of the gradient along a measured direction."""
-_LEAST_FOR_SCATTER = 2 * UNKNOWNS
-_MOST_CORRELATED = 4000
+_MIN_FOR_OUTLIERS = 2 * UNKNOWNS
+MAX_CORRELATED = 4000
+"""Largest number of readings of a plane with speckle."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def fit_plane_readings(
     Raises
     ------
     MethodError
-        Too few readings, a stage that does not move along three independent directions, or readings on no plane.
+        Too few readings, a stage that does not move along three independent directions, or readings off a plane.
     """
     used = np.isfinite(distance) & np.isfinite(stage).all(axis=1)
     valid = int(used.sum())
@@ -104,22 +105,23 @@ def fit_plane_readings(
     centre = stage[used].mean(axis=0)
     design = np.column_stack([stage - centre, np.ones(distance.size)])
     _check_strokes(design[used], np.hypot(noise, speckle), name)
-    total, everything = float(np.hypot(noise, speckle)), used
-    look = robust and valid >= _LEAST_FOR_SCATTER
-    if look:
-        used = everything & ~_far_off(distance - design @ _least_deviations(design[used], distance[used]), used, total)
+    total, measured = float(np.hypot(noise, speckle)), used
+    detect = robust and valid >= _MIN_FOR_OUTLIERS
+    if detect:
+        used = measured & ~_outliers(distance - design @ _least_deviations(design[used], distance[used]), used, total)
     for _ in range(10):
-        solution, covariance, whitened = _generalised(design[used], distance[used], stage[used], noise, speckle,
-                                                      speckle_length, name)  # fmt: skip
+        solution, covariance, whitened = _generalised(
+            design[used], distance[used], stage[used], noise, speckle, speckle_length, name
+        )
         residual = distance - design @ solution
-        kept = everything & ~_far_off(residual, used, total) if look else used
+        kept = measured & ~_outliers(residual, used, total) if detect else used
         if (kept == used).all():
             break
         used = kept
-    if used.sum() < max(LEAST_USED * valid, UNKNOWNS):
+    if used.sum() < max(MIN_USED * valid, UNKNOWNS):
         raise MethodError(
-            f"{name}: {valid - used.sum()} of {valid} readings do not fit any plane. Check that positions and readings "
-            "belong together and that all of them are on one plane."
+            f"{name}: {valid - used.sum()} of {valid} readings do not fit a plane. Check that positions and readings "
+            "correspond, and that all readings are on one plane."
         )
     _check_strokes(design[used], total, name)
     padded = np.full(distance.size, np.nan)
@@ -130,21 +132,20 @@ def fit_plane_readings(
         covariance=_about_zero(covariance, centre),
         residual=residual,
         whitened=padded,
-        left_out=everything & ~used,
+        left_out=measured & ~used,
     )
 
 
 def expected_covariance(stage: Array, noise: float, speckle: float = 0.0, speckle_length: float = 0.0) -> Array:
-    """Return the covariance (4, 4) that gradient and offset of readings at positions (n, 3), m, will have."""
+    """Return the expected covariance (4, 4) of gradient and offset of readings at positions (n, 3), m."""
     centre = stage.mean(axis=0)
     design = np.column_stack([stage - centre, np.ones(len(stage))])
-    nothing = np.zeros(len(stage))
-    covariance = _generalised(design, nothing, stage, noise, speckle, speckle_length, "The plane")[1]
+    covariance = _generalised(design, np.zeros(len(stage)), stage, noise, speckle, speckle_length, "The plane")[1]
     return _about_zero(covariance, centre)
 
 
 def gradient_covariance(stage: Array, noise: float, speckle: float = 0.0, speckle_length: float = 0.0) -> Array:
-    """Return the covariance (3, 3) that the gradient of readings at positions (n, 3), m, will have."""
+    """Return the expected covariance (3, 3) of the gradient of readings at positions (n, 3), m."""
     return expected_covariance(stage, noise, speckle, speckle_length)[:3, :3]
 
 
@@ -157,8 +158,8 @@ def _about_zero(covariance: Array, centre: Array) -> Array:
 
 def correlation_factor(stage: Array, noise: float, speckle: float, speckle_length: float) -> Array:
     """Return the lower triangular factor (n, n) of the covariance of readings at positions (n, 3); m."""
-    apart = np.linalg.norm(stage[:, None] - stage[None], axis=2)
-    C = speckle**2 * (np.exp(-apart / speckle_length) if speckle_length > 0 else np.eye(len(stage)))
+    separation = np.linalg.norm(stage[:, None] - stage[None], axis=2)
+    C = speckle**2 * (np.exp(-separation / speckle_length) if speckle_length > 0 else np.eye(len(stage)))
     C[np.diag_indices_from(C)] += noise**2
     return np.asarray(cholesky(C, lower=True))
 
@@ -168,10 +169,10 @@ def _generalised(
 ) -> tuple[Array, Array, Array]:
     """Return solution (4,), covariance (4, 4) and whitened residuals (n,)."""
     if speckle > 0 and speckle_length > 0:
-        if len(stage) > _MOST_CORRELATED:
+        if len(stage) > MAX_CORRELATED:
             raise MethodError(
-                f"{name}: {len(stage)} readings with speckle; expected at most {_MOST_CORRELATED}. Use fewer: "
-                f"readings closer than the correlation length ({speckle_length * 1e6:g} um) add little information."
+                f"{name}: {len(stage)} readings with speckle; expected at most {MAX_CORRELATED}. Use fewer readings: "
+                f"those closer than the correlation length ({speckle_length * 1e6:g} um) add little information."
             )
         L = correlation_factor(stage, noise, speckle, speckle_length)
         A, b = (solve_triangular(L, part, lower=True) for part in (design, distance))
@@ -186,7 +187,7 @@ def _generalised(
 
 
 def _least_deviations(design: Array, distance: Array) -> Array:
-    """Return the solution (4,) of approximately least absolute deviations, by weights from the previous residuals."""
+    """Return the solution (4,) of approximately least absolute deviations, by iteratively reweighted least squares."""
     weight = np.ones(distance.size)
     for _ in range(30):
         solution = np.linalg.lstsq(design * weight[:, None], distance * weight)[0]
@@ -195,24 +196,24 @@ def _least_deviations(design: Array, distance: Array) -> Array:
     return np.asarray(solution)
 
 
-def _far_off(residual: Array, used: Mask, total: float) -> Mask:
+def _outliers(residual: Array, used: Mask, total: float) -> Mask:
     """Return the outliers with respect to the stated noise and to the observed scatter."""
     scatter = NORMAL_MAD * np.median(np.abs(residual[used] - np.median(residual[used])))
     return np.asarray(np.abs(residual) > OUTLIER * max(float(scatter), total))
 
 
 def _check_strokes(design: Array, total: float, name: str) -> None:
-    """Refuse positions that do not spread along three directions, which would not determine the gradient."""
+    """Raise MethodError for positions that do not spread along three directions, which the gradient requires."""
     values, vectors = np.linalg.eigh(design[:, :3].T @ design[:, :3])
-    least = max((total / WEAKEST) ** 2, 1e-14 * float(values[2]))
-    open_ = vectors.T[values <= least]
-    if not len(open_):
+    least = max((total / MAX_GRADIENT_U) ** 2, 1e-14 * float(values[2]))
+    missing = vectors.T[values <= least]
+    if not len(missing):
         return
-    open_ = open_ * np.sign(open_[np.arange(len(open_)), np.argmax(np.abs(open_), axis=1)])[:, None]
+    missing = missing * np.sign(missing[np.arange(len(missing)), np.argmax(np.abs(missing), axis=1)])[:, None]
     spread = float(np.sqrt(max(values[0], 0.0) / len(design)))
-    along = ", ".join("({:.2f}, {:.2f}, {:.2f})".format(*(np.round(v, 2) + 0.0)) for v in open_)
+    along = ", ".join("({:.2f}, {:.2f}, {:.2f})".format(*(np.round(v, 2) + 0.0)) for v in missing)
     raise MethodError(
-        f"{name}: the stage moves along {3 - len(open_)} of three independent directions; along {along} its positions "
-        f"spread by {spread * 1e6:.3g} um. Expected strokes along three directions, such as X, Y and Z, that spread by "
-        f"more than {np.sqrt(least / len(design)) * 1e6:.2g} um, which determine the gradient."
+        f"{name}: the stage moves along {3 - len(missing)} of three independent directions; along {along} the spread "
+        f"(rms) of its positions is {spread * 1e6:.3g} um. Expected strokes along three directions, such as X, Y and "
+        f"Z, with a spread of more than {np.sqrt(least / len(design)) * 1e6:.2g} um, to determine the gradient."
     )

@@ -1,1 +1,1 @@
-"""Planning: beam direction, the uncertainty to expect before a measurement."""
+"""Planning of the measurement of a beam's direction: set-up and expected uncertainty."""

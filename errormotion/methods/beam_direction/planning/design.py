@@ -3,15 +3,15 @@
 A plane of gradient g is one condition for the beam u: g.u = -1. Small angles between the beam and its nominal direction
 change g.u in proportion to t, the plane's tilt across the beam (|t| = tan of the inclination). The uncertainty of the
 condition is that of the slope of the reading along the beam. From strokes of lengths L along X, Y and Z with n readings
-in all, optimally distributed, that slope has the variance 12 (sigma^2 / n) c^2 with c = sum |u_i| / L_i. The range R of
-the sensor limits a stroke to L_i = R / |g_i|; hence c >= sum |u_i g_i| / R >= 1 / R, equal where no u_i g_i is
-positive. With an inclination of alpha at most, no set-up with n readings in all can bring the worse of the two angles
-below
+in total, optimally distributed, that slope has the variance 12 (sigma^2 / n) c^2 with c = sum |u_i| / L_i. The range R
+of the sensor limits a stroke to L_i = R / |g_i|; hence c >= sum |u_i g_i| / R >= 1 / R, with equality if no u_i g_i is
+positive. With an inclination of at most alpha, the larger uncertainty of the two angles, for n readings in total, is at
+least
 
     sqrt(24 / n) sigma / (R tan alpha),
 
-and two planes tilted at right angles to one another reach it where gauge and travel allow. A longer stroke is never
-worse, so the search covers only the orientations of the planes and their shares of the readings.
+the value of two planes tilted in perpendicular directions, if gauge and travel allow them. A longer stroke never
+increases the uncertainty, so the search is only over the orientations of the planes and their shares of the readings.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ if TYPE_CHECKING:
     from errormotion.methods.beam_direction.settings import Settings
 
 
-LEAST_READINGS = 3
-"""Smallest number of readings of a stroke, so that its straightness can be checked."""
-_LEAST_SHARE = 0.02
+MIN_READINGS = 3
+"""Of a stroke, so that its straightness can be checked."""
+_MIN_SHARE = 0.02
 _PENALTY = 1e3
-_EVALUATIONS = 1000
-"""Largest number of evaluations of each search, for each plane."""
+_MAX_EVALUATIONS = 1000
+"""Largest number of evaluations of each search, per plane."""
 _TOLERANCE = 1e-7
 _ROUNDING = 1e-9
-_ROUNDS = 2
-_TURNS = 3
-"""Number of sets of planes, evenly about the beam, from which the search starts in addition to the given one."""
+_RESTARTS = 2
+_STARTS = 3
+"""Sets of planes, distributed evenly about the beam, from which the search starts in addition to the given one."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Limits:
     beam_uncertainty : float
         Standard uncertainty of each of its two angles, rad.
     reach : float
-        Change of the reading that a stroke may make, m.
+        Largest change of the reading over a stroke, m.
     travel : ndarray (3,)
         Longest strokes along X, Y, Z, m.
     plate : float
@@ -68,7 +68,7 @@ class Limits:
     max_inclination : float
         Largest angle between the beam and the plane's normal, rad.
     readings : int
-        Of all planes together.
+        Total number for all planes.
     noise : float
         Standard deviation of one reading, m.
     scale_uncertainty : float
@@ -95,7 +95,7 @@ class Limits:
 def limits_of(
     settings: Settings, sensor_range: float | None = None, slope_uncertainty: Callable[[Array], Array] | None = None
 ) -> Limits:
-    """Return the limits of the settings; ``sensor_range``, m, where the sensor reports it."""
+    """Return the limits of the settings; ``sensor_range`` (m) of the sensor replaces that of the settings."""
     p = settings.layout
     if sensor_range is None:
         sensor_range = p.reading_range[1] - p.reading_range[0]
@@ -138,7 +138,7 @@ class Design:
     path: Array | None = None
 
     def stages(self) -> list[Array]:
-        """Return for each plane the positions (n, 3) of the stage, m, about the one where the reading is mid-range."""
+        """Return for each plane the positions (n, 3) of the stage, m, relative to that with the reading mid-range."""
         if self.path is not None:
             return [self.path] * len(self.planes)
         return [stroke_points(lengths, counts) for lengths, counts in zip(self.strokes, self.readings, strict=True)]
@@ -172,12 +172,12 @@ def tilts(normals: Array, beam: Array) -> Array:
 
 @lru_cache(maxsize=4)
 def _basis(beam: tuple[float, ...]) -> Array:
-    """Return ``across(beam)``; cached, because a search calls it very often."""
+    """Return ``across(beam)``; cached for the search."""
     return across(np.array(beam))
 
 
 def inclinations(normals: Array, beam: Array) -> Array:
-    """Return the angles (k,) between the reversed beam and the normals, rad; above pi/2: on the back of the plane."""
+    """Return the angles (k,) between the reversed beam and the normals, rad; above pi/2 at the back of a plane."""
     return np.asarray(np.arccos(np.clip(-(normals @ beam), -1.0, 1.0)))
 
 
@@ -192,13 +192,13 @@ def longest_strokes(normals: Array, limits: Limits) -> Array:
 
 def shares_of_strokes(strokes: Array, limits: Limits) -> tuple[Array, Array]:
     """Return the best shares (k, 3) of the strokes in a plane's readings, and c (k,), 1/m (see the module)."""
-    # A beam that deviates from nominal has a component along every axis.
+    # with the uncertainty, because a beam that deviates from nominal has a component along every axis
     per_stroke = np.hypot(limits.beam, limits.beam_uncertainty) / strokes
     c = per_stroke.sum(axis=1)
     return per_stroke / c[:, None], c
 
 
-def spread(planes: Array, shares: Array, limits: Limits) -> Array:
+def angle_covariance(planes: Array, shares: Array, limits: Limits) -> Array:
     """Return the covariance (2, 2) of the beam's two angles, rad^2, for planes with shares (k,) of the readings."""
     normals = plane_normals(planes)
     t = tilts(normals, limits.beam)
@@ -214,18 +214,18 @@ def spread(planes: Array, shares: Array, limits: Limits) -> Array:
 
 
 def common_scale(covariance: Array, weighted: Array, limits: Limits) -> Array:
-    """Return the contribution of a scale error common to all planes to the covariance (2, 2) of the angles."""
+    """Return the contribution of a scale error, common to all planes, to the covariance (2, 2) of the angles."""
     effect = covariance @ weighted.sum(axis=0) * limits.scale_uncertainty
     return np.outer(effect, effect)
 
 
 def worst_angle(covariance: Array) -> float:
-    """Return the standard uncertainty, rad, of the angle in the direction across the beam in which it is largest."""
+    """Return the largest standard uncertainty of the beam's angle, over all directions across the beam, rad."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
 def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
-    """Return the planes, strokes and readings that minimise the uncertainty of the worse of the beam's two angles.
+    """Return the planes, strokes and readings that minimise the larger uncertainty of the beam's two angles.
 
     Parameters
     ----------
@@ -233,19 +233,19 @@ def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
     start : array_like (k, 2)
         Initial inclination and rotation of the planes, rad; the number of planes is kept.
     seed : int
-        Of the search over all orientations; the same seed gives the same result.
+        Of the search over all orientations, whose result is reproducible.
 
     Raises
     ------
     MethodError
-        Fewer than two planes, fewer readings than they need, or no orientation within the limits.
+        Fewer than two planes, too few readings, or no orientation within the limits.
     """
     import nlopt
 
     start = np.asarray(start, np.float64).reshape(-1, 2)
     number = len(start)
     check_numbers(number, limits)
-    lower = np.array([0.0, -np.pi] * number + [_LEAST_SHARE] * number)
+    lower = np.array([0.0, -np.pi] * number + [_MIN_SHARE] * number)
     upper = np.array([limits.max_inclination, 3 * np.pi] * number + [1.0] * number)
 
     def cost(x: Array, gradient: Array) -> float:  # noqa: ARG001 - the signature of nlopt
@@ -254,7 +254,7 @@ def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
         if beyond > _ROUNDING:
             return _PENALTY * (1.0 + float(beyond))
         shares = x[2 * number :]
-        return float(np.log(worst_angle(spread(planes, shares / shares.sum(), limits))))
+        return float(np.log(worst_angle(angle_covariance(planes, shares / shares.sum(), limits))))
 
     nlopt.srand(seed)
 
@@ -266,25 +266,26 @@ def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
         problem.set_ftol_abs(_TOLERANCE)
         problem.set_maxeval(evaluations)
         try:
-            found = np.clip(problem.optimize(x), lower, upper)
-        except nlopt.RoundoffLimited:  # the search has come as far as rounding lets it
+            result = np.clip(problem.optimize(x), lower, upper)
+        except nlopt.RoundoffLimited:  # no further progress because of rounding
             return x
-        return found if cost(found, found) <= cost(x, x) else x
+        return result if cost(result, result) <= cost(x, x) else x
 
     equal = np.full(number, 0.5)
-    even = [(np.arange(number) + turn / _TURNS) * 2 * np.pi / number for turn in range(_TURNS)]
-    steep = [np.stack([np.full(number, limits.max_inclination), azimuth], axis=-1) for azimuth in even]
+    azimuths = [(np.arange(number) + turn / _STARTS) * 2 * np.pi / number for turn in range(_STARTS)]
+    steep = [np.stack([np.full(number, limits.max_inclination), azimuth], axis=-1) for azimuth in azimuths]
     starts = [np.clip(np.concatenate([p.ravel(), equal]), lower, upper) for p in (_about_beam(start, limits), *steep)]
-    starts[0] = search(nlopt.GN_CRS2_LM, starts[0], _EVALUATIONS * number)
-    starts = [search(nlopt.LN_SBPLX, x, _EVALUATIONS * number) for x in starts]
+    starts[0] = search(nlopt.GN_CRS2_LM, starts[0], _MAX_EVALUATIONS * number)
+    starts = [search(nlopt.LN_SBPLX, x, _MAX_EVALUATIONS * number) for x in starts]
     x = min(starts, key=lambda x: cost(x, x))
-    # The larger of two variances is not smooth, which slows the search down: it is restarted.
-    for algorithm in (nlopt.LN_COBYLA, nlopt.LN_SBPLX) * _ROUNDS:
-        x = search(algorithm, x, _EVALUATIONS * number)
+    # The larger of two variances is not smooth, which slows down the search; it is restarted.
+    for algorithm in (nlopt.LN_COBYLA, nlopt.LN_SBPLX) * _RESTARTS:
+        x = search(algorithm, x, _MAX_EVALUATIONS * number)
     if cost(x, x) >= _PENALTY:
         raise MethodError(
-            f"No plane of the gauge meets the beam at {np.degrees(limits.max_inclination):.3g} deg or less. Expected a "
-            "nominal direction that points down to the gauge, and a gauge that can be inclined towards it."
+            f"No face of the gauge has an inclination of {np.degrees(limits.max_inclination):.3g} deg or less to the "
+            "beam. Expected a nominal direction that points down to the gauge, and a gauge that can be inclined "
+            "towards the beam."
         )
     planes, shares = _planes(x[: 2 * number], limits), x[2 * number :]
     order = np.lexsort((planes[:, 0], planes[:, 1]))
@@ -294,8 +295,8 @@ def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
 def _planes(about_beam: Array, limits: Limits) -> Array:
     """Return planes (k, 2) of the gauge from their inclinations to the beam and azimuths about it, flat (2 k,).
 
-    A plane outside the limits of the gauge is replaced by the nearest one within them, which is never steeper for a
-    beam within these limits.
+    A plane outside the limits of the gauge is replaced by the nearest one within them, whose inclination is not larger
+    for a beam within these limits.
     """
     inclination, azimuth = about_beam.reshape(-1, 2).T
     sideways = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) @ _basis(tuple(limits.beam))
@@ -318,30 +319,30 @@ def check_numbers(planes: int, limits: Limits) -> None:
     Raises
     ------
     MethodError
-        Fewer than two planes, or fewer readings than `LEAST_READINGS` for each stroke.
+        Fewer than two planes, or fewer readings than `MIN_READINGS` for each stroke.
     """
     if planes < 2:
-        raise MethodError(f"One plane does not determine both angles of the beam: expected two or more; found {planes}")
-    if limits.readings < (needed := 3 * LEAST_READINGS * planes):
+        raise MethodError(f"Expected two planes or more, to determine both angles of the beam; found {planes}")
+    if limits.readings < (needed := 3 * MIN_READINGS * planes):
         raise MethodError(
-            f"{planes} planes with three strokes each need {needed} readings or more; found {limits.readings}"
+            f"Expected {needed} readings or more for {planes} planes with three strokes each; found {limits.readings}"
         )
 
 
 def with_readings(planes: Array, shares: Array, limits: Limits) -> Design:
-    """Return the design with the longest strokes, and the readings distributed in whole numbers."""
+    """Return the design with the longest strokes, and the readings rounded to whole numbers."""
     strokes = longest_strokes(plane_normals(planes), limits)
     fractions = (shares[:, None] * shares_of_strokes(strokes, limits)[0]).ravel()
-    spare = limits.readings - LEAST_READINGS * fractions.size
-    wanted = np.maximum(fractions * limits.readings - LEAST_READINGS, 0.0)
+    spare = limits.readings - MIN_READINGS * fractions.size
+    wanted = np.maximum(fractions * limits.readings - MIN_READINGS, 0.0)
     wanted *= spare / max(wanted.sum(), np.finfo(float).tiny)
     counts = np.floor(wanted).astype(np.int64)
     counts[np.argsort(counts - wanted, kind="stable")[: spare - counts.sum()]] += 1
-    return Design(planes, strokes, (counts + LEAST_READINGS).reshape(-1, 3))
+    return Design(planes, strokes, (counts + MIN_READINGS).reshape(-1, 3))
 
 
 def equal_strokes(planes: Array, limits: Limits) -> Design:
-    """Return planes with strokes of one length and the same number of readings each, without optimisation."""
+    """Return planes with strokes of the same length and number of readings, without optimisation."""
     planes = np.asarray(planes, np.float64).reshape(-1, 2)
     check_numbers(len(planes), limits)
     length = longest_strokes(plane_normals(planes), limits).min()

@@ -1,4 +1,4 @@
-"""The chapter of one beam's direction from planes: beam against nominal, planes, inclination error, check bar."""
+"""The chapter of the direction of a beam: comparison with nominal, planes, inclination error, check bar."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from errormotion.methods.beam_direction.report import check_bar as beam_direction_bar
-from errormotion.methods.beam_direction.report import drawings as beam_direction_figures
-from errormotion.methods.beam_direction.report import planes as beam_direction_planes
-from errormotion.methods.beam_direction.report import surface as beam_direction_surface
-from errormotion.methods.beam_direction.report.view import STROKES, Found, found, is_direction
+from errormotion.methods.beam_direction.report import check_bar, drawings, surface
+from errormotion.methods.beam_direction.report import planes as planes_section
+from errormotion.methods.beam_direction.report.view import STROKES, BeamView, beam_view, is_direction
 from errormotion.report import budget, provenance, quality
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
@@ -23,30 +21,30 @@ from errormotion.report.text import ARCSEC, DASH, finite, fixed, integer, listed
 __all__ = ["is_direction", "part"]
 
 _UNKNOWN = "the direction was not determined"
-_NO_ORIGIN = "no plane has a known point, so that the position of the beam is not determined"
-_NO_NOMINAL = "no nominal is known"
+_NO_ORIGIN = "the known points of the planes do not determine the position of the beam"
+_NO_NOMINAL = "the nominal value is unknown"
 _ABOUT_ITSELF = "the rotation of a beam about its own axis cannot be measured"
 _INDEPENDENT = "noise of the readings"
 _UNITS = (("arcsec", ARCSEC), ("mrad", 1e-3), ("°", math.pi / 180))
 
 
 def part(source: Source, key: str) -> Part:
-    """Return the chapter of one beam; ``key`` keeps its figures' identifiers apart."""
-    beam = found(source.errors, source.raw)
-    calibration, why = beam_direction_surface.calibration_of(source, beam.planes)
-    bar = beam_direction_bar.bar_of(source)
+    """Return the chapter of one beam; ``key`` makes the identifiers of its figures unique."""
+    beam = beam_view(source.errors, source.raw)
+    calibration, reason = surface.calibration_of(source, beam.planes)
+    bar = check_bar.bar_of(source)
     sections = [
         Section("direction", "Direction and origin", _direction(beam, source.errors, key)),
-        Section("planes", "Planes and residuals", beam_direction_planes.blocks(beam.planes, f"{key}-residual")),
+        Section("planes", "Planes and residuals", planes_section.blocks(beam.planes, f"{key}-residual")),
         Section("compensation", "Compensation of the inclination error", _compensation(beam, source.errors, key)),
         Section(
             "surface",
             "Inclination error of the sensor",
-            beam_direction_surface.blocks(beam, calibration, why, f"{key}-surface"),
+            surface.blocks(beam, calibration, reason, f"{key}-surface"),
         ),
     ]
     if bar is not None:
-        sections.append(Section("bar", "Check bar", beam_direction_bar.blocks(bar, f"{key}-bar")))
+        sections.append(Section("bar", "Check bar", check_bar.blocks(bar, f"{key}-bar")))
     sections += [
         Section("uncertainty", "Uncertainty", _uncertainty(source.errors, beam)),
         Section("quality", "Data quality", _quality(source)),
@@ -60,38 +58,40 @@ def part(source: Source, key: str) -> Part:
     )
 
 
-def _worst(beam: Found) -> float:
-    """Return the standard uncertainty of the direction across the beam, in the worst direction, rad."""
+def _largest_u(beam: BeamView) -> float:
+    """Return the largest standard uncertainty of the direction, over all directions across the beam, rad."""
     C = beam.covariance[3:, 3:]
     return float(np.sqrt(np.linalg.eigvalsh(C)[-1].clip(0))) if np.isfinite(C).all() else math.nan
 
 
-def _to_nominal(beam: Found) -> tuple[float, float]:
-    """Return the angle to nominal and its standard uncertainty, rad; NaN where either is unknown."""
+def _to_nominal(beam: BeamView) -> tuple[float, float]:
+    """Return the angle to nominal and its standard uncertainty, rad; NaN if either direction is unknown."""
     if not (beam.known and np.isfinite(beam.nominal).all()):
         return math.nan, math.nan
     return angle_between(beam.direction, beam.nominal, beam.covariance[3:, 3:])
 
 
-def _shift(beam: Found) -> float:
+def _shift(beam: BeamView) -> float:
     return float(np.linalg.norm(beam.origin - beam.nominal_origin))
 
 
-def _key_figures(beam: Found, bar: beam_direction_bar.Bar | None) -> list[KeyFigure]:
+def _key_figures(beam: BeamView, bar: check_bar.Bar | None) -> list[KeyFigure]:
     figures = []
     angle, sigma = _to_nominal(beam)
     if math.isfinite(angle):
         value = estimate(angle / ARCSEC, 2 * sigma / ARCSEC, signed=False)
         figures.append(KeyFigure("angle to nominal", value, "arcsec", f"{fixed(1e3 * angle, 3)} mrad"))
-    if math.isfinite(_worst(beam)):
-        value = Cell(significant(2 * _worst(beam) / ARCSEC))
-        figures.append(KeyFigure("direction known to", value, "arcsec", "U, k = 2, worst direction"))
+    if math.isfinite(_largest_u(beam)):
+        value = Cell(significant(2 * _largest_u(beam) / ARCSEC))
+        figures.append(
+            KeyFigure("uncertainty of the direction", value, "arcsec", "U, k = 2, largest over all directions")
+        )
     if math.isfinite(_shift(beam)):
         figures.append(KeyFigure("zero point", Cell(fixed(1e6 * _shift(beam), 0)), "µm", "from nominal"))
     if beam.known and beam.compensated:
-        turned = beam_direction_figures.angle_between(beam.direction, beam.uncompensated)
-        note = "by the inclination error, if it is not compensated"
-        figures.append(KeyFigure("turned", Cell(fixed(turned / ARCSEC, 0)), "arcsec", note))
+        change = drawings.angle_between(beam.direction, beam.uncompensated)
+        note = "of the direction, by the compensation of the inclination error"
+        figures.append(KeyFigure("correction", Cell(fixed(change / ARCSEC, 0)), "arcsec", note))
     if bar is not None and math.isfinite(bar.rms):
         out = int(bar.left_out.sum())
         note = f"rms; {integer(out)} {'point' if out == 1 else 'points'} left out"
@@ -99,55 +99,56 @@ def _key_figures(beam: Found, bar: beam_direction_bar.Bar | None) -> list[KeyFig
     return figures
 
 
-def _summary(beam: Found, errors: xr.Dataset, bar: beam_direction_bar.Bar | None) -> list[str]:
+def _summary(beam: BeamView, errors: xr.Dataset, bar: check_bar.Bar | None) -> list[str]:
     planes = beam.planes
-    words = []
+    sentences = []
     if len(planes):
         used, out = int((planes.given & ~planes.left_out).sum()), int(planes.left_out.sum())
         left = f"; {integer(out)} left out" if out else ""
         count = f"{integer(len(planes))} planes" if len(planes) != 1 else "one plane"
-        words.append(f"The direction comes from {integer(used)} readings on {count}{left}.")
+        sentences.append(f"The direction was determined from {integer(used)} readings on {count}{left}.")
     angle, sigma = _to_nominal(beam)
     if not beam.known:
-        words.append("The direction could not be determined.")
+        sentences.append("The direction could not be determined.")
     elif not math.isfinite(angle):
-        words.append("The direction was determined; no nominal direction was given for comparison.")
+        sentences.append("No nominal direction was given for comparison.")
     else:
         value, expanded = rounded(angle / ARCSEC, 2 * sigma / ARCSEC, signed=False)
         within = f" ± {expanded}" if expanded != DASH else ""
-        words.append(
-            f"The beam is {value}{within} arcsec off nominal: 10 mm along it that is {fixed(1e4 * angle, 1)} µm."
+        sentences.append(
+            f"The angle between beam and nominal is {value}{within} arcsec, which is {fixed(1e4 * angle, 1)} µm over "
+            "10 mm."
         )
     if beam.known and math.isfinite(_shift(beam)):
-        words.append(f"Its zero point is {fixed(1e6 * _shift(beam), 0)} µm from nominal.")
+        sentences.append(f"The zero point is {fixed(1e6 * _shift(beam), 0)} µm from nominal.")
     elif beam.known and not np.isfinite(beam.origin).all():
-        words.append(f"The zero point is unknown: {_NO_ORIGIN}.")
-    words += _inclination_in_words(beam)
-    off = beam_direction_planes.far_off(planes) if np.isfinite(planes.closure).sum() > 2 else []
+        sentences.append(f"The zero point is unknown: {_NO_ORIGIN}.")
+    sentences += _inclination_sentences(beam)
+    off = planes_section.not_closed(planes) if np.isfinite(planes.closure).sum() > 2 else []
     if off:
-        words.append(
+        sentences.append(
             f"The planes contradict one another: {listed([f'plane {name}' for name, _ in off])} "
             f"{'do' if len(off) > 1 else 'does'} not close."
         )
     if bar is not None and math.isfinite(bar.radius):
         known = f" (known: {fixed(1e3 * bar.given, 4)} mm)" if math.isfinite(bar.given) else ""
-        words.append(f"The measured radius of the check bar is {fixed(1e3 * bar.radius, 4)} mm{known}.")
-    unseen = [name for name in FREEDOMS if not np.isfinite(errors[name].values).any()]
-    if beam.known and unseen:
-        words.append(f"Not determined: {listed(unseen)}. Reported as unknown, not as zero.")
-    return words
+        sentences.append(f"The measured radius of the check bar is {fixed(1e3 * bar.radius, 4)} mm{known}.")
+    unknown = [name for name in FREEDOMS if not np.isfinite(errors[name].values).any()]
+    if beam.known and unknown:
+        sentences.append(f"Not determined: {listed(unknown)}. Reported as unknown, not as zero.")
+    return sentences
 
 
-def _inclination_in_words(beam: Found) -> list[str]:
-    taken = np.abs(beam.planes.compensation)
+def _inclination_sentences(beam: BeamView) -> list[str]:
+    correction = np.abs(beam.planes.compensation)
     if beam.known and beam.compensated:
-        turned = beam_direction_figures.angle_between(beam.direction, beam.uncompensated)
+        change = drawings.angle_between(beam.direction, beam.uncompensated)
         return [
-            f"Up to {fixed(1e6 * finite(np.max, taken), 1)} µm of inclination error were subtracted from the readings; "
-            f"without this correction the direction would differ by {fixed(turned / ARCSEC, 0)} arcsec."
+            f"Up to {fixed(1e6 * finite(np.max, correction), 1)} µm of inclination error were subtracted from the "
+            f"readings; without this correction the direction would differ by {fixed(change / ARCSEC, 0)} arcsec."
         ]
     tilted = beam.planes.inclination[np.isfinite(beam.planes.inclination)]
-    if beam.known and tilted.size and not np.nan_to_num(taken).any():
+    if beam.known and tilted.size and not np.nan_to_num(correction).any():
         return [
             "The readings were not compensated for the tilt of the planes (up to "
             f"{fixed(np.rad2deg(tilted.max()), 0)}°); an inclination error of the sensor changes the direction and is "
@@ -156,17 +157,15 @@ def _inclination_in_words(beam: Found) -> list[str]:
     return []
 
 
-def _direction(beam: Found, errors: xr.Dataset, key: str) -> list[Block]:
+def _direction(beam: BeamView, errors: xr.Dataset, key: str) -> list[Block]:
     if not beam.known:
         return [Text("The direction could not be determined.", "warning")]
-    drawn = [
-        beam_direction_figures.space(beam, f"{key}-space"),
-        beam_direction_figures.lines(beam, f"{key}-lines"),
-    ]
-    return [*(figure for figure in drawn if figure is not None), _angles(beam, errors), _vectors(beam), _origins(beam)]
+    figures = [drawings.space(beam, f"{key}-space"), drawings.lines(beam, f"{key}-lines")]
+    present = [figure for figure in figures if figure is not None]
+    return [*present, _angles(beam, errors), _vectors(beam), _origins(beam)]
 
 
-def _angles(beam: Found, errors: xr.Dataset) -> Table:
+def _angles(beam: BeamView, errors: xr.Dataset) -> Table:
     angle, sigma = _to_nominal(beam)
     rows = [["to nominal", *_in_units(angle, sigma, _NO_NOMINAL, signed=False)]]
     for i, name in enumerate(FREEDOMS[3:]):
@@ -187,14 +186,14 @@ def _in_units(value: float, sigma: float, reason: str, *, signed: bool = True) -
     return [estimate(value / size, 2 * sigma / size, reason=reason, signed=signed) for _, size in _UNITS]
 
 
-def _vectors(beam: Found) -> Table:
+def _vectors(beam: BeamView) -> Table:
     variance = np.diag(beam.covariance[3:, 3:])
     sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
     rows: list[list[Cell | str]] = []
     for i, name in enumerate(STROKES):
         sine = math.sqrt(max(1 - beam.direction[i] ** 2, 0.0))
-        # Near an axis the angle to it has no linear part; the largest uncertainty of the direction is used.
-        spread = sigma[i] / sine if sine > 1e-2 else _worst(beam)
+        # Near an axis the angle to it is not linear; the largest uncertainty of the direction is used.
+        spread = sigma[i] / sine if sine > 1e-2 else _largest_u(beam)
         inclined = math.acos(float(np.clip(beam.direction[i], -1, 1)))
         row: list[Cell | str] = [
             f"u_{name.lower()}",
@@ -213,18 +212,18 @@ def _vectors(beam: Found) -> Table:
     )
 
 
-def _origins(beam: Found) -> Block:
+def _origins(beam: BeamView) -> Block:
     if not np.isfinite(beam.origin).any():
         return Text(f"The zero point of the beam is unknown: {_NO_ORIGIN}.")
     variance = np.diag(beam.covariance[:3, :3])
     expanded = 2 * np.sqrt(np.where(variance >= 0, variance, np.nan))
-    apart = beam.origin - beam.nominal_origin
+    difference = beam.origin - beam.nominal_origin
     rows: list[list[Cell | str]] = [
         [
             name.lower(),
             estimate(1e3 * beam.origin[i], 1e3 * expanded[i], reason=_NO_ORIGIN),
             or_dash(fixed(1e3 * beam.nominal_origin[i], 3, signed=True), _NO_NOMINAL),
-            estimate(1e6 * apart[i], 1e6 * expanded[i], reason=_NO_NOMINAL),
+            estimate(1e6 * difference[i], 1e6 * expanded[i], reason=_NO_NOMINAL),
         ]
         for i, name in enumerate(STROKES)
     ]
@@ -236,25 +235,25 @@ def _origins(beam: Found) -> Block:
     )
 
 
-def _compensation(beam: Found, errors: xr.Dataset, key: str) -> list[Block]:
-    taken = beam_direction_planes.compensation(beam.planes, f"{key}-compensation")
+def _compensation(beam: BeamView, errors: xr.Dataset, key: str) -> list[Block]:
+    corrections = planes_section.compensation(beam.planes, f"{key}-compensation")
     if not (beam.compensated and beam.known):
-        if taken:
-            return taken
+        if corrections:
+            return corrections
         return [
             Text(
-                "The readings were not corrected. A triangulation sensor has an error on an inclined surface, in "
-                "proportion to depth; on a plane it changes the gradient, and therefore the direction.",
+                "The readings were not corrected. On an inclined surface a triangulation sensor has an error "
+                "proportional to depth; on a plane it changes the gradient, and therefore the direction.",
                 "note",
             )
         ]
     rows: list[list[Cell | str]] = []
-    for what, direction in (("without compensation", beam.uncompensated), ("compensated", beam.direction)):
-        to_nominal = beam_direction_figures.angle_between(direction, beam.nominal)
-        off = beam_direction_figures.angle_between(direction, beam.direction)
+    for name, direction in (("without compensation", beam.uncompensated), ("compensated", beam.direction)):
+        to_nominal = drawings.angle_between(direction, beam.nominal)
+        off = drawings.angle_between(direction, beam.direction)
         rows.append(
             [
-                what,
+                name,
                 *(fixed(value, 6, signed=True) for value in direction),
                 or_dash(fixed(to_nominal / ARCSEC, 1), _NO_NOMINAL),
                 fixed(off / ARCSEC, 1),
@@ -267,37 +266,37 @@ def _compensation(beam: Found, errors: xr.Dataset, key: str) -> list[Block]:
         rows,
         [("", 1), ("direction", 3), ("angle", 3)],
     )
-    return [table, *_rounds(errors), *taken]
+    return [table, *_iterations(errors), *corrections]
 
 
-def _rounds(errors: xr.Dataset) -> list[Block]:
-    rounds = float(errors["iterations"].values.ravel()[0]) if "iterations" in errors else math.nan
-    if not math.isfinite(rounds) or rounds < 1:
+def _iterations(errors: xr.Dataset) -> list[Block]:
+    iterations = float(errors["iterations"].values.ravel()[0]) if "iterations" in errors else math.nan
+    if not math.isfinite(iterations) or iterations < 1:
         return []
-    count = f"{integer(rounds)} iterations" if rounds > 1 else "one iteration"
+    count = f"{integer(iterations)} iterations" if iterations > 1 else "one iteration"
     return [
         Text(
             "The compensation depends on the tilt of each plane to the beam, and the beam on the compensated "
-            f"readings. The result was found by iteration: {count}."
+            f"readings. The result was determined by iteration: {count}."
         )
     ]
 
 
-def _uncertainty(errors: xr.Dataset, beam: Found) -> list[Block]:
+def _uncertainty(errors: xr.Dataset, beam: BeamView) -> list[Block]:
     here = errors.isel(beam=0)
     point = ", ".join(fixed(1e3 * float(value), 3) for value in np.atleast_1d(errors.attrs["functional_point"]))
     blocks: list[Block] = []
     if "influence" in errors and beam.known:
-        made = budget.table(here, f"of the beam '{beam.name}'")
-        rest = budget.readable("independent")
-        rows = [[_INDEPENDENT if row[0] == rest else row[0], *row[1:]] for row in made.rows]
-        blocks.append(replace(made, rows=rows))
+        table = budget.table(here, f"of the beam '{beam.name}'")
+        independent = budget.readable("independent")
+        rows = [[_INDEPENDENT if row[0] == independent else row[0], *row[1:]] for row in table.rows]
+        blocks.append(replace(table, rows=rows))
     else:
         blocks.append(_freedoms(here))
     blocks.append(
         Text(
-            f"The error motions are those of the beam against nominal, about the zero point ({point}) mm in the frame "
-            f"'{errors.attrs.get('frame', 'not stated')}'. The uncertainty covers noise of the readings and the "
+            f"The errors are those of the beam relative to nominal, about the zero point ({point}) mm in the frame "
+            f"'{errors.attrs.get('frame', 'not stated')}'. The uncertainty includes noise of the readings and the "
             "listed sources. It does not include straightness and squareness of the stage and flatness of the planes.",
             "note",
         )
@@ -314,7 +313,9 @@ def _freedoms(here: xr.Dataset) -> Table:
         reason = _NO_ORIGIN if i < 3 else _ABOUT_ITSELF
         rows.append([name, unit, estimate(float(here[name]) / size, 2 * sigma / size, reason=reason)])
     return Table(
-        "The beam's errors against nominal. After ±: expanded uncertainty, k = 2.", ["freedom", "unit", "value"], rows
+        "Errors of the beam relative to nominal. After ±: expanded uncertainty, k = 2.",
+        ["freedom", "unit", "value"],
+        rows,
     )
 
 
@@ -326,8 +327,8 @@ def _quality(source: Source) -> list[Block]:
         blocks.append(
             Text(f"Noise of one reading about its plane: {significant(1e6 * noise)} µm, one standard deviation.")
         )
-    counted = quality.counts(errors, source.raw)
-    if counted:
-        words = ", ".join(f"{name} {number}" for name, number in counted.items())
-        blocks.append(Text(f"Events during the measurement: {words}."))
+    counts = quality.counts(errors, source.raw)
+    if counts:
+        events = ", ".join(f"{name} {number}" for name, number in counts.items())
+        blocks.append(Text(f"Events during the measurement: {events}."))
     return blocks or [Text("The result contains no remarks on the data.", "note")]

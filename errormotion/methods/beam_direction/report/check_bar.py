@@ -1,4 +1,4 @@
-"""The check bar measured with the beam: its circle and the enlarged residuals."""
+"""The check bar that was measured with the beam: fitted circle and enlarged residuals."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from errormotion.report.document import Block, Cell, Figure, Source, Table, Text
 from errormotion.report.fields import field
 from errormotion.report.text import finite, fixed, integer
 
-_DRAWN = 0.25  # of the radius: how far the largest residual is drawn from the circle
-_NAMED = 20
+_DRAWN_RESIDUAL = 0.25  # drawn length of the largest residual, as a share of the radius
+_MAX_LISTED = 20
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class Bar:
         Azimuth of each point about the axis, rad, and its residual, m, positive outside; NaN without a reading.
     left_out : (n,) of bool
     centre : (3,)
-        m; NaN where it is not known.
+        m; NaN if unknown.
     centre_u : (3,)
         Standard uncertainty, m.
     radius, radius_u, given : float
-        Fitted radius, its standard uncertainty, and the radius that the bar is known to have, m.
+        Fitted radius, its standard uncertainty, and the known radius of the bar, m.
     names : (str, str)
-        What the two directions of the drawing are.
+        Names of the two directions of the drawing.
     """
 
     angle: Array
@@ -55,12 +55,12 @@ class Bar:
 
     @property
     def rms(self) -> float:
-        """Of the residuals of the points that were used, m."""
+        """Root mean square of the residuals of the points that were used, m."""
         return math.sqrt(finite(np.mean, self.residual[~self.left_out] ** 2))
 
 
 def bar_of(source: Source) -> Bar | None:
-    """Return the bar of a result; None where there is none."""
+    """Return the bar of a result, if it contains one."""
     errors = source.errors
     if "bar_residual" not in errors or errors["bar_residual"].ndim != 1:
         return None
@@ -90,7 +90,7 @@ def bar_of(source: Source) -> Bar | None:
 
 
 def blocks(bar: Bar, key: str) -> list[Block]:
-    """Return the section on the check bar; ``key`` keeps its figure's identifiers apart."""
+    """Return the section on the check bar; ``key`` makes the identifiers of its figure unique."""
     used = int((np.isfinite(bar.residual) & ~bar.left_out).sum())
     rows: list[list[Cell | str]] = [
         [f"centre, {name}", "mm", _coordinate(value, u)]
@@ -99,38 +99,36 @@ def blocks(bar: Bar, key: str) -> list[Block]:
     rows.append(["radius", "mm", estimate(1e3 * bar.radius, 2e3 * bar.radius_u, digits=6, signed=False)])
     if math.isfinite(bar.given):
         rows.append(["known radius of the bar", "mm", fixed(1e3 * bar.given, 4)])
-        off = 1e6 * (bar.radius - bar.given)
-        rows.append(["difference of the radii", "µm", estimate(off, 2e6 * bar.radius_u)])
+        difference = 1e6 * (bar.radius - bar.given)
+        rows.append(["difference of the radii", "µm", estimate(difference, 2e6 * bar.radius_u)])
     rows.append(["points used", "", integer(used)])
     rows.append(["points left out", "", integer(int(bar.left_out.sum()))])
     rows.append(["residual, rms of the points used", "µm", or_dash(fixed(1e6 * bar.rms, 2), "no residuals")])
     table = Table(
         "Check bar measured with this beam. After ±: expanded uncertainty, k = 2.", ["quantity", "unit", "value"], rows
     )
-    found: list[Block] = [table]
-    if bar.left_out.any():
-        found.append(_named(bar))
-    drawn = figure(bar, key)
-    return [*found, drawn] if drawn else [*found, Text("The points of the bar are not in the result.", "note")]
+    outliers = [_outliers(bar)] if bar.left_out.any() else []
+    drawn = figure(bar, key) or Text("The points of the bar are not in the result.", "note")
+    return [table, *outliers, drawn]
 
 
 def _coordinate(value: float, u: float) -> Cell:
     if u == 0:
-        return Cell(fixed(1e3 * value, 3, signed=True), reason="along the bar, where its centre is not determined")
+        return Cell(fixed(1e3 * value, 3, signed=True), reason="along the bar, in which the centre is not determined")
     return estimate(1e3 * value, 2e3 * u, digits=7)
 
 
-def _named(bar: Bar) -> Table:
-    positions = np.flatnonzero(bar.left_out)
+def _outliers(bar: Bar) -> Table:
+    left_out = np.flatnonzero(bar.left_out)
     rows: list[list[Cell | str]] = [
         [
             f"point {k + 1}",
             or_dash(fixed(np.rad2deg(bar.angle[k]), 1), "its position is not in the result"),
             fixed(1e6 * bar.residual[k], 1, signed=True),
         ]
-        for k in positions[:_NAMED]
+        for k in left_out[:_MAX_LISTED]
     ]
-    notes = [f"{len(positions) - _NAMED} more are in the dataset."] if len(positions) > _NAMED else []
+    notes = [f"{len(left_out) - _MAX_LISTED} more are in the dataset."] if len(left_out) > _MAX_LISTED else []
     caption = "Points of the bar that were left out as outliers."
     return Table(caption, ["point", "azimuth / °", "residual / µm"], rows, notes=notes)
 
@@ -142,7 +140,7 @@ def figure(bar: Bar, key: str) -> Figure | None:
     if not used.any() or not bar.radius > 0:
         return None
     largest = float(np.abs(bar.residual[used]).max())
-    factor = max(round_down(_DRAWN * bar.radius / largest), 1.0) if largest > 0 else 1.0
+    factor = max(round_down(_DRAWN_RESIDUAL * bar.radius / largest), 1.0) if largest > 0 else 1.0
     middle = _middle(bar.angle[used])
     turned = np.angle(np.exp(1j * (bar.angle - middle)))
 
@@ -170,8 +168,8 @@ def figure(bar: Bar, key: str) -> Figure | None:
 
     crosses = " Crosses: points left out, with their number." if (shown & bar.left_out).any() else ""
     caption = (
-        f"The check bar across its axis, in mm. Dots: the measured points, their distance from the fitted circle "
-        f"enlarged {number(factor)} times; right: the same over azimuth.{crosses}"
+        f"Section across the check bar, in mm. Dots: the measured points, their distance from the fitted circle "
+        f"enlarged {number(factor)} times; right: the residuals over azimuth.{crosses}"
     )
     alt = (
         f"Circle of radius {fixed(1e3 * bar.radius, 4)} mm with {integer(int(used.sum()))} points, residuals up to "
@@ -186,28 +184,19 @@ def _circle(axes: Axes, bar: Bar, factor: float, shown: NDArray[np.bool_]) -> No
     axes.fill(r * np.cos(turn), r * np.sin(turn), facecolor="#f3f4f6", edgecolor="#666666", lw=0.9)
     axes.plot(0, 0, marker="+", color="#666666", ms=8, mew=0.8)
     order = [k for k in np.argsort(np.angle(np.exp(1j * (bar.angle - _middle(bar.angle[shown]))))) if shown[k]]
-    use = np.array([k for k in order if not bar.left_out[k]])
-    far = r * (1 + 1.4 * _DRAWN)
-    position = np.clip(r + 1e3 * factor * bar.residual, r * (1 - 1.4 * _DRAWN), far)
-    axes.plot(
-        position[use] * np.cos(bar.angle[use]), position[use] * np.sin(bar.angle[use]), color=canvas.VERMILLION, lw=0.8
-    )
-    for k in use:
-        c, s = math.cos(bar.angle[k]), math.sin(bar.angle[k])
-        axes.plot([r * c, position[k] * c], [r * s, position[k] * s], color=canvas.VERMILLION, lw=0.5)
-    axes.plot(
-        position[use] * np.cos(bar.angle[use]),
-        position[use] * np.sin(bar.angle[use]),
-        "o",
-        color=canvas.VERMILLION,
-        ms=2.4,
-    )
-    for k in np.flatnonzero(shown & bar.left_out):
-        c, s = math.cos(bar.angle[k]), math.sin(bar.angle[k])
-        axes.plot(position[k] * c, position[k] * s, "x", color="#222222", ms=5, mew=1.1)
-        axes.annotate(
-            str(k + 1), (position[k] * c, position[k] * s), xytext=(5, 3), textcoords="offset points", fontsize=7
+    used = np.array([k for k in order if not bar.left_out[k]])
+    far = r * (1 + 1.4 * _DRAWN_RESIDUAL)
+    radial = np.clip(r + 1e3 * factor * bar.residual, r * (1 - 1.4 * _DRAWN_RESIDUAL), far)
+    x, y = radial * np.cos(bar.angle), radial * np.sin(bar.angle)
+    axes.plot(x[used], y[used], color=canvas.VERMILLION, lw=0.8)
+    for k in used:
+        axes.plot(
+            [r * math.cos(bar.angle[k]), x[k]], [r * math.sin(bar.angle[k]), y[k]], color=canvas.VERMILLION, lw=0.5
         )
+    axes.plot(x[used], y[used], "o", color=canvas.VERMILLION, ms=2.4)
+    for k in np.flatnonzero(shown & bar.left_out):
+        axes.plot(x[k], y[k], "x", color="#222222", ms=5, mew=1.1)
+        axes.annotate(str(k + 1), (x[k], y[k]), xytext=(5, 3), textcoords="offset points", fontsize=7)
     axes.set(xlim=(-1.02 * far, 1.02 * far), ylim=(-1.02 * far, 1.02 * far), aspect="equal")
     axes.set_xlabel(f"{bar.names[0]} from the centre / mm")
     axes.set_ylabel(f"{bar.names[1]} from the centre / mm")
@@ -228,10 +217,10 @@ def _scalar(errors: xr.Dataset | None, name: str) -> float:
 
 
 def _axis(source: Source, points: Array) -> Array:
-    """Return the direction of the bar: as stated, or across the plane of its points."""
-    for holder in (source.errors, source.raw):
-        if holder is not None and "bar_axis" in holder:
-            axis = _vector(holder, "bar_axis")
+    """Return the direction of the bar: the stated one, or the normal of the plane of its points."""
+    for dataset in (source.errors, source.raw):
+        if dataset is not None and "bar_axis" in dataset:
+            axis = _vector(dataset, "bar_axis")
             if np.isfinite(axis).all() and np.linalg.norm(axis) > 0:
                 return axis / float(np.linalg.norm(axis))
     known = points[np.isfinite(points).all(axis=1)]
@@ -241,7 +230,7 @@ def _axis(source: Source, points: Array) -> Array:
 
 
 def _plane(axis: Array) -> tuple[Array, tuple[str, str]]:
-    """Return two unit vectors (2, 3) across the bar, machine axes where it lies along one, and their names."""
+    """Return two unit vectors (2, 3) across the bar, machine axes if it is parallel to one, and their names."""
     along = int(np.argmax(np.abs(axis)))
     if abs(axis[along]) < 1 - 1e-6:
         return across(axis), ("across 1", "across 2")

@@ -23,7 +23,7 @@ class Planes:
     Attributes
     ----------
     names : list of str
-        Of the planes: their numbers from 1 where the dataset has none.
+        Labels of the planes, by default their numbers from 1.
     inclination, rotation, closure, closure_u : (plane,)
         rad; closure is g.u + 1.
     gradient : (plane, 3)
@@ -59,21 +59,21 @@ class Planes:
 
     @property
     def strokes(self) -> NDArray[np.str_]:
-        """Which axis moved for each reading, (plane, reading): ``X``, ``Y``, ``Z`` or ``path``.
+        """Moving axis at each reading, (plane, reading): ``X``, ``Y``, ``Z`` or ``path``.
 
-        Empty where the stage positions are not known, or where it did not move.
+        Empty if the stage positions are unknown, or if the stage did not move.
         """
-        found = np.full(self.given.shape, "", dtype="U4")
+        result = np.full(self.given.shape, "", dtype="U4")
         for plane, (positions, given) in enumerate(zip(self.stage, self.given, strict=True)):
             known = np.flatnonzero(given & np.isfinite(positions).all(axis=1))
             if known.size < 2:
                 continue
             steps = np.diff(positions[known], axis=0)
             names = np.array([_axis_of(step) for step in steps])
-            # A reading belongs to the step that leads to it; after a move to the next stroke to the one that follows.
+            # A reading belongs to the step before it, or after a move to the next stroke to the step after it.
             before, after = np.concatenate([names[:1], names]), np.concatenate([names, names[-1:]])
-            found[plane, known] = np.where(np.isin(before, list(STROKES)), before, after)
-        return found
+            result[plane, known] = np.where(np.isin(before, list(STROKES)), before, after)
+        return result
 
 
 def _axis_of(step: Array) -> str:
@@ -84,13 +84,13 @@ def _axis_of(step: Array) -> str:
 
 
 @dataclass(frozen=True)
-class Found:
+class BeamView:
     """One beam: nominal and measured position and direction, and their uncertainty. NaN for unknown values.
 
     Attributes
     ----------
     direction, nominal, uncompensated : (3,)
-        Unit vectors; ``uncompensated`` is the direction that readings as they came would give.
+        Unit vectors; ``uncompensated`` is the direction without compensation of the readings.
     origin, nominal_origin : (3,)
         m.
     covariance : (6, 6)
@@ -108,7 +108,7 @@ class Found:
 
     @property
     def known(self) -> bool:
-        """Whether there is a direction."""
+        """Whether the direction is known."""
         return bool(np.isfinite(self.direction).all())
 
     @property
@@ -123,14 +123,14 @@ def is_direction(errors: xr.Dataset) -> bool:
     return measured and "beam" in errors.dims and errors.attrs.get("method") == "beam_direction"
 
 
-def found(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Found:
-    """Return the view of a result; ``raw`` gives the stage positions where the result does not contain them."""
+def beam_view(errors: xr.Dataset, raw: xr.Dataset | None = None) -> BeamView:
+    """Return the view of a result, with the stage positions of ``raw`` if the result does not contain them."""
     name = str(errors["beam"].values[0]) if "beam" in errors.coords else "beam"
     direction, nominal = (_of_beam(errors, f"{kind}_direction") for kind in ("beam", "nominal"))
     covariance = np.full((6, 6), np.nan)
     if "beam_covariance" in errors and errors["beam_covariance"].shape[1:] == (6, 6):
         covariance = np.asarray(errors["beam_covariance"].values[0], float)
-    return Found(
+    return BeamView(
         name,
         _unit(direction),
         _unit(nominal),
@@ -194,7 +194,7 @@ def _unit(vector: Array) -> Array:
 
 
 def across(direction: Array) -> tuple[Array, tuple[str, str]]:
-    """Return two unit vectors (2, 3) across a direction, nearest to two machine axes, and the names of those."""
+    """Return two unit vectors (2, 3) across a direction, nearest to two machine axes, and the names of these axes."""
     along = int(np.argmax(np.abs(direction)))
     first, second = (i for i in range(3) if i != along)
     a = np.eye(3)[first] - direction[first] * direction

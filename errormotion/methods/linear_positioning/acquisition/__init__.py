@@ -1,1 +1,1 @@
-"""Acquisition: an axis approaches its targets, and an interferometer or a tracker in line with it is read."""
+"""Acquisition: the axis moves to its targets, and an interferometer or a tracker in line with the axis is read."""

@@ -1,7 +1,7 @@
-"""What reads the axis: an interferometer with a channel for each freedom, or a laser tracker in line with the axis.
+"""Instruments that read the axis: an interferometer with a channel for each freedom, or a laser tracker in line.
 
-A tracker gives the distance of the reflector from where it was at zero, by distance and angles. Along a line that
-points to the tracker the angles have an effect of second order only.
+A tracker measures the displacement of its reflector since zero, by distance and angles. Along a line that points to the
+tracker, the angles have an effect of second order only.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from errormotion.plugins import Bench
 
 UNITS = ("m", "m", "m", "rad", "rad", "rad")
-NEAR = 0.01
-"""Distance from the zero below which the side of the reflector is unknown, m."""
+SIGN_DISTANCE = 0.01
+"""Distance from the zero below which the sign of a tracker's displacement cannot be determined from its readings, m."""
 
 
 class Reader(Protocol):
     """Reads all freedoms of a test.
 
-    ``lost`` states whether the zero was lost: readings are NaN until `zero`.
+    ``lost`` states whether there is no zero, as at the start and after a broken beam: call `zero` before `read`.
     """
 
     id: str
@@ -36,17 +36,17 @@ class Reader(Protocol):
     def zero(self) -> None:
         """Take the present position as zero."""
 
-    def read(self, way: float) -> Array:
-        """Return the readings (freedom,), m and rad; ``way`` (m) is the commanded distance from the zero."""
+    def read(self, distance: float) -> Array:
+        """Return the readings (freedom,), m and rad; ``distance`` (m) is the commanded one from the zero."""
 
 
-def reader(bench: Bench, settings: Settings) -> Reader:
-    """Return the reader of a bench.
+def axis_reader(bench: Bench, settings: Settings) -> Reader:
+    """Return the reader of the freedoms of an axis.
 
     Raises
     ------
     MethodError
-        No instrument that can read these freedoms.
+        No instrument on the bench can read these freedoms.
     """
     if bench.has_kind("interferometer"):
         wanted = {
@@ -58,7 +58,7 @@ def reader(bench: Bench, settings: Settings) -> Reader:
         tracker = bench.of_kind("laser_tracker")
         if settings.freedoms != (along,):
             raise MethodError(
-                f"freedoms: a laser tracker in line with {settings.axis} reads {along} alone; found "
+                f"freedoms: a laser tracker in line with {settings.axis} reads only {along}; found "
                 f"{', '.join(settings.freedoms)}."
             )
         if hasattr(tracker, "measure"):
@@ -66,13 +66,13 @@ def reader(bench: Bench, settings: Settings) -> Reader:
     raise _missing()
 
 
-def along_line(bench: Bench, settings: Settings, channel: str, name: str) -> Reader:
+def diagonal_reader(bench: Bench, settings: Settings, channel: str, name: str) -> Reader:
     """Return the reader of displacements along a diagonal; ``channel`` is that of an interferometer.
 
     Raises
     ------
     MethodError
-        No instrument that can read them.
+        No instrument on the bench can read them.
     """
     if bench.has_kind("interferometer"):
         wanted = {f"diagonals.channels.{name}": (channel, "m")}
@@ -93,7 +93,7 @@ class InterferometerReader:
     """Reads the channels of an interferometer."""
 
     def __init__(self, instrument: Any, wanted: Mapping[str, tuple[str, str]], average: int) -> None:
-        """Take the channels of an instrument: ``wanted`` holds channel and unit by the key of the setting."""
+        """Select channels of an instrument; ``wanted`` maps the key of each setting to channel and unit."""
         self._instrument, self._average = instrument, average
         self.id = str(type(instrument).info.id)
         self.lost = True
@@ -116,19 +116,17 @@ class InterferometerReader:
         self._instrument.zero()
         self.lost = False
 
-    def read(self, way: float) -> Array:  # noqa: ARG002 - as of a tracker
+    def read(self, distance: float) -> Array:  # noqa: ARG002 - needed by a tracker only
         """Return means of several readings, NaN where a beam was broken."""
-        values = np.array([[float(found[name]) for name in self._names] for found in self._readings()])
+        readings = [self._instrument.read() for _ in range(self._average)]
+        values = np.array([[float(reading[name]) for name in self._names] for reading in readings])
         mean = np.asarray(values.mean(axis=0) * np.array(self._signs))
         self.lost = bool(np.isnan(mean).any())
         return mean
 
-    def _readings(self) -> list[Any]:
-        return [self._instrument.read() for _ in range(self._average)]
-
 
 class TrackerReader:
-    """Reads the distance of a tracker's reflector from its zero."""
+    """Reads the displacement of a tracker's reflector since zero."""
 
     def __init__(self, tracker: Any, average: int) -> None:
         self._tracker, self._average = tracker, average
@@ -136,7 +134,7 @@ class TrackerReader:
         self.lost = True
         self._zero: Array | None = None
         self._path = 0
-        self._outward = 1.0  # 1 where the distance increases with the axis, -1 where it decreases; known from far ways
+        self._outward = 1.0  # 1: the distance increases with the axis, -1: it decreases; updated far from the zero
 
     def zero(self) -> None:
         """Take the present position of the reflector as zero.
@@ -144,31 +142,33 @@ class TrackerReader:
         Raises
         ------
         MethodError
-            The tracker has no distance.
+            The tracker measures no distance.
         """
-        found = self._position()
-        if found is None:
-            raise MethodError("The tracker has no distance at the first target. Let it acquire its reflector.")
-        self._zero, self._path = found
+        measured = self._measured()
+        if measured is None:
+            raise MethodError(
+                "The tracker measures no distance at the first target. Check that it has acquired its reflector."
+            )
+        self._zero, self._path = measured
         self.lost = False
 
-    def read(self, way: float) -> Array:
-        """Return the distance from the zero, with the sign of the way; NaN after the count was lost."""
-        found = self._position()
-        if found is None or self._zero is None or found[1] != self._path:
+    def read(self, distance: float) -> Array:
+        """Return the displacement since zero, with the sign of ``distance``; NaN after the beam was broken."""
+        measured = self._measured()
+        if measured is None or self._zero is None or measured[1] != self._path:
             self.lost = True
             return np.full(1, np.nan)
-        place, start = found[0], self._zero
-        change = float(np.linalg.norm(place) - np.linalg.norm(start))
-        if abs(way) < NEAR:
+        position, start = measured[0], self._zero
+        change = float(np.linalg.norm(position) - np.linalg.norm(start))
+        if abs(distance) < SIGN_DISTANCE:
             return np.array([self._outward * change])
-        self._outward = float(np.sign(change * way))
-        return np.array([np.sign(way) * np.linalg.norm(place - start)])
+        self._outward = float(np.sign(change * distance))
+        return np.array([np.sign(distance) * np.linalg.norm(position - start)])
 
-    def _position(self) -> tuple[Array, int] | None:
-        """Return the mean position of the reflector in the tracker's frame, m, and its dead path; None without."""
-        found = [self._tracker.measure() for _ in range(self._average)]
-        paths = {int(each.dead_path) for each in found}
-        if not all(each.valid for each in found) or len(paths) > 1:
+    def _measured(self) -> tuple[Array, int] | None:
+        """Return the mean position of the reflector in the tracker's frame, m, and its dead path; None if invalid."""
+        readings = [self._tracker.measure() for _ in range(self._average)]
+        paths = {int(reading.dead_path) for reading in readings}
+        if not all(reading.valid for reading in readings) or len(paths) > 1:
             return None
-        return np.array([each.position for each in found], np.float64).mean(axis=0), paths.pop()
+        return np.array([reading.position for reading in readings], np.float64).mean(axis=0), paths.pop()

@@ -1,7 +1,7 @@
-"""Measurement: the control takes the axis through the approaches of the plan, and each target is read at rest.
+"""Measurement: the control moves the axis to each target in the planned order, and the target is read at rest.
 
-The instrument is set to zero at the first target, approached forward. Where a beam breaks, the readings up to the next
-such approach are missing. Linear cycles yield one dataset a run, pendulum cycles one a target.
+The instrument is set to zero at the first target, approached forward. After a broken beam, readings are missing until
+the next such approach. Linear cycles yield one dataset per run, pendulum cycles one per target.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
-from errormotion.methods.linear_positioning.acquisition.instruments import reader
+from errormotion.methods.linear_positioning.acquisition.instruments import Reader, axis_reader
 from errormotion.methods.linear_positioning.planning.motions import stops
 from errormotion.methods.linear_positioning.planning.targets import Approach, positions, sequence
 from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, SCHEMA, SENSORS
@@ -41,25 +41,25 @@ def measure_axis(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
         ``thermometer``, where the settings name sensors.
     settings : Settings
     done : Dataset, optional
-        Data of an interrupted run, which are not measured again. The instrument is then set to zero once more.
+        Data of an interrupted run, which are not measured again. The instrument is then set to zero again.
 
     Raises
     ------
     MethodError
-        No instrument that can do it, limits that the test would leave, an axis that does not arrive.
+        The bench lacks an instrument, the test would exceed the limits, or the axis does not reach a target.
     """
-    list(stops(settings))  # the limits, before anything moves
-    stand = Stand(bench, settings)
+    list(stops(settings))  # checks the limits before the axis moves
+    axis = AxisMeasurement(bench, settings)
     along_runs = settings.cycle == "linear"
     finished = 0 if done is None else int(done.sizes["run" if along_runs else "target"])
-    parts = groupby(sequence(settings), key=lambda each: each.run if along_runs else each.target)
+    parts = groupby(sequence(settings), key=lambda approach: approach.run if along_runs else approach.target)
     for number, part in parts:
         if number >= finished:
-            yield stand.measure(list(part), along_runs)
+            yield axis.measure(list(part), along_runs)
 
 
 class Motion:
-    """The control of a bench: it moves to positions and lets time pass."""
+    """The control of a bench, with moves that wait for the arrival."""
 
     def __init__(self, bench: Bench, settings: Settings) -> None:
         self.bench, self.settings = bench, settings
@@ -70,143 +70,147 @@ class Motion:
                 "has none. Run the NC program, write the readings to a table, and use 'errormotion identify FILE'."
             )
 
-    def go(self, goal: Array, feed: float | None = None) -> None:
-        """Move to a position (3,), m, with the feed of the approaches or another, and wait until the axes have arrived.
+    def move_to(self, position: Array, feed: float | None = None) -> None:
+        """Move to a position (3,), m, at the feed of the approaches or another, and wait until the axes have arrived.
 
         Raises
         ------
         MethodError
-            They do not arrive.
+            The axes have not arrived within the timeout.
         """
-        self.control.move_to([float(value) for value in goal], self.settings.feed if feed is None else feed)
-        limit = time.monotonic() + self.settings.timeout
+        self.control.move_to([float(value) for value in position], self.settings.feed if feed is None else feed)
+        deadline = time.monotonic() + self.settings.timeout
         while True:
             state = self.control.state()
-            off = np.abs(np.array(state["position"], np.float64) - goal)
+            off = np.abs(np.array(state["position"], np.float64) - position)
             if not state.get("running", False) and off.max() <= self.settings.arrival:
                 return
-            if time.monotonic() > limit:
+            if time.monotonic() > deadline:
                 k = int(off.argmax())
                 raise MethodError(
-                    f"{'XYZ'[k]} {goal[k] * 1e3:.3f} mm: the control is {off[k] * 1e3:.4g} mm off after "
-                    f"{self.settings.timeout:g} s. Is the feed held, or the position out of travel?"
+                    f"{'XYZ'[k]} {position[k] * 1e3:.3f} mm: the axis is {off[k] * 1e3:.4g} mm from this position "
+                    f"after {self.settings.timeout:g} s. Check for feed hold, and that the position is within the "
+                    "travel."
                 )
             time.sleep(_POLL_INTERVAL)
 
     def wait(self, seconds: float) -> None:
-        """Let time pass: that of the machine, where it has its own."""
+        """Wait, in the time of the control where it is simulated, else in real time."""
         if hasattr(self.control, "elapse"):
             self.control.elapse(seconds)
         else:
             time.sleep(seconds)
 
 
-class Stand(Motion):
+class AxisMeasurement(Motion):
     """Machine and instrument of a bench, for one axis."""
 
     def __init__(self, bench: Bench, settings: Settings, zero: float | None = None) -> None:
         super().__init__(bench, settings)
-        self.reader = reader(bench, settings)
-        self.places = positions(settings)
-        self.zero = float(self.places[0]) if zero is None else zero  # position at which the instrument is set to zero
+        self.reader = axis_reader(bench, settings)
+        self.targets = positions(settings)
+        self.zero = float(self.targets[0]) if zero is None else zero  # position at which the instrument is set to zero
         self.along = DOF[direction_of(settings.axis)]
         self.sensors = (*settings.machine.sensors, *settings.workpiece.sensors)
         self.thermometer = self._thermometer()
-        self.fresh = True
 
     def measure(self, approaches: list[Approach], along_runs: bool) -> xr.Dataset:
-        """Return the raw dataset of some approaches: those of one run, or of one target."""
+        """Return the raw dataset of the approaches of one run, or of one target."""
         start = datetime.now(UTC).isoformat(timespec="seconds")
         runs = 1 if along_runs else self.settings.runs
-        targets = self.places.size if along_runs else 1
+        targets = self.targets.size if along_runs else 1
         x = np.full((len(self.settings.freedoms), runs, 2, targets), np.nan)
         T = np.full((runs, 2, targets, len(self.sensors)), np.nan)
-        for each in approaches:
-            if each.before is not None:
-                self.move(each.before)
-            self.move(each.place)
+        for approach in approaches:
+            if approach.before is not None:
+                self.move(approach.before)
+            self.move(approach.position)
             self.wait(self.settings.settle)
-            where = (0 if along_runs else each.run, each.approach, each.target if along_runs else 0)
-            if (each.target, each.approach) == (0, 0) and (self.fresh or self.reader.lost):
+            index = (0 if along_runs else approach.run, approach.direction, approach.target if along_runs else 0)
+            if (approach.target, approach.direction) == (0, 0) and self.reader.lost:
                 self.reader.zero()
-                self.fresh = False
-            x[(slice(None), *where)] = self.read(each.place)
-            T[where] = self.temperatures()
+            x[(slice(None), *index)] = self.read(approach.position)
+            T[index] = self.temperatures()
             self.wait(self.settings.dwell - self.settings.settle)
         return self._dataset(x, T, approaches, along_runs, start)
 
-    def read(self, place: float) -> Array:
+    def read(self, position: float) -> Array:
         """Return the deviations (freedom,) at a position, m and rad; NaN while there is no zero."""
-        way = place - self.zero
-        if self.fresh or self.reader.lost:
+        distance = position - self.zero
+        if self.reader.lost:
             return np.full(len(self.settings.freedoms), np.nan)
-        values = self.reader.read(way).copy()
+        values = self.reader.read(distance).copy()
         if self.along in self.settings.freedoms:
-            values[self.settings.freedoms.index(self.along)] -= way
+            values[self.settings.freedoms.index(self.along)] -= distance
         return np.asarray(values)
 
-    def move(self, place: float, feed: float | None = None) -> None:
-        """Move the axis to a position, m, with the feed of the approaches or another, and wait until it has arrived.
-
-        Raises
-        ------
-        MethodError
-            It does not arrive.
-        """
-        goal = np.array(self.settings.start, np.float64)
-        goal[direction_of(self.settings.axis)] = place
-        self.go(goal, feed)
+    def move(self, position: float, feed: float | None = None) -> None:
+        """Move the axis to a position, m, as `move_to` does; the other axes are at their positions in ``start``."""
+        target = np.array(self.settings.start, np.float64)
+        target[direction_of(self.settings.axis)] = position
+        self.move_to(target, feed)
 
     def temperatures(self) -> Array:
-        """Return the temperatures of the sensors now, degC; NaN where unknown."""
+        """Return the present temperatures of the sensors, degC; NaN where unknown."""
         if self.thermometer is None:
             return np.full(len(self.sensors), np.nan)
-        found = self.thermometer.read()
-        return np.array([found.get(name, np.nan) for name in self.sensors], np.float64)
+        read = self.thermometer.read()
+        return np.array([read.get(name, np.nan) for name in self.sensors], np.float64)
 
     def _thermometer(self) -> Any:
         if not self.sensors:
             return None
         if not self.bench.has_kind("thermometer"):
             raise MethodError(
-                f"Sensors {', '.join(self.sensors)} (machine.sensors, workpiece.sensors) need an instrument of kind "
-                "'thermometer' on the bench; there is none. Add it, or leave them out."
+                f"machine.sensors, workpiece.sensors: expected an instrument of kind 'thermometer' on the bench for "
+                f"{', '.join(self.sensors)}; found none. Add it, or leave the sensors out."
             )
-        found = self.bench.of_kind("thermometer")
-        if missing := [name for name in self.sensors if name not in found.channels]:
+        thermometer = self.bench.of_kind("thermometer")
+        if missing := [name for name in self.sensors if name not in thermometer.channels]:
             raise MethodError(
-                f"machine.sensors, workpiece.sensors: the thermometer has no {', '.join(missing)}; expected names from "
-                f"{', '.join(found.channels)}."
+                f"machine.sensors, workpiece.sensors: expected channels of the thermometer, "
+                f"{', '.join(thermometer.channels)}; found {', '.join(missing)}."
             )
-        return found
+        return thermometer
 
     def _dataset(self, x: Array, T: Array, approaches: list[Approach], along_runs: bool, start: str) -> xr.Dataset:
-        settings = self.settings
-        names = iso_names(settings.axis)
-        places = self.places if along_runs else self.places[[approaches[0].target]]
+        targets = self.targets if along_runs else self.targets[[approaches[0].target]]
         variables: dict[str, Any] = {
             "deviation": (READINGS, x),
-            "target_position": ("target", places, _M),
+            "target_position": ("target", targets, _M),
             "zero_position": ((), self.zero, _M),
         }
-        coords: dict[str, Any] = {
-            "freedom": [names[name] for name in settings.freedoms],
-            "approach": list(APPROACHES),
-        }
+        return self.dataset(variables, {"approach": list(APPROACHES)}, x, (SENSORS, T), start)
+
+    def dataset(
+        self,
+        variables: dict[str, Any],
+        labels: dict[str, Any],
+        x: Array,
+        temperatures: tuple[tuple[str, ...], Array],
+        start: str,
+    ) -> xr.Dataset:
+        """Return a raw dataset of readings ``x`` and temperatures (dims, values), with what the settings state."""
+        settings = self.settings
+        names = iso_names(settings.axis)
+        coords = {"freedom": [names[name] for name in settings.freedoms], **labels}
         if settings.functional_point is not None:
             variables["functional_point"] = ("direction", np.array(settings.functional_point), _M)
             coords["direction"] = list("xyz")
         if self.sensors:
-            variables["temperature"] = (SENSORS, T, {"units": "degC"})
+            variables["temperature"] = (*temperatures, {"units": "degC"})
             coords["sensor"] = list(self.sensors)
-        missing = int(np.isnan(x).sum())
-        attrs = {
-            "schema": SCHEMA,
-            "axis": settings.axis,
-            "machine": self.bench.machine,
-            "instrument": self.reader.id,
-            "start": start,
-            "dropped": 0,
-            "invalid": {"beam broken": missing} if missing else {},
-        }
+        attrs = {"schema": SCHEMA, "axis": settings.axis, **measured_attrs(self.bench, self.reader, x, start)}
         return xr.Dataset(variables, coords, attrs)
+
+
+def measured_attrs(bench: Bench, reader: Reader, x: Array, start: str) -> dict[str, Any]:
+    """Return the attributes that state where, when and how readings ``x`` were taken, and how many are missing."""
+    missing = int(np.isnan(x).sum())
+    return {
+        "machine": bench.machine,
+        "instrument": reader.id,
+        "start": start,
+        "dropped": 0,
+        "invalid": {"beam broken": missing} if missing else {},
+    }

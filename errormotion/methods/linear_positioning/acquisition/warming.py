@@ -1,4 +1,4 @@
-"""Measurement of a moving axis (ISO 230-3): both ends of the stroke are read cold, between the moves, and cooling."""
+"""Measurement of a moving axis (ISO 230-3): both ends of the stroke are read cold, during warm-up, and cooling."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.kinematics.iso import iso_names
-from errormotion.methods.linear_positioning.acquisition.measure import Stand
+from errormotion.methods.linear_positioning.acquisition.measure import AxisMeasurement
 from errormotion.methods.linear_positioning.moving import Cycle, cycles, ends, moving_of
-from errormotion.methods.linear_positioning.schema import SCHEMA
 
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
@@ -28,77 +26,59 @@ def measure_moving(bench: Bench, settings: Settings, done: xr.Dataset | None) ->
     Raises
     ------
     MethodError
-        An interrupted test, a broken beam in the cold state, and what `measure_axis` raises.
+        An interrupted test, a broken beam in the cold state, and as of `measure_axis`.
     """
     if done is not None:
         raise MethodError(
-            "A test of a moving axis cannot be continued: the axis has cooled down meanwhile. Let it cool, and start "
-            "a new run."
+            "A test of a moving axis cannot be continued, since the axis has cooled down in the meantime. Let it cool "
+            "completely, and start a new run."
         )
     low, high = ends(settings)
-    stand = Stand(bench, settings, zero=low)
-    stand.move(low)
-    stand.wait(settings.settle)
-    stand.reader.zero()
-    stand.fresh = False
-    started: float | None = None
+    axis = AxisMeasurement(bench, settings, zero=low)
+    axis.move(low)
+    axis.wait(settings.settle)
+    axis.reader.zero()
     cold = [cycle for cycle in cycles(settings) if cycle.cold]
-    read = [_ends(stand, low, high) for _ in cold]
-    last = read[-1][0]
-    for cycle, found in zip(cold, read, strict=True):
-        yield _dataset(stand, cycle, (found[0] - last, *found[1:]))
+    readings = [_read_ends(axis, low, high) for _ in cold]
+    end_of_cold = readings[-1][0]
+    for cycle, reading in zip(cold, readings, strict=True):
+        yield _dataset(axis, cycle, end_of_cold, reading)
+    start: float | None = None
     for cycle in cycles(settings):
         if cycle.cold:
             continue
-        started = _now(stand) if started is None else started
+        start = _now(axis) if start is None else start
         for _ in range(cycle.strokes):
-            stand.move(high, moving_of(settings).feed)
-            stand.move(low, moving_of(settings).feed)
-        stand.wait(cycle.rest)
-        found = _ends(stand, low, high)
-        yield _dataset(stand, cycle, (found[0] - started, *found[1:]))
+            axis.move(high, moving_of(settings).feed)
+            axis.move(low, moving_of(settings).feed)
+        axis.wait(cycle.rest)
+        yield _dataset(axis, cycle, start, _read_ends(axis, low, high))
 
 
-def _ends(stand: Stand, low: float, high: float) -> tuple[float, Array, Array]:
+def _read_ends(axis: AxisMeasurement, low: float, high: float) -> tuple[float, Array, Array]:
     """Return time, s, deviations (end, freedom) and temperatures of a reading of both ends, forward and backward."""
-    found = {}
-    for place in (high, low):
-        stand.move(place)
-        stand.wait(stand.settings.settle)
-        found[place] = stand.read(place)
-        stand.wait(stand.settings.dwell - stand.settings.settle)
-    return _now(stand), np.stack([found[low], found[high]]), stand.temperatures()
+    deviations = {}
+    for position in (high, low):
+        axis.move(position)
+        axis.wait(axis.settings.settle)
+        deviations[position] = axis.read(position)
+        axis.wait(axis.settings.dwell - axis.settings.settle)
+    return _now(axis), np.stack([deviations[low], deviations[high]]), axis.temperatures()
 
 
-def _now(stand: Stand) -> float:
+def _now(axis: AxisMeasurement) -> float:
     """Return the time of the control, or of this computer, s."""
-    return float(stand.control.state().get("time", time.monotonic()))
+    return float(axis.control.state().get("time", time.monotonic()))
 
 
-def _dataset(stand: Stand, cycle: Cycle, found: tuple[float, Array, Array]) -> xr.Dataset:
-    settings, (when, x, T) = stand.settings, found
-    names = iso_names(settings.axis)
+def _dataset(axis: AxisMeasurement, cycle: Cycle, start: float, reading: tuple[float, Array, Array]) -> xr.Dataset:
+    """Return the raw dataset of one reading; its time counts from ``start``, s."""
+    now, x, T = reading
     variables: dict[str, Any] = {
         "end_deviation": (("cycle", "end", "freedom"), x[None]),
-        "end_position": ("end", np.array(ends(settings)), {"units": "m"}),
-        "reading_time": ("cycle", np.array([when]), {"units": "s"}),
+        "end_position": ("end", np.array(ends(axis.settings)), {"units": "m"}),
+        "reading_time": ("cycle", np.array([now - start]), {"units": "s"}),
         "moving": ("cycle", np.array([float(cycle.moving)]), {"units": "1"}),
     }
-    coords: dict[str, Any] = {"freedom": [names[name] for name in settings.freedoms]}
-    if settings.functional_point is not None:
-        variables["functional_point"] = ("direction", np.array(settings.functional_point), {"units": "m"})
-        coords["direction"] = list("xyz")
-    if stand.sensors:
-        variables["temperature"] = (("cycle", "sensor"), T[None], {"units": "degC"})
-        coords["sensor"] = list(stand.sensors)
-    missing = int(np.isnan(x).sum())
-    attrs = {
-        "schema": SCHEMA,
-        "axis": settings.axis,
-        "machine": stand.bench.machine,
-        "instrument": stand.reader.id,
-        "start": datetime.now(UTC).isoformat(timespec="seconds"),
-        "dropped": 0,
-        "invalid": {"beam broken": missing} if missing else {},
-    }
-    return xr.Dataset(variables, coords, attrs)
+    start_time = datetime.now(UTC).isoformat(timespec="seconds")
+    return axis.dataset(variables, {}, x, (("cycle", "sensor"), T[None]), start_time)

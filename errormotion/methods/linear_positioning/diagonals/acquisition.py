@@ -1,4 +1,4 @@
-"""Measurement along diagonals: the instrument is aligned to each of them, and every stop is read at rest."""
+"""Measurement along diagonals: the instrument is aligned to each diagonal, and every stop is read at rest."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.linear_positioning.acquisition.instruments import Reader, along_line
-from errormotion.methods.linear_positioning.acquisition.measure import Motion
+from errormotion.methods.linear_positioning.acquisition.instruments import Reader, diagonal_reader
+from errormotion.methods.linear_positioning.acquisition.measure import Motion, measured_attrs
 from errormotion.methods.linear_positioning.diagonals.lines import Line, diagonals_of, distances, lines
 from errormotion.methods.linear_positioning.planning.targets import sequence
 from errormotion.methods.linear_positioning.schema import APPROACHES, SCHEMA, STOPS
@@ -38,56 +38,46 @@ def measure_diagonals(bench: Bench, settings: Settings, done: xr.Dataset | None)
     Raises
     ------
     MethodError
-        No instrument that can do it; axes that do not arrive; no zero at the start of a diagonal.
+        The bench lacks an instrument, the axes do not reach a stop, or a diagonal has no zero or no reading.
     """
     motion = Motion(bench, settings)
     channels = diagonals_of(settings).channels
-    readers = [along_line(bench, settings, channels.get(line.name, ""), line.name) for line in lines(settings)]
+    readers = [diagonal_reader(bench, settings, channels.get(line.name, ""), line.name) for line in lines(settings)]
     finished = 0 if done is None else int(done.sizes["diagonal"])
-    for k, (line, places, reader) in enumerate(zip(lines(settings), distances(settings), readers, strict=True)):
+    for k, (line, stops, reader) in enumerate(zip(lines(settings), distances(settings), readers, strict=True)):
         if k < finished:
             continue
         first, last = (
-            " ".join(f"{a}{v * 1e3:.3f}" for a, v in zip("XYZ", line.point(s), strict=True)) for s in places[[0, -1]]
+            " ".join(f"{a}{v * 1e3:.3f}" for a, v in zip("XYZ", line.point(s), strict=True)) for s in stops[[0, -1]]
         )
         bench.ask(
-            f"Align the instrument to diagonal {line.name}, from {first} to {last} mm; its reflector is at the tool."
+            f"Align the instrument to diagonal {line.name}, from {first} to {last} mm. Mount its reflector at the tool."
         )
-        yield _measure(bench, settings, motion, line, places, reader)
+        yield _measure(motion, line, stops, reader)
 
 
-def _measure(bench: Bench, settings: Settings, motion: Motion, line: Line, places: Array, reader: Reader) -> xr.Dataset:
+def _measure(motion: Motion, line: Line, stops: Array, reader: Reader) -> xr.Dataset:
+    settings = motion.settings
     start = datetime.now(UTC).isoformat(timespec="seconds")
-    x = np.full((settings.runs, 2, places.size), np.nan)
-    fresh = True
-    for each in sequence(settings, places):
-        if each.before is not None:
-            motion.go(line.point(each.before))
-        motion.go(line.point(each.place))
+    x = np.full((settings.runs, 2, stops.size), np.nan)
+    for approach in sequence(settings, stops):
+        if approach.before is not None:
+            motion.move_to(line.point(approach.before))
+        motion.move_to(line.point(approach.position))
         motion.wait(settings.settle)
-        if (each.target, each.approach) == (0, 0) and (fresh or reader.lost):
+        if (approach.target, approach.direction) == (0, 0) and reader.lost:
             reader.zero()
-            fresh = False
-        if not (fresh or reader.lost):
-            way = float(places[each.target] - places[0])
-            x[each.run, each.approach, each.target] = float(reader.read(way)[0]) - way
+        if not reader.lost:
+            distance = float(stops[approach.target] - stops[0])
+            x[approach.run, approach.direction, approach.target] = float(reader.read(distance)[0]) - distance
         motion.wait(settings.dwell - settings.settle)
     if not np.isfinite(x).any():
-        raise MethodError(f"Diagonal {line.name}: no reading. Is the beam broken?")
-    missing = int(np.isnan(x).sum())
+        raise MethodError(f"Diagonal {line.name}: no reading. Check that the beam is not broken.")
     variables: dict[str, Any] = {
         "diagonal_deviation": (STOPS, x[None], _M),
-        "stop_point": (("diagonal", "stop", "direction"), np.array([[line.point(float(s)) for s in places]]), _M),
+        "stop_point": (("diagonal", "stop", "direction"), np.array([[line.point(float(s)) for s in stops]]), _M),
     }
     coords: dict[str, Any] = {"diagonal": [line.name], "approach": list(APPROACHES), "direction": list("xyz")}
     if settings.functional_point is not None:
         variables["functional_point"] = ("direction", np.array(settings.functional_point), _M)
-    attrs = {
-        "schema": SCHEMA,
-        "machine": bench.machine,
-        "instrument": reader.id,
-        "start": start,
-        "dropped": 0,
-        "invalid": {"beam broken": missing} if missing else {},
-    }
-    return xr.Dataset(variables, coords, attrs)
+    return xr.Dataset(variables, coords, {"schema": SCHEMA, **measured_attrs(motion.bench, reader, x, start)})

@@ -1,8 +1,8 @@
-"""Diagonals of a volume: their ends, their stops, and which squareness two of them show.
+"""Diagonals of a volume: their ends, their stops, and the squareness that two of them determine.
 
 The errors of a machine displace its tool by E(p) at the position p. Along the unit vector u of a diagonal an instrument
-reads the deviation u . (E(p) - E(p_0)). A squareness g of two axes, a shear of their plane, gives a deviation in
-proportion to the distance s::
+reads the deviation u . (E(p) - E(p_0)). A squareness g of two axes, a shear of their plane, causes a deviation
+proportional to the distance s::
 
     Y to X, about Z:  E_x = -g y    u . E = -g u_x u_y s
     Z to Y, about X:  E_y = -g z    u . E = -g u_y u_z s
@@ -23,19 +23,17 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.linear_positioning.planning.targets import needed, spread
+from errormotion.methods.linear_positioning.planning.targets import randomised, standard_count
 
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Diagonals, Settings
 
 SQUARENESS = {"EC0Y": (0, 1, -1.0), "EA0Z": (1, 2, -1.0), "EB0Z": (0, 2, 1.0)}
 """The two axes of a face, and the sign of the shear by a squareness (ISO 230-1) along a diagonal."""
-RESOLUTION = 6
-"""Decimals of a commanded position in m: 1 um, that of programs."""
-
-
-SMALL = 1e-6
-"""Component of a unit vector that is none: an axis that rests."""
+DECIMALS = 6
+"""Of a commanded position in m: 1 um, the resolution of programs."""
+ZERO_COMPONENT = 1e-6
+"""Component of a unit vector below which the axis is at rest along the diagonal."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class Line:
     ----------
     name : str
     start : ndarray, (3,)
-        Corner from which it counts, m.
+        Corner at which it starts, m.
     unit : ndarray, (3,)
     length : float
         m.
@@ -59,11 +57,11 @@ class Line:
 
     def point(self, distance: float) -> Array:
         """Return the position of the axes at a distance from the start, (3,), m."""
-        return np.asarray(np.round(self.start + distance * self.unit, RESOLUTION))
+        return np.asarray(np.round(self.start + distance * self.unit, DECIMALS))
 
 
 def diagonals_of(settings: Settings) -> Diagonals:
-    """Return the settings of the diagonals; MethodError where there are none."""
+    """Return the settings of the diagonals; MethodError if there are none."""
     if settings.diagonals is None:
         raise MethodError("diagonals: expected the settings of the diagonals; found none")
     return settings.diagonals
@@ -71,37 +69,37 @@ def diagonals_of(settings: Settings) -> Diagonals:
 
 def lines(settings: Settings) -> list[Line]:
     """Return the diagonals in their order."""
-    given = diagonals_of(settings)
-    found = []
-    for name in given.names:
+    diagonals = diagonals_of(settings)
+    result = []
+    for name in diagonals.names:
         ends = []
-        for letter, (low, high), rest in zip(name, given.volume, settings.start, strict=True):
+        for letter, (low, high), rest in zip(name, diagonals.volume, settings.start, strict=True):
             ends.append({"P": (low, high), "N": (high, low), "0": (rest, rest)}[letter])
         start, end = np.array(ends).T
         length = float(np.linalg.norm(end - start))
-        found.append(Line(name, start, (end - start) / length, length))
-    return found
+        result.append(Line(name, start, (end - start) / length, length))
+    return result
 
 
 def distances(settings: Settings) -> Array:
     """Return the distance of each stop from the start of its diagonal, (diagonal, stop), m; with random parts.
 
-    A stop is where the control is sent, to 1 um in each axis; its distance is that along the diagonal.
+    The commanded positions are rounded to 1 um in each axis; the distances are those of the rounded positions.
     """
-    found = lines(settings)
-    count = settings.count or max(needed(line.length) for line in found)
+    diagonals = lines(settings)
+    count = settings.count or max(standard_count(line.length) for line in diagonals)
     rows = []
-    for line in found:
-        points = [line.point(float(place)) for place in spread(0.0, line.length, count, settings)]
+    for line in diagonals:
+        points = [line.point(float(distance)) for distance in randomised(0.0, line.length, count, settings)]
         rows.append([float((point - line.start) @ line.unit) for point in points])
     return np.array(rows)
 
 
 def squareness_of(units: Sequence[Array]) -> Iterator[tuple[str, int, int, float]]:
-    """Yield each squareness that two of some diagonals show: name, the two, difference of the coefficients."""
+    """Yield each squareness that two diagonals determine: name, their indices, difference of their coefficients."""
     for name, (a, b, sign) in SQUARENESS.items():
         c = 3 - a - b
-        flat = {k: unit[a] * unit[b] for k, unit in enumerate(units) if abs(unit[c]) < SMALL}
+        flat = {k: unit[a] * unit[b] for k, unit in enumerate(units) if abs(unit[c]) < ZERO_COMPONENT}
         pairs = [(k, other) for k, one in flat.items() for other, two in flat.items() if k < other and one * two < 0.0]
         for k, other in pairs:
             yield name, k, other, sign * float(flat[k] - flat[other])

@@ -1,4 +1,4 @@
-"""Expected uncertainty of a test along diagonals that is not measured yet."""
+"""Expected uncertainty of a planned test along diagonals."""
 
 from __future__ import annotations
 
@@ -21,26 +21,27 @@ if TYPE_CHECKING:
 
 
 def plan_diagonals(settings: Settings, info: MethodInfo) -> xr.Dataset:
-    """Return an error dataset of zeros along the diagonals, with the covariance to expect."""
+    """Return an error dataset of zeros along the diagonals, with the expected covariance."""
     assumed, scatter, drift = assumed_scatter(settings)
     raw, _ = simulate_diagonals(settings, 0)
-    still = raw.assign(diagonal_deviation=0.0 * raw["diagonal_deviation"]).assign_attrs(machine="plan")
+    zeros = raw.assign(diagonal_deviation=0.0 * raw["diagonal_deviation"]).assign_attrs(machine="plan")
     errors = identify_diagonals(
-        still.drop_vars(["length_uncertainty", "alignment_uncertainty"]), assumed, info, planned=True
+        zeros.drop_vars(["length_uncertainty", "alignment_uncertainty"]), assumed, info, planned=True
     )
     origin = json.dumps(provenance.make(assumed, None, None, steps=["plan"]))
     u = np.sqrt(errors["deviation_variance"].values)
     square = np.sqrt(np.diagonal(errors["squareness_covariance"].values))
-    found = ", ".join(
+    of_squareness = ", ".join(
         f"{name} {format_quantity(float(each), 'arcsec', 2)}"
         for name, each in zip(errors["squareness_of"].values, square, strict=True)
     )
-    least, most = (format_quantity(float(each), "um", 2) for each in (u.min(), u.max()))
+    smallest, largest = (format_quantity(float(each), "um", 2) for each in (u.min(), u.max()))
     note = (
         f"{errors.sizes['diagonal']} diagonals with {errors.sizes['target']} stops, {settings.runs} runs in both "
         f"directions, about {seconds(settings) / 60:.0f} min. With a scatter of "
         f"{format_quantity(scatter, 'um', 2)} and a drift of {format_quantity(drift, 'um', 2)} the standard "
-        f"uncertainty along a diagonal is {least} to {most}{', that of squareness ' + found if found else ''}."
+        f"uncertainty along a diagonal is {smallest} to {largest}"
+        f"{', that of squareness ' + of_squareness if of_squareness else ''}."
     )
     zero = {name: 0.0 * errors[name] for name in ("deviation", "squareness")}
     return errors.assign(zero).assign_attrs(reference="planned, not measured", provenance=origin, notes=[note])

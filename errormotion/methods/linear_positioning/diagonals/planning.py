@@ -1,4 +1,4 @@
-"""What the machine does along the diagonals: stops, steps, and the NC program."""
+"""Motions of the machine along the diagonals: stops, steps, and the NC program."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ PROGRAM = "diagonals.nc"
 
 
 def stops(settings: Settings) -> Iterator[tuple[Line, Array, float]]:
-    """Yield every position at which the axes stop: its diagonal, (3,) m, and how long they rest there, s."""
-    for line, places in zip(lines(settings), distances(settings), strict=True):
-        for approach in sequence(settings, places):
+    """Yield every stop of the axes: its diagonal, position (3,), m, and dwell, s."""
+    for line, distances_of_line in zip(lines(settings), distances(settings), strict=True):
+        for approach in sequence(settings, distances_of_line):
             if approach.before is not None:
                 yield line, line.point(approach.before), 0.0
-            yield line, line.point(approach.place), settings.dwell
+            yield line, line.point(approach.position), settings.dwell
 
 
 def steps(settings: Settings) -> list[Step]:
-    """Return every step: to the start of each diagonal in rapid, moves with the feed, and rests."""
-    found: list[Step] = []
+    """Return every step: a rapid move to the start of each diagonal, moves at the feed, and dwells."""
+    result: list[Step] = []
     last: tuple[str, Array] | None = None
-    for line, place, rest in stops(settings):
-        x, y, z = (float(value) for value in place)
+    for line, position, dwell in stops(settings):
+        x, y, z = (float(value) for value in position)
         if last is None or last[0] != line.name:
-            found.append(Step("move", (x, y, z), float("nan"), float("nan")))
-        elif (length := float(np.linalg.norm(place - last[1]))) > 0.0:
-            found.append(Step("move", (x, y, z), settings.feed, length / settings.feed))
-        last = (line.name, place)
-        if rest > 0:
-            found.append(Step("rest", None, float("nan"), rest))
-    return found
+            result.append(Step("move", (x, y, z), float("nan"), float("nan")))
+        elif (length := float(np.linalg.norm(position - last[1]))) > 0.0:
+            result.append(Step("move", (x, y, z), settings.feed, length / settings.feed))
+        last = (line.name, position)
+        if dwell > 0:
+            result.append(Step("rest", None, float("nan"), dwell))
+    return result
 
 
 def seconds(settings: Settings) -> float:
-    """Return the duration of the test at its feed, rests included, s; accelerations and rapid moves are neglected."""
+    """Return the duration of the test at its feed, dwells included, s; accelerations and rapid moves are neglected."""
     return float(np.nansum([step.seconds for step in steps(settings)]))
 
 
 def programs(settings: Settings) -> Mapping[str, str]:
-    """Return the test as an NC program by file name: it stops (M0) ahead of each diagonal, for the instrument."""
-    found = iter(lines(settings))
+    """Return the NC program by file name; it stops (M0) before each diagonal, for the alignment of the instrument."""
+    remaining = iter(lines(settings))
     text = [
         "%",
         f"({PROGRAM}: diagonals after ISO 230-6, {settings.runs} runs, {settings.cycle} cycles)",
@@ -66,17 +66,17 @@ def programs(settings: Settings) -> Mapping[str, str]:
             continue
         words = " ".join(f"{name}{value * MM:.3f}" for name, value in zip("XYZ", step.place, strict=True))
         if np.isnan(step.feed):
-            text += [f"(diagonal {next(found).name}: align the instrument)", f"G0 {words}", "M0"]
+            text += [f"(diagonal {next(remaining).name}: align the instrument)", f"G0 {words}", "M0"]
         else:
             text.append(f"G1 {words} F{step.feed * MM * MINUTE:.10g}")
     return {PROGRAM: "\n".join([*text, "M30", "%", ""])}
 
 
 def outside(settings: Settings, machine: MachineDescription) -> dict[str, str]:
-    """Return what contradicts the machine, by setting: an axis that it has not, stops outside of its travel."""
-    places = np.array([place for _, place, _ in stops(settings)])
+    """Return by setting what the machine cannot do: axes that it does not have, stops outside its travel."""
+    positions = np.array([position for _, position, _ in stops(settings)])
     for k, axis in enumerate("XYZ"):
-        first, last = float(places[:, k].min()), float(places[:, k].max())
+        first, last = float(positions[:, k].min()), float(positions[:, k].max())
         if axis not in machine.travel:
             return {"diagonals": f"expected a machine with the axes X, Y and Z; it has {', '.join(machine.travel)}"}
         low, high = machine.travel[axis]

@@ -1,4 +1,4 @@
-"""Sources of a test along diagonals, drawn anew for the Monte Carlo method; the alignment is drawn exponentially."""
+"""Draws of the sources of a test along diagonals for the Monte Carlo method."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.methods.linear_positioning.diagonals.identification import measure, shared
+from errormotion.methods.linear_positioning.diagonals.identification import evaluate_diagonals, shared_sources
 from errormotion.methods.linear_positioning.identification import budget
+from errormotion.methods.linear_positioning.identification.reading import labels
 from errormotion.methods.linear_positioning.schema import APPROACHES, STOPS
 from errormotion.plugins import Redraw, Redrawing
 
@@ -18,49 +19,43 @@ if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
 
 FEWEST_TRIALS = 200
-"""Of the figures in a trial, whose values are not used."""
+"""Trials for the figures of a redrawn test, which are not used."""
 
 
 def redraw_diagonals(raw: xr.Dataset, settings: Settings) -> Redrawing:
-    """Return the readings, and their sources: scatter, drift, scale, alignment."""
-    measured = measure(raw, settings, [])
-    _, groups, effects = shared(measured)
-    size = np.array(
-        [
-            np.sqrt(of.own_factor * of.own / np.maximum(np.isfinite(x).sum(axis=1), 1))
-            for x, of in ((each.found.readings.x[0], each.found.spreads[0]) for each in measured)
-        ]
-    )  # (diagonal, approach, stop)
+    """Return the readings, and the draws of their sources: scatter, drift, scale, alignment."""
+    diagonals = evaluate_diagonals(raw, settings, [])
+    _, groups, effects = shared_sources(diagonals)
+    size = np.array([each.evaluated.scatter_of_means()[0] for each in diagonals])  # (diagonal, approach, stop)
 
     def readings(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         return _changed(raw, size * generator.normal(size=size.shape)), settings
 
-    sources = {"readings": Redraw(readings, own=True)}
-    for group in dict.fromkeys(groups):
+    def shared(group: str) -> Redraw:
         chosen = np.nan_to_num(effects[[each == group for each in groups]])
-        sources[group] = Redraw(_Shared(chosen, exponential=group == budget.ALIGNMENT), groups=(group,))
+
+        def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+            return _changed(raw, draw_effects(chosen, group, generator)), settings
+
+        return Redraw(draw, groups=(group,))
+
+    sources = {"readings": Redraw(readings, own=True)} | {group: shared(group) for group in dict.fromkeys(groups)}
     return Redrawing(raw.load(), settings.model_copy(update={"trials": FEWEST_TRIALS}), sources)
 
 
-class _Shared:
-    """Draws sources (source, diagonal, stop) that all runs and both approaches share."""
+def draw_effects(effects: Array, group: str, generator: np.random.Generator) -> Array:
+    """Return a draw of the sources (source, item, target) of a group, (item, 1, target).
 
-    def __init__(self, effects: Array, *, exponential: bool) -> None:
-        self._effects, self._exponential = effects, exponential
-
-    def __call__(
-        self, raw: xr.Dataset, settings: Settings, generator: np.random.Generator
-    ) -> tuple[xr.Dataset, Settings]:
-        """Return changed readings, and the settings as they are."""
-        number = len(self._effects)
-        z = generator.exponential(size=number) - 1.0 if self._exponential else generator.normal(size=number)
-        return _changed(raw, np.tensordot(z, self._effects, axes=1)[:, None, :]), settings
+    The cosine error of the alignment has an exponential distribution, every other source a normal one.
+    """
+    exponential, number = group == budget.ALIGNMENT, len(effects)
+    z = generator.exponential(size=number) - 1.0 if exponential else generator.normal(size=number)
+    return np.asarray(np.tensordot(z, effects, axes=1)[:, None, :])
 
 
 def _changed(raw: xr.Dataset, change: Array) -> xr.Dataset:
     """Add a change (diagonal, approach, stop), approaches forward and backward, to the readings of all runs."""
-    labels = [str(label) for label in raw["approach"].values.astype(str)]
     shape = (change.shape[0], len(APPROACHES), change.shape[2])
-    by_label = np.broadcast_to(change, shape)[:, [APPROACHES.index(label) for label in labels]]
+    by_label = np.broadcast_to(change, shape)[:, [APPROACHES.index(label) for label in labels(raw, "approach")]]
     deviation = raw["diagonal_deviation"].transpose(*STOPS)
     return raw.assign(diagonal_deviation=deviation.copy(data=deviation.values + by_label[:, None]))

@@ -1,4 +1,4 @@
-"""Displacements along diagonals of the virtual machine, with the true errors along them."""
+"""Simulated displacements along diagonals of the virtual machine, with the true errors along them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _M = {"units": "m"}
 
 @dataclass(frozen=True)
 class Scatter:
-    """How readings differ from the mean errors, m: of a reading, of offset and slope of a run; and their reversal."""
+    """Standard deviations of a reading, and of offset and slope of a run; and the reversal error; m."""
 
     noise: float = 0.3e-6
     offset: float = 0.4e-6
@@ -33,9 +33,9 @@ class Scatter:
     reversal: float = 1.5e-6
 
 
-def true_deviations(machine: VirtualMachine, line: Line, places: Array) -> Array:
-    """Return the true displacement along a diagonal less the commanded one, from its first stop on, (stop,), m."""
-    points = np.array([line.point(float(place)) for place in places])
+def true_deviations(machine: VirtualMachine, line: Line, stops: Array) -> Array:
+    """Return the true displacement along a diagonal since its first stop minus the commanded one, (stop,), m."""
+    points = np.array([line.point(float(distance)) for distance in stops])
     displaced = machine.geometry.twist(points)[:, :3]
     return np.asarray((displaced - displaced[0]) @ line.unit)
 
@@ -45,27 +45,27 @@ def simulate_diagonals(
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Return readings along the diagonals of the settings, and the true errors along them, squareness included.
 
-    The squareness of the truth is that of the least-squares lines through the true deviations.
+    The true squareness is that of the least-squares lines through the true deviations.
     """
     machine = VirtualMachine(MACHINE, seed=seed)
     behaviour = behaviour or Scatter()
     generator = np.random.default_rng(seed)
     draw = generator.standard_normal
-    found, places = lines(settings), distances(settings)
+    diagonals, distance = lines(settings), distances(settings)
     scale = settings.uncertainty.length * draw()
-    shape = (settings.runs, 2, places.shape[1])
+    shape = (settings.runs, 2, distance.shape[1])
     sign = np.array([1.0, -1.0])[:, None]
     true, read = [], []
-    for line, where in zip(found, places, strict=True):
-        way = where - where[0]
-        deviation = true_deviations(machine, line, where) - behaviour.reversal / 2.0
+    for line, stops in zip(diagonals, distance, strict=True):
+        displacement = stops - stops[0]
+        deviation = true_deviations(machine, line, stops) - behaviour.reversal / 2.0
         angle = settings.uncertainty.alignment * draw(2)
-        z = way / (way[-1] / 2.0) - 1.0
+        z = displacement / (displacement[-1] / 2.0) - 1.0
         drift = behaviour.offset * draw((shape[0], 1, 1)) + behaviour.slope * draw((shape[0], 1, 1)) * z
         errors = sign * behaviour.reversal / 2.0 + drift + behaviour.noise * draw(shape)
         true.append(deviation)
-        read.append(deviation + errors + (scale - (angle @ angle) / 2.0) * way)
-    points = np.array([[line.point(float(s)) for s in where] for line, where in zip(found, places, strict=True)])
+        read.append(deviation + errors + (scale - (angle @ angle) / 2.0) * displacement)
+    points = np.array([[line.point(float(s)) for s in stops] for line, stops in zip(diagonals, distance, strict=True)])
     variables: dict[str, Any] = {
         "diagonal_deviation": (STOPS, np.array(read), _M),
         "stop_point": (("diagonal", "stop", "direction"), points, _M),
@@ -73,18 +73,23 @@ def simulate_diagonals(
         "length_uncertainty": ((), settings.uncertainty.length, {"units": "1"}),
         "alignment_uncertainty": ((), settings.uncertainty.alignment, {"units": "rad"}),
     }
-    names = [line.name for line in found]
+    names = [line.name for line in diagonals]
     coords = {"diagonal": names, "approach": list(APPROACHES), "direction": list("xyz")}
-    note = [{"id": "virtual interferometer", "address": f"twin://{machine.kind}?seed={seed}", "simulated": True}]
-    attrs = {"schema": SCHEMA, "machine": machine.name, "instruments": json.dumps(note)}
-    return xr.Dataset(variables, coords, attrs), _truth(machine, found, places, np.array(true))
+    attrs = {"schema": SCHEMA, "machine": machine.name, "instruments": instruments_of(machine)}
+    return xr.Dataset(variables, coords, attrs), _truth(machine, diagonals, distance, np.array(true))
 
 
-def _truth(machine: VirtualMachine, found: list[Line], places: Array, true: Array) -> xr.Dataset:
-    sensitivity = np.array([np.tile([*line.unit, 0.0, 0.0, 0.0], (places.shape[1], 1)) for line in found])
+def instruments_of(machine: VirtualMachine) -> str:
+    """Return the attribute ``instruments`` of a simulated raw dataset."""
+    address = f"twin://{machine.kind}?seed={machine.seed}"
+    return json.dumps([{"id": "virtual interferometer", "address": address, "simulated": True}])
+
+
+def _truth(machine: VirtualMachine, diagonals: list[Line], distance: Array, true: Array) -> xr.Dataset:
+    sensitivity = np.array([np.tile([*line.unit, 0.0, 0.0, 0.0], (distance.shape[1], 1)) for line in diagonals])
     square = {
-        name: float((np.polyfit(places[k], true[k], 1)[0] - np.polyfit(places[j], true[j], 1)[0]) / coefficient)
-        for name, k, j, coefficient in squareness_of([line.unit for line in found])
+        name: float((np.polyfit(distance[k], true[k], 1)[0] - np.polyfit(distance[j], true[j], 1)[0]) / coefficient)
+        for name, k, j, coefficient in squareness_of([line.unit for line in diagonals])
     }
     return build_deviations(
         true,
@@ -92,7 +97,7 @@ def _truth(machine: VirtualMachine, found: list[Line], places: Array, true: Arra
         sensitivity,
         dims=DIMS,
         coords={
-            "diagonal": ("diagonal", [line.name for line in found], {"long_name": "diagonal of the volume"}),
+            "diagonal": ("diagonal", [line.name for line in diagonals], {"long_name": "diagonal of the volume"}),
             "squareness_of": list(square),
         },
         component="tool",

@@ -1,17 +1,15 @@
 """Sources of uncertainty of the mean bidirectional deviations, after ISO/TR 230-9.
 
-Independent from target to target: the mean of the readings' scatter, and what the instrument adds at each target.
-Shared by all targets: drift from run to run, the scale of the instrument's lengths, its gain, the alignment of the
-measured line, and expansion.
+Independent from target to target: the scatter of the readings in the mean, and the errors of the instrument at each
+target. Shared by all targets: drift from run to run, the scale of the instrument's lengths, its gain, the alignment of
+the measured line, and expansion.
 
-Alignment: a line at the angle g to the axis gives ``l cos g`` for the length l, too short by ``l g^2 / 2``. With
-independent components of standard uncertainty u, g^2 / 2 has an exponential distribution of mean u^2 and standard
+Alignment: along a line at the angle g to the axis, the length l is measured as ``l cos g``, too short by ``l g^2 / 2``.
+With independent components of standard uncertainty u, g^2 / 2 has an exponential distribution of mean u^2 and standard
 deviation u^2. The mean is a bias and is corrected; the standard deviation is a source.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -19,7 +17,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import iso_names
 from errormotion.methods.linear_positioning.identification.expansion import Shared
-from errormotion.methods.linear_positioning.identification.reading import Readings, per_freedom
+from errormotion.methods.linear_positioning.identification.reading import Readings, length_uncertainty, per_freedom
 from errormotion.methods.linear_positioning.identification.scatter import DRIFTS, Scatter
 from errormotion.methods.linear_positioning.settings import Settings
 
@@ -30,20 +28,8 @@ DRIFT, ALIGNMENT, LENGTH, GAIN, END = (
 """Groups of sources."""
 
 
-@dataclass(frozen=True)
-class Budget:
-    """What is not known of the means: ``independent`` (freedom, target), variance; and what targets share.
-
-    ``drift`` are those of ``sources`` that come from the scatter of the readings themselves.
-    """
-
-    independent: Array
-    sources: list[Shared]
-    drift: list[Shared]
-
-
 def alignment_bias(raw: xr.Dataset, readings: Readings, settings: Settings) -> Array:
-    """Return by how much readings along the axis are too large by the mean cosine error, (target,), m."""
+    """Return the mean cosine error, by which readings along the axis are too large, (target,), m."""
     return np.asarray(-readings.lever * _alignment(raw, settings) ** 2)
 
 
@@ -54,28 +40,27 @@ def _alignment(raw: xr.Dataset, settings: Settings) -> float:
 def instrument_sources(raw: xr.Dataset, readings: Readings, settings: Settings, mean: Array) -> list[Shared]:
     """Return the sources of instrument and alignment; ``mean`` (freedom, target) are the mean deviations."""
     count, m = mean.shape
-    found = []
+    sources = []
     if readings.along in readings.freedoms:
         k = readings.freedoms.index(readings.along)
-        relative = float(raw["length_uncertainty"]) if "length_uncertainty" in raw else settings.uncertainty.length
         for name, group, size in (
-            ("scale of the lengths", LENGTH, relative),
+            (LENGTH, LENGTH, length_uncertainty(raw, settings)),
             ("angle of the measured line to the axis", ALIGNMENT, _alignment(raw, settings) ** 2),
         ):
             effect = np.zeros((count, m))
             effect[k] = size * readings.lever
-            found.append(Shared(name, group, effect))
+            sources.append(Shared(name, group, effect))
     names = iso_names(readings.axis)
     for k, gain in enumerate(per_freedom(raw, "gain_uncertainty", count)):
         effect = np.zeros((count, m))
         effect[k] = gain * np.nan_to_num(mean[k])
-        found.append(Shared(f"gain of {names[readings.freedoms[k]]}", GAIN, effect))
-    return [source for source in found if np.abs(source.effect).max() > 0]
+        sources.append(Shared(f"gain of {names[readings.freedoms[k]]}", GAIN, effect))
+    return [source for source in sources if np.abs(source.effect).max() > 0]
 
 
 def drift_sources(readings: Readings, spreads: list[Scatter]) -> list[Shared]:
-    """Return offset and slope of the runs, as they remain in the means; where no reading is missing, one draw each."""
-    found = []
+    """Return the effects of offset and slope of the runs on the means; one source each if no reading is missing."""
+    sources = []
     names = iso_names(readings.axis)
     for k, spread in enumerate(spreads):
         known = np.isfinite(readings.x[k])
@@ -84,32 +69,31 @@ def drift_sources(readings: Readings, spreads: list[Scatter]) -> list[Shared]:
         share = 1.0 / max(int(known.any(axis=(1, 2)).sum()), 1)
         shared = {"": share * weight.sum(axis=0), " by approach": share * (weight[0] - weight[1])}
         for (kind, of_run), variance in zip(shared.items(), (spread.common_mean, spread.opposite_mean), strict=True):
-            for what, size, shape in zip(DRIFTS, np.sqrt(variance), (np.ones_like(spread.z), spread.z), strict=True):
+            for drift, size, shape in zip(DRIFTS, np.sqrt(variance), (np.ones_like(spread.z), spread.z), strict=True):
                 for i, row in enumerate(_rows(size * of_run * shape)):
                     effect = np.zeros((len(spreads), spread.z.size))
                     effect[k] = row
                     number = f" {i + 1}" if i else ""
-                    found.append(
-                        Shared(f"{what} of the runs{kind}, {names[readings.freedoms[k]]}{number}", DRIFT, effect)
-                    )
-    return found
+                    name = f"{drift} of the runs{kind}, {names[readings.freedoms[k]]}{number}"
+                    sources.append(Shared(name, DRIFT, effect))
+    return sources
 
 
 def _rows(effects: Array) -> Array:
-    """Return as few rows as have the same sum of products over the rows."""
+    """Return the smallest number of rows with the same matrix ``effects.T @ effects``."""
     _, size, rows = np.linalg.svd(effects, full_matrices=False)
     kept = size > 1e-9 * max(float(size[0]), 1e-30)
     return np.asarray(size[kept, None] * rows[kept])
 
 
 def independent(raw: xr.Dataset, readings: Readings, spreads: list[Scatter]) -> Array:
-    """Return the variance of a mean that is new at each target, (freedom, target)."""
+    """Return the variance of a mean that is independent from target to target, (freedom, target)."""
     at_target = per_freedom(raw, "target_uncertainty", len(spreads))
-    found = []
+    variances = []
     for x, spread, u in zip(readings.x, spreads, at_target, strict=True):
         n = np.isfinite(x).sum(axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
             of_mean = spread.own_factor * spread.own / n
         measured = n.any(axis=1)
-        found.append(of_mean[measured].sum(axis=0) / measured.sum() ** 2 + u**2)
-    return np.array(found)
+        variances.append(of_mean[measured].sum(axis=0) / measured.sum() ** 2 + u**2)
+    return np.array(variances)

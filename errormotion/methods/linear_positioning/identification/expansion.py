@@ -1,9 +1,9 @@
 """Nominal differential expansion: deviations for the reference temperature, usually 20 degC.
 
-A positioning system that is warmer by ``dT_m`` moves too far by ``alpha_m dT_m`` of the way, and an artefact that is
-warmer by ``dT_w`` gives lengths that are too short by ``alpha_w dT_w``. A deviation along the axis at the distance
-``l`` from the zero of the instrument is therefore too large by ``(alpha_m dT_m - alpha_w dT_w) l``. An interferometer
-has ``alpha_w = 0``.
+A positioning system that is warmer by ``dT_m`` moves too far by the fraction ``alpha_m dT_m`` of the distance; lengths
+measured with an artefact that is warmer by ``dT_w`` are too short by the fraction ``alpha_w dT_w``. A deviation along
+the axis at the distance ``l`` from the zero of the instrument is therefore too large by
+``(alpha_m dT_m - alpha_w dT_w) l``. For an interferometer, ``alpha_w = 0``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SIDES = {"machine": 1.0, "workpiece": -1.0}
 
 @dataclass(frozen=True)
 class Shared:
-    """One standard uncertainty of a source that is one draw for the whole test.
+    """A source whose error is the same in the whole test, with the effect of its standard uncertainty.
 
     Attributes
     ----------
@@ -40,9 +40,10 @@ class Shared:
 
 @dataclass(frozen=True)
 class Correction:
-    """What expansion adds to the readings along the axis, (approach, run, target), and its sources; m.
+    """Effect of expansion on the readings along the axis, (approach, run, target), m, and its sources.
 
-    ``complete`` states whether the machine's side is known, so that the result holds at the reference temperature.
+    ``complete`` states whether the expansion of the machine is known, so that the result applies to the reference
+    temperature.
     """
 
     along: Array
@@ -68,13 +69,13 @@ def expansion(raw: xr.Dataset, readings: Readings, settings: Settings, notes: li
         excess = _excess(readings, name, side, settings.reference_temperature)
         if alpha is None and excess is None:
             continue
-        if not (alpha or u_alpha) and excess is None:  # nothing on this side expands
+        if not (alpha or u_alpha) and excess is None:  # no expansion on this side
             continue
         if alpha is None or excess is None:
             raise MethodError(
-                f"Expansion on the side of the {name}: expected its coefficient ({name}_expansion in the data, "
-                f"{name}.expansion in the settings) and its temperature ({name}.temperature, or the names of its "
-                f"sensors in {name}.sensors); found {'no coefficient' if alpha is None else 'no temperature'}."
+                f"Expansion of the {name}: expected its coefficient ({name}_expansion in the data, {name}.expansion in "
+                f"the settings) and its temperature ({name}.temperature, or the names of its sensors in "
+                f"{name}.sensors); found {'no coefficient' if alpha is None else 'no temperature'}."
             )
         total += sign * alpha * excess * readings.lever
         complete |= name == "machine"
@@ -90,7 +91,7 @@ def expansion(raw: xr.Dataset, readings: Readings, settings: Settings, notes: li
         ]
     if not complete:
         notes.append(
-            "The temperature of the positioning system is not stated: the errors hold at the temperature of the test."
+            "The temperature of the positioning system is not stated: the errors apply to the temperature of the test."
         )
     return Correction(total, sources, complete)
 
@@ -107,12 +108,12 @@ def _scalar(raw: xr.Dataset, name: str, default: float | None) -> float | None:
         return default
     value = float(raw[name])
     if not np.isfinite(value):
-        raise MethodError(f"{name}: expected a number; found NaN. Leave it out if it is not known")
+        raise MethodError(f"{name}: expected a number; found NaN. Omit it if it is unknown")
     return value
 
 
 def _excess(readings: Readings, name: str, side: Side, reference: float) -> Array | None:
-    """Return the temperature of a side above the reference at each reading, K; None where it is not stated."""
+    """Return the temperature of a side above the reference at each reading, K; None if it is not stated."""
     shape = readings.x.shape[1:]
     if not side.sensors and name in readings.temperature:
         names: tuple[str, ...] = (name,)
@@ -128,7 +129,7 @@ def _excess(readings: Readings, name: str, side: Side, reference: float) -> Arra
 
 
 def _filled(temperature: Array, sensor: str) -> Array:
-    """Return the temperatures of a sensor with its mean where single ones are missing."""
+    """Return the temperatures of a sensor, missing ones replaced by their mean."""
     if not np.isfinite(temperature).any():
-        raise MethodError(f"temperature: expected values of sensor {sensor}; found NaN only. Leave the sensor out")
+        raise MethodError(f"temperature: expected values of sensor {sensor}; found only NaN. Omit the sensor")
     return np.where(np.isfinite(temperature), temperature, np.nanmean(temperature))

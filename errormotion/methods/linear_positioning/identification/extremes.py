@@ -1,20 +1,21 @@
-"""Figures that are extreme values: by how much scatter enlarges them on average, and their standard uncertainty.
+"""Figures that are extreme values: their mean excess by scatter, and their standard uncertainty.
 
 The largest of noisy means, and the largest of standard deviations that are estimated from a few runs, are too large on
-average. The true figure is that of the true means and standard deviations, as an infinite number of runs would give it.
-Its distribution given the readings follows by simulation (JCGM 101). In each trial
+average. The true figure is that of the true means and standard deviations, the limit for an infinite number of runs.
+Its distribution given the readings is found by simulation (JCGM 101). In each trial
 
 * variances are drawn from their scaled inverse chi-square distributions;
-* the mean curve is a line plus a remainder. The remainder was observed with its noise, so its variance t^2 is that of
-  the observed remainder less that of the noise, and the true remainder of a target has the mean ``B r_i`` and the
-  variance ``B s^2`` with ``B = t^2 / (t^2 + s^2)`` (Efron, Morris, J. Am. Stat. Assoc. 68 (1973) 117). The reversal
-  curve is treated alike, and so are the logarithms of variances that differ from target to target;
+* the mean curve is a line plus a remainder r. The observed remainder contains noise of variance s^2, so the variance
+  t^2 of the true one is that of the observed remainder less s^2, and the true remainder of a target has the mean
+  ``B r_i`` and the variance ``B s^2`` with ``B = t^2 / (t^2 + s^2)`` (Efron, Morris, J. Am. Stat. Assoc. 68 (1973)
+  117). The reversal curve, and the logarithms of variances that differ from target to target, are treated in the same
+  way;
 * drift from run to run shifts and inclines both curves, and each source of the budget is drawn once.
 
-The figure of the standard exceeds the median of the trials by the ``bias``. How large it is depends on how alike the
-targets are taken to be, so half of it counts as its own standard uncertainty, beside the standard deviation of the
-trials. The mean reversal error is no extreme value and has no bias. ``docs/validation.md`` shows the share of intervals
-that hold the true figure, for several kinds of axes.
+The figure of the standard exceeds the median of the trials by the ``bias``. The bias depends on the assumption of how
+similar the targets are. Half of it is therefore added to the standard deviation of the trials as its standard
+uncertainty (root sum of squares). The mean reversal error is not an extreme value and has no bias.
+``docs/validation.md`` shows the share of intervals that contain the true figure, for several kinds of axes.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ from errormotion.methods.linear_positioning.identification.standard import Stati
 
 SEED = 230
 SIGNIFICANT = 0.01
-"""Probability below which a variance of the drift is taken as different from 0."""
-UNSURE = 0.5
-"""Standard uncertainty of a bias relative to it."""
+"""Probability below which a variance of the drift is significantly different from 0."""
+BIAS_UNCERTAINTY = 0.5
+"""Standard uncertainty of a bias, relative to it."""
 
 
 @dataclass(frozen=True)
@@ -55,16 +56,17 @@ class Figures:
     u: Array
 
 
-def straightened(found: Statistics, z: Array) -> Statistics:
-    """Return means (..., approach, target) less the least-squares line of the mean bidirectional deviation."""
-    middle = found.bidirectional if np.isfinite(found.mean).any(axis=-1).all() else _one(found.mean)
+def straightened(statistics: Statistics, z: Array) -> Statistics:
+    """Return means (..., approach, target) minus the least-squares line of the mean bidirectional deviation."""
+    both = np.isfinite(statistics.mean).any(axis=-1).all()
+    middle = statistics.bidirectional if both else _measured_approach(statistics.mean)
     known = np.isfinite(middle).reshape(-1, z.size)[0]
     Z = np.stack([np.ones_like(z), z], axis=1)
     line = (middle[..., known] @ np.linalg.pinv(Z[known]).T) @ Z.T
-    return Statistics(found.mean - line[..., None, :], found.s)
+    return Statistics(statistics.mean - line[..., None, :], statistics.s)
 
 
-def _one(mean: Array) -> Array:
+def _measured_approach(mean: Array) -> Array:
     return np.asarray(np.where(np.isfinite(mean[..., 0, :]), mean[..., 0, :], mean[..., 1, :]))
 
 
@@ -77,19 +79,19 @@ def figures(x: Array, spread: Scatter, shared: Array, target_u: float, *, straig
         Corrected deviations.
     spread : Scatter
     shared : ndarray, (source, target)
-        Effect of one standard uncertainty of each source that approaches and runs share, drift left out.
+        Effect of one standard uncertainty of each source that approaches and runs share, without drift.
     target_u : float
         Standard uncertainty that is independent from target to target.
     straight : bool
-        Whether a line is removed: a straightness.
+        Whether the freedom is a straightness, of which a line is removed.
     trials : int
     """
     observed = standard.statistics(x)
     value = _evaluate(observed, spread.z, straight)
     true = _evaluate(_trials(x, observed, spread, shared, target_u, trials), spread.z, straight)
     bias = value - np.median(true, axis=0)
-    u = np.hypot(true.std(axis=0, ddof=1), UNSURE * bias)
-    mean = standard.FIGURES.index("B_mean")  # no extreme value: unbiased as it is
+    u = np.hypot(true.std(axis=0, ddof=1), BIAS_UNCERTAINTY * bias)
+    mean = standard.FIGURES.index("B_mean")  # not an extreme value: unbiased
     if np.isfinite(value[mean]):
         bias[mean], u[mean] = 0.0, _mean_reversal_u(x, spread)
     return Figures(value, bias, u)
@@ -100,17 +102,17 @@ def _mean_reversal_u(x: Array, spread: Scatter) -> float:
     with np.errstate(invalid="ignore", divide="ignore"):
         own = (spread.own_factor * spread.own / n).sum(axis=0)
     known = np.isfinite(own)
-    inclined = spread.z[known].mean() ** 2  # 0 where the mean reversal is that of all targets
+    inclined = spread.z[known].mean() ** 2  # 0 if no target is missing
     drift = 4.0 * (spread.opposite_mean[0] + spread.opposite_mean[1] * inclined) / n.max()
     return float(np.sqrt(own[known].sum() / known.sum() ** 2 + drift))
 
 
-def _evaluate(found: Statistics, z: Array, straight: bool) -> Array:
-    return standard.figures(straightened(found, z) if straight else found)
+def _evaluate(statistics: Statistics, z: Array, straight: bool) -> Array:
+    return standard.figures(straightened(statistics, z) if straight else statistics)
 
 
 def _trials(x: Array, observed: Statistics, spread: Scatter, shared: Array, target_u: float, trials: int) -> Statistics:
-    """Return means and standard deviations (trial, approach, target) as they may be in truth."""
+    """Return draws of the true means and standard deviations, (trial, approach, target)."""
     generator = np.random.default_rng(SEED)
     draw = generator.standard_normal
     z, m = spread.z, spread.z.size
@@ -125,25 +127,25 @@ def _trials(x: Array, observed: Statistics, spread: Scatter, shared: Array, targ
         curves = [observed.bidirectional, observed.reversal / 2.0]
         noise = of_mean.sum(axis=1) / 4.0
     else:
-        curves = [_one(observed.mean)]
+        curves = [_measured_approach(observed.mean)]
         noise = of_mean[:, int(measured.argmax())]
     runs = max(int(n.max()), 1)
-    found = [
+    drawn = [
         _curve(curve, noise, drift / runs, z, about_zero=k > 0, generator=generator)
         for k, (curve, drift) in enumerate(zip(curves, (common, opposite), strict=False))
     ]
-    found[0] += draw((trials, len(shared))) @ shared + target_u * draw((trials, m))
+    drawn[0] += draw((trials, len(shared))) @ shared + target_u * draw((trials, m))
     mean = np.full((trials, 2, m), np.nan)
     if both:
-        mean[:, 0], mean[:, 1] = found[0] + found[1], found[0] - found[1]
+        mean[:, 0], mean[:, 1] = drawn[0] + drawn[1], drawn[0] - drawn[1]
     else:
-        mean[:, int(measured.argmax())] = found[0]
+        mean[:, int(measured.argmax())] = drawn[0]
     total = own + ((common + opposite) @ np.stack([np.ones_like(z), z**2]))[:, None, :]
     return Statistics(mean, np.sqrt(total))
 
 
 def _own(spread: Scatter, trials: int, generator: np.random.Generator) -> Array:
-    """Return variances of one reading, (trial, approach, target)."""
+    """Return draws of the variances of one reading, (trial, approach, target)."""
     known = np.isfinite(spread.own)
     freedom = 2.0 * spread.own_factor / (spread.own_factor - 1.0) if spread.own_factor > 1.0 else np.inf
     if spread.pooled:
@@ -160,32 +162,32 @@ def _own(spread: Scatter, trials: int, generator: np.random.Generator) -> Array:
 
 
 def _drifts(spread: Scatter, trials: int, generator: np.random.Generator) -> tuple[Array, Array]:
-    """Return variances of offset and slope of a run, common to the approaches and opposite, each (trial, 2).
+    """Return draws of the variances of offset and slope of a run, common and opposite, each (trial, 2).
 
     A variance that does not differ significantly from 0 is not drawn: its distribution would be that of the noise.
     """
     drawn = []
     for variance in (spread.common, spread.opposite):
-        found = np.tile(variance, (trials, 1))
+        variances = np.tile(variance, (trials, 1))
         if spread.freedom > 0:
             with np.errstate(invalid="ignore", divide="ignore"):
                 ratio = (variance + spread.noise) / spread.noise
             significant = stats.chi2.sf(spread.freedom * ratio, spread.freedom) < SIGNIFICANT
             scale = spread.freedom / generator.chisquare(spread.freedom, (trials, 2))
             with_noise = np.maximum(scale * (variance + spread.noise) - spread.noise, 0.0)
-            found = np.where(significant, with_noise, found)
-        drawn.append(found)
+            variances = np.where(significant, with_noise, variances)
+        drawn.append(variances)
     return drawn[0], drawn[1]
 
 
 def _curve(
     curve: Array, noise: Array, drift: Array, z: Array, *, about_zero: bool, generator: np.random.Generator
 ) -> Array:
-    """Return true curves (trial, target), given an observed one.
+    """Return draws of the true curve (trial, target), given an observed one.
 
-    ``noise`` (trial, target) is the variance of what is new at each target, ``drift`` (trial, 2) that of offset and
-    slope. Offset and slope of a curve ``about_zero``, such as a reversal, are drawn back like the remainder, with one
-    degree of freedom each.
+    ``noise`` (trial, target) is the variance that is independent from target to target, ``drift`` (trial, 2) that of
+    offset and slope. Offset and slope of a curve ``about_zero``, such as a reversal, are shrunk towards 0 like the
+    remainder, with one degree of freedom each.
     """
     known = np.isfinite(curve)
     m, trials = int(known.sum()), len(noise)

@@ -1,9 +1,9 @@
 """Thermal distortion by a moving axis (ISO 230-3): errors at both ends of the stroke over time, and their ranges.
 
-The errors are the deviations less their mean in the cold state. The noise of a reading is found from second differences
+The errors are the deviations minus their mean in the cold state. The noise of a reading follows from second differences
 over time, ``var(x_1 - 2 x_2 + x_3) = 6 s^2``, in which a smooth drift of the machine vanishes. A range of noisy values
-is too large; ranges are therefore taken over means of three successive cycles, and the uncertainty of a range is that
-of the difference of its two extremes.
+is too large; ranges are therefore those of means of three successive cycles, and the uncertainty of a range is that of
+the difference of its two extremes.
 """
 
 from __future__ import annotations
@@ -21,17 +21,22 @@ from errormotion.datasets.certificates import certified
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
-from errormotion.methods.linear_positioning.identification.reading import axis_of, freedoms_of, point_of
+from errormotion.methods.linear_positioning.identification.reading import (
+    axis_of,
+    freedoms_of,
+    length_uncertainty,
+    point_of,
+)
 from errormotion.methods.linear_positioning.settings import Settings
 
 if TYPE_CHECKING:
     from errormotion.plugins import MethodInfo
 
 QUANTITIES = ("P1", "P2", "P2 - P1")
-"""Both ends, in the order of their positions, and the change of the length between them."""
+"""The two ends, in the order of their positions, and the change of the length between them."""
 MEASURES = ("range_60min", "range_moving", "range_total", "end_of_moving")
 HOUR = 3600.0
-MEAN_OF = 3
+CYCLES_PER_MEAN = 3
 """Successive cycles in a mean."""
 COLD, LENGTH = "cold reference", "scale of the lengths"
 
@@ -39,7 +44,7 @@ COLD, LENGTH = "cold reference", "scale of the lengths"
 def identify_moving(raw: xr.Dataset, settings: Settings, info: MethodInfo, stated: float | None = None) -> xr.Dataset:
     """Return the errors of the axis at both ends over ``time`` and ``position``, relative to the cold state.
 
-    ``stated`` is the standard deviation of a reading, m or rad, for a plan; else it is estimated.
+    ``stated`` is the standard deviation of a reading, m or rad, for a plan; by default it is estimated.
 
     Raises
     ------
@@ -65,7 +70,7 @@ def identify_moving(raw: xr.Dataset, settings: Settings, info: MethodInfo, state
     t = np.concatenate([[0.0], time[~cold]])
     value = np.concatenate([np.zeros_like(change[:, :1]), change[:, ~cold]], axis=1)  # (freedom, time, end)
     u_cold = noise[:, None] / np.sqrt(known)
-    relative = float(raw["length_uncertainty"]) if "length_uncertainty" in raw else settings.uncertainty.length
+    relative = length_uncertainty(raw, settings)
     along = DOF[direction_of(axis)]
     lever = np.array([relative * (P[order] - P[order][0]) if name == along else np.zeros(2) for name in freedoms])
     names = iso_names(axis)
@@ -120,25 +125,25 @@ def identify_moving(raw: xr.Dataset, settings: Settings, info: MethodInfo, state
 
 def _check(time: Array, moving: Array, P: Array) -> None:
     if not np.isfinite(time).all() or any(second <= first for first, second in pairwise(time)):
-        raise MethodError("reading_time: expected increasing times; found others")
+        raise MethodError("reading_time: expected increasing times; found NaN, or a time that does not increase")
     if not np.isfinite(moving).all():
         raise MethodError("moving: expected 0 or 1 for each cycle; found NaN")
     if not (time <= 0).any():
         raise MethodError("reading_time: expected a cold state at times of 0 or less; found none")
-    if (time > 0).sum() < 2 * MEAN_OF:
+    if (time > 0).sum() < 2 * CYCLES_PER_MEAN:
         raise MethodError(
-            f"cycle: expected {2 * MEAN_OF} cycles or more after the cold state; found {(time > 0).sum()}"
+            f"cycle: expected {2 * CYCLES_PER_MEAN} cycles or more after the cold state; found {(time > 0).sum()}"
         )
     if not (np.isfinite(P).all() and np.ptp(P) > 0):
-        raise MethodError("end_position: expected two positions that differ; found others")
+        raise MethodError("end_position: expected two different positions; found NaN, or one position twice")
 
 
 def _noise(values: Array) -> float:
-    """Return the standard deviation of one reading from readings (cycle, end) of a smooth drift."""
+    """Return the standard deviation of one reading, from readings (cycle, end) under a smooth drift."""
     second = values[2:] - 2.0 * values[1:-1] + values[:-2]
     second = second[np.isfinite(second)]
-    if second.size < MEAN_OF:
-        raise MethodError("end_deviation: expected readings in successive cycles; found too few for their noise")
+    if second.size < CYCLES_PER_MEAN:
+        raise MethodError("end_deviation: expected more readings in successive cycles; found too few for their noise")
     return float(np.sqrt(np.mean(second**2) / 6.0))
 
 
@@ -150,25 +155,24 @@ def _figures(
     noises = noise * np.array([1.0, 1.0, np.sqrt(2.0)])
     shared = np.sqrt(np.array([*(u_cold**2 + lever**2), (u_cold**2).sum() + np.ptp(lever) ** 2]))
     last = float(t[moving].max()) if moving.any() else float(t[-1])
-    found, u = np.full((3, len(MEASURES)), np.nan), np.full((3, len(MEASURES)), np.nan)
+    figures, u = np.full((3, len(MEASURES)), np.nan), np.full((3, len(MEASURES)), np.nan)
     for q in range(3):
         means, times, counts = _means(both[:, q], t)
         for k, end in enumerate((HOUR, last, float(t[-1]))):
             here = times <= end + 1e-9
             if k == 0 and t[-1] < HOUR - 1e-9:
                 continue
-            found[q, k], u[q, k] = _range(means[here], counts[here], noises[q], shared[q])
+            figures[q, k], u[q, k] = _range(means[here], counts[here], noises[q], shared[q])
         final = np.flatnonzero(times <= last + 1e-9)[-1]
-        found[q, 3] = means[final]
+        figures[q, 3] = means[final]
         u[q, 3] = np.hypot(noises[q] / np.sqrt(counts[final]), shared[q]) if final else np.nan
-    return found, u
+    return figures, u
 
 
 def _means(values: Array, t: Array) -> tuple[Array, Array, Array]:
-    """Return means of successive cycles, their times and counts; the cold state, 0 by definition, comes first."""
+    """Return means of successive cycles, their times and counts; the first is the cold state, 0 by definition."""
     means, times, counts = [0.0], [0.0], [0]
-    later = [np.arange(i, min(i + MEAN_OF, t.size)) for i in range(1, t.size, MEAN_OF)]
-    for part in later:
+    for part in (np.arange(i, min(i + CYCLES_PER_MEAN, t.size)) for i in range(1, t.size, CYCLES_PER_MEAN)):
         known = part[np.isfinite(values[part])]
         if known.size:
             means.append(float(values[known].mean()))
@@ -182,7 +186,7 @@ def _range(means: Array, counts: Array, noise: float, shared: float) -> tuple[fl
     if low == high:
         return 0.0, float("nan")
     own = sum(noise**2 / counts[i] for i in (low, high) if counts[i])
-    cold = shared**2 if 0 in (low, high) else 0.0  # two warm states share the reference
+    cold = shared**2 if 0 in (low, high) else 0.0  # the reference cancels between two warm states
     return float(means[high] - means[low]), float(np.sqrt(own + cold))
 
 
@@ -191,10 +195,10 @@ def _extras(
 ) -> dict[str, xr.DataArray]:
     coords: dict[str, Any] = {"freedom": freedoms, "quantity": list(QUANTITIES), "measure": list(MEASURES)}
     dims = tuple(coords)
-    words = {"long_name": "ISO 230-3, thermal distortion by the moving axis; m, rad"}
+    attrs = {"long_name": "ISO 230-3, thermal distortion by the moving axis; m, rad"}
     return {
-        "distortion": xr.DataArray(np.array([value for value, _ in figures]), coords, dims, attrs=words),
-        "distortion_u": xr.DataArray(np.array([u for _, u in figures]), coords, dims, attrs=words),
+        "distortion": xr.DataArray(np.array([value for value, _ in figures]), coords, dims, attrs=attrs),
+        "distortion_u": xr.DataArray(np.array([u for _, u in figures]), coords, dims, attrs=attrs),
         "moving": xr.DataArray(moving.astype(float), dims="time", attrs={"long_name": "1 while the axis moved"}),
         "reading_noise": xr.DataArray(noise, {"freedom": freedoms}, "freedom", attrs={"long_name": "m, rad"}),
     }

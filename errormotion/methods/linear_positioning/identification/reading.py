@@ -16,18 +16,18 @@ from errormotion.methods.linear_positioning.schema import APPROACHES
 from errormotion.methods.linear_positioning.settings import Settings
 
 FEWEST_TARGETS = 3
-"""Positions by which a drift that grows with the position is distinguished from the scatter of the readings."""
+"""Needed to distinguish a drift proportional to the position from the scatter of the readings."""
 
 
 @dataclass(frozen=True)
 class Readings:
-    """Deviations of an axis, SI, NaN where there is no reading.
+    """Deviations of an axis, SI; NaN for missing readings.
 
     Attributes
     ----------
     axis : str
     freedoms : tuple of str
-        Of ``EX EY EZ EA EB EC``, as measured.
+        The measured ones of ``EX EY EZ EA EB EC``.
     x : ndarray, (freedom, approach, run, target)
         Deviations as recorded.
     position : ndarray, (target,)
@@ -70,10 +70,10 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     Raises
     ------
     MethodError
-        An unknown axis, freedom or approach; fewer than three targets, targets twice, nothing measured.
+        An unknown axis, freedom or approach; fewer than three targets, duplicate targets, no readings of a freedom.
     """
     axis = axis_of(raw)
-    approaches = _labels(raw, "approach")
+    approaches = labels(raw, "approach")
     if not approaches or set(approaches) - set(APPROACHES) or len(set(approaches)) < len(approaches):
         raise MethodError(f"approach: expected the labels forward, backward; found {', '.join(approaches) or 'none'}")
     freedoms = freedoms_of(raw, axis)
@@ -83,15 +83,15 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     measured = np.asarray(raw["deviation"].transpose("freedom", "approach", "run", "target").values, dtype=float)
     x = _by_approach(measured[..., order], approaches, axis=1)
     if not np.isfinite(x).any(axis=(1, 2, 3)).all():
-        raise MethodError("deviation: expected readings of each freedom; found one or more with none")
+        raise MethodError("deviation: expected readings of each freedom; found none for one or more of them")
     missing = int(np.isnan(measured).sum())
     if missing:
-        notes.append(f"{missing} of {measured.size} readings are missing; means and deviations are those of the rest.")
+        notes.append(f"{missing} of {measured.size} readings are missing; the others are evaluated.")
     if set(approaches) != set(APPROACHES):
         notes.append(f"Targets were approached {approaches[0]} only: figures of both directions are unknown.")
     zero = float(raw["zero_position"]) if "zero_position" in raw else float(position[0])
     if not np.isfinite(zero):
-        raise MethodError("zero_position: expected a position; found NaN. Leave it out if it is not known")
+        raise MethodError("zero_position: expected a position; found NaN. Omit it if it is unknown")
     return Readings(
         axis=axis,
         freedoms=freedoms,
@@ -104,41 +104,46 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
 
 
 def per_freedom(raw: xr.Dataset, name: str, count: int) -> Array:
-    """Return a variable over the freedoms, 0 where it is not in the data; MethodError where it is NaN."""
+    """Return a variable over the freedoms, zeros if it is not in the data; MethodError if it is NaN or negative."""
     if name not in raw:
         return np.zeros(count)
     values = np.asarray(raw[name].values, dtype=float)
     if not np.isfinite(values).all() or (values < 0).any():
-        raise MethodError(f"{name}: expected a value of 0 or more for each freedom; found one that is not")
+        raise MethodError(f"{name}: expected a value of 0 or more for each freedom; found a negative one, or NaN")
     return values
 
 
+def length_uncertainty(raw: xr.Dataset, settings: Settings) -> float:
+    """Return the relative standard uncertainty of lengths, of the data or else of the settings."""
+    return float(raw["length_uncertainty"]) if "length_uncertainty" in raw else settings.uncertainty.length
+
+
 def axis_of(raw: xr.Dataset) -> str:
-    """Return the axis by its attribute, else by the names of the freedoms."""
-    by_names = {label[-1:] for label in _labels(raw, "freedom")}
+    """Return the axis by its attribute, or else by the names of the freedoms."""
+    by_names = {label[-1:] for label in labels(raw, "freedom")}
     axis = str(raw.attrs.get("axis", by_names.pop() if len(by_names) == 1 else ""))
     if axis not in LINEAR_AXES:
         raise MethodError(f"attribute axis: expected one of {', '.join(LINEAR_AXES)}; found '{axis}'")
     return axis
 
 
-def _labels(raw: xr.Dataset, dim: str) -> list[str]:
-    return [_text(label) for label in raw[dim].values] if dim in raw.coords else []
-
-
-def _text(label: object) -> str:
-    return label.decode() if isinstance(label, bytes) else str(label)
+def labels(raw: xr.Dataset, dim: str) -> list[str]:
+    """Return the labels of a dim; empty if it has none."""
+    if dim not in raw.coords:
+        return []
+    return [label.decode() if isinstance(label, bytes) else str(label) for label in raw[dim].values]
 
 
 def freedoms_of(raw: xr.Dataset, axis: str) -> tuple[str, ...]:
     """Return the measured freedoms by the ISO 230-1 names of the data; MethodError for other names."""
     by_name = {name: dof for dof, name in iso_names(axis).items()}
-    labels = _labels(raw, "freedom")
-    if not labels or set(labels) - set(by_name) or len(set(labels)) < len(labels):
+    names = labels(raw, "freedom")
+    if not names or set(names) - set(by_name) or len(set(names)) < len(names):
         raise MethodError(
-            f"freedom: expected names of {', '.join(by_name)} for axis {axis}; found {', '.join(labels) or 'none'}"
+            f"freedom: expected different names among {', '.join(by_name)} for axis {axis}; found "
+            f"{', '.join(names) or 'none'}"
         )
-    return tuple(by_name[name] for name in labels)
+    return tuple(by_name[name] for name in names)
 
 
 def _check_positions(position: Array) -> None:
@@ -147,11 +152,11 @@ def _check_positions(position: Array) -> None:
     if position.size < FEWEST_TARGETS:
         raise MethodError(f"target_position: expected {FEWEST_TARGETS} targets or more; found {position.size}")
     if np.unique(position).size < position.size:
-        raise MethodError("target_position: expected positions that differ; found one twice")
+        raise MethodError("target_position: expected different positions; found one of them twice")
 
 
 def _by_approach(values: Array, approaches: list[str], axis: int) -> Array:
-    """Return values with both approaches in their order along an axis; NaN for one that was not measured."""
+    """Return values with both approaches in their order along ``axis``; NaN for one that was not measured."""
     moved = np.moveaxis(values, axis, 0)
     full = np.full((2, *moved.shape[1:]), np.nan)
     for k, name in enumerate(approaches):
@@ -162,13 +167,13 @@ def _by_approach(values: Array, approaches: list[str], axis: int) -> Array:
 def _temperatures(raw: xr.Dataset, approaches: list[str], order: NDArray[np.int64]) -> dict[str, Array]:
     if "temperature" not in raw:
         return {}
-    labels = _labels(raw, "sensor") or [str(k + 1) for k in range(raw.sizes["sensor"])]
+    sensors = labels(raw, "sensor") or [str(k + 1) for k in range(raw.sizes["sensor"])]
     values = np.asarray(raw["temperature"].transpose("sensor", "approach", "run", "target").values, dtype=float)
-    return {name: _by_approach(values[k][..., order], approaches, axis=0) for k, name in enumerate(labels)}
+    return {name: _by_approach(values[k][..., order], approaches, axis=0) for k, name in enumerate(sensors)}
 
 
 def point_of(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Array:
-    """Return the functional point of data or settings, (3,), m; a note where there is none."""
+    """Return the functional point of the data or settings, (3,), m; (0, 0, 0) with a note if neither states it."""
     if "functional_point" in raw:
         stated = raw["functional_point"]
         ordered = stated.sel(direction=["x", "y", "z"]) if "direction" in stated.coords else stated
@@ -176,7 +181,7 @@ def point_of(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Array:
     if settings.functional_point is not None:
         return np.array(settings.functional_point)
     notes.append(
-        "The functional point is not stated: (0, 0, 0) stands for the measured line. State it before the errors are "
-        "moved to another point."
+        "The functional point is not stated: (0, 0, 0) is used for the measured line. State it before the errors are "
+        "transformed to another point."
     )
     return np.zeros(3)

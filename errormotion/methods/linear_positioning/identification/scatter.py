@@ -1,16 +1,16 @@
-"""How the readings of one freedom vary: scatter from reading to reading, and drift from run to run.
+"""Variation of the readings of one freedom: scatter from reading to reading, and drift from run to run.
 
 Model of a reading of approach a, run j, target i, with the position scaled to z = -1 ... 1::
 
     x_aji = mu_ai + (o_j + q_j z_i) +- (p_j + w_j z_i) + e_aji
 
-``o`` and ``q`` are an offset and a slope that both approaches of a run share (the machine drifts, its scale expands);
-``p`` and ``w`` differ in sign between forward and backward. All are independent from run to run. A least-squares line
-of each run and approach, about the means of the targets, gives the coefficients; half their sum and half their
-difference over the approaches give the four variances, with n - 1 degrees of freedom each.
+``o`` and ``q`` are an offset and a slope that both approaches of a run share (drift of the machine, expansion of its
+scale); ``p`` and ``w`` have opposite signs forward and backward. All are independent from run to run. The coefficients
+are those of a least-squares line of each run and approach, about the means of the targets; half their sum and half
+their difference over the approaches determine the four variances, with n - 1 degrees of freedom each.
 
-A variance that is estimated with v degrees of freedom makes the standardised mean Student-distributed. Its standard
-deviation is larger by sqrt(v / (v - 2)) (JCGM 101:2008, 6.4.9.4), and that is what is stated.
+If a variance is estimated with v degrees of freedom, the standardised mean has a Student distribution. Its standard
+deviation is larger by sqrt(v / (v - 2)) (JCGM 101:2008, 6.4.9.4); the stated uncertainty includes this factor.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from errormotion.errors import MethodError
 
 DRIFTS = ("offset", "slope")
 FEWEST_RUNS = 4
-"""Runs from which the variance of the drift has a Student factor, v / (v - 2) with v = n - 1 above 2."""
+"""For which the variance of the drift has a Student factor, v / (v - 2) with v = n - 1 above 2."""
 SIGNIFICANT = 1e-3
-"""Probability of the test of equal variances (Bartlett) below which each target gets its own."""
+"""Probability in Bartlett's test of equal variances below which each target has its own variance."""
 
 
 @dataclass(frozen=True)
@@ -40,20 +40,20 @@ class Scatter:
     z : ndarray, (target,)
         Scaled position.
     own : ndarray, (approach, target)
-        Of one reading, by what is new at each reading; estimate.
+        Of one reading, independent from reading to reading; estimate.
     own_factor : float
         Student factor of ``own`` in a variance of a mean.
     common, opposite : ndarray, (2,)
-        Of offset and slope of a run that the approaches share, and of those that differ in sign; estimates.
+        Of offset and slope of a run that the approaches share, and of those with opposite signs; estimates.
     common_mean, opposite_mean : ndarray, (2,)
-        The same as stated for the mean of one run: with Student factor and stated drift, less the part that ``own``
-        contains already.
+        The same for the mean of one run: with Student factor and stated drift, minus the part that is already contained
+        in ``own``.
     pooled : bool
         Whether all targets have one variance.
     freedom : int
         Degrees of freedom of ``common`` and ``opposite``; 0 where they are stated.
     noise : ndarray, (2,)
-        Variance of the coefficients of a run by ``own``, which was taken off.
+        Variance of the coefficients of a run by ``own``, which has been subtracted.
     """
 
     z: Array
@@ -86,13 +86,13 @@ def scatter(
     Parameters
     ----------
     x : ndarray
-        NaN where there is no reading.
+        NaN for missing readings.
     position : ndarray, (target,)
         m.
     kind : {"auto", "pooled", "target", "stated"}
-        Whether targets have variances of their own; ``stated`` takes ``drift`` and ``stated`` and estimates nothing.
+        Whether each target has its own variance; with ``stated``, ``drift`` and ``stated`` replace all estimates.
     drift : float, optional
-        Standard deviation by drift of a run of one approach, stated; at least this is taken.
+        Stated standard deviation of a run of one approach by drift; a smaller estimate is replaced by it.
     stated : float, optional
         Standard deviation of a reading, for a single run.
 
@@ -143,8 +143,8 @@ def scatter(
 def _stated(x: Array, z: Array, stated: float | None, drift: float | None, stated_drift: Array) -> Scatter:
     if stated is None or drift is None:
         raise MethodError(
-            "One run does not show how readings scatter. Expected more runs, or the settings uncertainty.scatter "
-            "and uncertainty.drift."
+            "The scatter of the readings cannot be estimated from one run. Measure more runs, or state the settings "
+            "uncertainty.scatter and uncertainty.drift."
         )
     own = np.where(np.isfinite(x).any(axis=1), stated**2, np.nan)
     return Scatter(z, own, 1.0, stated_drift, stated_drift, stated_drift, stated_drift, True, 0, np.zeros(2))
@@ -180,13 +180,13 @@ def _own(residual: Array, kind: str) -> tuple[Array, float, bool]:
     n = known.sum(axis=1)
     square = np.where(known, residual**2, 0.0).sum(axis=1)
     runs = known.any(axis=2).sum(axis=1)
-    lost = 2 * np.maximum(runs - 1, 0).sum()  # lines of all runs, less one that the means of the targets contain
+    lost = 2 * np.maximum(runs - 1, 0).sum()  # lines of all runs but one, which the means of the targets contain
     total = int(np.maximum(n - 1, 0).sum())
     freedom = total - int(lost)
     if freedom < 3:
         raise MethodError(
-            f"Expected enough readings to estimate their scatter; {freedom} degrees of freedom remain. Measure more "
-            "targets or runs."
+            f"Too few readings to estimate their scatter: expected 3 degrees of freedom or more; found {freedom}. "
+            "Measure more targets or runs."
         )
     pooled = float(square.sum() / freedom)
     if kind == "pooled" or (kind == "auto" and not _differ(square, n)):

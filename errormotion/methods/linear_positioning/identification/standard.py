@@ -1,7 +1,7 @@
-"""The formulas of ISO 230-2:2014, of readings ``x`` (..., approach, run, target); approach is forward, backward.
+"""The formulas of ISO 230-2:2014, for readings ``x`` (..., approach, run, target); approaches are forward, backward.
 
-Unknown readings are NaN. A value that needs an unknown one is NaN; extremes are those of the known values. A figure
-of both directions is NaN where one of them was not measured.
+Unknown readings are NaN. A value that depends on an unknown one is NaN; extremes are those of the known values. A
+figure of both directions is NaN if one of them was not measured.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MEANINGS = {
 
 @dataclass(frozen=True)
 class Statistics:
-    """What the standard computes at each target; ``mean`` and ``s`` are (..., approach, target).
+    """Statistics of the standard at each target; ``mean`` and ``s`` are (..., approach, target).
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ def statistics(x: Array) -> Statistics:
 def figures(found: Statistics) -> Array:
     """Return the figures of the axis in the order of ``FIGURES``, (..., figure).
 
-    Clause 3 and 4 of ISO 230-2:2014: ``A = max(mean + 2 s) - min(mean - 2 s)``, ``E = max(mean) - min(mean)`` over one
+    Clauses 3 and 4 of ISO 230-2:2014: ``A = max(mean + 2 s) - min(mean - 2 s)``, ``E = max(mean) - min(mean)`` over one
     or both directions, ``R`` the largest repeatability, ``M`` the range of the mean bidirectional deviations, ``B`` the
     largest reversal error, ``B_mean`` its mean over the targets, with its sign.
     """
@@ -117,7 +117,7 @@ def figures(found: Statistics) -> Array:
 
 def _largest(values: Array) -> Array:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # NaN where nothing is known
+        warnings.simplefilter("ignore", RuntimeWarning)  # all values unknown: NaN
         return np.asarray(np.nanmax(values, axis=-1))
 
 

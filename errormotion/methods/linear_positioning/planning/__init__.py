@@ -1,1 +1,1 @@
-"""What is going to be measured: targets, the order of their approaches, programs, and the uncertainty to expect."""
+"""Targets, the order of their approaches, NC programs, and the expected uncertainty."""

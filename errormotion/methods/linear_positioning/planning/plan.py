@@ -1,4 +1,4 @@
-"""Expected uncertainty of a test that is not measured yet."""
+"""Expected uncertainty of a planned test."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from errormotion.plugins import MethodInfo
 
 SCATTER, DRIFT = 0.5e-6, 1.0e-6
-"""Standard deviation of a reading, and range by drift during a run, where the settings state none; m, rad."""
+"""Defaults of the standard deviation of a reading and of the range by drift during a run, m or rad."""
 
 
 def plan(settings: Settings, info: MethodInfo) -> xr.Dataset:
-    """Return an error dataset of zeros at the targets, with the covariance to expect."""
+    """Return an error dataset of zeros at the targets, with the expected covariance."""
     if settings.moving is not None:
         return _plan_moving(settings, info)
     P = positions(settings)
@@ -41,8 +41,8 @@ def plan(settings: Settings, info: MethodInfo) -> xr.Dataset:
     )
     assumed, scatter, drift = assumed_scatter(settings)
     notes: list[str] = []
-    found = evaluate(raw, assumed, notes, planned=True)
-    errors = build(found, raw, info, provenance.make(assumed, None, None, steps=["plan"]), {})
+    evaluated = evaluate(raw, assumed, notes, planned=True)
+    errors = build(evaluated, raw, info, provenance.make(assumed, None, None, steps=["plan"]), {})
     for name in settings.freedoms:
         errors[name] = errors[name].copy(data=np.zeros(P.size))
     k = [str(name) for name in errors["dof"].values].index(settings.freedoms[0])
@@ -58,7 +58,7 @@ def plan(settings: Settings, info: MethodInfo) -> xr.Dataset:
 
 
 def assumed_scatter(settings: Settings) -> tuple[Settings, float, float]:
-    """Return settings that state scatter and drift, and both."""
+    """Return settings that state scatter and drift, by default the assumed ones, and the two values."""
     stated = settings.uncertainty
     scatter = SCATTER if stated.scatter is None else stated.scatter
     drift = DRIFT if stated.drift is None else stated.drift
@@ -69,8 +69,8 @@ def assumed_scatter(settings: Settings) -> tuple[Settings, float, float]:
 def _plan_moving(settings: Settings, info: MethodInfo) -> xr.Dataset:
     scatter = SCATTER if settings.uncertainty.scatter is None else settings.uncertainty.scatter
     raw, _ = simulate_moving(settings, 0)
-    still = raw.assign(end_deviation=0.0 * raw["end_deviation"]).assign_attrs(machine="plan")
-    errors = identify_moving(still, settings, info, scatter)
+    zeros = raw.assign(end_deviation=0.0 * raw["end_deviation"]).assign_attrs(machine="plan")
+    errors = identify_moving(zeros, settings, info, scatter)
     origin = json.dumps(provenance.make(settings, None, None, steps=["plan"]))
     k = [str(name) for name in errors["dof"].values].index(settings.freedoms[0])
     u = float(np.sqrt(errors["covariance"].values[-1, -1, k, k]))

@@ -14,8 +14,8 @@ from errormotion.arrays import Array
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
 
-LONG = 2.0
-"""Travel up to which the standard asks for five targets per metre, m; beyond it, an interval of 250 mm."""
+LONG_TRAVEL = 2.0
+"""Travel up to which the standard requires five targets per metre, m; beyond it, an interval of 250 mm."""
 PER_METRE, LONG_INTERVAL, FEWEST = 5.0, 0.25, 11
 RANDOM_SHARE = 0.3
 """Largest random part of a position as a share of the interval."""
@@ -23,79 +23,79 @@ RANDOM_SHARE = 0.3
 
 @dataclass(frozen=True)
 class Approach:
-    """One approach of a target: over ``before`` (m) to ``place`` (m), where it is read.
+    """One approach to a target, in the ``direction`` 0 (forward) or 1 (backward), and the reading at ``position``, m.
 
-    ``before`` is beyond the target on the side from which it is approached; None where the axis comes from there
-    already.
+    ``before`` (m) is a position on the side from which the target is approached, to which the axis moves first; None if
+    the axis is on this side already.
     """
 
     run: int
-    approach: int
+    direction: int
     target: int
     before: float | None
-    place: float
+    position: float
 
 
 def positions(settings: Settings) -> Array:
     """Return the target positions in increasing order, (target,), m.
 
-    A position is a multiple of the interval plus a random part, so that the targets do not have the period of a pitch
-    or a grating. The first and the last target lie within the travel.
+    A position is a multiple of the interval plus a random part, so that the targets are not periodic like a screw or a
+    scale. The first and the last target lie within the travel.
     """
     if settings.targets:
         return np.sort(np.array(settings.targets, np.float64))
     low, high = settings.travel
-    return spread(low, high, settings.count or needed(high - low), settings)
+    return randomised(low, high, settings.count or standard_count(high - low), settings)
 
 
-def spread(low: float, high: float, count: int, settings: Settings) -> Array:
+def randomised(low: float, high: float, count: int, settings: Settings) -> Array:
     """Return positions from ``low`` to ``high`` with their random parts, (count,), m."""
     interval = (high - low) / (count - 1)
     largest = min(RANDOM_SHARE * interval if settings.random_part is None else settings.random_part, 0.49 * interval)
     part = np.random.default_rng(settings.seed).uniform(-largest, largest, count)
     part[0], part[-1] = abs(part[0]), -abs(part[-1])
-    # 1 um: the resolution of programs, so that commanded and stated positions agree.
+    # rounded to 1 um, the resolution of programs, so that commanded and stated positions agree
     return np.round(low + interval * np.arange(count) + part, 6)
 
 
-def needed(length: float) -> int:
-    """Return the number of targets for a travel, m: as the standard asks, and at least 11."""
-    if length <= LONG:
+def standard_count(length: float) -> int:
+    """Return the number of targets that the standard requires for a travel, m, and at least 11."""
+    if length <= LONG_TRAVEL:
         return max(FEWEST, math.ceil(PER_METRE * length - 1e-9) + 1)
     return max(FEWEST, math.ceil(length / LONG_INTERVAL - 1e-9) + 1)
 
 
-def sequence(settings: Settings, positions_of: Array | None = None) -> Iterator[Approach]:
-    """Yield the approaches in their order, linear or pendulum cycles: of the targets of the settings, or of others."""
-    places = [float(place) for place in (positions(settings) if positions_of is None else positions_of)]
-    beyond = settings.overrun
-    last = len(places) - 1
+def sequence(settings: Settings, targets: Array | None = None) -> Iterator[Approach]:
+    """Yield the approaches to targets, m, by default those of the settings, in the order of the cycle."""
+    P = [float(position) for position in (positions(settings) if targets is None else targets)]
+    overrun = settings.overrun
+    last = len(P) - 1
     if settings.cycle == "linear":
         for run in range(settings.runs):
-            for i, place in enumerate(places):
-                yield Approach(run, 0, i, place - beyond if i == 0 else None, place)
+            for i, position in enumerate(P):
+                yield Approach(run, 0, i, position - overrun if i == 0 else None, position)
             for i in range(last, -1, -1):
-                yield Approach(run, 1, i, places[i] + beyond if i == last else None, places[i])
+                yield Approach(run, 1, i, P[i] + overrun if i == last else None, P[i])
         return
-    for i, place in enumerate(places):
+    for i, position in enumerate(P):
         for run in range(settings.runs):
-            yield Approach(run, 0, i, place - beyond, place)
-            yield Approach(run, 1, i, place + beyond, place)
+            yield Approach(run, 0, i, position - overrun, position)
+            yield Approach(run, 1, i, position + overrun, position)
 
 
 def reach(settings: Settings) -> tuple[float, float]:
-    """Return lowest and highest position of the axis, overrun included, m."""
-    places = positions(settings)
-    return float(places[0]) - settings.overrun, float(places[-1]) + settings.overrun
+    """Return the lowest and highest position of the axis, overrun included, m."""
+    P = positions(settings)
+    return float(P[0]) - settings.overrun, float(P[-1]) + settings.overrun
 
 
 def seconds(settings: Settings) -> float:
-    """Return the duration of the test at its feed, rests included, s; accelerations are neglected."""
-    total, place = 0.0, None
+    """Return the duration of the test at its feed, dwells included, s; accelerations are neglected."""
+    total, last = 0.0, None
     for approach in sequence(settings):
-        for stop in (approach.before, approach.place):
+        for stop in (approach.before, approach.position):
             if stop is not None:
-                total += abs(stop - place) / settings.feed if place is not None else 0.0
-                place = stop
+                total += abs(stop - last) / settings.feed if last is not None else 0.0
+                last = stop
         total += settings.dwell
     return total

@@ -20,5 +20,5 @@ def chapters(source: Source) -> list[Part]:
 
 
 def texts(language: str) -> dict[str, str]:
-    """Return the catalogue of this chapter: English text = text in the language."""
+    """Return the catalogue of this chapter, from English texts to those in the language."""
     return texts_of(__name__, language)

@@ -7,54 +7,50 @@ import math
 import numpy as np
 import xarray as xr
 
-from errormotion.methods.linear_positioning.figures import LIMITS
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, MEANINGS
 from errormotion.methods.linear_positioning.report import drawings
 from errormotion.methods.linear_positioning.report.view import View, views
+from errormotion.methods.linear_positioning.schema import APPROACHES
+from errormotion.methods.linear_positioning.settings import LIMITS
 from errormotion.report import budget, provenance, quality
 from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate
 from errormotion.report.text import decimals_of, fixed, listed
 
 KEY_FIGURES = ("A", "R", "E", "B", "M")
-APPROACHES = ("forward", "backward")
-COLUMNS = 8
-"""Targets in one table."""
+TARGETS_PER_TABLE = 8
 
 
 def part(source: Source, key: str) -> Part:
-    """Return the chapter; ``key`` keeps the identifiers of its figures apart."""
-    errors, seen = source.errors, views(source.errors)
-    limits = drawings.limits_of(errors, LIMITS) if seen[0].along else {}
-    sections = [Section("figures", "Figures of ISO 230-2", _figures(seen, limits, f"{key}-limits"))]
+    """Return the chapter; ``key`` makes the identifiers of its figures unique."""
+    errors, freedoms = source.errors, views(source.errors)
+    limits = drawings.limits_of(errors, LIMITS) if freedoms[0].along else {}
+    sections = [Section("figures", "Figures of ISO 230-2", _figures(freedoms, limits, f"{key}-limits"))]
     sections += [
         Section(
             f"graph-{view.name}",
             f"{_title(view)} {view.name}",
             [drawings.over_position(view, f"{key}-{view.name}", source.limits), *target_tables(view)],
         )
-        for view in seen
+        for view in freedoms
     ]
     sections += [
-        Section("uncertainty", "Uncertainty", _uncertainty(errors, seen[0])),
+        Section("uncertainty", "Uncertainty", _uncertainty(errors, freedoms[0])),
         Section("quality", "Data quality", [*quality.notes(errors), *quality.sentences(errors, source.raw)]),
         Section("provenance", "Provenance", provenance.blocks(source)),
     ]
     axis = str(errors.attrs["component"])
-    return Part(f"Positioning of axis {axis}", _key_figures(seen[0], limits), _summary(errors, seen, limits), sections)
+    summary = _summary(errors, freedoms, limits)
+    return Part(f"Positioning of axis {axis}", _key_figures(freedoms[0], limits), summary, sections)
 
 
-def _figures(seen: list[View], limits: dict[str, float], key: str) -> list[Block]:
-    bars = [drawings.against_limits(seen[0], limits, key)] if limits else []
-    first, *others = (figure_table(view, limits) for view in seen)
+def _figures(freedoms: list[View], limits: dict[str, float], key: str) -> list[Block]:
+    bars = [drawings.against_limits(freedoms[0], limits, key)] if limits else []
+    first, *others = (figure_table(view, limits) for view in freedoms)
     return [first, *bars, *others]
 
 
 def _title(view: View) -> str:
     return "Positioning" if view.along else "Straightness" if view.straight else "Angle"
-
-
-def _signed(name: str) -> bool:
-    return name == "B_mean"
 
 
 def _key_figures(view: View, limits: dict[str, float]) -> list[KeyFigure]:
@@ -70,20 +66,18 @@ def _key_figures(view: View, limits: dict[str, float]) -> list[KeyFigure]:
     ]
 
 
-def _summary(errors: xr.Dataset, seen: list[View], limits: dict[str, float]) -> list[str]:
-    view, runs = seen[0], errors.sizes["run"]
-    words = [
+def _summary(errors: xr.Dataset, freedoms: list[View], limits: dict[str, float]) -> list[str]:
+    view, runs = freedoms[0], errors.sizes["run"]
+    return [
         f"{view.position.size} targets from {fixed(view.position[0], 1)} mm to {fixed(view.position[-1], 1)} mm, "
-        f"{runs} run{'s' if runs > 1 else ''}; {listed([each.name for each in seen])} measured. Errors are relative to "
-        f"the {errors.attrs['reference']}."
+        f"{runs} run{'s' if runs > 1 else ''}; {listed([each.name for each in freedoms])} measured. Errors are "
+        f"relative to the {errors.attrs['reference']}.",
+        *(f"{name} is {_verdict(view, name, limit)} {limit:g} µm." for name, limit in limits.items()),
     ]
-    for name, limit in limits.items():
-        words.append(f"{name} is {_verdict(view, name, limit)} {limit:g} µm.")
-    return words
 
 
 def _verdict(view: View, name: str, limit: float) -> str:
-    """Return the decision with the guard band of the uncertainty (ISO 14253-1)."""
+    """Return the decision, with the expanded uncertainty as guard band (ISO 14253-1)."""
     if view.value[name] + view.expanded(name) <= limit:
         return "within its limit of"
     if view.value[name] - view.expanded(name) > limit:
@@ -92,7 +86,7 @@ def _verdict(view: View, name: str, limit: float) -> str:
 
 
 def figure_table(view: View, limits: dict[str, float]) -> Table:
-    """Return the figures of one freedom or diagonal with excess and uncertainty."""
+    """Return the table of the figures of one freedom or diagonal, with excess and uncertainty."""
     rows: list[list[Cell | str]] = []
     for name in FIGURES:
         value, bias, u = view.value[name], view.bias[name], view.u[name]
@@ -100,32 +94,32 @@ def figure_table(view: View, limits: dict[str, float]) -> Table:
             [
                 name.replace("_forward", "↑").replace("_backward", "↓").replace("B_mean", "mean B"),
                 MEANINGS[name],
-                estimate(value, view.expanded(name), signed=_signed(name), reason="not measured in both directions"),
+                estimate(value, view.expanded(name), signed=name == "B_mean", reason="not measured in both directions"),
                 fixed(bias, decimals_of(2.0 * u, 2), signed=True) if name != "B_mean" else "",
-                estimate(value - bias, 2.0 * u, signed=_signed(name), reason="needs several runs"),
+                estimate(value - bias, 2.0 * u, signed=name == "B_mean", reason="needs several runs"),
                 f"{limits[name]:g}" if name in limits and view.along else "",
             ]
         )
     caption = (
         f"Figures of {view.name} in {view.unit} as the standard defines them; after ±: expanded uncertainty, k = 2, "
-        "excess included. Excess: what scatter adds to an extreme value; true figure: that of infinitely many runs."
+        "excess included. Excess: mean increase of an extreme value by scatter; true figure: the limit for an infinite "
+        "number of runs."
     )
-    return Table(caption, ["figure", "what it is", "value", "excess", "true figure", "limit"], rows, numeric=False)
+    return Table(caption, ["figure", "meaning", "value", "excess", "true figure", "limit"], rows, numeric=False)
 
 
 def target_tables(view: View) -> list[Block]:
-    """Return the results by target as the standard lists them, some targets a table."""
-    found: list[Block] = []
+    """Return the results by target as in the standard, in tables of some targets."""
+    tables: list[Block] = []
     decimals = _decimals(view)
     m = view.position.size
-    pieces = math.ceil(m / COLUMNS)
-    for piece in np.array_split(np.arange(m), pieces):
-        head = ["", *(f"{i + 1}" for i in piece)]
-        rows: list[list[Cell | str]] = [["target position / mm", *(fixed(view.position[i], 3) for i in piece)]]
+    for targets in np.array_split(np.arange(m), math.ceil(m / TARGETS_PER_TABLE)):
+        head = ["", *(f"{i + 1}" for i in targets)]
+        rows: list[list[Cell | str]] = [["target position / mm", *(fixed(view.position[i], 3) for i in targets)]]
         for k, approach in enumerate(APPROACHES):
             arrow = "↑" if k == 0 else "↓"
             for j, run in enumerate(view.readings[k]):
-                rows.append([f"run {j + 1} {arrow}", *(fixed(run[i], decimals) for i in piece)])
+                rows.append([f"run {j + 1} {arrow}", *(fixed(run[i], decimals) for i in targets)])
             mean, s = view.mean[k], view.s[k]
             for label, values in (
                 (f"mean {approach}", mean),
@@ -135,31 +129,29 @@ def target_tables(view: View) -> list[Block]:
                 (f"mean + 2 s {arrow}", mean + 2 * s),
                 (f"R = 4 s {arrow}", 4 * s),
             ):
-                rows.append([label, *(fixed(values[i], decimals) for i in piece)])
+                rows.append([label, *(fixed(values[i], decimals) for i in targets)])
         reversal = view.mean[0] - view.mean[1]
         both = np.maximum(2 * view.s.sum(axis=0) + np.abs(reversal), 4 * view.s.max(axis=0))
         for label, values in (("B", reversal), ("mean of both", view.mean.mean(axis=0)), ("R of both", both)):
-            rows.append([label, *(fixed(values[i], decimals) for i in piece)])
-        caption = f"{view.name} by target, {view.unit}."
-        found.append(Table(caption, head, rows))
-    return found
+            rows.append([label, *(fixed(values[i], decimals) for i in targets)])
+        tables.append(Table(f"{view.name} by target, {view.unit}.", head, rows))
+    return tables
 
 
 def _decimals(view: View) -> int:
-    """Return the decimals that show a tenth of the scatter."""
+    """Return the number of decimals that resolves a tenth of the scatter."""
     typical = float(np.nanmedian(view.s)) if np.isfinite(view.s).any() else math.nan
     return min(max(1 - math.floor(math.log10(typical)), 1), 4) if typical > 0 else 2
 
 
 def _uncertainty(errors: xr.Dataset, view: View) -> list[Block]:
     middle = errors.sizes["position"] // 2
-    here = errors.isel(position=[middle]).squeeze("position")
-    far = errors.isel(position=[errors.sizes["position"] - 1]).squeeze("position")
     return [
-        budget.table(here, f"at {fixed(view.position[middle], 1)} mm"),
-        budget.table(far, f"at {fixed(view.position[-1], 1)} mm"),
+        budget.table(errors.isel(position=middle), f"at {fixed(view.position[middle], 1)} mm"),
+        budget.table(errors.isel(position=-1), f"at {fixed(view.position[-1], 1)} mm"),
         Text(
-            "Independent: from target to target, by the scatter of the readings. Every other source is one draw for "
-            "the whole test. Bands and figures use the readings corrected for expansion and mean cosine error."
+            "Independent: from target to target, by the scatter of the readings. The error of every other source is "
+            "the same in the whole test. Bands and figures use the readings corrected for expansion and mean cosine "
+            "error."
         ),
     ]

@@ -1,4 +1,4 @@
-"""Graphs of a test as the standard draws them: runs, means and bands of two standard deviations, and the figures."""
+"""Graphs of a test as in the standard: runs, means and bands of two standard deviations, and the figures."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from errormotion.report.text import fixed
 APPROACHES = (("forward", canvas.BLUE), ("backward", canvas.VERMILLION))
 DARK = "#555555"
 HEIGHTS = (2.6, 1.1)
-"""Of the panels of deviations and of the reversal error, inch."""
+"""Heights of the panels of deviations and of the reversal error, inch."""
 
 
 def over_position(view: View, key: str, limits: Mapping[str, tuple[float, float]]) -> Figure:
-    """Return runs, means and mean ± 2 s of both approaches over the position, and the reversal error below."""
+    """Return the graph of runs, means and mean ± 2 s of both approaches, with the reversal error below."""
     P = view.position
 
     def paint(figure: Canvas) -> None:
@@ -78,7 +78,7 @@ def _levels(axes: Axes, view: View) -> None:
 
 
 def against_limits(view: View, limits: dict[str, float], key: str) -> Figure:
-    """Return a bar for each figure that has a limit, as a share of it, with its expanded uncertainty."""
+    """Return the bar chart of the figures that have a limit, in per cent of it, with expanded uncertainties."""
     names = list(limits)
 
     def paint(figure: Canvas) -> None:

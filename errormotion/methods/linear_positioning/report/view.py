@@ -1,4 +1,4 @@
-"""One freedom of a result in the units of the page."""
+"""One freedom or diagonal of a result in the units of the report."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from errormotion.report.text import SECOND_OF_ARC, UM
 
 @dataclass(frozen=True)
 class View:
-    """Readings and statistics of one freedom, in µm or arcsec over positions in mm; approach is forward, backward.
+    """Readings and statistics of one freedom or diagonal, in µm or arcsec over positions in mm.
+
+    Approaches are forward, backward.
 
     Attributes
     ----------
     name, unit : str
     size : float
-        Of the unit, SI.
+        The unit in SI.
     position : ndarray, (target,)
     readings : ndarray, (approach, run, target)
     mean, s : ndarray, (approach, target)
@@ -55,37 +57,49 @@ class View:
 
 def views(errors: xr.Dataset) -> list[View]:
     """Return every measured freedom, the positioning first."""
-    found = [_view(errors, str(name)) for name in errors["freedom"].values]
-    return sorted(found, key=lambda view: not view.along)
+    return sorted((_view(errors, str(name)) for name in errors["freedom"].values), key=lambda view: not view.along)
 
 
 def coordinate(errors: xr.Dataset) -> str:
-    """Return the name of the coordinate that holds the positions."""
+    """Return the name of the coordinate of the positions."""
     return next(name for name in "xyz" if name in errors.coords and errors[name].dims == ("position",))
 
 
 def _view(errors: xr.Dataset, name: str) -> View:
-    unit, size = UM if name[1] in "XYZ" else SECOND_OF_ARC
-    of = errors.sel(freedom=name)
-    figures = [str(figure) for figure in errors["figure"].values]
-
-    def named(part: str) -> dict[str, float]:
-        return dict(zip(figures, (of[part].values / size).tolist(), strict=True))
-
     position = errors[coordinate(errors)].values
-    mean = of["unidirectional_mean"].transpose("approach", "position").values
-    readings = of["deviations"].transpose("approach", "run", "position").values
-    if name[1] in "XYZ" and name[1] != name[2]:
+    straight = name[1] in "XYZ" and name[1] != name[2]
+    unit = UM if name[1] in "XYZ" else SECOND_OF_ARC
+    return _build(name, errors.sel(freedom=name), "position", position, unit, straight=straight)
+
+
+def diagonal_view(errors: xr.Dataset, name: str) -> View:
+    """Return one diagonal."""
+    selected = errors.sel(diagonal=name)
+    return _build(name, selected, "target", selected["distance"].values, UM, straight=False)
+
+
+def _build(
+    name: str, selected: xr.Dataset, dim: str, position: Array, unit: tuple[str, float], *, straight: bool
+) -> View:
+    symbol, size = unit
+    figures = [str(figure) for figure in selected["figure"].values]
+
+    def named(variable: str) -> dict[str, float]:
+        return dict(zip(figures, (selected[variable].values / size).tolist(), strict=True))
+
+    mean = selected["unidirectional_mean"].transpose("approach", dim).values
+    readings = selected["deviations"].transpose("approach", "run", dim).values
+    if straight:
         line = _line(position, mean)
         mean, readings = mean - line, readings - line
     return View(
         name=name,
-        unit=unit,
+        unit=symbol,
         size=size,
         position=np.asarray(position * 1e3),
         readings=readings / size,
         mean=mean / size,
-        s=of["unidirectional_s"].transpose("approach", "position").values / size,
+        s=selected["unidirectional_s"].transpose("approach", dim).values / size,
         value=named("figure_value"),
         bias=named("figure_bias"),
         u=named("figure_u"),
@@ -93,7 +107,7 @@ def _view(errors: xr.Dataset, name: str) -> View:
 
 
 def _line(position: Array, mean: Array) -> Array:
-    """Return the least-squares line of the mean of the measured approaches, from which a straightness counts."""
+    """Return the least-squares line of the mean of the measured approaches, the reference of a straightness."""
     measured = np.isfinite(mean).any(axis=1)
     middle = mean[measured].mean(axis=0)
     known = np.isfinite(middle)

@@ -1,1 +1,1 @@
-"""Acquisition: multilateration."""
+"""Acquisition: a tracker at several stations measures the targets of the machine."""

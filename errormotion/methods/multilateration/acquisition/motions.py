@@ -1,4 +1,4 @@
-"""Targets of a set-up in their order, and the steps of the machine in a test."""
+"""Order of the targets of a set-up, and the steps of the machine in a test."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 
 def tour(settings: Settings, returns: int) -> tuple[Array, Array, list[int]]:
-    """Return axis positions and places of the reflector, both (m, 3), m, returns last, and the order of visits."""
+    """Return axis positions and positions of the reflector, both (m, 3), m, and the order of visits.
+
+    Targets that are visited again (``returns``) are appended.
+    """
     position, target = layout.grid(settings.layout)
     order = layout.route(settings.layout)
     again = order[: len(order) // 2 + 1]
@@ -29,19 +32,19 @@ def tour(settings: Settings, returns: int) -> tuple[Array, Array, list[int]]:
 def stations(settings: Settings, measuring: Measuring) -> list[int]:
     """Return the stations in the order of their set-ups, from 0; MethodError for one that does not exist."""
     count = len(settings.layout.stations)
-    wanted = measuring.sequence or tuple(range(1, count + 1))
-    if strange := [k for k in wanted if not 1 <= k <= count]:
-        raise MethodError(f"expected numbers of stations from 1 to {count}; found {strange}")
-    return [k - 1 for k in wanted]
+    sequence = measuring.sequence or tuple(range(1, count + 1))
+    if wrong := [k for k in sequence if not 1 <= k <= count]:
+        raise MethodError(f"measuring.sequence: expected numbers of stations from 1 to {count}; found {wrong}")
+    return [k - 1 for k in sequence]
 
 
 def steps(settings: Settings) -> list[Step]:
-    """Return every step of all set-ups, without repetitions: moves in rapid, and rests."""
+    """Return every step of all set-ups, without repetitions: rapid moves, and dwells."""
     position, _, order = tour(settings, settings.measuring.returns)
-    found: list[Step] = []
+    result: list[Step] = []
     for _ in stations(settings, settings.measuring):
         for i in (order[0], *order):
             x, y, z = (float(each) for each in position[i])
-            found.append(Step("move", (x, y, z), math.nan, math.nan))
-            found.append(Step("rest", None, math.nan, settings.measuring.settle))
-    return found
+            result.append(Step("move", (x, y, z), math.nan, math.nan))
+            result.append(Step("rest", None, math.nan, settings.measuring.settle))
+    return result

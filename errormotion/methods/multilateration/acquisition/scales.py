@@ -17,12 +17,12 @@ log = logging.getLogger(__name__)
 
 
 class Scales:
-    """Sensors on the scales of X, Y and Z; without their names nothing is recorded.
+    """Sensors on the scales of X, Y and Z; without ``sensors`` nothing is recorded.
 
     Raises
     ------
     MethodError
-        Names, and no thermometer or not these sensors.
+        The bench has no thermometer, or the thermometer not these sensors.
     """
 
     def __init__(self, bench: Bench, sensors: tuple[str, str, str] | None) -> None:
@@ -32,19 +32,19 @@ class Scales:
             return
         if not bench.has_kind("thermometer"):
             raise MethodError(
-                f"Sensors {', '.join(sensors)} on the scales (measuring.scale_sensors) need an instrument of kind "
-                "'thermometer' on the bench; there is none. Add it, or leave them out."
+                f"measuring.scale_sensors: expected an instrument of kind 'thermometer' on the bench for "
+                f"{', '.join(sensors)}; found none. Add it, or leave the sensors out."
             )
         self._thermometer: Any = bench.of_kind("thermometer")
-        found = [str(name) for name in self._thermometer.read()]
-        if missing := [name for name in sensors if name not in found]:
+        known = [str(name) for name in self._thermometer.read()]
+        if missing := [name for name in sensors if name not in known]:
             raise MethodError(
-                f"measuring.scale_sensors: the thermometer has no {', '.join(dict.fromkeys(missing))}; expected names "
-                f"from {', '.join(found)}."
+                f"measuring.scale_sensors: expected sensors of the thermometer, {', '.join(known)}; found "
+                f"{', '.join(dict.fromkeys(missing))}."
             )
 
     def poll(self) -> None:
-        """Read the sensors once; a failure is logged and gives NaN."""
+        """Read the sensors once; a failure is logged, and the reading is omitted."""
         if self.sensors is None:
             return
         try:
@@ -54,8 +54,8 @@ class Scales:
             return
         self._read.append(np.array([reading.get(name, np.nan) for name in self.sensors], np.float64))
 
-    def taken(self) -> dict[str, Any]:
-        """Return the mean since the last time as a variable (station, direction), degC; none without sensors."""
+    def mean(self) -> dict[str, Any]:
+        """Return the mean of the readings since the last call as a variable, degC; none without sensors."""
         if self.sensors is None:
             return {}
         read = np.array(self._read).reshape(-1, 3)

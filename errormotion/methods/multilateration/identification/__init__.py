@@ -1,1 +1,1 @@
-"""Identification: multilateration, from raw data to errors with covariance."""
+"""Identification of volumetric errors: from raw data to errors with covariance."""

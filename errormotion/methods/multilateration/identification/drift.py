@@ -5,9 +5,9 @@ time t is then longer than one at the middle of the set-up by
 
     (t - t_j) (c_j + e_ij . v_j)
 
-with the rate c_j of the dead path and the velocity v_j of the machine. Two visits of a position show it; the rest of
-their difference is noise and repeatability. A rigid drift from one set-up to the next needs no correction: the position
-of the station contains it.
+with the rate c_j of the dead path and the velocity v_j of the machine. It is determined from repeated visits to a
+position, whose difference also contains noise and repeatability. A rigid drift from one set-up to the next needs no
+correction: it is contained in the position of the station.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SAME_POSITION = 1e-9
-"""Commanded positions closer than this are one, m."""
+"""Distance below which commanded positions are the same, m."""
 FALSE_ALARM = 1e-3
 """Probability of a note on returns that scatter as stated."""
 DRIFT_SIGNIFICANCE = 0.01
-"""Probability of a correction for a set-up that does not drift."""
-_LARGEST_CONDITION = 1e4
+"""Probability of a correction for a set-up without drift."""
+_MAX_CONDITION = 1e4
 """Of terms of the drift that are estimated together."""
 
 
@@ -43,15 +43,15 @@ class Drift:
     Attributes
     ----------
     rate : ndarray (station, 4)
-        Dead path, then X, Y, Z of the machine relative to the tracker, m/s; 0 where the returns need none, NaN where
-        there are no returns.
+        Dead path, then X, Y, Z of the machine relative to the tracker, m/s; 0 if it is not significant, NaN without
+        returns.
     correction : ndarray (station, target)
-        To be taken off the readings, m.
+        To be subtracted from the readings, m.
     sources : list of Shared
         Its uncertainty.
     repeatability : float
-        Scatter of the returns without that of the readings' noise, standard deviation of one coordinate, m; NaN
-        without returns.
+        Scatter of the returns minus the noise of the readings, standard deviation of one coordinate, m; NaN without
+        returns.
     pairs : int
         Visits after the first one of each position.
     square, freedom : float, int
@@ -85,19 +85,19 @@ def estimate_drift(
     Parameters
     ----------
     displacement, time : ndarray (n, m)
-        m and s; NaN where there is no reading.
+        m and s; NaN for missing readings.
     position : ndarray (m,)
         From `positions`.
     e : ndarray (n, m, 3)
         Unit vectors from the stations to the targets.
     noise : ndarray (n, m)
-        Standard deviation of each reading, repeatability included where it is stated, m.
+        Standard deviation of each reading, stated repeatability included, m.
     names : sequence of str
         Of the stations.
     notes : list of str
-        Added to.
+        To which remarks are appended.
     certain : bool
-        The noise is used unless the returns contradict it; otherwise their scatter is used where it is larger.
+        Use the noise unless the returns contradict it; otherwise use their scatter if it is larger.
     """
     n, m = displacement.shape
     rate, correction = np.full((n, 4), np.nan), np.zeros((n, m))
@@ -120,87 +120,87 @@ def estimate_drift(
         pairs += len(d)
         order = _order(d, A, scatter)
         rate[j] = 0.0
-        left = d
+        residual = d
         if order:
             solution, *_ = np.linalg.lstsq(A[:, :order], d)
             C = scatter[0] * np.asarray(np.linalg.inv(A[:, :order].T @ A[:, :order]), dtype=float)
             rate[j, :order] = solution
             correction[j] = terms[:, :order] @ solution
-            left = d - A[:, :order] @ solution
+            residual = d - A[:, :order] @ solution
             sources += _sources(names[j], j, terms[:, :order], C, (n, m))
-        square, freedom = square + float(left @ left), freedom + len(d) - order
+        square, freedom = square + float(residual @ residual), freedom + len(d) - order
     mean = float(np.sqrt(np.nanmean(noise**2)))
     ratio = square / freedom if freedom else np.nan
     repeatability = mean * float(np.sqrt(max(ratio - 1, 0.0)))
     if freedom and square > chdtri(freedom, FALSE_ALARM):
         notes.append(
-            f"Positions visited again differ {np.sqrt(ratio):.2g} times as much as expected from the noise of the "
+            f"Repeated visits to positions differ {np.sqrt(ratio):.2g} times as much as expected from the noise of the "
             f"readings: a repeatability of {repeatability * 1e6:.2g} um, or a drift that is not linear."
         )
     if not pairs:
         notes.append(
-            "No position was visited again within a set-up: drift and repeatability are not determined. Return to some "
-            "targets."
+            "No position was visited again within a set-up: drift and repeatability are not determined. Measure some "
+            "targets twice (measuring.returns)."
         )
     return Drift(rate, correction, sources, repeatability, pairs, square, freedom)
 
 
 def _visits(position: NDArray[np.intp], known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """Return the known targets of each position that has several."""
-    found = np.flatnonzero(known)
-    found = found[np.argsort(position[found], kind="stable")]
-    groups = np.split(found, np.flatnonzero(np.diff(position[found])) + 1)
+    """Return the known targets of each position that has more than one."""
+    targets = np.flatnonzero(known)
+    targets = targets[np.argsort(position[targets], kind="stable")]
+    groups = np.split(targets, np.flatnonzero(np.diff(position[targets])) + 1)
     return [group for group in groups if len(group) > 1]
 
 
 def _within(groups: list[NDArray[np.intp]], d: Array, terms: Array, noise: Array) -> tuple[Array, Array]:
-    """Return readings and terms of each position without their weighted mean, whitened; one row fewer than visits."""
-    left, rows = [], []
+    """Return whitened readings and terms of each position minus their weighted mean; one row fewer than visits."""
+    readings, rows = [], []
     for group in groups:
         w = 1 / noise[group]
-        # Rows orthogonal to the weights: the mean is removed and the rest stays white.
+        # Rows orthogonal to the weights: the mean is removed and the rest remains white.
         Q = np.linalg.qr(w[:, None], mode="complete")[0][:, 1:]
-        left.append(Q.T @ (w * d[group]))
+        readings.append(Q.T @ (w * d[group]))
         rows.append(Q.T @ (w[:, None] * terms[group]))
-    return np.concatenate(left), np.concatenate(rows)
+    return np.concatenate(readings), np.concatenate(rows)
 
 
 def _scatter(returns: list[tuple[Array, Array]]) -> tuple[float, int]:
-    """Return by how much the variance is larger than stated when all drifts are free (1 or more), and its freedoms."""
+    """Return the ratio, at least 1, of the variance with free drifts to the stated one, and its degrees of freedom."""
     square, freedom = 0.0, 0
     for d, A in returns:
-        order = max((k for k in _orders(d, A)), default=0)
-        left = d - A[:, :order] @ np.linalg.lstsq(A[:, :order], d)[0] if order else d
-        square, freedom = square + float(left @ left), freedom + len(d) - order
+        order = max(_orders(d, A), default=0)
+        residual = d - A[:, :order] @ np.linalg.lstsq(A[:, :order], d)[0] if order else d
+        square, freedom = square + float(residual @ residual), freedom + len(d) - order
     return (max(square / freedom, 1.0), freedom) if freedom else (1.0, 0)
 
 
 def _orders(d: Array, A: Array) -> list[int]:
-    """Return how many of the columns of A may be tried: 1, or all four."""
-    return [k for k in (1, A.shape[1]) if len(d) > k and np.linalg.cond(A[:, :k]) <= _LARGEST_CONDITION]
+    """Return the possible numbers of columns of A: 1, or all four."""
+    return [k for k in (1, A.shape[1]) if len(d) > k and np.linalg.cond(A[:, :k]) <= _MAX_CONDITION]
 
 
 def _order(d: Array, A: Array, scatter: tuple[float, int]) -> int:
-    """Return how many of the columns of A explain d: none, 1, or all four.
+    """Return the number of significant columns of A: none, 1, or all four.
 
-    ``scatter`` is the variance and from how many freedoms it is known, 0: exactly.
+    ``scatter`` is the variance with its degrees of freedom; 0: exact.
     """
-    square, found = float(d @ d), 0
+    square, accepted = float(d @ d), 0
     variance, freedom = scatter
     for order in _orders(d, A):
-        part, more = A[:, :order], order - found
-        left = d - part @ np.linalg.lstsq(part, d)[0]
+        part, more = A[:, :order], order - accepted
+        residual = d - part @ np.linalg.lstsq(part, d)[0]
         limit = more * fdtri(more, freedom, 1 - DRIFT_SIGNIFICANCE) if freedom else chdtri(more, DRIFT_SIGNIFICANCE)
-        if square - float(left @ left) > variance * limit:
-            square, found = float(left @ left), order
-    return found
+        if square - float(residual @ residual) > variance * limit:
+            square, accepted = float(residual @ residual), order
+    return accepted
 
 
 def _sources(name: str, j: int, terms: Array, C: Array, shape: tuple[int, int]) -> list[Shared]:
     values, vectors = np.linalg.eigh(C)
-    found = []
+    sources = []
     for k, value in enumerate(values):
         change = np.zeros(shape)
         change[j] = terms @ vectors[:, k] * np.sqrt(value)
-        found.append(Shared(f"drift at station {name}.{k}", "drift", change))
-    return found
+        sources.append(Shared(f"drift at station {name}.{k}", "drift", change))
+    return sources

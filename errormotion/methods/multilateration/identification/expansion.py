@@ -1,7 +1,7 @@
-"""The scale of everything: air along the beam, the tracker's own scale, and the machine's scales at 20 degC.
+"""Scale of the lengths: air along the beam, scale of the tracker, and the machine's scales at 20 degC.
 
-A correction or an uncertainty of scale is a change of the readings that all of them share, (station, target) in m. The
-network gives the effect of such a change on the targets.
+A correction or an uncertainty of scale is a change of all readings, (station, target) in m. The effect of such a change
+on the targets is computed by the network.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _AIR = ("air_temperature", "air_pressure", "relative_humidity")
 
 @dataclass(frozen=True)
 class Shared:
-    """One standard uncertainty of something that many readings share, as a change of the readings, m, (n, m)."""
+    """A source that many readings share, as the change of the readings by its standard uncertainty, (n, m), m."""
 
     name: str
     group: str
@@ -37,32 +37,32 @@ class Shared:
 
 
 def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | float, dict[str, float]]:
-    """Return by what displacements are multiplied, and relative standard uncertainties of the scale by cause.
+    """Return the factor for the displacements, and the relative standard uncertainties of the scale by cause.
 
     Parameters
     ----------
     raw : Dataset
-        Raw data; ``air_temperature``, ``air_pressure``, ``relative_humidity`` (station, target) where known, and
-        ``refractive_index``, which the displacements were computed with.
+        Raw data; ``air_temperature``, ``air_pressure``, ``relative_humidity`` (station, target) if known, and
+        ``refractive_index``, with which the displacements were computed.
     air : Air
     notes : list of str
-        Added to.
+        To which remarks are appended.
 
     Raises
     ------
     MethodError
-        An index to be replaced, but the air is not known.
+        The refractive index is to be replaced, but the state of the air is unknown.
     """
     missing = [name for name in _AIR if name not in raw]
     if missing:
         if "refractive_index" in raw:
             raise MethodError(
-                "The data state the refractive index of the displacements, so these are corrected again. This needs "
-                f"{', '.join(missing)} (station, target). Add them, or leave refractive_index out."
+                "The data state the refractive index of the displacements, which are therefore corrected again: "
+                f"expected {', '.join(missing)} (station, target). Add them, or omit refractive_index."
             )
         notes.append(
-            "The state of the air is not in the data: displacements are taken as compensated, and the scale as "
-            "uncertain as scale_uncertainty says. One kelvin of air is 1 um/m."
+            "The state of the air is not in the data: displacements are assumed to be compensated, and the uncertainty "
+            "of the scale is scale_uncertainty. An error of 1 K of the air temperature changes lengths by 1 um/m."
         )
         return 1.0, {}
     T, p, h = (np.asarray(raw[name].transpose("station", "target").values, dtype=float) for name in _AIR)
@@ -84,35 +84,35 @@ def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | floa
 
 
 def _refuse_unknown_air(raw: xr.Dataset, air: dict[str, Array]) -> None:
-    """Refuse a state of the air that is not known where it decides: nowhere at all, or where lengths need it."""
+    """Raise MethodError if the state of the air is unknown for all readings, or for one that is corrected with it."""
     read = np.isfinite(np.asarray(raw["displacement"].transpose("station", "target").values, dtype=float))
     if "refractive_index" in raw:
         index = np.asarray(raw["refractive_index"].transpose("station", "target").values, dtype=float)
         air = {"refractive_index": index, **air}
     for name, value in air.items():
-        lost = read & ~np.isfinite(value)
-        if "refractive_index" in raw and lost.any():
-            j, i = (int(k) for k in np.argwhere(lost)[0])
+        unknown = read & ~np.isfinite(value)
+        if "refractive_index" in raw and unknown.any():
+            j, i = (int(k) for k in np.argwhere(unknown)[0])
             first = [
                 str(raw[dim].values[k]) if dim in raw.coords else f"{dim} {k + 1}"
                 for dim, k in (("station", j), ("target", i))
             ]
             raise MethodError(
-                f"{name}: expected its value with every reading, since displacements are corrected again for the air; "
-                f"found NaN at {int(lost.sum())} of {int(read.sum())}, first at {first[0]}, {first[1]}. Add them, or "
-                "leave refractive_index out."
+                f"{name}: expected a value for every reading, since displacements are corrected again for the air; "
+                f"found NaN at {int(unknown.sum())} of {int(read.sum())}, first at {first[0]}, {first[1]}. Add the "
+                "values, or omit refractive_index."
             )
         if not np.isfinite(value).any():
-            raise MethodError(f"{name}: expected numbers; found NaN only. Leave it out if it is not known.")
+            raise MethodError(f"{name}: expected numbers; found only NaN. Omit it if it is unknown.")
 
 
 def scale_strain(raw: xr.Dataset, expansion: Expansion) -> tuple[Array, Array]:
-    """Return how far the scales of X, Y, Z are from their reference temperature, K, and their strain; (station, 3).
+    """Return temperatures of the scales of X, Y, Z above the reference, K, and their strains, both (station, 3).
 
     Raises
     ------
     MethodError
-        No temperature of the scales, in the data or in the settings.
+        Neither data nor settings state the temperature of the scales.
     """
     if "scale_temperature" in raw:
         T = np.asarray(raw["scale_temperature"].transpose("station", "direction").values, dtype=float)
@@ -125,28 +125,28 @@ def scale_strain(raw: xr.Dataset, expansion: Expansion) -> tuple[Array, Array]:
         )
     if np.isnan(T).any():
         station = str(raw["station"].values[np.argwhere(np.isnan(T))[0, 0]]) if "station" in raw.coords else "one"
-        raise MethodError(f"Expansion of the scales: their temperature at station {station} is not known.")
-    warmer = T - expansion.reference
-    return warmer, expansion.coefficient * warmer
+        raise MethodError(f"Expansion of the scales: expected their temperature at station {station}; found NaN.")
+    excess = T - expansion.reference
+    return excess, expansion.coefficient * excess
 
 
 def along_beams(strain: Array, position: Array, e: Array) -> Array:
-    """Return what a strain (n, 3) of the axes at positions (m, 3), m, adds to readings with beams e (n, m, 3), m."""
+    """Return the effect of a strain (n, 3) of the axes at positions (m, 3), m, on readings along e (n, m, 3), m."""
     return np.asarray(np.einsum("jta,ja,ta->jt", e, strain, position))
 
 
-def expansion_sources(warmer: Array, position: Array, e: Array, expansion: Expansion) -> list[Shared]:
-    """Return what is not known of the scales' expansion: its coefficient, and each axis's temperature."""
+def expansion_sources(excess: Array, position: Array, e: Array, expansion: Expansion) -> list[Shared]:
+    """Return the sources of the scales' expansion: its coefficient, and the temperature of each axis."""
     centred = position - np.nanmean(position, axis=0)
     changes = [
         Shared(
             "coefficient of expansion",
             "scales",
-            along_beams(expansion.coefficient_uncertainty * warmer, centred, e),
+            along_beams(expansion.coefficient_uncertainty * excess, centred, e),
         )
     ]
     for k, axis in enumerate("XYZ"):
-        strain = np.zeros_like(warmer)
+        strain = np.zeros_like(excess)
         strain[:, k] = expansion.coefficient * expansion.temperature_uncertainty
         changes.append(Shared(f"scale temperature {axis}", "scales", along_beams(strain, centred, e)))
     return [shared for shared in changes if np.nanmax(np.abs(shared.change)) > 0]

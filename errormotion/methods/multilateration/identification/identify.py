@@ -1,9 +1,9 @@
 """From displacements to the errors of every target, and to those of the axes.
 
-The steps, each of which takes the `State` that the one before has left: `prepare` reads the data, brings displacements
-to the refractive index of the air, and excludes targets that their readings hardly determine; `solve` finds stations
-and targets; `correct` takes drift and expansion off the readings and solves again; `judge` compares the scatter with
-what is stated; `result` states uncertainties and builds the error dataset.
+The steps work on one `State` in sequence: `prepare` reads the data, corrects displacements for the refractive index of
+the air, and excludes targets that are weakly determined; `solve` estimates stations and targets; `correct` subtracts
+drift and expansion from the readings and solves again; `scatter` compares the scatter with the stated one; `result`
+computes uncertainties and builds the error dataset.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from errormotion.methods.multilateration.identification.expansion import (
     expansion_sources,
     scale_strain,
 )
-from errormotion.methods.multilateration.identification.judging import judge, refuse_move
 from errormotion.methods.multilateration.identification.result import result
+from errormotion.methods.multilateration.identification.scatter import evaluate_scatter, refuse_move
 from errormotion.methods.multilateration.identification.state import State, read, short
 from errormotion.methods.multilateration.network import solver
 from errormotion.methods.multilateration.network.diagnosis.weakness import weak_targets
@@ -46,24 +46,24 @@ def identify_targets(raw: xr.Dataset, settings: Settings, method: str, version: 
     state = prepare(raw, settings)
     solve(state)
     correct(state)
-    judge(state)
+    evaluate_scatter(state)
     return result(state, method, version)
 
 
 def prepare(raw: xr.Dataset, settings: Settings) -> State:
-    """Return the readings, at the refractive index of the air, without targets that they hardly determine."""
+    """Return the state with readings at the refractive index of the air, without weakly determined targets."""
     notes: list[str] = []
     data = read(raw, notes)
-    times, scale = air_scale(raw, settings.air, notes)
+    factor, scale = air_scale(raw, settings.air, notes)
     machine = repeatability.stated(settings.repeatability, settings.repeatability_uncertainty)
-    state = State(raw, settings, data, notes, data.displacement * times, scale, machine)
+    state = State(raw, settings, data, notes, data.displacement * factor, scale, machine)
     weak = weak_targets(state.displacement, data.nominal, state.stations, state.noise())
     if weak.any():
         state.displacement[:, weak] = np.nan
         names = short([name for name, excluded in zip(data.targets, weak, strict=True) if excluded])
         notes.append(
-            f"{int(weak.sum())} of {len(weak)} targets are hardly determined by their readings, since they lie nearly "
-            f"in one plane with the stations that see them; their errors are unknown: {names}."
+            f"{int(weak.sum())} of {len(weak)} targets are weakly determined, since they lie nearly in one plane with "
+            f"the stations that measured them; their errors are unknown: {names}."
         )
     return state
 
@@ -74,7 +74,7 @@ def solve(state: State) -> None:
     Raises
     ------
     MethodError
-        Readings that fit no network; where a station was moved, the message states which.
+        Readings that do not fit a network; the message states the station if one was moved.
     """
     sources = [] if state.drift is None else state.drift.sources
     extra = np.nan_to_num([source.change for source in sources]) if sources else None
@@ -83,14 +83,14 @@ def solve(state: State) -> None:
     except MethodError as error:
         try:
             _network(state, robust=False)
-        except MethodError:  # there is no network, however badly the readings fit
+        except MethodError:  # not the outliers, but the network is the cause
             raise error from None
         refuse_move(state, state.stations, error)
         raise
 
 
 def _network(state: State, robust: bool, extra: Array | None = None) -> Network:
-    """Return the network of the present readings, ``extra`` further parameters (k, n, m) with a prior of 1."""
+    """Return the network of the present readings, with further parameters ``extra`` (k, n, m) of prior 1."""
     return solver.solve(
         state.displacement, state.data.nominal, state.stations, noise=state.noise(), robust=robust,
         extra=extra, extra_prior=None if extra is None else np.ones(len(extra)),
@@ -98,16 +98,16 @@ def _network(state: State, robust: bool, extra: Array | None = None) -> Network:
 
 
 def correct(state: State) -> None:
-    """Take drift and expansion of the scales off the readings, and solve again where that changes them."""
+    """Subtract drift and expansion of the scales from the readings, and solve again if that changes them."""
     data, expansion = state.data, state.settings.expansion
     noise, beams, correction = state.noise()[0, 0], state.beams(), np.zeros(())
-    if _shows_drift(state):
+    if _determines_drift(state):
         state.drift = _drift(state, beams)
         correction = state.drift.correction
     if expansion is not None:
-        warmer, strain = scale_strain(state.raw, expansion)
+        excess, strain = scale_strain(state.raw, expansion)
         correction = correction + along_beams(strain, data.position - data.position.mean(axis=0), beams)
-        state.sources += expansion_sources(warmer, data.position, beams, expansion)
+        state.sources += expansion_sources(excess, data.position, beams, expansion)
     if expansion is not None or correction.any():
         state.displacement = state.displacement - correction
         solve(state)
@@ -115,8 +115,8 @@ def correct(state: State) -> None:
         solve(state)
 
 
-def _shows_drift(state: State) -> bool:
-    """Return whether drift and repeatability are determined from returns."""
+def _determines_drift(state: State) -> bool:
+    """Return whether drift and repeatability are to be determined from returns."""
     if state.settings.drift == "none" or state.settings.together:
         return False
     if not state.data.timed:
@@ -125,7 +125,7 @@ def _shows_drift(state: State) -> bool:
 
 
 def _drift(state: State, beams: Array) -> Drift:
-    """Return the drift, and improve the repeatability of the state: each estimated with the other known."""
+    """Return the drift, and update the repeatability of the state: each is estimated with the other one known."""
     data, stated = state.data, state.machine
     certain = bool(stated.sources) and stated.spread == 0
 

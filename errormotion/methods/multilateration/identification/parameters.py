@@ -1,18 +1,18 @@
 """The 21 errors of a three-axis machine from the errors of targets, by linear least squares on its chain.
 
 Displacements of the reflector are linear in the errors (`errormotion.kinematics.machines`). Every error motion is a
-series of Legendre polynomials over the measured part of its axis, from the first term that is not another's:
+series of Legendre polynomials over the measured part of its axis, starting with the first term that is distinguishable:
 
-* six motions of the whole are the datum's and belong to no axis: they are estimated as well, and returned;
+* the six rigid motions of the whole are those of the datum: they are estimated as well, and returned;
 * constants of error motions and slopes of straightness are motions of the whole or squareness, so error motions have a
-  mean of zero, straightness no slope, and squareness is that of the axes' mean lines;
-* what an error does to no reflector, or nothing but what others do, is not seen. With one reflector these are the
-  rotations of the axis that carries it, and of others whose lever never changes across.
+  mean of zero, straightness has no slope, and squareness is that of the mean lines of the axes;
+* errors without effect on any reflector, or with the same effect as others, are not determined. With one reflector
+  these are the rotations of the axis that carries it, and of others with a constant lever.
 
-How many terms an error motion has is decided by the evidence: the coefficient of order k has the prior standard
-deviation tau / k^p, with tau of each error motion and one p for all of largest marginal likelihood (MacKay, Bayesian
-interpolation, Neural Computation 4, 1992). Terms that the targets do not determine keep their prior, so that what may
-be between the targets is in the uncertainty. Squareness and the slope of positioning have no prior.
+The number of terms of an error motion follows from the evidence: the coefficient of order k has the prior standard
+deviation tau / k^p, with the tau of each error motion and the common p of largest marginal likelihood (MacKay, Bayesian
+interpolation, Neural Computation 4, 1992). Terms that the targets do not determine keep their prior, so that possible
+errors between the targets are included in the uncertainty. Squareness and the slope of positioning have no prior.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ from errormotion.kinematics.twists import cross_matrix
 
 AXES = ("X", "Y", "Z")
 INDEPENDENT_SHARE = 1e-6
-"""A term with a smaller independent share is not distinguishable from the others."""
+"""Smallest independent share of a term that is distinguishable from the others."""
 FALSE_ALARM = 1e-3
 """Probability of a note on axes that explain the targets' errors."""
-FALLOFFS = (1.0, 2.0, 3.0, 4.0)
-"""How fast coefficients may fall with their order: p of the prior."""
-_PASSES = 100
-_SETTLED = 0.01
+EXPONENTS = (1.0, 2.0, 3.0, 4.0)
+"""Possible exponents p of the prior, by which coefficients decrease with their order."""
+_MAX_ITERATIONS = 100
+_TOLERANCE = 0.01
 _POOLED = 1.0
-"""Terms' worth of weight that the other error motions of the same kind have in the size of one."""
+"""Weight, in terms, of the other error motions of the same kind in the size of one."""
 _BLOCK = 4096
 
 
 @dataclass(frozen=True)
-class Unseen:
-    """An error that the targets do not determine: the reason, and errors that have the same effect, where these are."""
+class Undetermined:
+    """An error that the targets do not determine: the reason, and other errors with the same effect."""
 
     reason: str
     like: tuple[str, ...] = ()
@@ -55,7 +55,7 @@ class Unseen:
 
 @dataclass(frozen=True)
 class Term:
-    """One unknown: an error and the order of its polynomial; -1 for a squareness, which is one number."""
+    """One unknown: an error and the order of its polynomial; -1 for a squareness."""
 
     error: str
     order: int
@@ -63,14 +63,14 @@ class Term:
 
 @dataclass(frozen=True)
 class Chain:
-    """A three-axis machine, where its reflectors are, and the measured part of its axes.
+    """A three-axis machine, the position of its reflectors, and the measured part of its axes.
 
     Attributes
     ----------
     machine : Machine
         Error motions stated at ``reference``.
     reference : ndarray (3,)
-        Mean of the reflectors' places with all axes at zero, m.
+        Mean position of the reflectors with all axes at zero, m.
     low, high : ndarray (3,)
         Of the axis positions, m.
     """
@@ -82,7 +82,7 @@ class Chain:
 
     @classmethod
     def of(cls, chain: str, position: Array, reflector: Array) -> Chain:
-        """Return the chain of a machine with targets at ``position`` (m, 3) seen at ``reflector`` (m, 3), m.
+        """Return the chain of a machine with targets at ``position`` (m, 3) and reflectors at ``reflector`` (m, 3), m.
 
         Raises
         ------
@@ -106,22 +106,22 @@ class Chain:
         return np.asarray(legendre.legvander((position - (self.low + self.high) / 2) / half, order))
 
     def columns(self, terms: list[Term], position: Array, reflector: Array, dofs: int = 3) -> Array:
-        """Return what one unit of each term does, (m, dofs, term): displacements, with 6 dofs rotations too."""
+        """Return the effect of one unit of each term, (m, dofs, term): displacements, and with 6 dofs rotations."""
         P = self.polynomials(position, max(term.order for term in terms))
         J = np.empty((len(position), dofs, len(self.machine.error_names)))
-        for at in np.unique(reflector, axis=0):
-            chosen = (reflector == at).all(axis=1)
-            J[chosen] = self.machine.jacobian(position[chosen], at)[:, :dofs]
+        for point in np.unique(reflector, axis=0):
+            chosen = (reflector == point).all(axis=1)
+            J[chosen] = self.machine.jacobian(position[chosen], point)[:, :dofs]
         index = [self.machine.error_names.index(term.error) for term in terms]
         value = [
             np.ones(len(position)) if term.order < 0 else P[:, AXES.index(term.error[2]), term.order] for term in terms
         ]
         return np.asarray(J[:, :, index] * np.array(value).T[:, None, :])
 
-    def motions(self, place: Array, centre: Array) -> Array:
-        """Return what the six motions of the whole do, (m, 3, 6)."""
-        eye = np.broadcast_to(np.eye(3), (len(place), 3, 3))
-        return np.concatenate([eye, -cross_matrix(place - centre)], axis=2)
+    def motions(self, point: Array, centre: Array) -> Array:
+        """Return the displacements of points (m, 3) by the six rigid motions, (m, 3, 6)."""
+        eye = np.broadcast_to(np.eye(3), (len(point), 3, 3))
+        return np.concatenate([eye, -cross_matrix(point - centre)], axis=2)
 
 
 @dataclass(frozen=True)
@@ -136,16 +136,16 @@ class Parametric:
     coefficient, covariance : ndarray (term,), (term, term)
         m, rad; squareness rad.
     determined : ndarray (term,)
-        How far the targets determine each, 0 (its prior stands) to 1.
-    unseen : mapping of str to Unseen
+        Degree to which the targets determine each, from 0 (by its prior only) to 1.
+    undetermined : mapping of str to Undetermined
         Errors that the targets do not determine.
     sigma0 : float
-        Root mean square of what is left over what was expected: 1 where the axes explain the errors.
+        Rms of the residuals over the expected one: 1 if the axes explain the errors.
     freedom : float
-        Values less what they have determined.
+        Number of values minus determined parameters.
     datum : ndarray (6, term)
-        What has to be taken off the displacements of each term, so that the measured targets have no motion with the
-        whole; about ``centre`` (3,).
+        Rigid motion, about ``centre`` (3,), to subtract from the displacements of each term, so that those of the
+        measured targets have none.
     """
 
     chain: Chain
@@ -153,7 +153,7 @@ class Parametric:
     coefficient: Array
     covariance: Array = field(repr=False)
     determined: Array
-    unseen: dict[str, Unseen]
+    undetermined: dict[str, Undetermined]
     sigma0: float
     freedom: float
     datum: Array = field(repr=False)
@@ -162,34 +162,34 @@ class Parametric:
 
     @property
     def orders(self) -> dict[str, int]:
-        """Highest order of every error motion that the targets determine rather than its prior; 0 where none."""
-        found: dict[str, int] = {}
+        """Highest order of every error motion that is determined by the targets rather than the prior, or 0."""
+        orders: dict[str, int] = {}
         for term, share in zip(self.terms, self.determined, strict=True):
             if term.order >= 0:
-                found[term.error] = max(found.get(term.error, 0), term.order if share > 0.5 else 0)
-        return found
+                orders[term.error] = max(orders.get(term.error, 0), term.order if share > 0.5 else 0)
+        return orders
 
     def curve(self, error: str, position: Array) -> tuple[Array, Array]:
-        """Return an error motion and its standard uncertainty at axis positions (k,); NaN where it is not seen."""
+        """Return an error motion and its standard uncertainty at axis positions (k,); NaN if it is not determined."""
         q = np.asarray(position, dtype=float)
-        mine = [k for k, term in enumerate(self.terms) if term.error == error]
-        if not mine:
+        index = [k for k, term in enumerate(self.terms) if term.error == error]
+        if not index:
             return np.full(q.shape, np.nan), np.full(q.shape, np.nan)
         axis = AXES.index(error[2])
-        P = self.chain.polynomials(np.repeat(q[:, None], 3, axis=1), max(self.terms[k].order for k in mine))
-        B = P[:, axis, [self.terms[k].order for k in mine]]
+        P = self.chain.polynomials(np.repeat(q[:, None], 3, axis=1), max(self.terms[k].order for k in index))
+        B = P[:, axis, [self.terms[k].order for k in index]]
         inside = (q >= self.chain.low[axis] - 1e-9) & (q <= self.chain.high[axis] + 1e-9)
-        variance = np.einsum("ka,ab,kb->k", B, self.covariance[np.ix_(mine, mine)], B)
-        value = np.where(inside, B @ self.coefficient[mine], np.nan)
+        variance = np.einsum("ka,ab,kb->k", B, self.covariance[np.ix_(index, index)], B)
+        value = np.where(inside, B @ self.coefficient[index], np.nan)
         return value, np.where(inside, np.sqrt(np.maximum(variance, 0.0)), np.nan)
 
     def squareness(self) -> dict[str, tuple[float, float]]:
-        """Return each squareness and its standard uncertainty, rad; NaN where it is not seen."""
-        found = dict.fromkeys(self.chain.machine.error_names[18:], (float("nan"), float("nan")))
+        """Return each squareness and its standard uncertainty, rad; NaN if it is not determined."""
+        values = dict.fromkeys(self.chain.machine.error_names[18:], (float("nan"), float("nan")))
         for k, term in enumerate(self.terms):
             if term.order < 0:
-                found[term.error] = float(self.coefficient[k]), float(np.sqrt(self.covariance[k, k]))
-        return found
+                values[term.error] = float(self.coefficient[k]), float(np.sqrt(self.covariance[k, k]))
+        return values
 
 
 def fit_machine(
@@ -211,20 +211,20 @@ def fit_machine(
     position : ndarray (m, 3)
         Commanded axis positions, m.
     error : ndarray (m, 3)
-        Displacements in any datum, m; NaN where not known.
+        Displacements in any datum, m; NaN if unknown.
     own : ndarray (m, 3, 3)
-        Covariance of each target for itself, m^2.
+        Independent covariance of each target, m^2.
     influence : ndarray (source, m, 3)
-        What one standard uncertainty of each shared source does, m.
+        Effect of one standard uncertainty of each shared source, m.
     reflector : ndarray (m, 3), optional
-        Where the reflector of each target is with all axes at zero, m; the origin where not given.
+        Position of the reflector of each target with all axes at zero, m; default: the origin.
     max_order : int
         Of the polynomials.
 
     Raises
     ------
     MethodError
-        Not a chain of X, Y and Z; targets that leave even squareness and the lowest terms open.
+        Not a chain of X, Y and Z; too few known targets.
     """
     known = np.isfinite(error).all(axis=1) & np.isfinite(own).all(axis=(1, 2))
     if np.count_nonzero(known) < 10:
@@ -235,32 +235,34 @@ def fit_machine(
     which = np.flatnonzero(known)
     position, error, at = position[which], error[which], at[which]
     model = Chain.of(chain, position, at)
-    terms, levels = _candidates(model, position, max_order)
+    terms = unknowns(model, max_order)
+    levels = [len(np.unique(np.round(column, 6))) for column in position.T]
     centre = (position + at).mean(axis=0)
     N, b, square, datum = _normal_equations(model, terms, position, at, centre, error, own, influence, which)
-    unseen = _unseen(terms, levels, N, len(N) - len(terms))
-    kept = [k for k, term in enumerate(terms) if term.error not in unseen]
+    undetermined = _undetermined(terms, levels, N, len(N) - len(terms))
+    kept = [k for k, term in enumerate(terms) if term.error not in undetermined]
     S = kept + list(range(len(terms), len(N)))
     terms, datum = [terms[k] for k in kept], datum[:, kept]
-    found = _most_evident(terms, N[np.ix_(S, S)], b[S], len(influence), square)
-    freedom = 3 * len(position) - 6 - float(found.determined.sum())
-    ratio = found.left / max(freedom, 1.0)
+    estimates = [_estimate(terms, N[np.ix_(S, S)], b[S], len(influence), square, p) for p in EXPONENTS]
+    estimate = max(estimates, key=lambda each: each.evidence)
+    freedom = 3 * len(position) - 6 - float(estimate.determined.sum())
+    ratio = estimate.residual / max(freedom, 1.0)
     scale, notes = 1.0, []
-    if freedom > 0 and found.left > chdtri(freedom, FALSE_ALARM):
+    if freedom > 0 and estimate.residual > chdtri(freedom, FALSE_ALARM):
         scale = ratio
         notes.append(
-            f"Errors of the axes leave {np.sqrt(ratio):.3g} times as much of the targets' errors as their uncertainty "
-            "explains: a machine that is not rigid, hysteresis, or error motions of higher order than "
-            f"{max_order}. The uncertainties of the axes are raised to match."
+            f"The residuals of the targets' errors after the errors of the axes are {np.sqrt(ratio):.3g} times their "
+            "uncertainty. Possible causes: a machine that is not rigid, hysteresis, or error motions of higher order "
+            f"than {max_order}. The uncertainties of the axes are increased accordingly."
         )
     return Parametric(
-        model, terms, found.value, scale * found.covariance, found.determined, unseen, float(np.sqrt(ratio)), freedom,
-        datum, centre, tuple(notes),
+        model, terms, estimate.value, scale * estimate.covariance, estimate.determined, undetermined,
+        float(np.sqrt(ratio)), freedom, datum, centre, tuple(notes),
     )  # fmt: skip
 
 
 def first_order(error: str) -> int:
-    """Return the lowest order of an error motion that belongs to it alone: 2 for straightness, else 1."""
+    """Return the lowest distinguishable order of an error motion: 2 for straightness, else 1."""
     freedom, axis = DOF.index(error[:2]), AXES.index(error[2])
     return 2 if freedom < 3 and freedom != axis else 1
 
@@ -276,19 +278,14 @@ def unknowns(model: Chain, max_order: int) -> list[Term]:
     return terms
 
 
-def _candidates(model: Chain, position: Array, max_order: int) -> tuple[list[Term], list[int]]:
-    """Return all terms, and the number of positions of each axis."""
-    return unknowns(model, max_order), [len(np.unique(np.round(column, 6))) for column in position.T]
-
-
 def _normal_equations(
     model: Chain, terms: list[Term], position: Array, reflector: Array, centre: Array, error: Array, own: Array,
     influence: Array, which: NDArray[np.intp],
 ) -> tuple[Array, Array, float, Array]:  # fmt: skip
-    """Return N, b and y' W y over terms, six motions of the whole, and the shared sources, which have a prior of 1.
+    """Return N, b and y' W y over terms, six rigid motions, and the shared sources, which have a prior of 1.
 
-    ``own`` and ``influence`` are of all targets, of which the others are ``which``. And the motion with the whole that
-    fits the displacements of each term best, (6, term).
+    Also return the rigid motion that is the best fit to the displacements of each term, (6, term). ``own`` and
+    ``influence`` are those of all targets, the other arrays those of the targets ``which``.
     """
     size = len(terms) + 6 + len(influence)
     N, b, square = np.zeros((size, size)), np.zeros(size), 0.0
@@ -301,7 +298,7 @@ def _normal_equations(
         G = G.reshape(-1, 6)
         GG += G.T @ G
         GA += G.T @ A.reshape(-1, size)[:, : len(terms)]
-        # Whitened by each target's own covariance.
+        # whitened by the independent covariance of each target
         W = np.linalg.inv(np.linalg.cholesky(own[which[part]]))
         A = np.matmul(W, A).reshape(-1, size)
         y = np.matmul(W, error[part][:, :, None]).ravel()
@@ -312,63 +309,61 @@ def _normal_equations(
     return N, b, square, np.asarray(np.linalg.lstsq(GG, GA)[0])
 
 
-def _unseen(terms: list[Term], levels: list[int], N: Array, nuisance: int) -> dict[str, Unseen]:
-    """Return errors whose first term moves no reflector, or is not distinguishable from earlier ones."""
+def _undetermined(terms: list[Term], levels: list[int], N: Array, nuisance: int) -> dict[str, Undetermined]:
+    """Return errors without effect on the reflectors, or not distinguishable from earlier ones, by the first term.
+
+    ``levels`` are the numbers of positions of the axes.
+    """
     size = np.sqrt(np.diag(N))
     reference = size[: len(terms)].max()
     unit = np.where(size > 0, size, 1.0)
     R = N / np.outer(unit, unit)
-    taken = list(range(len(terms), len(terms) + min(nuisance, 6)))
-    unseen: dict[str, Unseen] = {}
+    accepted = list(range(len(terms), len(terms) + min(nuisance, 6)))
+    undetermined: dict[str, Undetermined] = {}
     for k, term in enumerate(terms):
         name = term.error
         axes = {AXES.index(letter) for letter in (name[2], name[3:]) if letter in AXES}
         few = [AXES[i] for i in axes if levels[i] < (2 if term.order < 0 else first_order(name) + 1)]
-        if name in unseen or (term.order >= 0 and term.order >= levels[AXES.index(name[2])]):
-            if few and name not in unseen:
-                unseen[name] = Unseen(f"too few positions of {few[0]}")
+        if name in undetermined or (term.order >= 0 and term.order >= levels[AXES.index(name[2])]):
+            if few and name not in undetermined:
+                undetermined[name] = Undetermined(f"too few positions of {few[0]}")
             continue
         if few:
-            unseen[name] = Unseen(f"too few positions of {few[0]}")
+            undetermined[name] = Undetermined(f"too few positions of {few[0]}")
         elif size[k] < 1e-9 * reference:
             if term.order <= first_order(name):
-                unseen[name] = Unseen("it moves no reflector")
+                undetermined[name] = Undetermined("no effect on the reflector")
         else:
-            others = linalg.solve(R[np.ix_(taken, taken)], R[taken, k], assume_a="sym")
-            if 1.0 - float(R[taken, k] @ others) > INDEPENDENT_SHARE:
-                taken.append(k)
+            others = linalg.solve(R[np.ix_(accepted, accepted)], R[accepted, k], assume_a="sym")
+            if 1.0 - float(R[accepted, k] @ others) > INDEPENDENT_SHARE:
+                accepted.append(k)
             elif term.order <= first_order(name):
-                unseen[name] = _like(terms, taken, others)
-    return unseen
+                undetermined[name] = _same_effect(terms, accepted, others)
+    return undetermined
 
 
-def _like(terms: list[Term], taken: list[int], weight: Array) -> Unseen:
-    """Return why an error is not determined that is the sum of others with these weights."""
+def _same_effect(terms: list[Term], accepted: list[int], weight: Array) -> Undetermined:
+    """Return the reason for an error whose effect is the sum of those of others with these weights."""
     parts: dict[str, float] = {}
-    for i, share in zip(taken, weight, strict=True):
+    for i, share in zip(accepted, weight, strict=True):
         if i < len(terms):
             parts[terms[i].error] = parts.get(terms[i].error, 0.0) + abs(float(share))
     like = tuple(name for name, part in parts.items() if part > 1e-3)
-    return Unseen(f"not distinguishable from {' and '.join(like) or 'a shift'}", like)
+    return Undetermined(f"not distinguishable from {' and '.join(like) or 'a shift'}", like)
 
 
 @dataclass(frozen=True)
-class _Evident:
-    """Coefficients, their covariance, how far the data determine each (0 to 1), and the residual sum of squares."""
+class _Estimate:
+    """Coefficients, covariance, degree of determination (0 to 1), residual sum of squares, and log evidence."""
 
     value: Array
     covariance: Array
     determined: Array
-    left: float
+    residual: float
     evidence: float
 
 
-def _most_evident(terms: list[Term], N: Array, b: Array, sources: int, square: float) -> _Evident:
-    found = [_with_falloff(terms, N, b, sources, square, p) for p in FALLOFFS]
-    return max(found, key=lambda each: each.evidence)
-
-
-def _with_falloff(terms: list[Term], N: Array, b: Array, sources: int, square: float, p: float) -> _Evident:
+def _estimate(terms: list[Term], N: Array, b: Array, sources: int, square: float, p: float) -> _Estimate:
     """Maximise the evidence over tau of every error motion, by expectation and maximisation."""
     n = len(terms)
     order = np.array([term.order for term in terms], dtype=float)
@@ -378,13 +373,13 @@ def _with_falloff(terms: list[Term], N: Array, b: Array, sources: int, square: f
     groups = {name: group for name, group in groups.items() if len(group)}
     shape = np.where(flat, np.inf, np.maximum(order, 1.0) ** -p)
     kinds = {name: "EA EB EC".find(name[:2]) >= 0 for name in groups}
-    # Columns of one size: metres and radians weigh alike.
+    # columns scaled to the same size, independent of the units m and rad
     unit = 1 / np.sqrt(np.diag(N))
     scaled, right = N * np.outer(unit, unit), b * unit
     guess = {kind: float(np.median([unit[i] for name, g in groups.items() if kinds[name] == kind for i in g] or [1.0]))
              for kind in (False, True)}  # fmt: skip
     tau = {name: 30 * guess[kinds[name]] for name in groups}
-    for _ in range(_PASSES):
+    for _ in range(_MAX_ITERATIONS):
         prior = np.zeros(len(N))
         for name, group in groups.items():
             prior[group] = 1 / (tau[name] * shape[group]) ** 2
@@ -400,12 +395,12 @@ def _with_falloff(terms: list[Term], N: Array, b: Array, sources: int, square: f
         before = dict(tau)
         for name, group in groups.items():
             tau[name] = float(np.sqrt((second[name] + _POOLED * typical[kinds[name]]) / (len(group) + _POOLED)))
-        if max(abs(np.log(tau[name] / before[name])) for name in groups) < _SETTLED:
+        if max(abs(np.log(tau[name] / before[name])) for name in groups) < _TOLERANCE:
             break
     determined = 1 - variance[:n] * prior[:n]
-    # Twice the logarithm of the marginal likelihood, up to a constant that no choice changes.
+    # Twice the logarithm of the marginal likelihood, minus a constant.
     log_det = 2 * float(np.log(np.diag(factor[0])).sum()) - 2 * float(np.log(unit).sum())
     evidence = float(b @ x) - log_det + float(np.log(prior[prior > 0]).sum())
     shared = slice(len(N) - sources, len(N))
-    left = max(square - 2 * float(b @ x) + float(x @ N @ x), float(x[shared] @ x[shared]))
-    return _Evident(x[:n], C[:n, :n], determined, left, evidence)
+    residual = max(square - 2 * float(b @ x) + float(x @ N @ x), float(x[shared] @ x[shared]))
+    return _Estimate(x[:n], C[:n, :n], determined, residual, evidence)

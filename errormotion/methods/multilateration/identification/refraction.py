@@ -1,7 +1,6 @@
-"""Refractive index of moist air, after Ciddor, and how uncertain it is.
+"""Refractive index of moist air after Ciddor, and its uncertainty.
 
-With the wave number s = 1 / wavelength in 1/um, the densities of dry and of moist air's parts against those of two
-standard states give
+With the densities rho of dry air and of water vapour, and those of two standard states,
 
     n - 1 = rho_a / rho_axs (n_axs - 1) + rho_w / rho_ws (n_ws - 1)
 
@@ -24,12 +23,12 @@ from errormotion.errors import MethodError
 from errormotion.methods.multilateration.settings import CO2, HELIUM_NEON
 
 MODEL_UNCERTAINTY = 2e-8
-"""Standard uncertainty of the equations themselves."""
+"""Standard uncertainty of the equations."""
 
 QUANTITIES = ("temperature", "pressure", "humidity", "co2", "wavelength")
 """Order of the arguments."""
 
-# Range that the equations are made for, in the units of the arguments.
+# Range of validity of the equations, in the units of the arguments.
 _RANGE: Mapping[str, tuple[float, float, str]] = {
     "temperature": (-40.0, 100.0, "degC"),
     "pressure": (10e3, 140e3, "Pa"),
@@ -37,7 +36,7 @@ _RANGE: Mapping[str, tuple[float, float, str]] = {
     "co2": (0.0, 2000e-6, "mole fraction"),
     "wavelength": (300e-9, 1700e-9, "m"),
 }
-_STEP = 1e-30  # of the derivative in the complex plane: exact to rounding
+_STEP = 1e-30  # of the complex-step derivative, which is exact except for rounding
 
 _GAS = 8.314510  # J/(mol K)
 _WATER = 0.018015  # kg/mol
@@ -73,10 +72,10 @@ def refractive_index(
     Raises
     ------
     MethodError
-        An argument out of the range of the equations, mostly one in another unit.
+        An argument outside the range of the equations, for example in another unit.
     """
-    given = _checked(temperature, pressure, humidity, co2, wavelength)
-    return np.asarray(1.0 + _refractivity(*given), dtype=np.float64)
+    arguments = _checked(temperature, pressure, humidity, co2, wavelength)
+    return np.asarray(1.0 + _refractivity(*arguments), dtype=np.float64)
 
 
 def sensitivities(
@@ -87,31 +86,31 @@ def sensitivities(
     wavelength: ArrayLike = HELIUM_NEON,
 ) -> dict[str, Array]:
     """Return the partial derivatives of `refractive_index` by each of ``QUANTITIES``: 1/K, 1/Pa, 1, 1, 1/m."""
-    given = _checked(temperature, pressure, humidity, co2, wavelength)
+    arguments = _checked(temperature, pressure, humidity, co2, wavelength)
     derivatives = {}
     for k, name in enumerate(QUANTITIES):
-        stepped = [value + (1j * _STEP if i == k else 0.0) for i, value in enumerate(given)]
+        stepped = [value + (1j * _STEP if i == k else 0.0) for i, value in enumerate(arguments)]
         derivatives[name] = np.asarray(np.imag(_refractivity(*stepped)) / _STEP)
     return derivatives
 
 
 def index_uncertainty(derivatives: Mapping[str, Array], uncertainties: Mapping[str, float]) -> dict[str, Array]:
-    """Return the standard uncertainty of the index from each cause, and from the ``equations`` themselves.
+    """Return the standard uncertainty of the index by each cause, and by the ``equations``.
 
     Parameters
     ----------
     derivatives : mapping
         From `sensitivities`.
     uncertainties : mapping
-        Standard uncertainty of each quantity, in its unit; one that is not named is taken as known.
+        Standard uncertainty of each quantity, in its unit; by default 0.
     """
-    found = {name: derivatives[name] * u for name, u in uncertainties.items() if u > 0}
-    some = next(iter(derivatives.values()))
-    return found | {"equations": np.full(np.shape(some), MODEL_UNCERTAINTY)}
+    effects = {name: derivatives[name] * u for name, u in uncertainties.items() if u > 0}
+    shape = np.shape(next(iter(derivatives.values())))
+    return effects | {"equations": np.full(shape, MODEL_UNCERTAINTY)}
 
 
-def _checked(*given: ArrayLike) -> list[Array]:
-    values = [np.asarray(value, dtype=np.float64) for value in given]
+def _checked(*arguments: ArrayLike) -> list[Array]:
+    values = [np.asarray(value, dtype=np.float64) for value in arguments]
     for (name, (low, high, unit)), value in zip(_RANGE.items(), values, strict=True):
         wrong = value[(value < low) | (value > high)]
         if wrong.size:
@@ -139,7 +138,7 @@ def _refractivity(t: Any, p: Any, h: Any, co2: Any, wavelength: Any) -> Any:
 
 
 def _saturation(t: Any) -> Any:
-    """Return the saturation vapour pressure, Pa: over water, below 0 degC over ice."""
+    """Return the saturation vapour pressure over water, and below 0 degC over ice, Pa."""
     T = t + 273.15
     water = np.exp(1.2378847e-5 * T**2 - 1.9121316e-2 * T + 33.93711047 - 6.3431645e3 / T)
     ice = 10 ** (-2663.5 / T + 12.537)

@@ -1,6 +1,6 @@
-"""The error dataset of an identification: uncertainties, errors of the axes, and further results.
+"""The error dataset of an identification: uncertainties, errors of the axes, and additional results.
 
-Datasets of very many targets are built and checked block by block, since a check needs several copies.
+Datasets of very many targets are built and checked in blocks, since the checks copy the data several times.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LEAST = 10
-"""Targets that four stations need."""
+MIN_TARGETS = 10
+"""Number of targets required for four stations."""
 DATUM = (
-    "best rigid fit of all targets to their commanded places; six motions of the whole, three shifts and three "
-    "rotations, are not seen"
+    "best rigid fit of all targets to their commanded positions; the six rigid motions of the whole, three "
+    "translations and three rotations, are not determined"
 )
 CERTIFIED = {
     "air temperature": ("thermometer", "offset"),
@@ -45,21 +45,21 @@ CERTIFIED = {
     "coefficient of expansion": ("scales", "coefficient of expansion"),
     **{f"scale temperature {axis}": ("scale_thermometer", f"offset at {axis}") for axis in "XYZ"},
 }
-"""Sources that are one draw in all measurements with one certificate."""
+"""Sources whose error is the same in all measurements with one certificate."""
 BLOCK = 50_000
-"""Targets that are checked at a time."""
+"""Number of targets that are checked at a time."""
 
 
 def result(state: State, method: str, version: str) -> xr.Dataset:
-    """Return the error dataset over ``target``; notes are logged as well."""
+    """Return the error dataset over ``target``; its notes are also logged."""
     data, network, notes = state.data, state.network, state.notes
     notes.extend(notes_of(network))
-    made = _uncertainty(state)
+    parts = _uncertainty(state)
     error = network.target - data.nominal
     values = np.full((len(error), 6), np.nan)
     values[:, :3] = error
-    extras = _extras(state) | _alternated(state) | _axes(state, error, made)
-    covariance = made.covariance(network.target_covariance, state.factor**2)
+    extras = _extras(state) | _alternated(state) | _axes(state, error, parts)
+    covariance = parts.covariance(network.target_covariance, state.factor**2)
     if state.settings.together and state.machine.variance > 0:
         covariance[:, :3, :3] += state.machine.variance * np.eye(3)
     for note in notes:
@@ -68,7 +68,7 @@ def result(state: State, method: str, version: str) -> xr.Dataset:
     ds = build(
         values,
         covariance,
-        made.influence,
+        parts.influence,
         {
             "target": ("target", np.array(data.targets), {}),
             "direction": ("direction", list("xyz"), {}),
@@ -85,9 +85,9 @@ def result(state: State, method: str, version: str) -> xr.Dataset:
         measured={**state.raw.attrs, **({"chain": state.settings.chain} if state.settings.chain else {})},
         start=start_of(state.raw),
         provenance=provenance.make(state.settings, state.raw, None, steps=_steps(state)),
-        sources=made.names,
-        source_groups=made.groups,
-        source_ids=certified(state.raw.attrs, {name: CERTIFIED[name] for name in made.names if name in CERTIFIED}),
+        sources=parts.names,
+        source_groups=parts.groups,
+        source_ids=certified(state.raw.attrs, {name: CERTIFIED[name] for name in parts.names if name in CERTIFIED}),
     )
     return ds.assign_attrs(notes=notes or [""])
 
@@ -99,30 +99,30 @@ def _uncertainty(state: State) -> Parts:
         for name, relative in state.scale.items()
         if relative > 0
     ]
-    made = uncertainty.parts(
+    parts = uncertainty.parts(
         state.network, state.factor, state.scatter, scales, state.displacement if scales else np.empty(0), state.sources
     )
     if state.settings.together and state.machine.variance > 0:
-        made.own[:] += state.machine.variance * np.eye(3)
-    return made
+        parts.own[:] += state.machine.variance * np.eye(3)
+    return parts
 
 
-def _axes(state: State, error: Array, made: Parts) -> dict[str, xr.DataArray]:
-    """Return the errors of the axes as further results; where there are none, a note gives the reason."""
+def _axes(state: State, error: Array, parts: Parts) -> dict[str, xr.DataArray]:
+    """Return the errors of the axes; if they are not determined, a note states the reason."""
     data, settings, notes = state.data, state.settings, state.notes
     if not settings.parametric:
         return {}
     chain = settings.chain or state.raw.attrs.get("chain")
     if not isinstance(chain, str):
-        notes.append("No errors of the axes: the chain of the machine is not known (setting or attribute 'chain').")
+        notes.append("No errors of the axes: the chain of the machine is unknown (setting or attribute 'chain').")
         return {}
     try:
         axes = fit_machine(
             chain,
             data.position,
             error,
-            made.own,
-            made.influence[..., :3],
+            parts.own,
+            parts.influence[..., :3],
             reflector=data.reflector,
             max_order=settings.max_order,
         )
@@ -130,33 +130,34 @@ def _axes(state: State, error: Array, made: Parts) -> dict[str, xr.DataArray]:
         notes.append(f"No errors of the axes. {refusal}")
         return {}
     notes.extend(axes.notes)
-    if axes.unseen:
-        unseen = "; ".join(f"{name}: {each.reason}" for name, each in axes.unseen.items())
-        notes.append(f"Errors of the axes that these targets do not determine: {unseen}.")
+    if axes.undetermined:
+        reasons = "; ".join(f"{name}: {each.reason}" for name, each in axes.undetermined.items())
+        notes.append(f"Errors of the axes that these targets do not determine: {reasons}.")
     return parametric_extras(axes)
 
 
 def _alternated(state: State) -> dict[str, xr.DataArray]:
-    """Return the results of the published scheme from the targets with all readings, where they are wanted."""
+    """Return the results of the published scheme for the targets with all readings, if the settings request them."""
     data, network, notes = state.data, state.network, state.notes
     if not state.settings.alternating:
         return {}
-    whole = np.isfinite(state.displacement).all(axis=0)
-    if np.count_nonzero(whole) < LEAST:
-        notes.append(f"The alternating scheme was left out: fewer than {LEAST} targets have all readings.")
+    complete = np.isfinite(state.displacement).all(axis=0)
+    if np.count_nonzero(complete) < MIN_TARGETS:
+        notes.append(f"The alternating scheme was not applied: fewer than {MIN_TARGETS} targets have all readings.")
         return {}
     start = network.station if data.station is None else data.station
-    other = alternate(state.displacement[:, whole], data.nominal[whole], start)
-    place = np.full(data.nominal.shape, np.nan)
-    place[whole] = other.target
+    other = alternate(state.displacement[:, complete], data.nominal[complete], start)
+    position = np.full(data.nominal.shape, np.nan)
+    position[complete] = other.target
     notes.append(
-        f"The alternating scheme {'stopped' if other.converged else 'ended'} after {other.iterations} iterations "
-        f"(joint solution: {network.iterations}); a target may still be about {other.left * 1e6:.2g} um off."
+        f"The alternating scheme {'stopped' if other.converged else 'was ended'} after {other.iterations} iterations "
+        f"(joint solution: {network.iterations}); the estimated remaining error of a target is "
+        f"{other.remaining * 1e6:.2g} um."
     )
     return {
-        "alternating_place": xr.DataArray(place, dims=("target", "direction"), attrs={"units": "m"}),
+        "alternating_place": xr.DataArray(position, dims=("target", "direction"), attrs={"units": "m"}),
         "alternating_iterations": xr.DataArray(other.iterations),
-        "alternating_left": xr.DataArray(other.left, attrs={"units": "m"}),
+        "alternating_left": xr.DataArray(other.remaining, attrs={"units": "m"}),
     }
 
 
@@ -165,7 +166,7 @@ def _steps(state: State) -> list[str]:
     if state.network.left_out:
         steps.append(f"{len(state.network.left_out)} readings excluded")
     if state.drift is not None and state.drift.correction.any():
-        steps.append("drift taken off the readings")
+        steps.append("drift subtracted from the readings")
     if state.settings.expansion is not None:
         steps.append(f"scales corrected to {state.settings.expansion.reference:g} degC")
     return [*steps, "free network on the commanded positions"]
@@ -201,11 +202,11 @@ def _extras(state: State) -> dict[str, xr.DataArray]:
         "dead_path_u": array(np.sqrt(f2 * dead_path_variance), ("station",), "m"),
         "residual": array(network.residual, by_reading, "m", "reading minus model"),
         "redundancy": array(network.redundancy, by_reading, "1", "share of a reading's error that is in its residual"),
-        "left_out": array(left_out, by_reading, "", "1: wrong; 2: target given up, wrong reading not identified"),
+        "left_out": array(left_out, by_reading, "", "1: wrong; 2: target excluded, wrong reading not identified"),
         "iterations": array(network.iterations, (), ""),
         "condition": array(network.condition, (), "1", "of the stations' information, without motions of the whole"),
-        "sigma0": array(network.sigma0, (), "1", "scatter of the readings over the stated one"),
-        "freedom": array(network.freedom, (), "", "readings less unknowns"),
+        "sigma0": array(network.sigma0, (), "1", "ratio of the scatter of the readings to the stated one"),
+        "freedom": array(network.freedom, (), "", "readings minus unknowns"),
         "noise": array(state.factor / np.max(network.weight), (), "m", "of a reading, repeatability included"),
     }
     if data.station is not None:
@@ -219,7 +220,7 @@ def _extras(state: State) -> dict[str, xr.DataArray]:
     shares = state.scatter.shares
     extras["scatter_share"] = xr.DataArray(
         list(shares.values()), {"cause": list(shares)}, "cause",
-        attrs={"units": "1", "long_name": "of each cause in the variance of a reading"},
+        attrs={"units": "1", "long_name": "share of each cause in the variance of a reading"},
     )  # fmt: skip
     return extras
 
@@ -233,7 +234,7 @@ def build(
     Parameters
     ----------
     values, covariance, influence : ndarray (m, 6), (m, 6, 6), (source, m, 6)
-        Become part of the dataset where there are many; unknown ones are set NaN in place.
+        For many targets they become part of the dataset without a copy; unknown values are set to NaN in position.
     coords : mapping
         Name to (dims, array, attrs).
     extras : mapping of str to DataArray
@@ -269,9 +270,9 @@ def build(
     whole |= {name: values[:, k] for k, name in enumerate(piece["dof"].values)}
     whole["target_index"] = np.arange(m)
     variables = {name: (piece[name].dims, array, piece[name].attrs) for name, array in whole.items()}
-    own = {name: piece.coords[name] for name in piece.coords if "target" not in piece[name].dims}
-    places = {
+    without_target = {name: piece.coords[name] for name in piece.coords if "target" not in piece[name].dims}
+    over_target = {
         name: (piece[name].dims, array, piece[name].attrs)
         for name, (dims, array, _) in coords.items() if "target" in dims
     }  # fmt: skip
-    return xr.Dataset(variables, {**own, **places}, piece.attrs).assign(dict(extras))
+    return xr.Dataset(variables, {**without_target, **over_target}, piece.attrs).assign(dict(extras))

@@ -1,4 +1,4 @@
-"""State of an identification: the readings of a raw dataset as arrays, and what each step adds to them."""
+"""State of an identification: the readings of a raw dataset as arrays, and the results of the steps."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ class Readings:
     Attributes
     ----------
     displacement : ndarray (n, m)
-        m; NaN where the beam was broken.
+        m; NaN for a broken beam.
     noise : float
         Standard deviation of one reading, m.
     nominal : ndarray (m, 3)
-        Commanded places of the reflector, m.
+        Commanded positions of the reflector, m.
     reflector : ndarray (m, 3)
-        Where it is with all axes at zero, m; 0 where the data do not state it.
+        Position of the reflector with all axes at zero, m; 0 if the data do not state it.
     station : ndarray (n, 3) or None
-        Rough places, m.
+        Approximate positions, m.
     time : ndarray (n, m)
-        Of each reading, s; its number where the data do not state it.
+        Of each reading, s; its number if the data do not state times.
     timed : bool
-        Whether they do.
+        Whether the data state times.
     stations, targets : list of str
         Names.
     """
@@ -69,10 +69,10 @@ class State:
     Attributes
     ----------
     raw, settings
-        What is identified.
+        Inputs.
     data : Readings
     notes : list of str
-        Notes for the operator, in the order of the steps.
+        In the order of the steps.
     displacement : ndarray (n, m)
         Readings at the refractive index of the air, less corrections, m; NaN where missing or excluded.
     scale : dict of str to float
@@ -80,15 +80,15 @@ class State:
     machine : Repeatability
         Of the machine, as far as it is known.
     drift : Drift or None
-        None where drift is not looked for.
+        None if drift is not determined.
     sources : list of Shared
-        Uncertain corrections that many readings share, those of the drift excepted.
+        Sources that many readings share, except for the drift.
     network : Network
         The present solution.
     factor : float
-        Standard deviation of a reading over that of the network's weights.
+        Ratio of the standard deviation of a reading to that of the network's weights.
     scatter : Scatter
-        The parts of it.
+        Parts of this standard deviation.
     """
 
     raw: xr.Dataset
@@ -106,19 +106,19 @@ class State:
 
     @property
     def stations(self) -> Array | None:
-        """Approximate positions of the stations (n, 3), m, where they are to be used."""
+        """Approximate positions of the stations (n, 3), m, if they are to be used."""
         return self.data.station if self.settings.start == "nominal" else None
 
     def noise(self, machine: Repeatability | None = None) -> Array:
-        """Return the standard deviation of every reading, (n, m), m: one number, broadcast.
+        """Return the standard deviation of the readings, the same for all, (n, m), m.
 
-        It contains the repeatability (default: the present one), unless all stations are read at the same time.
+        It includes the repeatability (default: the present one), unless all stations are read at the same time.
         """
         variance = 0.0 if self.settings.together else (machine or self.machine).variance
         return np.broadcast_to(np.sqrt(self.data.noise**2 + variance), self.displacement.shape)
 
     def beams(self) -> Array:
-        """Return unit vectors (n, m, 3) from the stations to the targets, nominal ones where no others are known."""
+        """Return unit vectors (n, m, 3) from the stations to the estimated targets, or else to the nominal ones."""
         target = self.network.target
         return directions(np.where(np.isnan(target), self.data.nominal, target), self.network.stations)
 
@@ -129,36 +129,41 @@ def read(raw: xr.Dataset, notes: list[str]) -> Readings:
     Raises
     ------
     MethodError
-        A noise that is not positive; nothing measured.
+        A noise that is not positive; a station without readings; NaN for the position of the reflector.
     """
     d = _array(raw, "displacement", "station", "target")
     n, m = d.shape
     nominal = _array(raw, "target_nominal", "target", "direction")
     noise = float(raw["displacement_noise"])
     if not noise > 0:
-        raise MethodError(f"expected displacement_noise above 0, found {noise:g} m; state the instrument's noise")
+        raise MethodError(
+            f"displacement_noise: expected a positive standard deviation; found {noise:g} m. State that of the tracker."
+        )
     if not np.isfinite(d).any():
-        raise MethodError("displacement: expected readings; found NaN only. Was the beam broken all the time?")
+        raise MethodError("displacement: expected readings; found only NaN. Check that the beam was not broken.")
     names = {dim: _names(raw, dim, letter) for dim, letter in (("station", "S"), ("target", "T"))}
-    silent = [name for name, row in zip(names["station"], d, strict=True) if not np.isfinite(row).any()]
-    if silent:
-        raise MethodError(f"No reading of station {', '.join(silent)}: leave it out, or measure from there.")
+    empty = [name for name, row in zip(names["station"], d, strict=True) if not np.isfinite(row).any()]
+    if empty:
+        raise MethodError(
+            f"displacement: expected readings of every station; found none of {', '.join(empty)}. Remove the station, "
+            "or measure from it."
+        )
     few = np.count_nonzero(np.isfinite(d), axis=0) < 3
     if few.any():
-        first = short([name for name, lost in zip(names["target"], few, strict=True) if lost])
-        notes.append(f"{int(few.sum())} of {m} targets have fewer than three readings and are not known: {first}.")
+        first = short([name for name, unknown in zip(names["target"], few, strict=True) if unknown])
+        notes.append(f"{int(few.sum())} of {m} targets have fewer than three readings and are unknown: {first}.")
     station = None
     if "station_nominal" in raw:
         station = _array(raw, "station_nominal", "station", "direction")
         if np.isnan(station).any():
             station = None
             notes.append(
-                "Not every station has an approximate position (station_nominal): the distances determine all of them."
+                "Not every station has an approximate position (station_nominal): all are determined by the distances."
             )
     if "reflector" in raw:
         reflector = _array(raw, "reflector", "target", "direction")
         if np.isnan(reflector).any():
-            raise MethodError("reflector: expected its place for every target; found NaN. Leave it out if not known.")
+            raise MethodError("reflector: expected a position for every target; found NaN. Omit it if it is unknown.")
     else:
         reflector = np.zeros_like(nominal)
     timed = "reading_time" in raw
@@ -177,5 +182,5 @@ def _names(raw: xr.Dataset, dim: str, letter: str) -> list[str]:
 
 
 def short(names: list[str]) -> str:
-    """Return names as a text, the first eight of them."""
+    """Return names as text: the first eight, and the number of the others."""
     return ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:8])} and {len(names) - 8} more"

@@ -1,7 +1,7 @@
-"""Parts of the targets' uncertainty: their own readings, and sources that all share.
+"""Parts of the targets' uncertainty: their readings, and sources that all targets share.
 
-Sources are kept as one array over source, target and freedom, which is what an error dataset holds. It is filled block
-by block: nothing else is as large.
+The effects of the sources are one array over source, target and freedom, as in an error dataset. It is filled in
+blocks, so that no other array is as large.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from errormotion.methods.multilateration.network.network import Network
 
 BLOCK = 16384
-"""Targets at a time."""
+"""Number of targets that are computed at a time."""
 READINGS = "stations"
-"""Group of what the tracker's own noise does to all targets through the stations."""
+"""Group of the sources by which the noise of the tracker acts on all targets through the stations."""
 REPEATABILITY = "repeatability"
 UNEXPLAINED = "unexplained scatter"
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Standard deviation of a reading by cause, m: root sum of squares is that of the reading.
+    """Standard deviation of a reading by cause, m; the total is the root sum of squares.
 
     Attributes
     ----------
@@ -43,12 +43,12 @@ class Scatter:
 
     @property
     def total(self) -> float:
-        """Of all, m."""
+        """Standard deviation of the reading, m."""
         return float(np.sqrt(self.tracker**2 + self.machine**2 + self.unexplained**2))
 
     @property
     def shares(self) -> dict[str, float]:
-        """Share of each group in the variance; only those that have one."""
+        """Share of each group in the variance, of groups that contribute."""
         parts = {READINGS: self.tracker, REPEATABILITY: self.machine, UNEXPLAINED: self.unexplained}
         return {group: (part / self.total) ** 2 for group, part in parts.items() if part > 0}
 
@@ -60,13 +60,13 @@ class Parts:
     Attributes
     ----------
     own : ndarray (m, 3, 3)
-        By a target's own readings, m^2; NaN where it is not known.
+        Independent part, by the readings of the target, m^2; NaN if unknown.
     influence : ndarray (source, m, 6)
-        What one standard uncertainty of each shared source does, m; rotations NaN.
+        Effect of one standard uncertainty of each shared source, m; rotations NaN.
     names, groups : list of str
         Of the sources.
     stations : int
-        Number of the sources that are parts of the stations' covariance; they come first.
+        Number of the sources, the first ones, that are parts of the stations' covariance.
     """
 
     own: Array
@@ -75,17 +75,17 @@ class Parts:
     groups: list[str]
     stations: int
 
-    def covariance(self, given: Array, factor: float) -> Array:
-        """Return the total covariance (m, 6, 6): ``given`` (m, 3, 3) of the readings times ``factor``, and the rest."""
-        C = np.full((len(given), 6, 6), np.nan)
-        for part in blocks(len(given)):
+    def covariance(self, by_readings: Array, factor: float) -> Array:
+        """Return the total covariance (m, 6, 6): that by readings (m, 3, 3) times ``factor``, and by other sources."""
+        C = np.full((len(by_readings), 6, 6), np.nan)
+        for part in blocks(len(by_readings)):
             F = self.influence[self.stations :, part, :3]
-            C[part, :3, :3] = factor * given[part] + np.einsum("sta,stb->tab", F, F)
+            C[part, :3, :3] = factor * by_readings[part] + np.einsum("sta,stb->tab", F, F)
         return C
 
 
 def blocks(count: int) -> Iterator[slice]:
-    """Yield slices of so many targets."""
+    """Yield the blocks of a number of targets."""
     for first in range(0, count, BLOCK):
         yield slice(first, min(first + BLOCK, count))
 
@@ -95,7 +95,7 @@ def parts(
     factor: float,
     scatter: Scatter,
     scales: Sequence[tuple[str, str, float]],
-    stretched: Array,
+    lengths: Array,
     shared: Sequence[Shared],
 ) -> Parts:
     """Return the parts of the targets' uncertainty.
@@ -104,15 +104,15 @@ def parts(
     ----------
     network : Network
     factor : float
-        Standard deviation of a reading over that of the network's weights.
+        Ratio of the standard deviation of a reading to that of the network's weights.
     scatter : Scatter
-        What that is made of.
+        Parts of this standard deviation.
     scales : sequence of (name, group, relative standard uncertainty)
         Of all lengths.
-    stretched : ndarray (n, m)
-        The lengths, m.
+    lengths : ndarray (n, m)
+        m.
     shared : sequence of Shared
-        Further sources.
+        Additional sources.
     """
     network, k = _drift_first(network), len(network.extra)
     m, p = len(network.target), network.datum.factor.shape[1] - k
@@ -124,7 +124,7 @@ def parts(
     names += [name for name, _, _ in scales] + [source.name for source in shared]
     groups += [group for _, group, _ in scales] + [source.group for source in shared]
     own, influence = np.empty((m, 3, 3)), np.full((len(names), m, 6), np.nan)
-    changes = ([stretched] if scales else []) + [source.change for source in shared]
+    changes = ([lengths] if scales else []) + [source.change for source in shared]
     moved = responses(network, changes)
     for part in blocks(m):
         D, F, _ = network.blocks(part)
@@ -143,21 +143,21 @@ def parts(
 
 
 def _drift_first(network: Network) -> Network:
-    """Return the network with the independent parts of its stations turned: only the first have to do with drift.
+    """Return the network with the independent parts of its stations rotated, so that only the first depend on drift.
 
-    What the first do is what is not known of the drift, with all that the stations make of it; what the others do
-    would be there with the drift known.
+    The first parts are the uncertainty of the drift with its effect on the stations; the others are the uncertainty
+    with known drift.
     """
     if not len(network.extra):
         return network
     datum = network.datum
-    turn = np.linalg.qr(datum.factor[4 * len(network.station) :].T, mode="complete")[0]
-    return replace(network, datum=replace(datum, factor=datum.factor @ turn, shift=datum.shift @ turn))
+    rotation = np.linalg.qr(datum.factor[4 * len(network.station) :].T, mode="complete")[0]
+    return replace(network, datum=replace(datum, factor=datum.factor @ rotation, shift=datum.shift @ rotation))
 
 
 @dataclass(frozen=True)
 class Responses:
-    """How targets move when readings change, for any of them."""
+    """Displacements of targets by changes of the readings."""
 
     network: Network
     changes: Sequence[Array]
@@ -165,7 +165,7 @@ class Responses:
     shift: Array
 
     def of(self, part: slice) -> Array:
-        """Return the moves (change, t, 3) of some targets, m."""
+        """Return the displacements (change, t, 3) of some targets, m."""
         alone, (_, F, G) = _alone(self.network, self.changes, part)
         return np.asarray(
             alone
@@ -175,7 +175,7 @@ class Responses:
 
 
 def responses(network: Network, changes: Sequence[Array]) -> Responses:
-    """Return how targets move by changes (n, m) of the readings, m; first order, in blocks."""
+    """Return the displacements of targets by changes (n, m) of the readings, m, to first order, in blocks."""
     n, further = len(network.station), len(network.extra)
     gradient, shift = np.zeros((len(changes), 4 * n + further)), np.zeros((len(changes), 6))
     for part in blocks(len(network.target)) if len(changes) else ():
@@ -184,30 +184,30 @@ def responses(network: Network, changes: Sequence[Array]) -> Responses:
         e = np.nan_to_num(directions(network.target[part], network.stations))
         w2 = np.where(used, network.weight[:, part] ** 2, 0.0)
         for c, change in enumerate(changes):
-            rest = w2 * (_seen(network, change, part) - np.einsum("jta,ta->jt", e, alone[c]))
+            rest = w2 * (_used(network, change, part) - np.einsum("jta,ta->jt", e, alone[c]))
             by_place = -np.einsum("jt,jta->ja", rest, e)
             gradient[c, : 4 * n] += np.concatenate([by_place, -rest.sum(axis=1)[:, None]], axis=1).ravel()
             if further:
                 gradient[c, 4 * n :] += np.einsum("kjt,jt->k", network.extra[:, :, part], rest)
-        carries = network.carries[part]  # the datum is fitted to these
+        carries = network.in_datum[part]  # targets to which the datum is fitted
         shift += np.einsum("tag,cta->cg", G[carries], alone[:, carries])
     return Responses(network, changes, gradient, shift @ network.datum.H.T)
 
 
-def _seen(network: Network, change: Array, part: slice) -> Array:
-    """Return what of a change is in readings that are in use, m."""
+def _used(network: Network, change: Array, part: slice) -> Array:
+    """Return a change of the readings, m; 0 for readings that are not used."""
     used = np.isfinite(network.target_covariance[part, 0, 0])
     return np.where((network.weight[:, part] > 0) & used, change[:, part], 0.0)
 
 
 def _alone(network: Network, changes: Sequence[Array], part: slice) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Return moves (change, t, 3) of the targets with the stations held, and the network's blocks of them."""
+    """Return displacements (change, t, 3) of the targets with fixed stations, and the network's blocks of them."""
     own, F, G = network.blocks(part)
     e = directions(network.target[part], network.stations)
     w = network.weight[:, part]
     alone = np.empty((len(changes), len(own), 3))
     for c, change in enumerate(changes):
-        right = np.einsum("jt,jta->ta", w**2 * _seen(network, change, part), np.nan_to_num(e))
+        right = np.einsum("jt,jta->ta", w**2 * _used(network, change, part), np.nan_to_num(e))
         alone[c] = np.einsum("tab,tb->ta", own, right)
     alone[:, np.isnan(own[:, 0, 0])] = 0.0
     return alone, (own, F, G)

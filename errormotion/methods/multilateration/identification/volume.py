@@ -1,8 +1,8 @@
-"""The errors of the axes in a dataset, and what they make of the volume: any grid, slices, diagonals."""
+"""The errors of the axes in a dataset, and the volumetric errors by them: any grid, slices, diagonals."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -10,7 +10,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.identification.parameters import AXES, Chain, Parametric, Term, Unseen
+from errormotion.methods.multilateration.identification.parameters import AXES, Chain, Parametric, Term, Undetermined
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 CURVE_POINTS = 41
-"""Positions at which an error motion is tabulated."""
+"""Number of positions at which an error motion is tabulated."""
 _DOFS = 6
 
 
 def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     """Return the errors of the axes as variables of an error dataset.
 
-    ``EXX(X_position)`` ... and ``EXX_u``: error motions and standard uncertainties, NaN where not seen, with the reason
-    as attribute ``unseen``; the attribute ``includes`` names errors with the same effect as this one; ``EC0Y`` ...
-    and ``EC0Y_u``: squareness; ``coefficient(term)`` with ``coefficient_covariance``, and what `volumetric_errors`
-    needs.
+    ``EXX(X_position)`` ... and ``EXX_u``: error motions and standard uncertainties, NaN if not determined, with the
+    reason as attribute ``unseen``; the attribute ``includes`` states errors with the same effect; ``EC0Y`` ... and
+    ``EC0Y_u``: squareness; ``coefficient(term)`` with ``coefficient_covariance``, and the inputs of
+    `volumetric_errors`.
     """
     extras: dict[str, xr.DataArray] = {}
     chain = axes.chain
-    includes = _includes(axes.unseen)
+    includes = _includes(axes.undetermined)
     for k, axis in enumerate(AXES):
         dim = f"{axis}_position"
         q = np.linspace(chain.low[k], chain.high[k], CURVE_POINTS)
@@ -54,11 +54,12 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
         "term_error": ("term", [term.error for term in axes.terms]),
         "term_order": ("term", [term.order for term in axes.terms]),
     }
-    about = {"chain": chain.machine.chain, "unseen": [f"{k}: {each.reason}" for k, each in axes.unseen.items()] or [""]}
-    extras["coefficient"] = xr.DataArray(axes.coefficient, terms, "term", attrs=about)
+    reasons = [f"{name}: {each.reason}" for name, each in axes.undetermined.items()]
+    attrs_of_terms = {"chain": chain.machine.chain, "unseen": reasons or [""]}
+    extras["coefficient"] = xr.DataArray(axes.coefficient, terms, "term", attrs=attrs_of_terms)
     extras["coefficient_covariance"] = xr.DataArray(axes.covariance, dims=("term", "term_"))
     extras["determined"] = xr.DataArray(
-        axes.determined, dims="term", attrs={"units": "1", "long_name": "by the targets: 1, by the prior: 0"}
+        axes.determined, dims="term", attrs={"units": "1", "long_name": "1: by the targets, 0: by the prior"}
     )
     extras["axes_datum"] = xr.DataArray(axes.datum, dims=("motion", "term"))
     m = {"units": "m"}
@@ -75,29 +76,30 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
 
 
 def _reason(axes: Parametric, error: str) -> str:
-    return axes.unseen[error].reason if error in axes.unseen else ""
+    return axes.undetermined[error].reason if error in axes.undetermined else ""
 
 
-def _includes(unseen: Mapping[str, Unseen]) -> dict[str, str]:
-    """Return for each error which others it includes, since they have the same effect at the reflector."""
-    found: dict[str, list[str]] = {}
-    for error, each in unseen.items():
+def _includes(undetermined: Mapping[str, Undetermined]) -> dict[str, str]:
+    """Return for each error the others that it includes, since they have the same effect at the reflector."""
+    included: dict[str, list[str]] = {}
+    for error, each in undetermined.items():
         for name in each.like:
-            found.setdefault(name, []).append(error)
-    return {name: f"the effect of {' and '.join(others)} at the reflector" for name, others in found.items()}
+            included.setdefault(name, []).append(error)
+    return {name: f"the effect of {' and '.join(others)} at the reflector" for name, others in included.items()}
 
 
 def axes_of(errors: xr.Dataset) -> Parametric:
-    """Return the errors of the axes that a dataset of this method holds.
+    """Return the errors of the axes in a dataset of this method.
 
     Raises
     ------
     MethodError
-        It holds none.
+        The dataset contains none.
     """
     if "coefficient" not in errors:
         raise MethodError(
-            "The dataset holds no errors of the axes: identify it with the chain of the machine (setting 'chain')."
+            "The dataset contains no errors of the axes. Identify the raw data with the chain of the machine (setting "
+            "'chain')."
         )
     c = errors["coefficient"]
     pairs = zip(c["term_error"].values, c["term_order"].values, strict=True)
@@ -106,10 +108,10 @@ def axes_of(errors: xr.Dataset) -> Parametric:
               ("centre", "reference", "low", "high")}  # fmt: skip
     model = Chain.of(str(c.attrs["chain"]), np.stack([vector["low"], vector["high"]]), vector["reference"][None])
     reasons = {name: str(errors[name].attrs.get("unseen", "")) for name in model.machine.error_names}
-    unseen = {name: Unseen(reason) for name, reason in reasons.items() if reason}
+    undetermined = {name: Undetermined(reason) for name, reason in reasons.items() if reason}
     covariance, datum = errors["coefficient_covariance"].values, errors["axes_datum"].values
     return Parametric(
-        model, terms, c.values, covariance, errors["determined"].values, unseen, float(errors["axes_sigma0"]),
+        model, terms, c.values, covariance, errors["determined"].values, undetermined, float(errors["axes_sigma0"]),
         float(errors["axes_freedom"]), datum, vector["centre"],
     )  # fmt: skip
 
@@ -122,16 +124,16 @@ def volumetric_errors(errors: xr.Dataset, position: ArrayLike, tool: ArrayLike |
     errors : Dataset
         Of this method, with errors of the axes.
     position : array_like (k, 3)
-        Commanded axis positions, m. Outside of what was measured the errors are NaN.
+        Commanded axis positions, m. Outside the measured part of the axes the errors are NaN.
     tool : array_like (3,), optional
-        Where the tool is with all axes at zero, m; where the reflector was, without it. At another place, errors that
-        no reflector showed matter: what they touch is NaN.
+        Position of the tool with all axes at zero, m; default: that of the reflector. At another position, freedoms
+        that depend on undetermined errors are NaN.
 
     Returns
     -------
     Dataset
-        Error dataset over ``target`` in the datum of ``errors``; its covariance follows from that of the coefficients,
-        whose parts are the sources of ``influence``.
+        Error dataset over ``target`` in the datum of ``errors``, with the covariance by that of the coefficients, whose
+        parts are the sources of ``influence``.
 
     Raises
     ------
@@ -141,7 +143,7 @@ def volumetric_errors(errors: xr.Dataset, position: ArrayLike, tool: ArrayLike |
     axes = axes_of(errors)
     q = np.atleast_2d(np.asarray(position, dtype=float))
     if q.ndim != 2 or q.shape[1] != 3 or not np.isfinite(q).all():
-        raise MethodError(f"expected axis positions (k, 3) in m, finite; found shape {q.shape}")
+        raise MethodError(f"position: expected finite axis positions (k, 3) in m; found shape {q.shape}, or NaN")
     at = axes.chain.reference if tool is None else np.asarray(tool, dtype=float)
     A = _field(axes, q, at)
     values = A @ axes.coefficient
@@ -153,7 +155,7 @@ def volumetric_errors(errors: xr.Dataset, position: ArrayLike, tool: ArrayLike |
     covariance = np.einsum("ska,skb->kab", influence, influence)
     notes = []
     if outside := int(np.count_nonzero(~_inside(axes, q))):
-        notes.append(f"{outside} of {len(q)} positions lie outside of what was measured: their errors are not known.")
+        notes.append(f"{outside} of {len(q)} positions are outside the measured volume: their errors are unknown.")
     attrs = errors.attrs
     ds = build_errors(
         values,
@@ -176,7 +178,7 @@ def volumetric_errors(errors: xr.Dataset, position: ArrayLike, tool: ArrayLike |
 
 
 def grid(low: Sequence[float], high: Sequence[float], count: Sequence[int]) -> Array:
-    """Return the axis positions of a grid, (k, 3), m; a count of 1 is a slice at the middle of low and high."""
+    """Return the axis positions of a grid, (k, 3), m; a count of 1 is a slice in the middle of low and high."""
     axes = [
         np.linspace(a, b, n) if n > 1 else np.array([(a + b) / 2]) for a, b, n in zip(low, high, count, strict=True)
     ]
@@ -184,11 +186,11 @@ def grid(low: Sequence[float], high: Sequence[float], count: Sequence[int]) -> A
 
 
 def diagonals(low: Sequence[float], high: Sequence[float], count: int = 11) -> Array:
-    """Return positions along the four body diagonals, (4, count, 3), m; each starts at low Z (ISO 230-6)."""
+    """Return positions along the four body diagonals, (4, count, 3), m; each starts at the lowest Z (ISO 230-6)."""
     a, b = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     starts = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], dtype=float)
-    way = np.linspace(0.0, 1.0, count)[None, :, None]
-    share = starts[:, None] + way * (1 - 2 * starts[:, None])
+    t = np.linspace(0.0, 1.0, count)[None, :, None]
+    share = starts[:, None] + t * (1 - 2 * starts[:, None])
     return np.asarray(a + share * (b - a))
 
 
@@ -202,7 +204,7 @@ def _inside(axes: Parametric, q: Array) -> NDArray[np.bool_]:
 
 
 def _field(axes: Parametric, q: Array, tool: Array) -> Array:
-    """Return twists by the coefficients, (k, 6, term), in the datum."""
+    """Return the derivative of the twists by the coefficients, (k, 6, term), in the datum."""
     A = axes.chain.columns(axes.terms, q, np.tile(tool, (len(q), 1)), _DOFS)
     A[:, :3] -= axes.chain.motions(q + tool, axes.centre) @ axes.datum
     A[:, 3:] -= axes.datum[3:]
@@ -216,20 +218,15 @@ def _known_dofs(axes: Parametric, q: Array, tool: Array) -> NDArray[np.bool_]:
     there. Elsewhere, and for rotations, every error with an effect must be determined.
     """
     J = axes.chain.machine.jacobian(q, tool)
-    unseen = [axes.chain.machine.error_names.index(name) for name in axes.unseen]
-    known = np.asarray((J[:, :, unseen] == 0).all(axis=2), dtype=bool)
+    undetermined = [axes.chain.machine.error_names.index(name) for name in axes.undetermined]
+    known = np.asarray((J[:, :, undetermined] == 0).all(axis=2), dtype=bool)
     if np.allclose(tool, axes.chain.reference, rtol=0, atol=1e-9):
         known[:, :3] = True
     return known
 
 
 def _root(covariance: Array) -> Array:
-    values, vectors = np.linalg.eigh(_scaled(covariance)[0])
+    size = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
     kept = values > 1e-14 * values[-1]
-    root: Array = _scaled(covariance)[1][:, None] * vectors[:, kept] * np.sqrt(values[kept])
-    return root
-
-
-def _scaled(covariance: Array) -> tuple[Array, Array]:
-    size: Any = np.sqrt(np.diag(covariance))
-    return covariance / np.outer(size, size), size
+    return np.asarray(size[:, None] * vectors[:, kept] * np.sqrt(values[kept]))

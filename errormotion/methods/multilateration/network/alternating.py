@@ -1,9 +1,8 @@
-"""The scheme of the paper: stations from targets, targets from stations, and again, relative to the first target.
+"""Alternating scheme of the paper: stations from targets and targets from stations, relative to the first target.
 
-Takeuchi et al., section 2.2, equations (6) and (7), with L_j = |u_1 - U_j|. The first target's readings then do
-not determine it: it stays in its position, and everything else is relative to it. Each half is a
-least-squares problem of three unknowns at a time. Together they creep: a station moves only by what the targets have
-not taken.
+Takeuchi et al., section 2.2, equations (6) and (7), with L_j = |u_1 - U_j|. The position of the first target is fixed,
+all others are relative to it. Each half of an iteration is a set of least-squares problems of three unknowns. The
+convergence is linear and slow, since each half keeps the result of the other fixed.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.network.model import Stations
-from errormotion.methods.multilateration.network.turning import fitted
+from errormotion.methods.multilateration.network.rigid_motion import fitted
 
 TOLERANCE = 1e-9
 _HALF_STEPS = 2
@@ -24,23 +23,23 @@ _HALF_STEPS = 2
 
 @dataclass(frozen=True)
 class Alternated:
-    """Where the alternating scheme has come to.
+    """Result of the alternating scheme.
 
     Attributes
     ----------
     target : ndarray (m, 3)
         m, fitted to the nominal targets as a free network.
     station : ndarray (n, 3)
-        m, likewise.
+        m, in the same frame.
     iterations : int
-        Pairs of steps (i) and (ii) taken.
+        Pairs of steps (i) and (ii).
     converged : bool
-        Whether the last pair moved no target by more than the tolerance. It says that the scheme hardly moves, not that
-        it has arrived: at a rate of 1 - 1e-4 what is left is ten thousand times the last step.
+        Whether the last pair moved no target by more than the tolerance. The remaining error can be much larger: at a
+        rate of 1 - 1e-4 it is ten thousand times the last step.
     moved : float
-        How far the last pair moved a target at most, m.
+        Largest displacement of a target by the last pair, m.
     rate : float
-        Ratio of the last two moves: 1 where it creeps.
+        Ratio of the last two of these, at most 1.
     rms : float
         Root mean square of the residuals, m.
     """
@@ -54,8 +53,8 @@ class Alternated:
     rms: float
 
     @property
-    def left(self) -> float:
-        """How far the targets may still have to go, m: the rest of a geometric series."""
+    def remaining(self) -> float:
+        """Estimate of the remaining displacement of the targets, m: the rest of a geometric series."""
         return float(self.moved * self.rate / (1.0 - self.rate)) if self.rate < 1.0 else np.inf
 
 
@@ -72,19 +71,24 @@ def alternate(
     Parameters
     ----------
     displacement : array_like (n, m)
-        m, all known; only differences from those of the first target count.
+        m, all known; only differences from those of the first target are used.
     target : array_like (m, 3)
         Reference targets, m.
     station : array_like (n, 3)
-        Rough places of the stations, m.
+        Approximate positions of the stations, m.
     tolerance : float
-        A pair of steps that moves no target further, m, is the last.
+        Displacement of the targets by a pair of steps, m, below which the iteration ends.
     iterations : int
-        Most pairs of steps.
+        Maximum number of pairs of steps.
+
+    Raises
+    ------
+    MethodError
+        A displacement is NaN.
     """
     d, u, U = (np.array(a, dtype=float) for a in (displacement, target, station))
     if not np.isfinite(d).all():
-        raise MethodError("the alternating scheme expects every displacement, found NaN; use the solver")
+        raise MethodError("Expected all displacements, for the alternating scheme; found NaN. Use the solver.")
     d -= d[:, :1]
     nominal, moved, rate, done = u.copy(), np.inf, 1.0, 0
     while done < iterations:
@@ -101,7 +105,9 @@ def alternate(
             break
     r = d - (np.linalg.norm(u - U[:, None], axis=-1) - np.linalg.norm(u[0] - U, axis=1)[:, None])
     stations, u, _ = fitted(Stations(U, np.zeros(len(U)), np.zeros(0)), u, nominal, np.ones(len(u), dtype=bool))
-    return Alternated(u, stations.place, done, moved < tolerance, moved, min(rate, 1.0), float(np.sqrt(np.mean(r**2))))
+    return Alternated(
+        u, stations.position, done, moved < tolerance, moved, min(rate, 1.0), float(np.sqrt(np.mean(r**2)))
+    )
 
 
 def _stations(d: Array, u: Array, U: Array) -> Array:
@@ -112,14 +118,14 @@ def _stations(d: Array, u: Array, U: Array) -> Array:
     r, J = d - (distance - distance[:, :1]), e[:, :1] - e
     A = J.transpose(0, 2, 1) @ J
     step = np.linalg.solve(A, np.einsum("jia,ji->ja", J, r)[..., None])[..., 0]
-    # No further than half the way to the nearest target.
+    # At most half the distance to the nearest target.
     share = np.minimum(1.0, 0.5 * distance.min(axis=1) / np.maximum(np.linalg.norm(step, axis=1), 1e-300))
     moved: Array = U + share[:, None] * step
     return moved
 
 
 def _targets(reach: Array, u: Array, U: Array) -> Array:
-    """Return the targets after a Gauss-Newton step on equation (7), the stations and their distances known."""
+    """Return the targets after a Gauss-Newton step on equation (7), from known stations and distances."""
     v = u - U[:, None]
     distance = np.linalg.norm(v, axis=-1)
     e = v / distance[..., None]

@@ -1,10 +1,9 @@
-"""Gauss-Newton of a multilateration network with each target's block eliminated: cost and memory linear in the targets.
+"""Gauss-Newton of a network with the block of each target eliminated: cost and memory are linear in the targets.
 
-A pass puts every target where its distances from the present stations are best fulfilled, and adds up what is left of
-its readings: information and gradient of 4 n parameters, whatever the number of targets. Their step follows from a
-system of that size, in which the six motions of the whole are left out. Levenberg's damping comes in when a step makes
-things worse. Many targets are preceded by a sample of them, which takes the stations so far that two passes over all
-will do.
+A pass moves every target to the best fit of its distances from the present stations, and sums the information and
+gradient of the 4 n parameters of the stations. Their step follows from a system of that size, without the six rigid
+motions. Levenberg's damping is used when a step increases the sum of squares. With many targets the stations are first
+fitted to a sample of them, so that two passes over all are sufficient.
 """
 
 from __future__ import annotations
@@ -20,84 +19,83 @@ from errormotion.methods.multilateration.network.problem import Problem, Sums
 PASSES = 200
 SAMPLE = 512
 """Targets in a sample."""
-_WORTH = 4
-_FITTING = 10.0
-_DAMPED = 1e-8
-_UNDAMPED = 1e-11
-_LONG = 12
-_NEAR = 1e-6
+_MIN_SAMPLES = 4  # numbers of targets, in samples, from which a sample is used
+_MAX_RMS = 10.0  # over the noise; a sample that fits worse is not used
+_FIRST_DAMPING, _MIN_DAMPING = 1e-8, 1e-11
+_MANY_PASSES = 12
+_SAMPLE_TOLERANCE = 1e-6  # m
 
 
 @dataclass(frozen=True)
 class State:
-    """Stations and targets (3, m), their sums, passes, and whether the last step was small enough."""
+    """Stations and targets (3, m), their sums, number of passes, and whether the iteration converged."""
 
     stations: Stations
-    place: Array
+    position: Array
     sums: Sums
     passes: int
     converged: bool
 
 
 def descend(problem: Problem, stations: Stations, target: Array, tolerance: float) -> State:
-    """Take steps until a further one would move no target by more than ``tolerance``, from targets (m, 3)."""
+    """Iterate from targets (m, 3) until a further step would move no target by more than ``tolerance``, m."""
     Z, many = problem.basis(stations, problem.centre), len(target) // SAMPLE
-    if many >= _WORTH and not problem.known:
-        stations = _rehearsed(problem.sample(many), stations, Z)
-    place = np.ascontiguousarray(target.T)
-    sums = problem.reduce(stations, place)
+    if many >= _MIN_SAMPLES and not problem.known:
+        stations = _fitted_to_sample(problem.sample(many), stations, Z)
+    position = np.ascontiguousarray(target.T)
+    sums = problem.reduce(stations, position)
     mu, moved, stepped, passes = 0.0, np.inf, np.inf, 1
     while passes < PASSES:
         step, size, gain = _step(Z, sums.H, sums.h, mu)
         trial = stations.stepped(step)
-        if mu == 0.0 and _ahead(size, stepped) < tolerance:
-            return State(trial, place, replace(sums, square=max(sums.square - gain, 0.0)), passes, True)
-        found = problem.reduce(trial, place)
+        if mu == 0.0 and _remaining(size, stepped) < tolerance:
+            return State(trial, position, replace(sums, square=max(sums.square - gain, 0.0)), passes, True)
+        found = problem.reduce(trial, position)
         passes += 1
         if not found.square <= sums.square * (1 + 1e-9) + 1e-6:
-            place[:] = target.T
-            mu, stepped = max(10 * mu, _DAMPED), np.inf
+            position[:] = target.T
+            mu, stepped = max(10 * mu, _FIRST_DAMPING), np.inf
             if mu > 1e8:
                 break
             continue
-        stations, sums, stepped, mu = trial, found, size, (0.1 * mu if mu > _UNDAMPED else 0.0)
-        ahead, moved = _ahead(found.moved, moved), found.moved
-        # What no longer shrinks and is far below any noise is rounding.
-        if mu == 0.0 and (ahead < tolerance or (passes > _LONG and moved < 1e-10)):
-            return State(stations, place, sums, passes, True)
-    return State(stations, place, sums, passes, False)
+        stations, sums, stepped, mu = trial, found, size, (0.1 * mu if mu > _MIN_DAMPING else 0.0)
+        remaining, moved = _remaining(found.moved, moved), found.moved
+        # Steps far below any noise that no longer decrease are rounding errors.
+        if mu == 0.0 and (remaining < tolerance or (passes > _MANY_PASSES and moved < 1e-10)):
+            return State(stations, position, sums, passes, True)
+    return State(stations, position, sums, passes, False)
 
 
-def _ahead(size: float, last: float) -> float:
-    """Return how far it still is after a step: steps shrink at least as fast as they have; unknown after the first."""
+def _remaining(size: float, last: float) -> float:
+    """Return an upper estimate of the next step from the last two; infinite after the first."""
     if last == np.inf:
         return float(np.inf)
     return size * min(1.0, size / last) if last > 0.0 else size
 
 
-def _rehearsed(problem: Problem, stations: Stations, Z: Array) -> Stations:
-    """Return the stations that a sample of the targets leads to; those given where it leads nowhere."""
+def _fitted_to_sample(problem: Problem, stations: Stations, Z: Array) -> Stations:
+    """Return the stations fitted to a sample of the targets; unchanged if it does not determine or fit them."""
     by_target, by_station = problem.by_target, problem.by_station
     unknown = len(problem.free) - 6
     if by_station.min() < 4 or np.maximum(by_target - 3, 0).sum() < 2 * unknown:
         return stations
-    place, now, last = np.ascontiguousarray(problem.nominal.T), stations, np.inf
-    for _ in range(_LONG):
-        sums = problem.reduce(now, place)
+    position, now, last = np.ascontiguousarray(problem.nominal.T), stations, np.inf
+    for _ in range(_MANY_PASSES):
+        sums = problem.reduce(now, position)
         step, size, _ = _step(Z, sums.H, sums.h, 0.0)
         now = now.stepped(step)
-        # The sample is off by its noise: closer than this to its own answer is of no use.
-        if size < _NEAR or _ahead(size, last) < 0.1 * _NEAR:
-            fits = sums.square < _FITTING**2 * problem.reading.size
+        # The error of the sample by its noise is larger than this.
+        if size < _SAMPLE_TOLERANCE or _remaining(size, last) < 0.1 * _SAMPLE_TOLERANCE:
+            fits = sums.square < _MAX_RMS**2 * problem.reading.size
             return now if fits else stations
         last = size
     return stations
 
 
 def _step(Z: Array, H: Array, h: Array, mu: float) -> tuple[Array, float, float]:
-    """Return the step of the stations' parameters within the columns of Z, damped by mu, its size, and its gain.
+    """Return the step of the stations' parameters within the columns of Z, with damping mu, its size, and its gain.
 
-    The size is its largest part; the gain is that of the sum of squares, to second order.
+    The size is its largest component; the gain is the decrease of the sum of squares, to second order.
     """
     A = Z.T @ H @ Z
     scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-30 * np.trace(A) + 1e-300))

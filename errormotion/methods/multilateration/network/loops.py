@@ -1,15 +1,15 @@
-"""Which loops work on a network: array operations on a small one, compiled loops on a large one."""
+"""Choice of the sums over targets: array operations for a small network, compiled loops for a large one."""
 
 from __future__ import annotations
 
 from types import ModuleType
 
 COMPILED_FROM = 5000
-"""Targets from which compiled loops are used. They save time from some hundred targets on, once they are compiled."""
+"""Number of targets from which compiled loops are used. Once compiled, they are faster from some hundred targets."""
 
 
 def loops(targets: int) -> ModuleType:
-    """Return the module of the loops for so many targets; both give the same results but for rounding."""
+    """Return the module for this number of targets; both have the same results except for rounding."""
     if targets < COMPILED_FROM:
         from errormotion.methods.multilateration.network import vectorised
 

@@ -1,9 +1,9 @@
-"""Model of multilateration: readings from targets and stations, their derivatives, and which way to count parameters.
+"""Model of multilateration: readings from targets and stations, their derivatives, and the order of the parameters.
 
     d_ij = |u_i - U_j| - L_j + sum_k p_k c_kij
 
-u_i target i, U_j station j, L_j its dead path, p_k further parameters with known coefficients. The parameters of the
-stations are counted (U_1, L_1, U_2, L_2, ..., p).
+u_i is target i, U_j station j, L_j its dead path, and p_k further parameters with known coefficients. The order of the
+stations' parameters is (U_1, L_1, U_2, L_2, ..., p).
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Stations:
-    """Places (n, 3) and dead paths (n,) of the stations, m, and further parameters (k,)."""
+    """Positions (n, 3) and dead paths (n,) of the stations, m, and further parameters (k,)."""
 
-    place: Array
+    position: Array
     dead_path: Array
     value: Array
 
     def stepped(self, step: Array) -> Stations:
         """Return the stations after a step (4 n + k,) of their parameters."""
-        n = len(self.place)
+        n = len(self.position)
         block = step[: 4 * n].reshape(n, 4)
-        return Stations(self.place + block[:, :3], self.dead_path + block[:, 3], self.value + step[4 * n :])
+        return Stations(self.position + block[:, :3], self.dead_path + block[:, 3], self.value + step[4 * n :])
 
     @property
     def vector(self) -> Array:
         """Parameters (4 n + k,)."""
-        return np.concatenate([np.column_stack([self.place, self.dead_path]).ravel(), self.value])
+        return np.concatenate([np.column_stack([self.position, self.dead_path]).ravel(), self.value])
 
     def motions(self, centre: Array) -> Array:
-        """Return what a rigid motion (t, r about ``centre``) of the whole does to the parameters, (4 n + k, 6)."""
-        n = len(self.place)
+        """Return the effect (4 n + k, 6) of rigid motions of the network (t, r about ``centre``) on the parameters."""
+        n = len(self.position)
         T = np.zeros((4 * n + len(self.value), 6))
-        T[: 4 * n].reshape(n, 4, 6)[:, :3] = motions(self.place, centre)
+        T[: 4 * n].reshape(n, 4, 6)[:, :3] = motions(self.position, centre)
         return T
 
     def complement(self, centre: Array, free: NDArray[np.bool_]) -> Array:
-        """Return orthonormal columns (4 n + k, p) that span the free parameters without the motions of the whole."""
+        """Return orthonormal columns (4 n + k, p) that span the free parameters without the rigid motions."""
         T = self.motions(centre)[free]
         size = np.linalg.norm(T, axis=0)
         Z = np.zeros((len(free), len(T) - 6))
@@ -55,10 +55,10 @@ class Stations:
         return Z
 
 
-def motions(places: Array, centre: Array) -> Array:
-    """Return G (n, 3, 6): how places (n, 3) move with a rigid motion t + r x (place - ``centre``)."""
-    x, y, z = (places - centre).T
-    G = np.zeros((len(places), 3, 6))
+def motions(positions: Array, centre: Array) -> Array:
+    """Return G (n, 3, 6): the displacement of positions (n, 3) by a rigid motion t + r x (position - ``centre``)."""
+    x, y, z = (positions - centre).T
+    G = np.zeros((len(positions), 3, 6))
     G[:, [0, 1, 2], [0, 1, 2]] = 1.0
     G[:, 0, 4], G[:, 0, 5], G[:, 1, 5] = z, -y, x
     G[:, 1, 3], G[:, 2, 3], G[:, 2, 4] = -z, y, -x
@@ -67,19 +67,19 @@ def motions(places: Array, centre: Array) -> Array:
 
 def readings(target: Array, stations: Stations, extra: Array | None = None) -> Array:
     """Return the displacements (n, m), m, of targets (m, 3) from stations."""
-    distance = np.linalg.norm(target - stations.place[:, None], axis=-1)
+    distance = np.linalg.norm(target - stations.position[:, None], axis=-1)
     found: Array = distance - stations.dead_path[:, None]
     return found if extra is None else found + np.tensordot(stations.value, extra, 1)
 
 
 def directions(target: Array, stations: Stations) -> Array:
     """Return the unit vectors (n, m, 3) from the stations to the targets."""
-    v = target - stations.place[:, None]
+    v = target - stations.position[:, None]
     return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True), dtype=float)
 
 
 def jacobian(target: Array, stations: Stations, known: NDArray[np.bool_]) -> sp.csr_array:
-    """Return the derivatives of the known readings by (u_1, ..., u_m, U_1, L_1, ..., U_n, L_n), sparse.
+    """Return the sparse derivatives of the known readings by (u_1, ..., u_m, U_1, L_1, ..., U_n, L_n).
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def jacobian(target: Array, stations: Stations, known: NDArray[np.bool_]) -> sp.
     stations : Stations
         Without further parameters.
     known : ndarray (n, m)
-        Rows of the result: target after target, station after station.
+        Rows of the result: by target, then by station.
     """
     import scipy.sparse as sp
 

@@ -1,17 +1,17 @@
 """Result of a multilateration: positions, dead paths, and their covariances.
 
-The datum is a free network: of all rigid motions of the whole, the one that fits the targets to their nominal places
-best. With a_i the part of target i that its own readings decide, covariance D_i, and ds that of the stations,
+The datum is a free network: the rigid motion that is the best fit of the targets to their nominal positions. With a_i
+the displacement of target i by its own readings, of covariance D_i, and ds the displacement of the stations,
 
     u_i = a_i + F_i ds - G_i H (sum_k G_k^T (a_k + F_k ds)),   H = (sum_k G_k^T G_k)^-1,
 
-G_i = [1, -(c_i x)] the motions of target i with the whole. Covariances of one target with another, i and k, are then
+G_i = [1, -(c_i x)] is the displacement of target i by rigid motions. The covariances of targets i and k are then
 
     D_i delta_ik + F'_i F'_k^T - D_i G_i H G_k^T - G_i H G_k^T D_k + G_i K G_k^T,   K = H (sum G^T D G) H,
 
-F' the factor of the stations after the datum has taken its part. A target that its readings hardly fix does not carry
-the datum: the sums leave it out, and so do the terms in its own D G. What follows from a solution (datum, covariances,
-residuals and notes) is reckoned when it is asked for, and then kept.
+with F' the factor of the stations in the datum. A weakly determined target does not define the datum: it is excluded
+from the sums and from the terms in its own D G. Quantities that follow from a solution (datum, covariances, residuals
+and notes) are calculated on first access and cached.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from errormotion.methods.multilateration.network.model import Stations, directio
 
 @dataclass(frozen=True)
 class Datum:
-    """Free network on the targets: what is needed to carry covariances into it.
+    """Free network on the targets, and quantities for the transformation of covariances into it.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Datum:
     shift : ndarray (6, p)
         H sum(G^T F) W.
     H, K : ndarray (6, 6)
-        As above.
+        See the module.
     """
 
     centre: Array
@@ -52,7 +52,7 @@ class Datum:
 
 
 class _OnDemand:
-    """The datum of a network: as given, or else reckoned when it is first asked for."""
+    """Descriptor of the datum of a network: as passed, or else calculated on first access."""
 
     def __set__(self, network: Network, value: Any) -> None:
         network.__dict__["_datum"] = None if value is self else value
@@ -61,7 +61,7 @@ class _OnDemand:
         if network is None:
             return self
         if network.__dict__["_datum"] is None:
-            network.__dict__["_datum"] = network._reckoned_datum()
+            network.__dict__["_datum"] = network._calculated_datum()
         return network.__dict__["_datum"]
 
 
@@ -72,40 +72,39 @@ class Network:
     Attributes
     ----------
     target : ndarray (m, 3)
-        Estimated places, m, in the frame of the nominal ones; NaN where readings do not determine a target.
+        Estimated positions, m, in the frame of the nominal ones; NaN where readings do not determine a target.
     stations : Stations
-        Places, dead paths and further parameters in the same frame.
+        Positions, dead paths and further parameters in the same frame.
     reading : ndarray (n, m)
         Displacements, m; NaN where there is none.
     weight : ndarray (n, m)
-        1 / standard deviation, 1/m; 0 for readings that are missing or left out.
+        1 / standard deviation, 1/m; 0 for readings that are missing or ignored.
     left_out : tuple of (int, int)
-        Readings (station, target) found wrong, from 0.
+        Outliers (station, target), from 0.
     undecided : tuple of int
-        Targets with a wrong reading that is not identified; they are NaN.
+        Targets with an outlier that is not identified; they are NaN.
     sigma0 : float
-        Root mean square of the residuals over their expected size: 1 where the noise is what was stated.
+        Root mean square of the residuals over the expected one: 1 if the noise is as stated.
     freedom : int
-        Readings in use minus parameters.
+        Valid readings minus parameters.
     iterations : int
         Passes over the targets.
     converged : bool
         Whether a further step would be below the tolerance.
     condition : float
-        Of the stations' information, its diagonal scaled to 1: largest over smallest eigenvalue of what distances can
-        determine.
+        Condition of the stations' information, scaled to a diagonal of 1, without the rigid motions.
     extra : ndarray (k, n, m)
         Derivatives of the readings by further parameters.
-    carries : ndarray of bool (m,)
-        Targets that carry the datum: those that their readings fix about as well as the others.
+    in_datum : ndarray of bool (m,)
+        Targets that define the datum: those that are not weakly determined.
     centre : ndarray (3,)
         Mean of these, m.
     factor : ndarray (4 n + k, p)
         W, W W^T the covariance of the stations' parameters in some datum.
-    rough : ndarray (n, 3) or None
-        Rough places of the stations as given, m.
+    approximate : ndarray (n, 3) or None
+        Stated approximate positions of the stations, m.
     datum : Datum
-        What is needed to carry covariances into the datum.
+        Quantities for the transformation of covariances into the datum.
     """
 
     target: Array
@@ -120,15 +119,15 @@ class Network:
     converged: bool
     condition: float
     extra: Array = field(repr=False)
-    carries: NDArray[np.bool_] = field(repr=False)
+    in_datum: NDArray[np.bool_] = field(repr=False)
     centre: Array = field(repr=False)
     factor: Array = field(repr=False)
-    rough: Array | None = field(repr=False)
+    approximate: Array | None = field(repr=False)
     datum: Datum = field(default=cast(Any, _OnDemand()), repr=False)
 
-    def _reckoned_datum(self) -> Datum:
+    def _calculated_datum(self) -> Datum:
         GG, GDG, GF = loops(len(self.target)).datum_sums(
-            self.weight, self.station, self.extra, self.target, self.carries, self.centre
+            self.weight, self.station, self.extra, self.target, self.in_datum, self.centre
         )
         H = np.asarray(np.linalg.inv(GG), dtype=np.float64)
         return Datum(self.centre, self.factor, H @ GF @ self.factor, H, H @ GDG @ H)
@@ -142,38 +141,37 @@ class Network:
 
     @property
     def target_covariance(self) -> Array:
-        """Covariances (m, 3, 3), m^2, in the datum, in which the six motions of the whole have none."""
+        """Covariances (m, 3, 3), m^2, in the datum, in which the six rigid motions have none."""
         return self._examined[0]
 
     @property
     def redundancy(self) -> Array:
-        """Share (n, m) of a reading's error that shows in its residual, 0 to 1; NaN where none is in use."""
+        """Share (n, m) of the error of a reading that appears in its residual, 0 to 1; NaN without a valid reading."""
         return self._examined[1]
 
     @cached_property
     def residual(self) -> Array:
-        """Reading minus model (n, m), m: of every reading that exists and whose target has a place, left out or not.
+        """Reading minus model (n, m), m, of every reading of a target with a position, outliers included; else NaN.
 
-        NaN for all others. A reading that was left out did not determine its target's position, so that its residual
-        shows its whole error.
+        The residual of an outlier is its whole error, since it did not contribute to the position.
         """
         s = self.stations
         of = loops(len(self.target))
-        return np.asarray(of.residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target))
+        return np.asarray(of.residuals(self.reading, s.position, s.dead_path, self.extra, s.value, self.target))
 
     @cached_property
     def _examined(self) -> tuple[Array, Array]:
         datum = self.datum
         covariance, redundancy = loops(len(self.target)).examine(
-            self.weight, self.station, self.extra, self.target, self.carries,
+            self.weight, self.station, self.extra, self.target, self.in_datum,
             datum.centre, datum.factor, datum.shift, datum.H, datum.K,
         )  # fmt: skip
         return covariance, redundancy
 
     @property
     def station(self) -> Array:
-        """Places of the stations, (n, 3), m."""
-        return self.stations.place
+        """Positions of the stations, (n, 3), m."""
+        return self.stations.position
 
     @property
     def dead_path(self) -> Array:
@@ -182,22 +180,22 @@ class Network:
 
     @property
     def station_covariance(self) -> Array:
-        """Covariances of the stations' places, (n, 3, 3), m^2."""
+        """Covariances of the stations' positions, (n, 3, 3), m^2."""
         n = len(self.station)
         blocks = self.joint_covariance[: 4 * n, : 4 * n].reshape(n, 4, n, 4)
         return np.ascontiguousarray(blocks[np.arange(n), :3, np.arange(n), :3])
 
     def blocks(self, targets: NDArray[np.intp] | slice = slice(None)) -> tuple[Array, Array, Array]:
-        """Return what joint covariances of some targets (t of them) are made of.
+        """Return the components of the joint covariances of some targets (t of them).
 
         Returns
         -------
         own : ndarray (t, 3, 3)
-            D, m^2: covariance from a target's own readings, the stations known.
+            D, m^2: covariance from a target's own readings, with known stations.
         factor : ndarray (t, 3, p)
-            F', m: what one standard deviation of each independent part of the stations does, in the datum.
+            F', m: effect of one standard uncertainty of each independent part of the stations, in the datum.
         G : ndarray (t, 3, 6)
-            Motions with the whole about the datum's centre.
+            Displacements by rigid motions about the centre of the datum.
         """
         u, w = self.target[targets], self.weight[:, targets]
         e = directions(u, self.stations)
@@ -218,15 +216,15 @@ class Network:
         """Return the effect of the stations' uncertainty on all targets, (p, m, 3), m.
 
         One row for each independent part of the stations' covariance: the sources of ``influence`` of an error
-        dataset. What is left of ``target_covariance`` is independent from target to target but for the datum's
-        small terms, of the order 6 / (3 m) of it.
+        dataset. The remainder of ``target_covariance`` is independent from target to target, except for small terms
+        of the datum, of the order 6 / (3 m) of it.
         """
         return np.ascontiguousarray(self.blocks()[1].transpose(2, 0, 1))
 
     def covariance(self, targets: NDArray[np.intp] | slice = slice(None)) -> Array:
         """Return the joint covariance (3 t, 3 t), m^2, of some targets (t of them)."""
         own, F, G = self.blocks(targets)
-        t, DG = len(own), np.where(self.carries[targets][:, None, None], own @ G, 0.0)
+        t, DG = len(own), np.where(self.in_datum[targets][:, None, None], own @ G, 0.0)
         F, DG, G = F.reshape(3 * t, -1), DG.reshape(3 * t, 6), G.reshape(3 * t, 6)
         side = DG @ self.datum.H @ G.T
         C: Array = F @ F.T - side - side.T + G @ self.datum.K @ G.T
@@ -234,10 +232,10 @@ class Network:
         return C
 
     def response(self, change: Array) -> tuple[Array, Array]:
-        """Return how targets (m, 3) and stations' parameters (4 n + k,) move when readings change by (n, m), m.
+        """Return the effect of a change (n, m), m, of the readings on targets (m, 3) and stations (4 n + k,).
 
-        For systematic effects: refraction, a drift between set-ups, a wrong wavelength. First order. Changes of
-        readings that are not in use have none.
+        To first order; for systematic effects: refraction, a drift between set-ups, a wrong wavelength. Readings that
+        are not used have no effect.
         """
         w = self.weight
         used = np.isfinite(self.target_covariance).all(axis=(1, 2))
@@ -246,12 +244,12 @@ class Network:
         d = np.where((w > 0) & used, change, 0.0)
         alone = np.einsum("tab,jt,jta->tb", own, w**2 * d, e)
         alone[~used] = 0.0
-        # Gradient of the stations: derivatives of the readings by them, times what the targets have not taken.
+        # Gradient of the stations: derivatives of the readings by them, times the residuals of the targets.
         rest = w**2 * (d - np.einsum("jta,ta->jt", np.nan_to_num(e), alone))
         g = np.concatenate([-np.einsum("jt,jta->ja", rest, np.nan_to_num(e)), -rest.sum(axis=1)[:, None]], axis=1)
         gradient = np.concatenate([g.ravel(), np.einsum("kjt,jt->k", self.extra, rest)])
         parts = self.datum.factor.T @ gradient
-        shift = self.datum.H @ np.einsum("tab,ta->b", G[self.carries], alone[self.carries])
+        shift = self.datum.H @ np.einsum("tab,ta->b", G[self.in_datum], alone[self.in_datum])
         moved = alone + factor @ parts - G @ shift
         T = self.stations.motions(self.datum.centre)
         return moved, self.datum.factor @ parts - T @ (self.datum.shift @ parts + shift)

@@ -1,4 +1,4 @@
-"""What is to be solved: readings, their weights, and what is known of the stations' parameters beforehand."""
+"""Statement of the problem: readings, their weights, and prior knowledge of the stations' parameters."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from errormotion.methods.multilateration.network.model import Stations
 
 @dataclass(frozen=True)
 class Problem:
-    """Readings, their weights, and what is known of the stations' parameters.
+    """Readings, their weights, and prior knowledge of the stations' parameters.
 
     Attributes
     ----------
     reading, weight : ndarray (n, m)
-        m, NaN where there is none, and 1 / standard deviation, 1/m, 0 for what does not count.
+        m, NaN where there is none, and 1 / standard deviation, 1/m, 0 for readings that are not used.
     extra : ndarray (k, n, m)
         Derivatives of the readings by further parameters.
     precision : ndarray (4 n + k,)
-        1 / variance of what is known of each parameter beforehand, about ``prior``; infinite for what is fixed.
+        1 / variance of the prior value of each parameter; infinite for a fixed parameter, 0 for an unknown one.
     prior : ndarray (4 n + k,)
-        Only where the precision is not 0.
+        Prior values; used only where the precision is not 0.
     nominal : ndarray (m, 3)
         Nominal targets, m: the datum.
     centre : ndarray (3,)
         Their mean, m.
     by_target, by_station : ndarray (m,), (n,)
-        How many readings count.
+        Number of readings used.
     """
 
     reading: Array
@@ -53,23 +53,23 @@ class Problem:
 
     @cached_property
     def known(self) -> bool:
-        """Whether anything is known of the parameters that are estimated."""
+        """Whether an estimated parameter has a prior value."""
         return bool((self.free & (self.precision > 0)).any())
 
     @property
     def unknown(self) -> int:
-        """Parameters of which nothing is known."""
+        """Number of parameters without prior value."""
         return int(np.count_nonzero(self.precision == 0))
 
     def weighted(self, weight: Array) -> Problem:
-        """Return the problem with other weights (n, m); a target with fewer than three readings has no place."""
+        """Return the problem with other weights (n, m); a target with fewer than three readings has no position."""
         count = loops(weight.shape[1]).count
         weight[:, count(weight)[0] < 3] = 0.0
         by_target, by_station = count(weight)
         return replace(self, weight=weight, by_target=by_target, by_station=by_station)
 
     def sample(self, every: int) -> Problem:
-        """Return the problem of every so many-th target."""
+        """Return the problem of every ``every``-th target."""
         part = slice(every // 2, None, every)
         reading, weight = (np.ascontiguousarray(a[:, part]) for a in (self.reading, self.weight))
         extra = np.ascontiguousarray(self.extra[:, :, part])
@@ -80,13 +80,13 @@ class Problem:
         )  # fmt: skip
 
     def basis(self, stations: Stations, centre: Array) -> Array:
-        """Return orthonormal columns (4 n + k, p) that span the free parameters without the motions of the whole."""
+        """Return orthonormal columns (4 n + k, p) that span the free parameters without the rigid motions."""
         return stations.complement(centre, self.free)
 
-    def reduce(self, stations: Stations, place: Array) -> Sums:
+    def reduce(self, stations: Stations, position: Array) -> Sums:
         """Move the targets (3, m) in place and return their sums for the stations."""
-        sums, moved = loops(place.shape[1]).reduce_targets(
-            self.reading, self.weight, stations.place, stations.dead_path, self.extra, stations.value, place
+        sums, moved = loops(position.shape[1]).reduce_targets(
+            self.reading, self.weight, stations.position, stations.dead_path, self.extra, stations.value, position
         )
         H, h, square = sums[:-1, :-1].copy(), sums[:-1, -1].copy(), float(sums[-1, -1])
         if self.known:
@@ -101,7 +101,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Sums:
-    """Information H, gradient h, sum of squares, and how far targets went, m."""
+    """Information H, gradient h, sum of squares, and the largest displacement of a target, m."""
 
     H: Array
     h: Array
@@ -117,34 +117,34 @@ def state_problem(
     extra: ArrayLike | None = None,
     extra_prior: ArrayLike | None = None,
 ) -> Problem:
-    """Check shapes and values, and turn them into a problem."""
+    """Return the problem stated by arguments of `solver.solve`; raise MethodError for wrong shapes or values."""
     d, u = np.asarray(displacement, dtype=float), np.asarray(target, dtype=float)
     if d.ndim != 2 or u.shape != (d.shape[1], 3):
         raise MethodError(
-            f"expected displacements (station, target) and targets (target, 3), found {d.shape} and {u.shape}; "
-            "give a row of displacements for every station and a place for every target"
+            f"Expected displacements (station, target) and targets (target, 3); found {d.shape} and {u.shape}. "
+            "State a row of displacements for every station and a position for every target."
         )
     n, m = d.shape
     of = loops(m)
     u, centre = of.copied(np.ascontiguousarray(u))
     if not np.isfinite(centre).all():
-        raise MethodError("expected a nominal place for every target, found NaN among them; leave such targets out")
+        raise MethodError("Expected a nominal position for every target; found NaN. Remove such targets.")
     sigma = np.asarray(noise, dtype=float)
     if sigma.ndim == 1 and len(sigma) == n:
         sigma = sigma[:, None]
     if sigma.shape not in ((), (n, 1), (n, m)):
         raise MethodError(
-            f"expected noise as one value, ({n},) or ({n}, {m}), found {sigma.shape}; state it for all readings, each "
-            "station, or each reading"
+            f"Expected the noise as one value, ({n},) or ({n}, {m}); found {sigma.shape}. State it for all readings, "
+            "each station, or each reading."
         )
     sigma = np.ascontiguousarray(np.broadcast_to(sigma, (n, 1)) if sigma.ndim == 0 else sigma)
     reading, weight, positive = of.weigh(np.ascontiguousarray(d), sigma)
     by_target, by_station = of.count(weight)
     if not positive:
-        raise MethodError("expected a positive standard deviation for every reading; state the instrument's noise, m")
+        raise MethodError("Expected a positive standard deviation of every reading. State the instrument's noise, m.")
     c = np.zeros((0, n, m)) if extra is None else np.nan_to_num(np.asarray(extra, dtype=float))
     if c.ndim != 3 or c.shape[1:] != d.shape:
-        raise MethodError(f"expected further parameters as (k, {n}, {m}), found {c.shape}; give a value per reading")
+        raise MethodError(f"Expected further parameters as (k, {n}, {m}); found {c.shape}. State a value per reading.")
     precision, prior = np.zeros((2, 4 * n + len(c)))
     if dead_path is not None:
         value, uncertainty = (np.broadcast_to(np.asarray(a, dtype=float), (n,)) for a in dead_path)

@@ -1,9 +1,8 @@
-"""Sums over the targets of a small network, by array operations. `kernels` does the same for large ones.
+"""Sums over the targets of a small network, by array operations. `kernels` has the same functions for large ones.
 
 With E (n, 3) the weighted directions from the stations to a target, N orthonormal rows with N E = 0, and Q the weighted
-derivatives of the readings by the parameters of the stations, a target gives the equations N Q ds = N r for these:
-n - 3 of them, one with four stations. N comes from Householder reflections, so that no digits cancel. Arrays have the
-targets last.
+derivatives of the readings by the parameters of the stations, a target contributes the n - 3 equations N Q ds = N r.
+N is calculated by Householder reflections, without cancellation. The targets are the last dimension of the arrays.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _STEPS, _SHORT = 8, 1e-3
 _LAST_STEPS, _SETTLED = 30, 1e-7
 """The same where the stations are final."""
 _SILENT = np.errstate(invalid="ignore", divide="ignore", over="ignore")
-"""A target without a position gives NaN."""
+"""The result is NaN for a target without a position."""
 
 
 def weigh(d: Array, sigma: Array) -> tuple[Array, Array, bool]:
@@ -50,16 +49,16 @@ def copied(u: Array) -> tuple[Array, Array]:
     return u.copy(), u.sum(axis=0) / max(len(u), 1)
 
 
-def moments(place: Array, nominal: Array, used: NDArray[np.bool_], centre: Array) -> Array:
+def moments(position: Array, nominal: Array, used: NDArray[np.bool_], centre: Array) -> Array:
     """Return number, sums and products (16,) of used targets (3, m) and nominal ones (m, 3), about ``centre``."""
-    u, v = place[:, used] - centre[:, None], nominal[used].T - centre[:, None]
+    u, v = position[:, used] - centre[:, None], nominal[used].T - centre[:, None]
     return np.concatenate([[np.count_nonzero(used)], u.sum(axis=1), v.sum(axis=1), (v @ u.T).ravel()])
 
 
-def moved(place: Array, a: Array, b: Array, R: Array, openness: Array) -> Array:
-    """Return R (u - a) + b (m, 3) of targets u (3, m); NaN where the openness (m,) is infinite."""
-    target = (place.T - a) @ R.T + b
-    target[~(openness < np.inf)] = np.nan
+def moved(position: Array, a: Array, b: Array, R: Array, traces: Array) -> Array:
+    """Return R (u - a) + b (m, 3) of targets u (3, m); NaN where the traces (m,) is infinite."""
+    target = (position.T - a) @ R.T + b
+    target[~(traces < np.inf)] = np.nan
     return np.asarray(target)
 
 
@@ -72,7 +71,7 @@ def residuals(reading: Array, station: Array, dead_path: Array, extra: Array, va
 @_SILENT
 def reduce_targets(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array,
+    position: Array,
 ) -> tuple[Array, float]:  # fmt: skip
     """Move every target and sum its equations for the stations.
 
@@ -84,7 +83,7 @@ def reduce_targets(
         m.
     extra, value : ndarray (k, n, m), (k,)
         Effect of a unit of each further parameter on a reading, and the parameters.
-    place : ndarray (3, m)
+    position : ndarray (3, m)
         Targets, m; changed in place.
 
     Returns
@@ -96,9 +95,9 @@ def reduce_targets(
         Longest first step of a target, m.
     """
     reach = np.where(weight > 0, _reach(reading, dead_path, extra, value), 0.0)
-    far, _ = _locate(reach, weight, station, place, _STEPS, _SHORT)
-    e, distance = _sight(place, station)
-    N = left_over(weight[:, None] * e)
+    far, _ = _locate(reach, weight, station, position, _STEPS, _SHORT)
+    e, distance = _sight(position, station)
+    N = orthogonal_rows(weight[:, None] * e)
     c = N * weight
     rows = [equations(c, e)]
     if len(extra):
@@ -111,33 +110,33 @@ def reduce_targets(
 @_SILENT
 def settle_targets(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array, nominal: Array, centre: Array,
+    position: Array, nominal: Array, centre: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Move every target (3, m) to the best fit of its distances from the final stations.
 
     Returns
     -------
-    openness : ndarray (m,)
-        Trace of each target's covariance with the stations known, m^2; infinite where readings leave a direction open.
+    traces : ndarray (m,)
+        Trace of each target's covariance with known stations, m^2; infinite if a direction is not determined.
     moments : ndarray (16,)
         Of the targets with a position: their number, sums of targets and of nominal ones (m, 3) about ``centre`` (3,),
         and the sum (3, 3) of nominal times target.
     """
     reach = np.where(weight > 0, _reach(reading, dead_path, extra, value), 0.0)
-    _, openness = _locate(reach, weight, station, place, _LAST_STEPS, _SETTLED)
-    return openness, moments(place, nominal, openness < np.inf, centre)
+    _, traces = _locate(reach, weight, station, position, _LAST_STEPS, _SETTLED)
+    return traces, moments(position, nominal, traces < np.inf, centre)
 
 
 @_SILENT
 def datum_sums(
-    weight: Array, station: Array, extra: Array, target: Array, carries: NDArray[np.bool_], centre: Array
+    weight: Array, station: Array, extra: Array, target: Array, in_datum: NDArray[np.bool_], centre: Array
 ) -> tuple[Array, Array, Array]:
-    """Return sums over the targets that carry the datum of G^T G (6, 6), G^T D G (6, 6) and G^T F (6, 4 n + k).
+    """Return sums over the targets that define the datum: G^T G (6, 6), G^T D G (6, 6) and G^T F (6, 4 n + k).
 
-    G are a target's motions with the whole about ``centre``, D its covariance with the stations known, F its motion by
-    the stations' parameters.
+    G is the displacement of a target by rigid motions about ``centre``, D its covariance with known stations, F its
+    displacement by the stations' parameters.
     """
-    weight, extra, target = weight[:, carries], extra[:, :, carries], target[carries]
+    weight, extra, target = weight[:, in_datum], extra[:, :, in_datum], target[in_datum]
     e, D, whole = seen(weight, station, target)
     weight, extra, target, e, D = weight[:, whole], extra[:, :, whole], target[whole], e[:, :, whole], D[:, :, whole]
     G = motions(target, centre)
@@ -151,7 +150,7 @@ def datum_sums(
 
 @_SILENT
 def examine(
-    weight: Array, station: Array, extra: Array, target: Array, carries: NDArray[np.bool_],
+    weight: Array, station: Array, extra: Array, target: Array, in_datum: NDArray[np.bool_],
     centre: Array, W: Array, shift: Array, H: Array, K: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return covariances (m, 3, 3) of the targets, m^2, and redundancies (n, m) of the readings.
@@ -161,7 +160,7 @@ def examine(
     W : ndarray (4 n + k, p)
         Factor of the covariance of the stations' parameters, in any datum.
     shift : ndarray (6, p)
-        How the datum's fit to the targets moves with the factor.
+        Effect of the factor on the rigid motion of the datum.
     H, K : ndarray (6, 6)
         Inverse of the sum of G^T G; and H (sum of G^T D G) H.
     """
@@ -181,8 +180,8 @@ def examine(
     redundancy = np.where(whole & (weight > 0), 1.0 - hat - taken, np.nan)
     G = motions(target, centre)
     F = F - G @ shift
-    DG = np.where(carries[:, None, None], own @ G, 0.0)
-    # 1/2 G K - D G H: G times its transpose, and the transpose of that, make both sides of the datum.
+    DG = np.where(in_datum[:, None, None], own @ G, 0.0)
+    # (1/2 G K - D G H) G^T and its transpose are the terms of the datum.
     side = (0.5 * G @ K - DG @ H) @ G.transpose(0, 2, 1)
     covariance = own + F @ F.transpose(0, 2, 1) + side + side.transpose(0, 2, 1)
     covariance[~whole] = np.nan
@@ -202,20 +201,20 @@ def response(own: Array, e: Array) -> Array:
 
 
 def _reach(reading: Array, dead_path: Array, extra: Array, value: Array) -> Array:
-    """Return the distances (n, m) that readings stand for, m."""
+    """Return the distances (n, m) measured by the readings, m."""
     found = reading + dead_path[:, None]
     return found - np.tensordot(value, extra, 1) if len(value) else found
 
 
-def _sight(place: Array, station: Array) -> tuple[Array, Array]:
+def _sight(position: Array, station: Array) -> tuple[Array, Array]:
     """Return unit vectors (n, 3, m) from the stations to targets (3, m), and distances (n, m), m."""
-    v = place - station[:, :, None]
+    v = position - station[:, :, None]
     distance = np.sqrt(np.einsum("jam,jam->jm", v, v))
     return v / distance[:, None], distance
 
 
 def seen(weight: Array, station: Array, target: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return directions (n, 3, m), D (3, 3, m) of targets (m, 3), and which have one; 0 and the unit matrix else."""
+    """Return directions (n, 3, m) and D (3, 3, m) of targets (m, 3), and which have a D; else 0 and the unit matrix."""
     e, _ = _sight(target.T, station)
     D, _, whole = _inverse(weight[:, None] * e)
     if not whole.all():
@@ -224,7 +223,7 @@ def seen(weight: Array, station: Array, target: Array) -> tuple[Array, Array, ND
 
 
 def _inverse(E: Array) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return D (3, 3, m), the inverse of E^T E, whether it can move a target, and whether it gives a position."""
+    """Return D (3, 3, m), the inverse of E^T E, whether it can move a target, and whether it determines a position."""
     (a00, a01, a02), (_, a11, a12), (_, _, a22) = np.einsum("jam,jbm->abm", E, E)
     trace = a00 + a11 + a22
     least = NO_POSITION * trace
@@ -246,25 +245,27 @@ def _inverse(E: Array) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     return D, moves, whole
 
 
-def _locate(reach: Array, weight: Array, station: Array, place: Array, steps: int, short: float) -> tuple[float, Array]:
+def _locate(
+    reach: Array, weight: Array, station: Array, position: Array, steps: int, short: float
+) -> tuple[float, Array]:
     """Move targets (3, m) in place by Gauss-Newton steps on their distances (n, m) until the longest is short.
 
-    Return the length of the longest first step, m, and the traces (m,) of the targets' covariances with the stations
-    known, m^2: infinite where the distances leave a direction open.
+    Return the length of the longest first step, m, and the traces (m,) of the targets' covariances with known stations,
+    m^2: infinite if a direction is not determined.
     """
     first = 0.0
     for step in range(steps + 1):
-        e, distance = _sight(place, station)
+        e, distance = _sight(position, station)
         E = weight[:, None] * e
         D, moves, whole = _inverse(E)
         right = np.einsum("jam,jm->am", E, weight * (reach - distance))
         s = np.where(moves, np.einsum("abm,bm->am", D, right), 0.0)
         size = np.sqrt(np.einsum("am,am->m", s, s))
-        # No further than half the distance to the nearest station.
+        # At most half the distance to the nearest station.
         half = 0.5 * np.where(weight > 0, distance, np.inf).min(axis=0)
         if (size > half).any():
             s *= np.minimum(1.0, half / np.maximum(size, 1e-300))
-        place += s
+        position += s
         far = float(size.max(initial=0.0))
         first = far if step == 0 else first
         if not far >= short:
@@ -272,7 +273,7 @@ def _locate(reach: Array, weight: Array, station: Array, place: Array, steps: in
     return first, np.where(whole, np.einsum("aam->m", D), np.inf)
 
 
-def left_over(E: Array) -> Array:
+def orthogonal_rows(E: Array) -> Array:
     """Return orthonormal rows (n - 3, n, m) that are orthogonal to the columns of E (n, 3, m)."""
     n, _, m = E.shape
     R = np.concatenate([E, np.broadcast_to(np.eye(n)[:, :, None], (n, n, m))], axis=1)

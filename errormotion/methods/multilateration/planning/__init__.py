@@ -1,1 +1,1 @@
-"""Planning: multilateration, the uncertainty to expect before a measurement."""
+"""Planning of a multilateration: the expected uncertainty."""

@@ -1,8 +1,8 @@
 """Predicted uncertainty of a layout: the Cramer-Rao bound of targets and stations.
 
-The covariance of a network depends on places and noise alone. Estimates of `solver` reach it as long as the stations'
-uncertainty is small against their distances. The formulation of the paper, L_j = |u_1 - U_j|, takes the first target's
-readings for exact: it puts their noise into everything else, and its own covariance does not know.
+The covariance of a network depends only on positions and noise. The estimates of `solver` reach it if the uncertainty
+of the stations is small compared with their distances. The formulation of the paper, L_j = |u_1 - U_j|, assumes the
+readings of the first target to be exact: their noise affects all results, but is not in the stated covariance.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from errormotion.errors import MethodError
 from errormotion.methods.multilateration.network import vectorised
 from errormotion.methods.multilateration.network.descent import State
 from errormotion.methods.multilateration.network.diagnosis import determinacy
-from errormotion.methods.multilateration.network.diagnosis.weakness import carriers
+from errormotion.methods.multilateration.network.diagnosis.weakness import datum_targets
 from errormotion.methods.multilateration.network.model import Stations, motions, readings
 from errormotion.methods.multilateration.network.network import Network
 from errormotion.methods.multilateration.network.problem import state_problem
 from errormotion.methods.multilateration.network.solver import conclude
 
 _EXACT = 1e-3
-"""Noise of the first target's readings, in units of their own, that counts as none."""
+"""Ratio by which the noise of the first target's readings is reduced to assume them exact."""
 
 
 def bound(
@@ -33,7 +33,7 @@ def bound(
     seen: ArrayLike | None = None,
     dead_path_uncertainty: ArrayLike | None = None,
 ) -> Network:
-    """Return the network of error-free readings, with the covariances that readings with noise will have.
+    """Return the network of error-free readings with the expected covariances.
 
     Parameters
     ----------
@@ -44,22 +44,20 @@ def bound(
     noise : array_like (), (n,) or (n, m)
         Standard deviation of a reading, m.
     seen : array_like of bool (n, m), optional
-        Which readings there will be; all without it.
+        Which readings exist; default: all.
     dead_path_uncertainty : array_like (n,), optional
-        What is known of the dead paths, m; nothing without it.
+        Standard uncertainties of the dead paths, m; default: unknown dead paths.
 
     Raises
     ------
     MethodError
-        Positions that leave a freedom undetermined.
+        Positions with an undetermined freedom.
     """
     u, U = np.asarray(target, dtype=float), np.asarray(station, dtype=float)
     if u.ndim != 2 or u.shape[1] != 3 or U.ndim != 2 or U.shape[1] != 3:
-        raise MethodError(f"expected places (target, 3) and (station, 3), found {u.shape} and {U.shape}")
+        raise MethodError(f"Expected positions (target, 3) and (station, 3); found {u.shape} and {U.shape}.")
     if not (np.isfinite(u).all() and np.isfinite(U).all()):
-        raise MethodError(
-            "expected places of targets and stations as numbers, found NaN or infinite ones; leave them out"
-        )
+        raise MethodError("Expected finite positions of targets and stations; found NaN or infinite ones.")
     stations = Stations(U, np.zeros(len(U)), np.zeros(0))
     d = readings(u, stations)
     if seen is not None:
@@ -67,23 +65,23 @@ def bound(
     known = None if dead_path_uncertainty is None else (np.zeros(len(U)), dead_path_uncertainty)
     problem = state_problem(d, u, noise, known)
     determinacy.refuse_too_few(problem.by_target, problem.by_station, problem.unknown)
-    place = np.ascontiguousarray(u.T)
-    return conclude(problem, State(stations, place, problem.reduce(stations, place), 0, True), U)
+    position = np.ascontiguousarray(u.T)
+    return conclude(problem, State(stations, position, problem.reduce(stations, position), 0, True), U)
 
 
 @np.errstate(all="ignore")
 def predicted_uncertainty(weight: Array, station: Array, target: Array) -> Array | None:
     """Return the standard uncertainties (m,) of targets (m, 3), three coordinates together, m; NaN without a position.
 
-    None where a freedom is loose. Stations and dead paths are unknown; the covariances are those of `examine`.
+    None if a freedom is undetermined. Stations and dead paths are unknown; the covariances are those of `examine`.
     """
     weight = np.where(np.count_nonzero(weight, axis=0) >= 3, weight, 0.0)
     e, D, whole = vectorised.seen(weight, station, target)
     own = np.einsum("aam->m", D)
-    used = whole & carriers(np.where(whole, own, np.inf))
+    used = whole & datum_targets(np.where(whole, own, np.inf))
     if np.count_nonzero(used) < 3:
         return None
-    N = vectorised.left_over(weight[:, None] * e)
+    N = vectorised.orthogonal_rows(weight[:, None] * e)
     V = vectorised.equations(N * weight, e)
     n, centre = len(station), target[used].mean(axis=0)
     stations = Stations(station, np.zeros(n), np.zeros(0))
@@ -113,7 +111,7 @@ def relative_bound(
     target_covariance, joint_covariance : ndarray (m, 3, 3), (4 n, 4 n)
         Of its estimates, in the datum of the free network.
     stated : Network
-        As the formulation states it, with the readings of that target taken as exact.
+        With the covariances that it states: the readings of that target are assumed exact.
     """
     n, m = len(np.asarray(station)), len(np.asarray(target))
     sigma = np.full((n, m), float(noise))

@@ -1,4 +1,4 @@
-"""Candidates for targets, and limits of their number."""
+"""Candidates for targets, and limits of the number of targets."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def positions(choosing: Choosing, low: Position, high: Position) -> Array:
     b = np.array(choosing.high if choosing.high is not None else high, np.float64)
     if (a > b).any():
         raise MethodError(
-            f"candidates: expected low <= high in every coordinate; found {_mm(a)} and {_mm(b)}; swap them"
+            f"candidates: expected low <= high in every coordinate; found {_mm(a)} and {_mm(b)}. Swap them."
         )
     if (travel := choosing.travel) is not None and ((a < travel.low) | (b > travel.high)).any():
         raise MethodError(
-            f"candidates: the box from {_mm(a)} to {_mm(b)} reaches beyond the travel from {_mm(travel.low)} to "
-            f"{_mm(travel.high)}. Make it smaller (planning.targets.low, high)."
+            f"candidates: expected a box within the travel, {_mm(travel.low)} to {_mm(travel.high)}; found {_mm(a)} to "
+            f"{_mm(b)}. Reduce it (planning.targets.low, high)."
         )
     axes = [np.linspace(x, y, k) if k > 1 else np.array([(x + y) / 2])
             for x, y, k in zip(a, b, choosing.candidates, strict=True)]  # fmt: skip
@@ -34,24 +34,19 @@ def positions(choosing: Choosing, low: Position, high: Position) -> Array:
 
 
 def refuse_count(wanted: int, candidates: int, stations: int) -> None:
-    """Refuse more targets than there are candidates, and fewer than determine the stations.
-
-    Raises
-    ------
-    MethodError
-    """
+    """Raise MethodError for more targets than candidates, or for fewer than determine the stations."""
     least = -((6 - 4 * stations) // (stations - 3))
     if wanted > candidates:
         raise MethodError(
-            f"expected at most {candidates} targets, the candidates that three stations see; found {wanted}. Choose "
-            "fewer, or give more candidates (planning.targets.candidates)."
+            f"Expected at most {candidates} targets, the number of candidates visible from three stations; found "
+            f"{wanted}. Choose fewer, or increase the number of candidates (planning.targets.candidates)."
         )
     if wanted < least:
         raise MethodError(
-            f"expected at least {least} targets, which {stations} stations with unknown places and dead paths need; "
-            f"found {wanted}. Choose more, allow more time, or add a station."
+            f"Expected at least {least} targets for {stations} stations with unknown positions and dead paths; found "
+            f"{wanted}. Choose more, allow more time, or add a station."
         )
 
 
-def _mm(place: Array | Position) -> str:
-    return "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * float(x) for x in place))
+def _mm(position: Array | Position) -> str:
+    return "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * float(x) for x in position))

@@ -1,7 +1,7 @@
-"""Optimal positions of the tracker: the layout with the least uncertain targets.
+"""Optimal positions of the tracker: the layout with the smallest uncertainty of the targets.
 
-The uncertainty follows from positions alone (see `bound`). Positions are searched within boxes, from many starts,
-first with a smooth stand-in for the largest uncertainty of all targets, then with that itself.
+The uncertainty depends only on positions (see `bound`). Positions are searched within boxes from many start values,
+first with a smooth approximation of the largest uncertainty of all targets, then with the largest itself.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     from errormotion.methods.multilateration.settings import Layout
 
 
-LEAST = 4
-"""Stations, and readings of each."""
+MIN_STATIONS = 4
+"""Minimum number of stations, and of readings of each."""
 _PENALTY = 1e3
-_UNSEEN = 10.0
-"""Places of the volume that are not seen: one in a hundred counts like uncertainties larger by a tenth."""
+_NOT_VISIBLE = 10.0
+"""Cost of positions that are not visible: one in a hundred is equivalent to uncertainties larger by a tenth."""
 _TRIED, _GLOBAL, _LOCAL = 30, 80, 60
-"""Evaluations for each coordinate that is searched: places at random, all over, from each start."""
+"""Evaluations per coordinate: random positions, global search, and local search from each start value."""
 _STARTS = 3
 _ROUNDS = 2
 _POWER = 16.0
-"""The mean of the uncertainties to such a power is nearly the largest, and smooth."""
+"""Exponent of the power mean of the uncertainties: a smooth approximation of the largest."""
 _TOLERANCE = 1e-6
 
 
 def grid(layout: Layout) -> tuple[Array, Array]:
-    """Return axis positions of the targets and places of the reflector there, both (m, 3), m."""
+    """Return axis positions of the targets and positions of the reflector, both (m, 3), m."""
     if layout.targets:
         listed = np.array(layout.targets, np.float64)
         return listed, listed + np.array(layout.reflector)
@@ -48,7 +48,7 @@ def grid(layout: Layout) -> tuple[Array, Array]:
 
 
 def serpentine(count: tuple[int, int, int]) -> list[int]:
-    """Return the targets of a grid in an order in which each is a neighbour of the one before."""
+    """Return the targets of a grid in an order in which each is a neighbour of the previous one."""
     nx, ny, nz = count
     order: list[int] = []
     for i in range(nx):
@@ -60,20 +60,20 @@ def serpentine(count: tuple[int, int, int]) -> list[int]:
 
 
 def route(layout: Layout) -> list[int]:
-    """Return the targets in the order of a tour: of a grid row by row, else always to the nearest that is left."""
+    """Return the targets in the order of measurement: a grid by rows, others by the nearest remaining target."""
     if not layout.targets:
         return serpentine(layout.count)
     position = grid(layout)[0]
-    left = list(range(len(position)))
-    order = [left.pop(int(np.argmin(position.sum(axis=1))))]
-    while left:
-        away = np.abs(position[left] - position[order[-1]]).max(axis=1)  # axes move at the same time
-        order.append(left.pop(int(np.argmin(away))))
+    remaining = list(range(len(position)))
+    order = [remaining.pop(int(np.argmin(position.sum(axis=1))))]
+    while remaining:
+        away = np.abs(position[remaining] - position[order[-1]]).max(axis=1)  # axes move simultaneously
+        order.append(remaining.pop(int(np.argmin(away))))
     return order
 
 
 def uncertainty(covariance: Array) -> Array:
-    """Return standard uncertainties (m,) of all three coordinates together, m, from covariances (m, 3, 3)."""
+    """Return standard uncertainties (m,) of the three coordinates together, m, from covariances (m, 3, 3)."""
     return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2)))
 
 
@@ -89,16 +89,16 @@ def optimise(
     worth: Callable[[Array], Array] | None = None,
     thorough: bool = True,
 ) -> Array:
-    """Find the places of the tracker that leave the targets least uncertain.
+    """Return the positions of the tracker with the smallest uncertainty of the targets.
 
     Parameters
     ----------
     target : array_like (m, 3)
-        Places of the reflector, m.
+        Positions of the reflector, m.
     boxes : array_like (n, 2, 3)
         Lower and upper corner of the box of each station, m.
     sight : Sight
-        What is seen from where. Every target has to be seen by three stations at least, and enough of them by four.
+        Lines of sight. Every target must be visible from at least three stations, and enough of them from four.
     noise : float
         Standard deviation of a reading, m.
     start : array_like (n, 3), optional
@@ -106,11 +106,11 @@ def optimise(
     minimise : {"largest", "mean"}
         Which uncertainty.
     seed : int
-        Of the search; same seed, same answer.
+        Of the search, which is reproducible.
     worth : callable, optional
-        Uncertainties that count, m, from places (n, 3); without it those of the targets.
+        Uncertainties to minimise, m, from positions (n, 3); default: those of the targets.
     thorough : bool
-        Look all over the boxes; without it near the start only.
+        Whether to search the whole boxes, or only near the start.
 
     Returns
     -------
@@ -120,21 +120,21 @@ def optimise(
     Raises
     ------
     MethodError
-        No places within the boxes determine all targets.
+        No positions within the boxes determine all targets.
     """
     import nlopt
 
     from errormotion.methods.multilateration.planning.bound import predicted_uncertainty
 
     u, corners = np.asarray(target, np.float64), np.asarray(boxes, np.float64)
-    if len(corners) < LEAST:
-        raise MethodError(f"expected boxes for at least {LEAST} stations; found {len(corners)}; add some")
+    if len(corners) < MIN_STATIONS:
+        raise MethodError(f"Expected boxes for at least {MIN_STATIONS} stations; found {len(corners)}. Add some.")
     low, high = corners[:, 0].ravel(), corners[:, 1].ravel()
     free = np.flatnonzero(high > low)
-    places = low.copy()
+    fixed = low.copy()
 
     def at(x: Array) -> Array:
-        full = places.copy()
+        full = fixed.copy()
         full[free] = x
         return full.reshape(-1, 3)
 
@@ -147,13 +147,13 @@ def optimise(
             sigma = predicted_uncertainty(seen / noise, U, u) if worth is None else worth(U)
         except np.linalg.LinAlgError:
             return _PENALTY
-        if sigma is None or (worth is None and not np.isfinite(sigma).all()):  # a freedom is loose there
+        if sigma is None or (worth is None and not np.isfinite(sigma).all()):  # a freedom is undetermined
             return _PENALTY
-        return weighed(sigma, power)
+        return cost_of(sigma, power)
 
-    def weighed(sigma: Array, power: float | None) -> float:
+    def cost_of(sigma: Array, power: float | None) -> float:
         known = np.isfinite(sigma)
-        unseen, sigma = _UNSEEN * float(np.mean(~known)), sigma[known]
+        unseen, sigma = _NOT_VISIBLE * float(np.mean(~known)), sigma[known]
         if not len(sigma):
             return _PENALTY
         if minimise == "mean":
@@ -181,14 +181,14 @@ def optimise(
         problem.set_min_objective(follow)
         problem.set_ftol_abs(_TOLERANCE)
         problem.set_maxeval(evaluations * x.size)
-        with suppress(nlopt.RoundoffLimited):  # it has come as far as it can
+        with suppress(nlopt.RoundoffLimited):  # converged
             problem.optimize(x)
         return np.asarray(np.clip(best, low[free], high[free]), np.float64)
 
-    given = places if start is None else np.clip(np.asarray(start, np.float64).ravel(), low, high)
+    given = fixed if start is None else np.clip(np.asarray(start, np.float64).ravel(), low, high)
     best = given[free]
     if free.size:
-        # Good places are on the sides and at the corners of the boxes more often than inside.
+        # Good positions are often on the faces and at the corners of the boxes.
         share = rng.uniform(size=(_TRIED * free.size if thorough else 0, free.size))
         share = np.where(rng.uniform(size=share.shape) < 0.5, np.round(share), share)
         tried = sorted((low[free] + share * (high - low)[free]).tolist(), key=lambda x: cost(np.array(x)))
@@ -196,21 +196,21 @@ def optimise(
         starts = [best, *everywhere, *(np.array(x) for x in tried[:_STARTS])]
         starts = [search(nlopt.LN_SBPLX, x, _LOCAL, _POWER) for x in starts]
         best = min([best, *starts], key=cost)
-        # The largest of many uncertainties has edges along which a search is slow: a new search continues.
+        # The largest uncertainty is not smooth, so that a search is slow: the search is restarted.
         for algorithm in (nlopt.LN_BOBYQA, nlopt.LN_SBPLX, nlopt.LN_COBYLA) * (_ROUNDS if thorough else 1):
             best = search(algorithm, best, _LOCAL)
     if cost(best) >= _PENALTY:
         raise MethodError(
-            f"expected places within the boxes from which {LEAST} stations see the targets; found none in the search: "
-            f"{_lacking(sight.sees(at(best), u))} readings are lacking at the best. Enlarge the boxes, choose a "
-            "reflector with a wider acceptance, move the obstacles, or add stations"
+            f"Expected positions within the boxes with the targets visible from {MIN_STATIONS} stations; found none: "
+            f"the best ones lack {_lacking(sight.sees(at(best), u))} readings. Enlarge the boxes, use a reflector with "
+            "a larger acceptance angle, move the obstacles, or add stations."
         )
     return at(best)
 
 
 def _lacking(sees: NDArray[np.bool_]) -> int:
-    """Return how many readings are lacking: three for a target, as many for a station, and all unknowns."""
+    """Return the number of missing readings, for each target, each station, and all unknowns."""
     n, _ = sees.shape
     by_target, by_station = sees.sum(axis=0), sees.sum(axis=1)
-    lacking = np.maximum(3 - by_target, 0).sum() + np.maximum(LEAST - by_station, 0).sum()
+    lacking = np.maximum(3 - by_target, 0).sum() + np.maximum(MIN_STATIONS - by_station, 0).sum()
     return int(lacking + max(4 * n - 6 - np.maximum(by_target - 3, 0).sum(), 0))

@@ -1,4 +1,4 @@
-"""Predicted uncertainty of the layout in the settings, and of the best one."""
+"""Predicted uncertainty of the layout of the settings, and of the best one."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ if TYPE_CHECKING:
 
 SETUPS = ("as set", "best")
 _COARSE = 4
-"""Targets along each axis with which places are searched: the worst are at the sides."""
+"""Targets along each axis for the search of positions: the largest uncertainties are at the faces."""
 _AIR = (20.0, 101325.0, 0.5)
-"""Temperature (degC), pressure (Pa), humidity (1) of the air that a plan reckons with."""
+"""Assumed temperature (degC), pressure (Pa) and humidity (1) of the air."""
 
 
 def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None) -> xr.Dataset:
-    """Return an error dataset of zeros with the covariance to expect of the layout that the settings name.
+    """Return an error dataset of zeros with the expected covariance of the layout of the settings.
 
-    Further variables; all standard uncertainties are of three coordinates together, by the readings alone, m:
+    Further variables; standard uncertainties are those of three coordinates together, by the readings only, m:
     ``target_uncertainty`` (target) of the layout as set; ``map_uncertainty`` (setup, place) at ``map_position``
     (place, direction), as set and with the best layout; ``largest_uncertainty`` and ``mean_uncertainty`` (setup) of
-    that map; ``gain``, the factor by which the best layout is better in what was minimised; ``station_place`` and
-    ``best_place`` (station, direction), m; ``sees`` (station, target) and ``best_sees`` (station, place). Where targets
-    are chosen, the map is over the candidates, and ``chosen`` (place) is 1 for those to measure. The attribute
-    ``best_layout`` has the best layout as settings of a campaign; ``notes`` describe the plan.
+    that map; ``gain``, the ratio of the minimised uncertainty, as set over best; ``station_place`` and ``best_place``
+    (station, direction), m; ``sees`` (station, target) and ``best_sees`` (station, place). If targets are chosen, the
+    map is over the candidates, and ``chosen`` (place) is 1 for those to measure. The attribute ``best_layout`` is the
+    best layout as settings of a campaign; ``notes`` describe the plan.
 
     Parameters
     ----------
@@ -55,12 +55,12 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
         Of the method.
     settings : Settings
     planning : Planning, optional
-        Boxes, obstacles, reflector, and what is minimised; default: those of the settings.
+        Boxes, obstacles, reflector, and the minimised quantity; default: those of the settings.
 
     Raises
     ------
     MethodError
-        The layout leaves a freedom undetermined, or there is no better one within the boxes.
+        The layout has an undetermined freedom, or no positions within the boxes determine the targets.
     """
     p = settings.layout
     planning = planning or settings.planning
@@ -72,10 +72,10 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
     expected = bound(target, own, noise=noise, seen=sees)
     sigma = layout.uncertainty(expected.target_covariance)
     if planning.targets is None:
-        found = _best(settings, planning, sight, own, expected)
+        found = _best_stations(settings, planning, sight, own, expected)
     else:
         found = choose(settings, planning, planning.targets, sight, boxes_of(planning, own, target), noise)
-    gain = _measure(planning, found.own) / _measure(planning, found.best) if found.better else 1.0
+    gain = _minimised(planning, found.own) / _minimised(planning, found.best) if found.better else 1.0
     text = layout_text(p, found.station, None if planning.targets is None else found.position[found.chosen])
     if planning.write is not None:
         _write(planning.write, text)
@@ -84,7 +84,7 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
     influence = np.concatenate([moves, np.zeros_like(moves)], axis=-1)
     covariance = np.full((len(target), 6, 6), np.nan)
     covariance[:, :3, :3] = expected.target_covariance + np.einsum("sia,sib->iab", shared, shared)
-    if settings.together and settings.repeatability:  # one visit, which all stations see
+    if settings.together and settings.repeatability:  # one visit, common to all stations
         covariance[:, :3, :3] += settings.repeatability**2 * np.eye(3)
     errors = np.zeros((len(target), 6))
     errors[:, 3:] = np.nan
@@ -131,16 +131,16 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
 
 
 def reading_noise(settings: Settings) -> float:
-    """Return the standard deviation of a reading, m: the tracker's, and with set-ups in turn the machine's."""
+    """Return the standard deviation of a reading, m: of the tracker, and with separate set-ups of the machine."""
     repeated = 0.0 if settings.together else settings.repeatability or 0.0
     return float(np.hypot(settings.layout.displacement_noise, repeated))
 
 
 def boxes_of(planning: Planning, stations: Array, targets: Array) -> Array:
-    """Return the box of each station, (n, 2, 3), m: as stated, or without stated ones outside of the machine.
+    """Return the box of each station, (n, 2, 3), m: as stated, or by default outside of the machine.
 
-    Such a box is that around all stations of the layout, on the station's own side of the targets (m, 3) and no nearer
-    to them than the station was set: nothing is known of what stands between. A station amid the targets stays.
+    A default box is around all stations of the layout, on the same side of the targets (m, 3) as the station and not
+    closer to them than it: possible obstacles are not known. A station among the targets is fixed.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def boxes_of(planning: Planning, stations: Array, targets: Array) -> Array:
         boxes = np.array([(box.low, box.high) for box in planning.boxes], np.float64)
         if len(boxes) not in (1, len(stations)):
             raise MethodError(
-                f"expected one box for all stations or one for each of {len(stations)}; found {len(boxes)}"
+                f"Expected one box for all stations, or one for each of {len(stations)}; found {len(boxes)}."
             )
         return np.tile(boxes, (len(stations), 1, 1)) if len(boxes) == 1 else boxes
     boxes = np.tile(np.stack([stations.min(axis=0), stations.max(axis=0)]), (len(stations), 1, 1))
@@ -166,17 +166,17 @@ def boxes_of(planning: Planning, stations: Array, targets: Array) -> Array:
     return boxes
 
 
-def _measure(planning: Planning, sigma: Array) -> float:
-    """Return what is minimised, m, of uncertainties of the targets, NaN for those that are not determined."""
+def _minimised(planning: Planning, sigma: Array) -> float:
+    """Return the minimised quantity, m, of uncertainties of the targets, NaN for undetermined ones."""
     return float(np.nanmax(sigma) if planning.minimise == "largest" else np.nanmean(sigma))
 
 
-def _best(settings: Settings, planning: Planning, sight: Sight, own: Array, expected: Network) -> Choice:
-    """Return the best positions and the uncertainty at the targets; those of the layout where no others are better."""
+def _best_stations(settings: Settings, planning: Planning, sight: Sight, own: Array, expected: Network) -> Choice:
+    """Return the best stations and the uncertainty at the targets; the layout as set if none are better."""
     p, noise = settings.layout, reading_noise(settings)
     position, target = layout.grid(p)
     coarse = p.model_copy(update={"count": tuple(min(k, _COARSE) for k in p.count)})
-    place = layout.optimise(
+    station = layout.optimise(
         layout.grid(coarse)[1],
         boxes_of(planning, own, target),
         sight,
@@ -184,18 +184,18 @@ def _best(settings: Settings, planning: Planning, sight: Sight, own: Array, expe
         start=own,
         minimise=planning.minimise,
     )
-    seen = sight.sees(place, target)
-    best = bound(target, place, noise=noise, seen=seen)
+    seen = sight.sees(station, target)
+    best = bound(target, station, noise=noise, seen=seen)
     there, here = (layout.uncertainty(network.target_covariance) for network in (best, expected))
-    found = Choice(position, np.arange(len(target)), place, here, there, here, seen)
+    found = Choice(position, np.arange(len(target)), station, here, there, here, seen)
     unseen = np.isnan(here).sum() - np.isnan(there).sum()
-    if unseen > 0 or _measure(planning, there) < _measure(planning, here):
+    if unseen > 0 or _minimised(planning, there) < _minimised(planning, here):
         return found
     return replace(found, station=own, best=here, sees=sight.sees(own, target))
 
 
 def _chosen(planning: Planning, found: Choice) -> dict[str, xr.DataArray]:
-    """Return which candidates to measure, where they were chosen."""
+    """Return the variable of the candidates to measure, if targets are chosen."""
     if planning.targets is None:
         return {}
     chosen = np.zeros(len(found.position), np.int8)
@@ -210,14 +210,14 @@ def _write(path: Path, text: str) -> None:
             file.write(text)
     except OSError as error:
         raise MethodError(
-            f"planning.write: {path}: the file cannot be created; {error.strerror or error}. Give another name."
+            f"planning.write: {path}: the file cannot be created: {error.strerror or error}. State another name."
         ) from error
 
 
 def _sources(
     settings: Settings, expected: Network, names: list[str], groups: list[str], shared: Array
 ) -> tuple[list[str], list[str], Array]:
-    """Return the sources of the stations, by cause, before the given ones."""
+    """Return the sources of the stations, by cause, followed by the shared ones."""
     machine = 0.0 if settings.together else settings.repeatability or 0.0
     shares, rows = Scatter(settings.layout.displacement_noise, machine).shares, expected.influence()
     moves = [np.sqrt(share) * rows for share in shares.values()]
@@ -228,10 +228,10 @@ def _sources(
 
 
 def _shared(settings: Settings, position: Array, target: Array) -> tuple[list[str], list[str], Array]:
-    """Return sources that all readings share, their groups, and what they do to the targets (source, m, 3), m.
+    """Return the sources common to all readings, their groups, and their effects on the targets (source, m, 3), m.
 
-    A scale error of the lengths makes the whole larger, stations and dead paths with it. An expansion of the scales
-    that is not known makes the grid look smaller.
+    A scale error of the lengths changes the size of the whole network, stations and dead paths included. An unknown
+    expansion of the scales changes the apparent size of the grid of targets.
     """
     centred = target - target.mean(axis=0)
     air = settings.air
@@ -262,7 +262,7 @@ def _shared(settings: Settings, position: Array, target: Array) -> tuple[list[st
 
 
 def _without_motion(change: Array, target: Array) -> Array:
-    """Return a change (m, 3) of the targets less the rigid motion that fits it best."""
+    """Return a change (m, 3) of the targets minus its best-fit rigid motion."""
     G = motions(target, target.mean(axis=0)).reshape(-1, 6)
     left = change.ravel() - G @ np.linalg.lstsq(G, change.ravel())[0]
     return np.asarray(left.reshape(change.shape))
@@ -274,23 +274,23 @@ def _notes(
     worst = "({:.0f}, {:.0f}, {:.0f}) mm".format(*(position[np.nanargmax(sigma)] * 1e3))
     own = _largest_and_mean(sigma)
     notes = [
-        f"As set, a target has a standard uncertainty (three coordinates together) of {own[0]} at the worst, with the "
-        f"axes at {worst}, and {own[1]} in the mean, by the readings alone.",
+        f"Layout as set: the standard uncertainty of a target (three coordinates together), by the readings only, is "
+        f"at most {own[0]}, with the axes at {worst}, and {own[1]} on average.",
     ]
     if missing := int(np.count_nonzero(~sees)):
         notes.append(
-            f"As set, {missing} of {sees.size} lines of sight are blocked or beyond the reflector's acceptance."
+            f"Layout as set: {missing} of {sees.size} lines of sight are blocked or exceed the acceptance angle of the "
+            "reflector."
         )
     if unseen := int(np.count_nonzero(np.isnan(sigma))):
-        what = "target is" if unseen == 1 else "targets are"
-        notes.append(f"As set, {unseen} {what} seen by fewer than three stations and will not be determined.")
+        notes.append(f"Layout as set: targets visible from fewer than three stations, not determined: {unseen}.")
     if planning.targets is not None:
         notes += _notes_of_choice(found, len(position), planning.targets.uncertainty)
     where = "; ".join("{:.0f}, {:.0f}, {:.0f}".format(*(U * 1e3)) for U in found.station)
     if gain != 1:
         best = _largest_and_mean(found.best)
         notes.append(
-            f"The best layout within the boxes: {best[0]} at the worst, {best[1]} in the mean. Its {planning.minimise} "
+            f"Best layout within the boxes: at most {best[0]}, {best[1]} on average. Its {planning.minimise} "
             f"uncertainty is {_times(gain)}. Stations at (mm): {where}."
         )
     else:
@@ -298,17 +298,17 @@ def _notes(
     if text := map_text(found.position, found.own, found.best):
         notes.append(text)
     if planning.write is not None:
-        notes.append(f"The best layout is in {planning.write}: put it in the campaign in place of its layout.")
+        notes.append(f"The best layout is in {planning.write}. It can replace the layout of the campaign.")
     return notes
 
 
 def _notes_of_choice(found: Choice, own: int, of: str) -> list[str]:
-    what = "the error that follows from the errors of the axes" if of == "axes" else "a target measured there"
+    what = "the error calculated from the errors of the axes" if of == "axes" else "a target measured there"
     as_set, chosen = _largest_and_mean(found.own), _largest_and_mean(found.before)
     return [
-        f"Of {len(found.position)} candidates {len(found.chosen)} targets are chosen. Anywhere in the box, {what} has "
-        f"a standard uncertainty of {as_set[0]} at the worst and {as_set[1]} in the mean with the {own} targets as "
-        f"set; of {chosen[0]} and {chosen[1]} with as many chosen ones as are allowed, from the same stations.",
+        f"{len(found.chosen)} of {len(found.position)} candidates are chosen as targets. Over the box, the standard "
+        f"uncertainty of {what} is at most {as_set[0]} and {as_set[1]} on average with the {own} targets as set; at "
+        f"most {chosen[0]} and {chosen[1]} on average with the chosen ones, from the same stations.",
     ]
 
 
@@ -317,4 +317,4 @@ def _largest_and_mean(sigma: Array) -> list[str]:
 
 
 def _times(gain: float) -> str:
-    return f"{gain:.3g} times smaller" if gain > 1 else f"{1 / gain:.3g} times larger"
+    return f"smaller by the factor {gain:.3g}" if gain > 1 else f"larger by the factor {1 / gain:.3g}"

@@ -1,4 +1,4 @@
-"""Which targets a tracker sees from where: nothing in between, and the reflector turned towards it."""
+"""Lines of sight between tracker and targets: obstacles, and the acceptance angle of the reflector."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class Sight:
     obstacles : ndarray (k, 2, 3)
         Lower and upper corners of boxes, m.
     axis : ndarray (3,) or None
-        Where the reflector looks, a unit vector; None: from the middle of the targets to each station.
+        Direction of the reflector, a unit vector; None: from the middle of the targets to each station.
     acceptance : float
-        Largest angle between that and the beam, rad.
+        Largest angle between that direction and the beam, rad.
     nearest : float
-        Least distance, m.
+        Smallest distance, m.
     middle : ndarray (3,) or None
-        Where reflectors turned towards a station look from; None: the mean of the targets.
+        Middle of the targets, m; None: their mean.
     """
 
     obstacles: Array
@@ -39,7 +39,7 @@ class Sight:
 
     @classmethod
     def of(cls, planning: Planning) -> Sight:
-        """Return the lines of sight that settings describe."""
+        """Return the lines of sight of the settings."""
         boxes = np.array([(box.low, box.high) for box in planning.obstacles], np.float64).reshape(-1, 2, 3)
         axis = None
         if planning.reflector_axis is not None:
@@ -48,7 +48,7 @@ class Sight:
         return cls(boxes, axis, planning.acceptance, planning.nearest)
 
     def sees(self, station: ArrayLike, target: ArrayLike) -> NDArray[np.bool_]:
-        """Return which targets (m, 3), m, are seen from which stations (n, 3), m, as (n, m)."""
+        """Return which targets (m, 3), m, are visible from which stations (n, 3), m, as (n, m)."""
         U, u = np.asarray(station, np.float64), np.asarray(target, np.float64)
         back = U[:, None] - u
         distance = np.linalg.norm(back, axis=-1)
@@ -65,10 +65,10 @@ class Sight:
 
 
 def blocked(start: Array, way: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Return whether the lines from ``start`` (m, 3) over ``way`` (n, m, 3) pass the inside of a box, (n, m)."""
+    """Return whether the lines from ``start`` (m, 3) along ``way`` (n, m, 3) intersect a box, (n, m)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (low - start) / way, (high - start) / way
-    # Along a side: within its extent for the whole way, or for none of it.
+    # Parallel to a face: the whole line is within the extent of the box in that direction, or none of it.
     still = way == 0
     inside = np.broadcast_to((start > low) & (start < high), way.shape)
     enters = np.where(still, np.where(inside, -np.inf, np.inf), np.minimum(first, second))

@@ -1,4 +1,4 @@
-"""Targets and stations chosen alternately: the targets for the stations, the stations for the targets."""
+"""Alternating choice of targets and stations: targets for given stations, stations for given targets."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from errormotion.methods.multilateration.settings import Choosing, Planning, Settings
 
 _ROUNDS = 3
-_ENOUGH = 0.01
-"""A further round is made while the last one gained more than this share."""
+_MIN_GAIN = 0.01
+"""Relative gain of a round below which it is the last."""
 _COARSE = 4
-"""Candidates along each axis by which places of the stations are judged."""
+"""Candidates along each axis in the search of stations."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,15 @@ class Choice:
     position : ndarray (k, 3)
         Axis positions of the candidates, m.
     chosen : ndarray of int
-        Which of them are to be measured.
+        Numbers of those to measure.
     station : ndarray (n, 3)
-        Where from, m.
+        Positions of the tracker, m.
     own, best : ndarray (k,)
-        Uncertainty at the candidates with the layout as set, and with what was chosen, m; NaN where not seen.
+        Uncertainty at the candidates with the layout as set, and with the choice, m; NaN where not visible.
     before : ndarray (k,)
         With the chosen targets, from the stations as set.
     sees : ndarray of bool (n, k)
-        From the best stations.
+        Lines of sight from the best stations.
     """
 
     position: Array
@@ -57,44 +57,44 @@ class Choice:
 
     @property
     def better(self) -> bool:
-        """Whether the choice can be compared with the layout as set, and is another one."""
+        """Whether the choice differs from the layout as set."""
         return self.best is not self.own
 
 
 def choose(
     settings: Settings, planning: Planning, choosing: Choosing, sight: Sight, boxes: Array, noise: float
 ) -> Choice:
-    """Return the targets and stations that leave the volume least uncertain.
+    """Return the targets and stations with the smallest uncertainty over the volume.
 
     Raises
     ------
     MethodError
-        A box beyond the travel, more targets than candidates, too few to determine the stations, no chain.
+        A box beyond the travel, more targets than candidates, too few to determine the stations, or no chain.
     """
     p = settings.layout
     position = positions(choosing, p.low, p.high)
     k, own_stations = len(position), np.array(p.stations, np.float64)
     everywhere = np.concatenate([position, layout.grid(p)[0]])
-    place = everywhere + np.array(p.reflector)
-    sight = replace(sight, middle=place[:k].mean(axis=0))
+    point = everywhere + np.array(p.reflector)
+    sight = replace(sight, middle=point[:k].mean(axis=0))
     expected = _expected(settings, choosing, everywhere)
 
     def volume(station: Array) -> Volume:
-        return Volume.of(station, place, sight.sees(station, place), noise, expected, k)
+        return Volume.of(station, point, sight.sees(station, point), noise, expected, k)
 
     now = volume(own_stations)
     refuse_count(choosing.wanted, int(now.fine.sum()), len(own_stations))
     own = now.worth()
     if not now.further.any():
-        raise MethodError("The layout as set is not seen by three stations at any target: see to lines of sight.")
+        raise MethodError("Layout as set: no target is visible from three stations. Check the lines of sight.")
     chosen = np.array(now.choose(choosing.wanted, planning.minimise))
     station, before = own_stations, now.worth(chosen)
     best, cost = before, power_mean(before, planning)
     some = _coarse(choosing)
     for turn in range(_ROUNDS):
         trial = layout.optimise(
-            place[chosen], boxes, sight, noise=noise, start=station, minimise=planning.minimise, thorough=turn == 0,
-            worth=_judged(place, chosen, some, sight, noise, expected),
+            point[chosen], boxes, sight, noise=noise, start=station, minimise=planning.minimise, thorough=turn == 0,
+            worth=_Worth(point, chosen, some, sight, noise, expected),
         )  # fmt: skip
         there = volume(trial)
         again = np.array(there.choose(choosing.wanted, planning.minimise))
@@ -106,21 +106,21 @@ def choose(
             break
         gained, cost = 1 - costs[which] / cost, costs[which]
         station, chosen, best = trial, sets[which], worth[which]
-        if gained < _ENOUGH:
+        if gained < _MIN_GAIN:
             break
-    sees = sight.sees(station, place[:k])
+    sees = sight.sees(station, point[:k])
     try:
-        bound(place[chosen], station, noise=noise, seen=sees[:, chosen])
+        bound(point[chosen], station, noise=noise, seen=sees[:, chosen])
     except MethodError as error:
         raise MethodError(
-            f"The {len(chosen)} targets that would be best do not determine places and dead paths of the stations: "
-            f"{error} Choose more targets, or add a station."
+            f"The best {len(chosen)} targets do not determine positions and dead paths of the stations. {error} Choose "
+            "more targets, or add a station."
         ) from error
     return Choice(position, chosen, station, own, best, before, sees)
 
 
 def power_mean(sigma: Array, planning: Planning) -> float:
-    """Return what is minimised, m; positions that no station sees increase it."""
+    """Return the minimised quantity, m; positions that are not visible increase it."""
     known = sigma[np.isfinite(sigma)]
     top, power = float(known.max()), POWERS[planning.minimise]
     unseen = 1 - len(known) / len(sigma)
@@ -132,8 +132,8 @@ def _expected(settings: Settings, choosing: Choosing, position: Array) -> Expect
         return None
     if settings.chain is None:
         raise MethodError(
-            "To choose targets for the errors of the axes, the chain of the machine is needed (setting 'chain', such "
-            "as workpiece-X-Y-bed-Z-spindle-tool); or choose them for places (planning.targets.uncertainty = 'target')."
+            "chain: expected the chain of the machine, such as workpiece-X-Y-bed-Z-spindle-tool, to choose targets for "
+            "the errors of the axes; found none. State it, or use planning.targets.uncertainty = 'target'."
         )
     reflector = np.array(settings.layout.reflector, np.float64)
     return Expected.of(
@@ -143,23 +143,23 @@ def _expected(settings: Settings, choosing: Choosing, position: Array) -> Expect
 
 
 def _coarse(choosing: Choosing) -> NDArray[np.intp]:
-    """Return some of the candidates, spread evenly, sides included."""
+    """Return evenly distributed candidates, faces included."""
     number = np.arange(int(np.prod(choosing.candidates))).reshape(choosing.candidates)
     kept = [np.unique(np.linspace(0, c - 1, min(c, _COARSE)).round().astype(int)) for c in choosing.candidates]
     return np.asarray(number[np.ix_(*kept)].ravel(), dtype=np.intp)
 
 
-class _judged:  # noqa: N801 - called like a function
-    """The uncertainty at some candidates when the chosen ones are measured, by the places of the stations."""
+class _Worth:
+    """Uncertainty at some candidates with the chosen ones measured, as a function of the stations."""
 
     def __init__(
-        self, place: Array, chosen: NDArray[np.intp], some: NDArray[np.intp], sight: Sight, noise: float,
+        self, point: Array, chosen: NDArray[np.intp], some: NDArray[np.intp], sight: Sight, noise: float,
         expected: Expected | None,
     ) -> None:  # fmt: skip
         which = np.concatenate([some, chosen])
-        self.place, self.count, self.sight, self.noise = place[which], len(some), sight, noise
+        self.point, self.count, self.sight, self.noise = point[which], len(some), sight, noise
         self.expected = None if expected is None else Expected(expected.columns[which], expected.size)
 
     def __call__(self, station: Array) -> Array:
-        sees = self.sight.sees(station, self.place)
-        return Volume.of(station, self.place, sees, self.noise, self.expected, self.count).worth()
+        sees = self.sight.sees(station, self.point)
+        return Volume.of(station, self.point, sees, self.noise, self.expected, self.count).worth()

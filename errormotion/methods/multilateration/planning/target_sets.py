@@ -1,17 +1,17 @@
-"""Choosing targets: the set of a grid of candidates that leaves least uncertain what is wanted of the whole volume.
+"""Choice of targets: the set of candidates of a grid with the smallest uncertainty over the whole volume.
 
-What is not known before measuring has Gaussian information M = M_0 + sum_i B_i^T B_i, one term for each chosen target;
-what is wanted at place c is Phi_c times the unknowns, with covariance Phi_c M^-1 Phi_c^T + K_c.
+The unknowns have the Gaussian information M = M_0 + sum_i B_i^T B_i, with one term for each chosen target; the quantity
+of interest at position c is Phi_c times the unknowns, with covariance Phi_c M^-1 Phi_c^T + K_c.
 
-* ``target``: the unknowns are the stations' places and dead paths. A target with n readings tells n - 3 numbers of
-  them, what is left of its readings when it has taken its own place: B_i = (1 - hat) W^1/2 Q_i, of rank one with four
-  stations. At c a further target is measured: K_c from its own readings, Phi_c what the stations do to it.
-* ``axes``: the unknowns are the errors of the axes as well, series of polynomials whose coefficients are expected to
-  have a size (see `parameters`). Readings tell of both: B_i = W^1/2 [e A_i, Q_i]. At c the volumetric error is wanted.
+* ``target``: the unknowns are the positions and dead paths of the stations. A target with n readings contributes n - 3
+  equations, after elimination of its own position: B_i = (1 - hat) W^1/2 Q_i, of rank one with four stations. The
+  quantity is the position of a further target at c: K_c from its own readings, Phi_c the effect of the stations.
+* ``axes``: the unknowns are also the errors of the axes, series of polynomials with coefficients of an expected size
+  (see `parameters`): B_i = W^1/2 [e A_i, Q_i]. The quantity is the volumetric error at c.
 
-Both have the datum of the whole grid: motions of the whole are left out. Targets are taken one by one, the one that
-helps most first; then exchanged one for one while that helps, each by an update of rank n and the best of them
-reckoned anew. For the largest uncertainty the mean of a high power of it stands in.
+Both are in the datum of the whole grid, without rigid motions. Targets are added one by one, each with the largest
+gain; then exchanged one by one while that is a gain, estimated by an update of rank n and calculated exactly for the
+best. The largest uncertainty is approximated by a power mean.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 POWERS = {"mean": 1.0, "largest": 16.0}
-_LOOSE = 0.1
-"""What is known of stations and dead paths before, m: nothing that matters, and a matrix that has an inverse."""
+_PRIOR = 0.1
+"""Prior standard uncertainty of stations and dead paths, m: without effect, but the information has an inverse."""
 _OUT, _IN = 4, 6
-"""Exchanges that are reckoned exactly in each turn: targets that go, and that come for each."""
-_TURNS = 400
-_GAIN = 1e-6
-_FALLOFF = 2.0
-"""How fast coefficients are expected to fall with their order."""
+"""Exchanges calculated exactly in each iteration: removed targets, and replacements of each."""
+_MAX_EXCHANGES = 400
+_MIN_GAIN = 1e-6
+_EXPONENT = 2.0
+"""Exponent of the decrease of expected coefficients with their order."""
 
 
 @dataclass(frozen=True)
 class Expected:
-    """Errors of the axes as they are expected before measuring.
+    """Expected errors of the axes.
 
     Attributes
     ----------
     columns : ndarray (k, 3, term)
-        What a unit of each coefficient does at each candidate, m.
+        Effect of a unit of each coefficient at each candidate, m.
     size : ndarray (term,)
         Standard deviation of each coefficient.
     """
@@ -60,7 +60,7 @@ class Expected:
     def of(
         cls, chain: str, position: Array, reflector: Array, order: int, displacement: float, rotation: float
     ) -> Expected:
-        """Return them for axis positions (k, 3), m, with ``reflector`` (3,) at the tool.
+        """Return the expected errors at axis positions (k, 3), m, with ``reflector`` (3,) at the tool.
 
         Raises
         ------
@@ -75,16 +75,16 @@ class Expected:
 
 
 def _size(term: Term, displacement: float, rotation: float) -> float:
-    """Return the standard deviation of a coefficient: of the lowest order as large as expected, of higher ones less."""
+    """Return the standard deviation of a coefficient: as expected for the lowest order, smaller for higher ones."""
     if term.order < 0:
         return rotation
     higher = term.order - first_order(term.error) + 1
-    return float((rotation if term.error[1] in "ABC" else displacement) / higher**_FALLOFF)
+    return float((rotation if term.error[1] in "ABC" else displacement) / higher**_EXPONENT)
 
 
 @dataclass(frozen=True)
 class Volume:
-    """Candidates, the rows of their readings in the design matrix, and what is required at each.
+    """Candidates, the rows of their readings in the design matrix, and the quantity of interest at each.
 
     Attributes
     ----------
@@ -97,9 +97,9 @@ class Volume:
     own : ndarray (k,)
         Trace of K, m^2.
     fine : ndarray of bool (k,)
-        Candidates that three stations see.
+        Candidates visible from three stations.
     further : ndarray (l, n, P)
-        B of further targets, which may be measured and are not to be chosen.
+        B of the targets of the layout as set, which are not candidates.
     """
 
     rows: Array
@@ -111,7 +111,7 @@ class Volume:
 
     @classmethod
     def of(
-        cls, station: Array, place: Array, sees: NDArray[np.bool_], noise: float, expected: Expected | None, count: int
+        cls, station: Array, point: Array, sees: NDArray[np.bool_], noise: float, expected: Expected | None, count: int
     ) -> Volume:
         """Return the candidates and their rows.
 
@@ -119,19 +119,19 @@ class Volume:
         ----------
         station : ndarray (n, 3)
             m.
-        place : ndarray (k + l, 3)
+        point : ndarray (k + l, 3)
             m.
         sees : ndarray of bool (n, k + l)
         noise : float
             Of a reading, m.
         expected : Expected or None
-            Of the errors of the axes at all places; None: a further target is wanted.
+            Of the errors of the axes at all positions; None: the quantity is the position of a further target.
         count : int
-            k: so many places are candidates, and the volume.
+            k: number of candidates, the first of the positions.
         """
-        n, k = len(station), len(place)
+        n, k = len(station), len(point)
         stations = Stations(station, np.zeros(n), np.zeros(0))
-        e = directions(place, stations).transpose(1, 0, 2)
+        e = directions(point, stations).transpose(1, 0, 2)
         fine = sees.sum(axis=0) >= 3
         w = np.where(sees.T & fine[:, None], 1.0 / noise, 0.0)
         Q = np.zeros((k, n, 4 * n))
@@ -140,8 +140,8 @@ class Volume:
             Q[:, j, 4 * j + 3] = -1.0
         Q *= w[..., None]
         E = w[..., None] * e
-        centre = place[:count].mean(axis=0)
-        G = motions(place[:count], centre)
+        centre = point[:count].mean(axis=0)
+        G = motions(point[:count], centre)
         if expected is None:
             A = np.einsum("kja,kjb->kab", E, E)
             A[~fine] = np.eye(3)
@@ -153,31 +153,31 @@ class Volume:
             F = -D @ np.einsum("kja,kjp->kap", E, Q)
             rows = np.where(fine[:, None, None], Q + E @ F, 0.0)
             wanted = _in_datum(F[:count], G, fine[:count])
-            own, known = np.trace(D[:count], axis1=1, axis2=2), np.eye(basis.shape[1]) / _LOOSE**2
+            own, known = np.trace(D[:count], axis1=1, axis2=2), np.eye(basis.shape[1]) / _PRIOR**2
             return cls(rows[:count], known, wanted, own, fine[:count], rows[count:])
         rows = np.concatenate([E @ expected.columns, Q], axis=2)
-        known = np.diag(np.concatenate([expected.size**-2.0, np.full(4 * n, _LOOSE**-2.0)]))
+        known = np.diag(np.concatenate([expected.size**-2.0, np.full(4 * n, _PRIOR**-2.0)]))
         shown = _in_datum(expected.columns[:count], G, np.ones(count, bool))
         wanted = np.concatenate([shown, np.zeros((count, 3, 4 * n))], axis=2)
         return cls(rows[:count], known, wanted, np.zeros(count), fine[:count], rows[count:])
 
     def covariance(self, chosen: Sequence[int] | NDArray[np.intp] | None = None) -> Array:
-        """Return that of the unknowns, (P, P), when the chosen ones are measured, or without them the further ones."""
+        """Return the covariance (P, P) of the unknowns with the chosen candidates; default: the further targets."""
         rows = self.further if chosen is None else self.rows[np.asarray(chosen, dtype=np.intp)]
         B = rows.reshape(-1, self.known.shape[0])
         return _inverse(self.known + B.T @ B)
 
     def worth(self, chosen: Sequence[int] | NDArray[np.intp] | None = None) -> Array:
-        """Return the standard uncertainty at every candidate, (k,), m, when these are measured."""
+        """Return the standard uncertainty at every candidate, (k,), m, with the chosen ones measured."""
         return self.sigma(self.covariance(chosen))
 
     def sigma(self, C: Array) -> Array:
-        """Return the standard uncertainty, three coordinates together, at every candidate, (k,), m; NaN where none."""
+        """Return the standard uncertainty, three coordinates together, at every candidate, (k,), m; NaN if unknown."""
         variance = np.einsum("kap,pq,kaq->k", self.wanted, C, self.wanted, optimize=True) + self.own
         return np.where(self.fine | ~self.own.any(), np.sqrt(np.maximum(variance, 0.0)), np.nan)
 
     def choose(self, count: int, minimise: Literal["largest", "mean"]) -> list[int]:
-        """Return the candidates to measure, by number."""
+        """Return the numbers of the candidates to measure."""
         power = POWERS[minimise]
         chosen: list[int] = []
         C = _inverse(self.known)
@@ -189,10 +189,10 @@ class Volume:
         return self._exchanged(chosen, power)
 
     def _exchanged(self, chosen: list[int], power: float) -> list[int]:
-        """Return the set after exchanges, one for one, while they help."""
+        """Return the set after exchanges of one target each, while there is a gain."""
         C = self.covariance(chosen)
         best = self._cost(C, power)
-        for _ in range(_TURNS):
+        for _ in range(_MAX_EXCHANGES):
             V = self._weight(C, power)
             trials = []
             for out in np.argsort(self._losses(C, V, chosen))[:_OUT]:
@@ -203,7 +203,7 @@ class Volume:
                     if np.isfinite(gain[new]):
                         trials.append([*rest, int(new)])
             costs = [self._cost(self.covariance(trial), power) for trial in trials]
-            if not costs or not min(costs) < best * (1 - _GAIN):
+            if not costs or not min(costs) < best * (1 - _MIN_GAIN):
                 break
             best = min(costs)
             chosen = trials[int(np.argmin(costs))]
@@ -218,20 +218,20 @@ class Volume:
         return top * float(np.mean((sigma / top) ** power) ** (1 / power))
 
     def _weight(self, C: Array, power: float) -> Array:
-        """Return V (P, P): the cost falls with the trace of V C."""
+        """Return V (P, P): the cost decreases with the trace of V C."""
         sigma = self.sigma(C)
         weight = np.nan_to_num((sigma / np.nanmax(sigma)) ** (power - 2.0))
         return np.asarray(np.einsum("k,kap,kaq->pq", weight, self.wanted, self.wanted, optimize=True))
 
     def _gains(self, C: Array, V: Array) -> Array:
-        """Return the decrease of the trace of V C by each candidate, (k,); -inf for candidates that are not seen."""
+        """Return the decrease of the trace of V C by each candidate, (k,); -inf for candidates that are not visible."""
         BC = self.rows @ C
         inner = np.eye(self.rows.shape[1]) + BC @ self.rows.transpose(0, 2, 1)
         gain = np.trace(np.linalg.solve(inner, BC @ V @ BC.transpose(0, 2, 1)), axis1=1, axis2=2)
         return np.where(self.fine, gain, -np.inf)
 
     def _losses(self, C: Array, V: Array, chosen: list[int]) -> Array:
-        """Return by how much the trace of V C rises without each of the chosen ones."""
+        """Return the increase of the trace of V C without each of the chosen candidates."""
         B = self.rows[chosen]
         BC = B @ C
         inner = np.eye(B.shape[1]) * (1 + 1e-9) - BC @ B.transpose(0, 2, 1)
@@ -245,12 +245,12 @@ def _inverse(M: Array) -> Array:
 
 
 def _without_motions(T: Array) -> Array:
-    """Return orthonormal columns that span the stations' parameters without motions T (4 n, 6) of the whole."""
+    """Return orthonormal columns that span the stations' parameters without rigid motions T (4 n, 6)."""
     return np.asarray(np.linalg.qr(T / np.linalg.norm(T, axis=0), mode="complete")[0][:, 6:])
 
 
 def _in_datum(F: Array, G: Array, fine: NDArray[np.bool_]) -> Array:
-    """Return effects (k, 3, P) less the motions (k, 3, 6) of the whole that fit them best at the fine candidates."""
+    """Return effects (k, 3, P) minus their best-fit rigid motions G (k, 3, 6) at the candidates ``fine``."""
     some = fine.nonzero()[0]
     shift = np.linalg.lstsq(G[some].reshape(-1, 6), F[some].reshape(3 * len(some), -1))[0]
     return np.asarray(F - G @ shift)

@@ -1,4 +1,4 @@
-"""A plan in words: the map of predicted uncertainty, and the best layout as settings of a campaign."""
+"""Text of a plan: the map of the predicted uncertainty, and the best layout as settings of a campaign."""
 
 from __future__ import annotations
 
@@ -15,52 +15,52 @@ _ACROSS, _LEVELS = 7, 3
 
 
 def map_text(position: Array, own: Array, best: Array) -> str:
-    """Return tables of the uncertainty over the volume, um: as set, then best, one table for each of some heights.
+    """Return tables of the uncertainty over the volume, um, as set and best, one table for each of some heights.
 
     Parameters
     ----------
     position : ndarray (k, 3)
-        Axis positions of a grid, m; of anything else there is no table.
+        Axis positions, m; the text is empty if they are not a grid.
     own, best : ndarray (k,)
-        m; NaN where it is not known.
+        m; NaN where unknown.
     """
     x, y, z = (np.unique(np.round(column, 9)) for column in position.T)
     if len(x) * len(y) * len(z) != len(position):
         return ""
     x, y, z = _some(x, _ACROSS), _some(y, _ACROSS), _some(z, _LEVELS)
-    at = {tuple(np.round(place, 9)): k for k, place in enumerate(position)}
+    at = {tuple(np.round(row, 9)): k for k, row in enumerate(position)}
     lines = ["Uncertainty over the volume, um, as set | best; columns X, rows Y, mm:"]
     for level in z:
         lines.append(f"Z {1e3 * level:.0f}")
         head = " ".join(f"{1e3 * column:6.0f}" for column in x)
         lines.append(f"{'':7}{head} | {head}")
         for row in y[::-1]:
-            places = [at[(column, row, level)] for column in x]
-            cells = [" ".join(_cell(values[k]) for k in places) for values in (own, best)]
+            numbers = [at[(column, row, level)] for column in x]
+            cells = [" ".join(_cell(values[k]) for k in numbers) for values in (own, best)]
             lines.append(f"{1e3 * row:6.0f} {cells[0]} | {cells[1]}")
     return "\n".join(lines)
 
 
 def layout_text(layout: Layout, station: Array, targets: Array | None) -> str:
-    """Return the table ``[test.settings.layout]`` of a campaign file with these places, m; a grid without targets."""
+    """Return the table ``[test.settings.layout]`` of a campaign file; without targets (m), with the grid."""
     lines = ["[test.settings.layout]"]
     if targets is None:
-        lines += [f"{name} = {_place(getattr(layout, name))}" for name in ("low", "high")]
+        lines += [f"{name} = {_quoted(getattr(layout, name))}" for name in ("low", "high")]
         lines.append(f"count = {list(layout.count)}")
     lines += [
-        f"reflector = {_place(layout.reflector)}",
+        f"reflector = {_quoted(layout.reflector)}",
         f'displacement_noise = "{layout.displacement_noise * 1e6:g} um"',
         "stations = [",
-        *(f"    {_place(np.round(place, 3))}," for place in station),
+        *(f"    {_quoted(np.round(point, 3))}," for point in station),
         "]",
     ]
     if targets is not None:
-        lines += ["targets = [", *(f"    {_place(np.round(place, 6))}," for place in targets), "]"]
+        lines += ["targets = [", *(f"    {_quoted(np.round(point, 6))}," for point in targets), "]"]
     return "\n".join(lines) + "\n"
 
 
-def _place(place: Array | tuple[float, float, float]) -> str:
-    return "[{}]".format(", ".join(f'"{1e3 * float(v):.7g} mm"' for v in place))
+def _quoted(point: Array | tuple[float, float, float]) -> str:
+    return "[{}]".format(", ".join(f'"{1e3 * float(v):.7g} mm"' for v in point))
 
 
 def _cell(value: float) -> str:

@@ -1,4 +1,4 @@
-"""The errors of the axes as multilateration finds them: error motions with their bands, and squareness."""
+"""Errors of the axes: error motions with their uncertainty bands, and squareness."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def motions(axis: str) -> list[str]:
 
 
 def _curve(errors: xr.Dataset, name: str, axis: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, str] | None:
-    """Return positions, values and standard uncertainties (SI), and why there are none."""
+    """Return positions, values and standard uncertainties (SI), and the reason if they are not determined."""
     dim = f"{axis}_position"
     if name not in errors or errors[name].dims != (dim,) or dim not in errors.coords:
         return None
@@ -35,26 +35,27 @@ def _curve(errors: xr.Dataset, name: str, axis: str) -> tuple[np.ndarray, np.nda
 
 
 def blocks(errors: xr.Dataset, key: str) -> list[Block]:
-    """Return curves and squareness; one sentence where the result holds neither."""
+    """Return curves and squareness, or a sentence if the result contains neither."""
     curves = {name: _curve(errors, name, axis) for axis in AXES for name in motions(axis)}
-    held = {name: found for name, found in curves.items() if found is not None}
+    known = {name: found for name, found in curves.items() if found is not None}
     square = _squareness(errors)
-    if not held and square is None:
-        return [Text("The errors of the axes were not estimated; the remarks state a known reason.", "note")]
+    if not known and square is None:
+        return [Text("The errors of the axes were not estimated; the remarks state the reason if it is known.", "note")]
     found: list[Block] = []
-    if held:
+    if known:
         found.append(_figure(curves, key))
     if square is not None:
         found.append(square)
-    unseen = [f"{name}: {c[3]}" for name, c in held.items() if c[3]]
-    if unseen:
-        found.append(Text(f"Not determined by these targets: {'; '.join(unseen)}. Unknown, and not zero.", "warning"))
+    undetermined = [f"{name}: {c[3]}" for name, c in known.items() if c[3]]
+    if undetermined:
+        reasons = "; ".join(undetermined)
+        found.append(Text(f"Not determined by these targets: {reasons}. Unknown, not zero.", "warning"))
     sigma0 = scalar(errors, "axes_sigma0")
     if np.isfinite(sigma0):
         found.append(
             Text(
-                f"What the errors of the axes leave of the errors of the targets is {fixed(sigma0, 2)} times what "
-                "their uncertainty lets expect; 1 means that the axes explain them.",
+                f"The residuals of the targets' errors after the errors of the axes are {fixed(sigma0, 2)} times their "
+                "uncertainty; with about 1, the errors of the axes explain those of the targets.",
                 "plain" if sigma0 < 1.5 else "warning",
             )
         )
@@ -91,7 +92,7 @@ def _figure(curves: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, str] | N
             drawn.append(name)
     caption = (
         f"Error motions of the axes (top three rows in {UM[0]}, others in arcsec), with expanded uncertainty, k = 2. "
-        "Each has a mean of zero, and straightness no slope: these are motions of the whole, or squareness."
+        "Each has a mean of zero, and straightness has no slope: these are rigid motions of the volume, or squareness."
     )
     return Figure(canvas.draw(paint, key, 7.6), caption, f"Error motions determined: {listed(drawn) or 'none'}.")
 

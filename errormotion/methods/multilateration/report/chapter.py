@@ -1,4 +1,4 @@
-"""The chapter of a multilateration: the volume's errors, the network behind them, the axes, and what is not seen."""
+"""Chapter of a multilateration: errors of the volume, the network, errors of the axes, and undetermined freedoms."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from errormotion.methods.multilateration.report import axes as multilateration_axes
-from errormotion.methods.multilateration.report import drawings as multilateration_figures
-from errormotion.methods.multilateration.report import plan as multilateration_plan
-from errormotion.methods.multilateration.report import quality as multilateration_quality
+from errormotion.methods.multilateration.report import axes, drawings, plan, quality
 from errormotion.methods.multilateration.report.view import Network, is_multilateration, network, scalar
 from errormotion.report import budget, provenance
 from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
@@ -24,45 +21,45 @@ _OWN = "noise of the target's own readings"
 _TRACKER = "stations"
 _WORDS = {_TRACKER: "stations, by the tracker's noise", "repeatability": "repeatability of the machine"}
 _UNKNOWN = "not determined at any target"
-_NOT_SEEN = (
-    "Distances determine the positions of the targets relative to each other, not that of the whole. Six motions are "
-    "therefore not determined: three shifts and three rotations of all targets together. They are set for the best fit "
-    "of the targets to their commanded positions. An error that moves or turns the whole volume does not appear here, "
-    "and is not in the uncertainty."
+_RIGID_MOTIONS = (
+    "Distances determine only the positions of the targets relative to one another. The six rigid motions of the "
+    "volume, three translations and three rotations, are not determined: the targets are fitted to their commanded "
+    "positions. An error that displaces or rotates the whole volume does not appear here, and is not in the "
+    "uncertainty."
 )
 _ROTATIONS = (
-    "A reflector is a point: rotations of the tool at a target, EA to EC, are unknown and not zero. Rotations of the "
-    "axes show only as displacements of the reflector."
+    "A reflector is a point: rotations of the tool at a target, EA to EC, are unknown, not zero. Rotations of the axes "
+    "are measured only as displacements of the reflector."
 )
 
 
 def part(source: Source, key: str) -> Part:
-    """Return the chapter of one result; ``key`` keeps its figures' identifiers apart."""
+    """Return the chapter of one result; ``key`` is a unique prefix of the identifiers of its figures."""
     errors = source.errors
     net = network(errors, source.raw)
     planned = "target_uncertainty" in errors
     volume: list[Block] = [] if planned else [_table(net)]
     if not planned:
         volume += [
-            multilateration_figures.vectors(net, f"{key}-vectors"),
-            multilateration_figures.slices(net, f"{key}-slices"),
-            multilateration_figures.histograms(net, f"{key}-histograms"),
+            drawings.vectors(net, f"{key}-vectors"),
+            drawings.slices(net, f"{key}-slices"),
+            drawings.histograms(net, f"{key}-histograms"),
         ]
     stations: list[Block] = [
-        multilateration_figures.layout(net, f"{key}-layout"),
-        multilateration_quality.planned(errors, net) if planned else multilateration_quality.stations(net),
+        drawings.layout(net, f"{key}-layout"),
+        quality.planned(errors, net) if planned else quality.stations(net),
     ]
-    predicted = multilateration_plan.blocks(errors, f"{key}-map")
+    predicted = plan.blocks(errors, f"{key}-map")
     sections = [
         *([Section("volume", "Errors of the volume", volume)] if volume else []),
         *([Section("map", "Predicted uncertainty", predicted)] if predicted else []),
-        Section("unseen", "What is not seen", [Text(_NOT_SEEN, "warning"), Text(_ROTATIONS)]),
+        Section("unseen", "Undetermined freedoms", [Text(_RIGID_MOTIONS, "warning"), Text(_ROTATIONS)]),
         Section("stations", "Stations", stations),
         Section("uncertainty", "Uncertainty", _uncertainty(errors, net, key)),
     ]
     if not planned:
         sections += [
-            Section("axes", "Errors of the axes", multilateration_axes.blocks(errors, f"{key}-axes")),
+            Section("axes", "Errors of the axes", axes.blocks(errors, f"{key}-axes")),
             Section("quality", "Readings", _readings(errors, net, key)),
         ]
     else:
@@ -82,12 +79,12 @@ def _key_figures(net: Network, planned: bool) -> list[KeyFigure]:
     sigma = net.worst_direction
     if np.isfinite(sigma).any():
         middle = Cell(significant(2e6 * finite(np.median, sigma)))
-        found.append(KeyFigure("targets known to", middle, "µm", "U, k = 2, worst direction, median"))
-        found.append(KeyFigure("worst target", Cell(significant(2e6 * finite(np.max, sigma))), "µm", "U, k = 2"))
+        found.append(KeyFigure("uncertainty of the targets", middle, "µm", "U, k = 2, worst direction, median"))
+        found.append(KeyFigure("largest uncertainty", Cell(significant(2e6 * finite(np.max, sigma))), "µm", "U, k = 2"))
     out = int((net.left_out > 0).sum())
     if np.isfinite(net.residual).any():
         used = int((np.isfinite(net.residual) & (net.left_out == 0)).sum())
-        found.append(KeyFigure("readings", Cell(integer(used)), "", f"used; {integer(out)} left out"))
+        found.append(KeyFigure("readings", Cell(integer(used)), "", f"used; {integer(out)} ignored"))
     return found
 
 
@@ -104,7 +101,7 @@ def _along(net: Network, target: int) -> float:
 def _summary(errors: xr.Dataset, net: Network, planned: bool) -> list[str]:
     known = int(np.isfinite(net.length).sum())
     m, n = len(net.targets), len(net.stations)
-    words = [f"{integer(m)} targets" + (f" from {integer(n)} places of the tracker." if n else ".")]
+    words = [f"{integer(m)} targets" + (f" from {integer(n)} positions of the tracker." if n else ".")]
     if planned:
         words = [f"Planned, not measured: {words[0]}"]
     elif known < m:
@@ -115,12 +112,12 @@ def _summary(errors: xr.Dataset, net: Network, planned: bool) -> list[str]:
     sigma0, freedom = scalar(errors, "sigma0"), scalar(errors, "freedom")
     if math.isfinite(sigma0) and freedom > 0:
         words.append(
-            f"The readings scatter {fixed(sigma0, 2)} times as much as stated; there are {integer(freedom)} readings "
-            "more than unknowns."
+            f"The scatter of the readings is {fixed(sigma0, 2)} times the stated one; there are {integer(freedom)} "
+            "more readings than unknowns."
         )
     elif freedom == 0:
-        words.append("There are as many readings as unknowns: nothing checks them.")
-    words.append("Shifts and rotations of the whole are not seen.")
+        words.append("There are as many readings as unknowns, so that there is no check.")
+    words.append("Translations and rotations of the whole volume are not determined.")
     return words
 
 
@@ -130,7 +127,7 @@ def _table(net: Network) -> Table:
     for name, values, sigma in columns:
         spans = [finite(np.min, values), finite(np.max, values), float(np.sqrt(finite(np.mean, values**2)))]
         expanded = [math.nan, math.nan] if sigma is None else [2 * finite(f, sigma) for f in (np.median, np.max)]
-        reason = "of a vector's length see the ellipsoids" if sigma is None else _UNKNOWN
+        reason = "see the ellipsoids" if sigma is None else _UNKNOWN
         rows.append(
             [
                 name,
@@ -142,19 +139,21 @@ def _table(net: Network) -> Table:
             ]
         )
     return Table(
-        "Errors of the targets in µm: actual minus commanded, after the best rigid fit of the whole.",
+        "Errors of the targets in µm: actual minus commanded, after the best rigid fit.",
         ["error", "lowest", "highest", "root mean square", "U (k = 2), median", "U, largest"],
         rows,
     )
 
 
 def _uncertainty(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
-    found: list[Block] = [multilateration_figures.ellipsoids(net, f"{key}-ellipsoids")]
+    found: list[Block] = [drawings.ellipsoids(net, f"{key}-ellipsoids")]
     sigma = net.worst_direction
     if "influence" not in errors or not np.isfinite(sigma).any():
         return [*found, Text("The result does not state the sources of its uncertainty.", "note")]
     worst = int(np.nanargmax(sigma))
-    table = budget.table(_parted(errors.isel(target=worst)), f"at {net.targets[worst]}, the least certain target")
+    table = budget.table(
+        _parted(errors.isel(target=worst)), f"at {net.targets[worst]}, the target with the largest uncertainty"
+    )
     own = budget.readable("independent")
     rows = [[_WORDS.get(str(row[0]), _OWN if row[0] == own else row[0]), *row[1:]] for row in table.rows]
     found.append(replace(table, rows=rows))
@@ -164,17 +163,16 @@ def _uncertainty(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
     return found
 
 
-def _parted(place: xr.Dataset) -> xr.Dataset:
-    """Return a result at one target with its own readings' covariance divided by cause, after ``scatter_share``.
+def _parted(here: xr.Dataset) -> xr.Dataset:
+    """Return a result at one target with the covariance of its own readings divided by cause (``scatter_share``).
 
-    What is independent from target to target is the tracker's noise and the machine's repeatability in one; at one
-    target the second is a group like others.
+    The independent part is due to the tracker's noise and the machine's repeatability; the second becomes a group.
     """
-    shares = place.get("scatter_share")
+    shares = here.get("scatter_share")
     if shares is None or shares.dims != ("cause",) or shares.size < 2:
-        return place
-    C = np.asarray(place["covariance"].transpose("dof", "dof_").values, float)[:3, :3]
-    F = np.asarray(place["influence"].transpose("source", "dof").values, float)
+        return here
+    C = np.asarray(here["covariance"].transpose("dof", "dof_").values, float)[:3, :3]
+    F = np.asarray(here["influence"].transpose("source", "dof").values, float)
     values, vectors = np.linalg.eigh(C - F[:, :3].T @ F[:, :3])
     rows, groups = [], []
     for cause, share in zip(shares["cause"].values, shares.values, strict=True):
@@ -183,9 +181,9 @@ def _parted(place: xr.Dataset) -> xr.Dataset:
         for value, vector in zip(values, vectors.T, strict=True):
             rows.append(np.append(np.sqrt(max(value, 0.0) * float(share)) * vector, np.full(3, np.nan)))
             groups.append(str(cause))
-    names = [*place["source"].values.tolist(), *(f"own.{k}" for k in range(len(rows)))]
-    all_groups = [*place["source_group"].values.tolist(), *groups]
-    without = place.drop_dims("source")
+    names = [*here["source"].values.tolist(), *(f"own.{k}" for k in range(len(rows)))]
+    all_groups = [*here["source_group"].values.tolist(), *groups]
+    without = here.drop_dims("source")
     parted = without.assign_coords(source=names, source_group=("source", all_groups))
     return parted.assign(influence=(("source", "dof"), np.concatenate([F, rows])))
 
@@ -202,24 +200,24 @@ def _shared(errors: xr.Dataset) -> str:
 
 
 def _remarks(errors: xr.Dataset) -> list[Block]:
-    return [Text(note, "warning") for note in remarks(errors) if "\n" not in note]  # a map in letters: drawn above
+    return [Text(note, "warning") for note in remarks(errors) if "\n" not in note]  # the map as text: drawn above
 
 
 def _readings(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
     facts = [
         ("noise of a reading, as used / µm", fixed(1e6 * net.noise, 2)),
-        ("scatter over the stated one", fixed(scalar(errors, "sigma0"), 3)),
-        ("readings less unknowns", integer(scalar(errors, "freedom"))),
+        ("ratio of the scatter to the stated one", fixed(scalar(errors, "sigma0"), 3)),
+        ("readings minus unknowns", integer(scalar(errors, "freedom"))),
         ("iterations", integer(scalar(errors, "iterations"))),
-        ("condition of what can be determined", significant(scalar(errors, "condition"), 3)),
+        ("condition of the determined freedoms", significant(scalar(errors, "condition"), 3)),
         ("iterations of the alternating scheme", integer(scalar(errors, "alternating_iterations"))),
-        ("its estimated remaining distance / µm", fixed(1e6 * scalar(errors, "alternating_left"), 3)),
+        ("its estimated remaining error / µm", fixed(1e6 * scalar(errors, "alternating_left"), 3)),
         ("repeatability of the machine / µm", fixed(1e6 * scalar(errors, "repeatability"), 2)),
         ("its standard uncertainty / µm", fixed(1e6 * scalar(errors, "repeatability_u"), 2)),
     ]
     rows: list[list[Cell | str]] = [[name, value] for name, value in facts if value != DASH]
-    found = [*_remarks(errors), *multilateration_quality.left_out(net)]
-    found.append(multilateration_quality.residuals(net, f"{key}-residuals"))
+    found = [*_remarks(errors), *quality.left_out(net)]
+    found.append(quality.residuals(net, f"{key}-residuals"))
     if rows:
         found.append(Table("The solution.", ["quantity", "value"], rows))
     return found

@@ -14,20 +14,20 @@ from errormotion.report.drawings.turntable import TURN, Dots, Ellipsoids, Lines,
 from errormotion.report.text import finite, fixed, integer, listed, rounded, significant
 
 _VECTORS, _SIGHTS, _ELLIPSOIDS = 400, 60, 150
-_ARROW = 0.12  # longest arrow, share of the diagonal of the volume
-_TYPICAL, _LARGEST = 0.015, 0.1  # half axis of the median ellipsoid, and of the largest: shares of the same
+_ARROW = 0.12  # longest arrow over the diagonal of the volume
+_TYPICAL, _LARGEST = 0.015, 0.1  # semi-axis of the median ellipsoid, and of the largest, over the same
 _SOFT, _FAINT = "#8a8f98", "#c3c8d0"
 _SHADES = ("#7fb0dc", "#2a5599", "#D55E00")  # thirds of the longest, shortest first
 
 
 def _span(net: Network) -> float:
-    places = net.place[net.drawn]
-    return float(np.linalg.norm(np.ptp(places, axis=0))) if len(places) else float("nan")
+    positions = net.position[net.drawn]
+    return float(np.linalg.norm(np.ptp(positions, axis=0))) if len(positions) else float("nan")
 
 
 def _box(net: Network) -> Lines:
     """Return the edges of the box around the targets."""
-    low, high = (f(net.place[net.drawn], axis=0) for f in (np.min, np.max))
+    low, high = (f(net.position[net.drawn], axis=0) for f in (np.min, np.max))
     corners = np.array([[(a, b)[i >> k & 1] for k, (a, b) in enumerate(zip(low, high, strict=True))] for i in range(8)])
     edges = [(corners[i], corners[i | 1 << k]) for i in range(8) for k in range(3) if not i >> k & 1]
     return Lines(np.array(edges), _FAINT, 0.6)
@@ -38,31 +38,31 @@ def vectors(net: Network, key: str) -> Block:
     known = net.drawn[np.isfinite(net.error[net.drawn]).all(axis=1)]
     if not known.size or net.worst is None or not net.length[net.worst] > 0:
         return Text(
-            "There are no error vectors to draw: no target has a known place and an error that is not zero.",
+            "No error vectors are drawn: no target has a known position and an error other than zero.",
             "note",
         )
     longest = net.length[net.worst]
     factor = enlargement(longest, max(_ARROW * _span(net), 2 * longest))
     picked = thinned(known, _VECTORS, net.worst)
-    ends = np.stack([net.place[picked], net.place[picked] + factor * net.error[picked]], axis=1)
+    ends = np.stack([net.position[picked], net.position[picked] + factor * net.error[picked]], axis=1)
     third = np.minimum(3 * net.length[picked] / longest, 2.999).astype(int)
     notes = [_note(net, int(i)) for i in picked]
-    parts: list[Lines | Dots | Ellipsoids] = [_box(net), Dots(net.place[picked], _SOFT, 0.9, notes=notes)]
+    parts: list[Lines | Dots | Ellipsoids] = [_box(net), Dots(net.position[picked], _SOFT, 0.9, notes=notes)]
     parts += [Lines(ends[third == k], colour, 1.0, 3.2) for k, colour in enumerate(_SHADES) if (third == k).any()]
     parts.append(Dots(ends[picked == net.worst, 0], _SHADES[2], 1.6, [net.targets[net.worst]]))
     um = 1e6 * longest
     fewer = f" {integer(picked.size)} of {integer(known.size)} targets are drawn." if picked.size < known.size else ""
     caption = (
-        f"Error vectors, {integer(factor)} times enlarged, from the commanded places (dots). Pale: up to a third of "
-        f"the longest, which is {fixed(um, 2)} µm at {net.targets[net.worst]}; dark: up to two thirds; "
-        f"red: above.{fewer}{TURN}"
+        f"Error vectors, enlarged {integer(factor)} times, from the commanded positions (dots). Light blue: up to a "
+        f"third of the longest, {fixed(um, 2)} µm at {net.targets[net.worst]}; dark blue: up to two thirds; "
+        f"red: longer.{fewer}{TURN}"
     )
     alt = f"Error vectors of {integer(picked.size)} targets in space; the longest is {fixed(um, 2)} µm."
     return Figure(draw(Scene(parts), key), caption, alt)
 
 
 def _note(net: Network, target: int) -> str:
-    """Return name and error of a target with its expanded uncertainty, one line each."""
+    """Return the name of a target and its errors with their expanded uncertainty, one line each."""
     errors = zip(("EX", "EY", "EZ"), net.error[target], net.sigma[target], strict=True)
     lines = [(name, *rounded(1e6 * value, 2e6 * sigma)) for name, value, sigma in errors]
     return "\n".join([net.targets[target], *(f"{name}: {value} ± {U} µm" for name, value, U in lines)])
@@ -70,33 +70,33 @@ def _note(net: Network, target: int) -> str:
 
 def layout(net: Network, key: str) -> Block:
     """Return stations, targets and the lines of sight between them."""
-    stands = np.flatnonzero(np.isfinite(net.station).all(axis=1))
-    if not (stands.size and net.drawn.size):
-        return Text("The places of the stations are not known, and their layout is not drawn.", "note")
+    known = np.flatnonzero(np.isfinite(net.station).all(axis=1))
+    if not (known.size and net.drawn.size):
+        return Text("The layout is not drawn: the positions of the stations are unknown.", "note")
     picked = thinned(net.drawn, _SIGHTS)
     parts: list[Lines | Dots | Ellipsoids] = [_box(net)]
     broken = []
-    for j in stands:
+    for j in known:
         colour = canvas.COLOURS[int(j) % len(canvas.COLOURS)]
-        ends = np.stack([np.broadcast_to(net.station[j], (picked.size, 3)), net.place[picked]], axis=1)
+        ends = np.stack([np.broadcast_to(net.station[j], (picked.size, 3)), net.position[picked]], axis=1)
         seen = np.isfinite(net.residual[j, picked]) | ~np.isfinite(net.residual).any()
         seen &= net.left_out[j, picked] == 0
         parts.append(Lines(ends[seen], colour + "55", 0.4))
         if (~seen).any():
             broken.append(Lines(ends[~seen], canvas.BLACK, 0.7, dash="3 2"))
     parts += broken
-    parts.append(Dots(net.place[net.drawn if net.drawn.size <= 2000 else picked], _SOFT, 1.0))
-    for j in stands:
+    parts.append(Dots(net.position[net.drawn if net.drawn.size <= 2000 else picked], _SOFT, 1.0))
+    for j in known:
         colour = canvas.COLOURS[int(j) % len(canvas.COLOURS)]
         parts.append(Dots(net.station[[j]], colour, 4.0, [net.stations[j]]))
     fewer = (
-        f" Lines of {integer(picked.size)} targets of {integer(net.drawn.size)}."
+        f" Lines of {integer(picked.size)} of {integer(net.drawn.size)} targets."
         if len(picked) < net.drawn.size
         else ""
     )
-    dashed = " Dashed: no reading, or one that was left out." if broken else ""
-    caption = f"Places of the tracker, targets, and lines of sight.{dashed}{fewer}{TURN}"
-    alt = f"{len(stands)} places of the tracker around {integer(net.drawn.size)} targets."
+    dashed = " Dashed: no reading, or one that was ignored." if broken else ""
+    caption = f"Positions of the tracker, targets, and lines of sight.{dashed}{fewer}{TURN}"
+    alt = f"{len(known)} positions of the tracker around {integer(net.drawn.size)} targets."
     return Figure(draw(Scene(parts), key), caption, alt)
 
 
@@ -105,7 +105,7 @@ def ellipsoids(net: Network, key: str) -> Block:
     sigma = net.worst_direction
     known = net.drawn[np.isfinite(sigma[net.drawn]) & (sigma[net.drawn] > 0)]
     if not known.size:
-        return Text("The uncertainty of no target is known, and no ellipsoids are drawn.", "note")
+        return Text("No ellipsoids are drawn: the uncertainties of the targets are unknown.", "note")
     worst = int(known[np.argmax(sigma[known])])
     largest, typical = 2 * sigma[worst], 2 * float(np.median(sigma[known]))
     wanted = _span(net) * min(_LARGEST, _TYPICAL * largest / typical)
@@ -113,21 +113,20 @@ def ellipsoids(net: Network, key: str) -> Block:
     picked = thinned(known, _ELLIPSOIDS, worst)
     parts: list[Lines | Dots | Ellipsoids] = [
         _box(net),
-        Ellipsoids(net.place[picked], (2 * factor) ** 2 * net.covariance[picked], canvas.BLUE),
-        Dots(net.place[[worst]], canvas.VERMILLION, 1.2, [net.targets[worst]]),
+        Ellipsoids(net.position[picked], (2 * factor) ** 2 * net.covariance[picked], canvas.BLUE),
+        Dots(net.position[[worst]], canvas.VERMILLION, 1.2, [net.targets[worst]]),
     ]
     caption = (
-        f"Uncertainty of the targets, k = 2: ellipsoids {integer(factor)} times enlarged. The longest half axis is "
+        f"Uncertainty of the targets, k = 2: ellipsoids enlarged {integer(factor)} times. The longest semi-axis is "
         f"{significant(1e6 * largest)} µm, at {net.targets[worst]}; the median over the targets is "
-        f"{significant(1e6 * typical)} µm. What all targets share lies in them "
-        f"too.{TURN}"
+        f"{significant(1e6 * typical)} µm. Contributions common to all targets are included.{TURN}"
     )
     return Figure(draw(Scene(parts), key), caption, f"Uncertainty ellipsoids of {integer(picked.size)} targets.")
 
 
 def _layer(net: Network, axis: int) -> tuple[np.ndarray, float]:
-    """Return the targets of the middle layer along an axis, and where it is, m."""
-    along = net.place[net.drawn, axis]
+    """Return the targets of the middle layer along an axis, and its position, m."""
+    along = net.position[net.drawn, axis]
     span = float(np.ptp(along))
     levels = np.unique(np.round(along / max(span, 1e-9), 4)) * max(span, 1e-9)
     if levels.size <= 40:  # a grid
@@ -142,7 +141,7 @@ def slices(net: Network, key: str) -> Block:
     """Return the errors in the middle layers across Z, Y and X."""
     known = np.asarray(np.isfinite(net.error).all(axis=1))
     if not (net.drawn.size and known[net.drawn].any()):
-        return Text("There are no errors at known places to draw in section.", "note")
+        return Text("No sections are drawn: no target has a known position and error.", "note")
     longest = finite(np.max, net.length)
     factor = enlargement(longest, max(1.5 * _ARROW * _span(net), 2 * longest))
     shown = [np.abs(net.error[_layer(net, k)[0], k]) for k in range(3)]
@@ -154,17 +153,17 @@ def slices(net: Network, key: str) -> Block:
         figure.subplots_adjust(left=0.095, right=0.985, top=0.92, bottom=0.33, wspace=0.34)
         for axes, normal in zip(panels, (2, 1, 0), strict=True):
             _slice(axes, net, normal, factor, top, known)
-        place = figure.add_axes((0.3, 0.15, 0.4, 0.03))
+        bar = figure.add_axes((0.3, 0.15, 0.4, 0.03))
         edges = np.linspace(-top, top, 42)
-        place.pcolor(edges, [0, 1], ((edges[1:] + edges[:-1]) / 2)[None], cmap="RdBu_r", vmin=-top, vmax=top)
-        place.set_yticks([])
-        place.grid(visible=False)
-        place.set_xlabel("error across the layer / µm")
+        bar.pcolor(edges, [0, 1], ((edges[1:] + edges[:-1]) / 2)[None], cmap="RdBu_r", vmin=-top, vmax=top)
+        bar.set_yticks([])
+        bar.grid(visible=False)
+        bar.set_xlabel("error perpendicular to the layer / µm")
 
     where = [f"{AXES[k]} = {fixed(1e3 * _layer(net, k)[1], 1)} mm" for k in (2, 1, 0)]
     caption = (
-        f"Errors in the middle layers, at {listed(where)} (places of the reflector): arrows {integer(factor)} times "
-        "enlarged show the error in the layer, colours that across it."
+        f"Errors in the middle layers, at {listed(where)} (positions of the reflector): arrows, enlarged "
+        f"{integer(factor)} times, for the error in the layer, colours for the error perpendicular to it."
     )
     return Figure(canvas.draw(paint, key, 3.0), caption, f"Sections through the volume at {listed(where)}.")
 
@@ -173,32 +172,32 @@ def _slice(axes: Axes, net: Network, normal: int, factor: int, top: float, known
     a, b = (k for k in range(3) if k != normal)
     layer, _ = _layer(net, normal)
     layer = thinned(layer[known[layer]], _VECTORS)
-    place, error = net.place[layer], net.error[layer]
-    axes.set_title(f"across {AXES[normal]}")
+    position, error = net.position[layer], net.error[layer]
+    axes.set_title(f"perpendicular to {AXES[normal]}")
     axes.set_xlabel(f"{'xyz'[a]} / mm")
     axes.set_ylabel(f"{'xyz'[b]} / mm")
     axes.set_aspect("equal", adjustable="datalim")
     if not layer.size:
         axes.text(0.5, 0.5, "no target", transform=axes.transAxes, ha="center", color="#555555")
         return
-    h, v = 1e3 * place[:, a], 1e3 * place[:, b]
+    h, v = 1e3 * position[:, a], 1e3 * position[:, b]
     across = 1e6 * error[:, normal]
     axes.scatter(h, v, 30, across, cmap="RdBu_r", vmin=-top, vmax=top, edgecolors="#666666", linewidths=0.4)
     axes.quiver(
         h, v, *(1e3 * factor * error[:, [a, b]]).T, angles="xy", scale_units="xy", scale=1,
         color=canvas.BLACK, width=0.006, headwidth=3.5, headlength=4, headaxislength=3.5,
     )  # fmt: skip
-    ends = 1e3 * np.concatenate([place, place + factor * error])
+    ends = 1e3 * np.concatenate([position, position + factor * error])
     axes.update_datalim(ends[:, [a, b]])
     axes.margins(0.08)
     axes.autoscale_view()
 
 
 def histograms(net: Network, key: str) -> Block:
-    """Return how often which error occurs: three coordinates, and the length of the vector."""
+    """Return histograms of the three coordinates of the errors, and of their length."""
     data: list[Array] = [*(1e6 * net.error.T), 1e6 * net.length]
     if not any(np.isfinite(values).any() for values in data):
-        return Text("The error of no target is known, and there is no distribution to draw.", "note")
+        return Text("No histograms are drawn: the errors of the targets are unknown.", "note")
     names = ["EX", "EY", "EZ", "length of the vector"]
 
     def paint(figure: Canvas) -> None:

@@ -1,4 +1,4 @@
-"""What a plan predicts: the map of uncertainty over the volume, as set and best, and the targets that were chosen."""
+"""Results of a plan: the map of the uncertainty over the volume, as set and best, and the chosen targets."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SAME = 1e-7  # m
 
 
 def blocks(errors: xr.Dataset, key: str) -> list[Block]:
-    """Return the map, what it comes to, and the targets to measure; nothing where the plan has no map."""
+    """Return the map, its summary, and the targets to measure; an empty list if the plan has no map."""
     if "map_uncertainty" not in errors or errors["map_uncertainty"].dims != ("setup", "place"):
         return []
     position = np.asarray(errors["map_position"].values, float)
@@ -28,8 +28,8 @@ def blocks(errors: xr.Dataset, key: str) -> list[Block]:
     if chosen.any():
         found.append(_targets(position[chosen]))
     if "best_layout" in errors.attrs:
-        words = "The best layout as settings of a campaign is the attribute best_layout of the plan's dataset"
-        found.append(Text(f"{words}; planning.write puts it in a file.", "plain"))
+        words = "The best layout, as settings of a campaign, is the attribute best_layout of the plan's dataset"
+        found.append(Text(f"{words}; the setting planning.write writes it to a file.", "plain"))
     return found
 
 
@@ -45,7 +45,7 @@ def _map(position: Array, sigma: Array, chosen: np.ndarray, key: str) -> Block:
     um = 1e6 * sigma
     top, low = finite(np.max, um), finite(np.min, um)
     if not np.isfinite(top):
-        return Text("The uncertainty is unknown everywhere, and no map is drawn.", "note")
+        return Text("No map is drawn: the uncertainty is unknown.", "note")
     scale = maps.scale_of(um, 12, colormaps["viridis_r"])
 
     def paint(figure: Canvas) -> None:
@@ -55,10 +55,9 @@ def _map(position: Array, sigma: Array, chosen: np.ndarray, key: str) -> Block:
             for axes, z in zip(panels[row], levels, strict=True):
                 here = np.abs(position[:, 2] - z) < _SAME
                 x, y = 1e3 * position[here, 0], 1e3 * position[here, 1]
-                lost = ~np.isfinite(values[here])
-                colours = scale.to_rgba(values[here][~lost])
-                axes.scatter(x[~lost], y[~lost], c=colours, s=90, marker="s", linewidths=0)
-                axes.plot(x[lost], y[lost], "x", color=canvas.BLACK, markersize=4)
+                known = np.isfinite(values[here])
+                axes.scatter(x[known], y[known], c=scale.to_rgba(values[here][known]), s=90, marker="s", linewidths=0)
+                axes.plot(x[~known], y[~known], "x", color=canvas.BLACK, markersize=4)
                 if row == 1:
                     mark = here & chosen
                     axes.plot(1e3 * position[mark, 0], 1e3 * position[mark, 1], "o", color=canvas.VERMILLION,
@@ -71,23 +70,22 @@ def _map(position: Array, sigma: Array, chosen: np.ndarray, key: str) -> Block:
             axes.set_ylabel("Y / mm")
         maps.colour_bar(panels[0, -1], scale, (0.89, 0.1, 0.018, 0.8), "u / µm")
 
-    height = 4.4
     marks = " Circles: targets to measure." if chosen.any() else ""
     caption = (
-        "Predicted standard uncertainty, three coordinates together, by the readings alone, over sections of the "
+        "Predicted standard uncertainty, three coordinates together, by the readings only, in sections of the "
         f"volume: with the layout as set, and with the best one.{marks}"
     )
-    alt = f"Predicted uncertainty between {fixed(low, 2)} and {fixed(top, 2)} µm at {integer(len(position))} places."
-    return Figure(canvas.draw(paint, key, height), caption, alt)
+    alt = f"Predicted uncertainty between {fixed(low, 2)} and {fixed(top, 2)} µm at {integer(len(position))} positions."
+    return Figure(canvas.draw(paint, key, 4.4), caption, alt)
 
 
 def _table(sigma: Array, errors: xr.Dataset) -> Table:
     rows: list[list[Cell | str]] = []
     for name, values in zip(("as set", "best"), sigma, strict=True):
         figures = (finite(np.max, values), finite(np.mean, values), finite(np.min, values))
-        rows.append([name, *(or_dash(fixed(1e6 * v, 2), "not known") for v in figures)])
+        rows.append([name, *(or_dash(fixed(1e6 * v, 2), "unknown") for v in figures)])
     gain = float(errors["gain"]) if "gain" in errors else float("nan")
-    words = f" The gain in what was minimised is {fixed(gain, 2)}." if np.isfinite(gain) else ""
+    words = f" Gain (minimised uncertainty as set / best): {fixed(gain, 2)}." if np.isfinite(gain) else ""
     return Table(
         f"Predicted standard uncertainty over the volume in µm.{words}", ["layout", "largest", "mean", "smallest"], rows
     )
@@ -95,6 +93,6 @@ def _table(sigma: Array, errors: xr.Dataset) -> Table:
 
 def _targets(position: Array) -> Table:
     rows: list[list[Cell | str]] = [
-        [integer(k), *(fixed(1e3 * v, 1) for v in place)] for k, place in enumerate(position, 1)
+        [integer(k), *(fixed(1e3 * v, 1) for v in row)] for k, row in enumerate(position, 1)
     ]
     return Table("Targets to measure: axis positions.", ["target", "X / mm", "Y / mm", "Z / mm"], rows)

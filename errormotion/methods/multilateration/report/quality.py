@@ -1,4 +1,4 @@
-"""Readings of a network: stations, residuals, and what was left out, by name."""
+"""Readings of a network: stations, residuals, outliers and excluded targets."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from errormotion.report import canvas
 from errormotion.report.document import Block, Cell, Figure, Table, Text, estimate, or_dash
 from errormotion.report.text import finite, fixed, integer, listed
 
-_MOST, _NAMED, _MANY = 1500, 40, 24
+_MAX_DRAWN, _MAX_NAMED, _MAX_STATIONS = 1500, 40, 24
 
 
 def stations(net: Network) -> Block:
-    """Return the table of stations: place, dead path, readings."""
+    """Return the table of stations: position, dead path, readings."""
     if not net.stations:
-        return Text("The result holds no stations.", "note")
+        return Text("The result contains no stations.", "note")
     rows: list[list[Cell | str]] = []
     unknown = "not part of this result"
     read = np.isfinite(net.residual).any()
     for j, name in enumerate(net.stations):
-        place = [
+        position = [
             estimate(1e3 * v, 2e3 * u, reason=unknown, digits=7, signed=False)
             for v, u in zip(net.station[j], net.station_u[j], strict=True)
         ]
@@ -31,27 +31,27 @@ def stations(net: Network) -> Block:
         used = np.isfinite(net.residual[j]) & (net.left_out[j] == 0)
         rms = float(np.sqrt(finite(np.mean, net.residual[j, used] ** 2)))
         count = integer(int(used.sum())) if read else Cell("—", reason=unknown)
-        rows.append([name, *place, path, off, count, or_dash(fixed(1e6 * rms, 2), unknown)])
+        rows.append([name, *position, path, off, count, or_dash(fixed(1e6 * rms, 2), unknown)])
     return Table(
-        "Positions of the tracker and dead paths (offsets of its counter), with expanded uncertainty, "
-        "k = 2. Off: distance from the approximate position. Residual: root mean square.",
-        ["station", "x / mm", "y / mm", "z / mm", "dead path / mm", "off / mm", "used", "residual / µm"],
+        "Positions of the tracker and dead paths (zero offsets of its counter), with expanded uncertainty, "
+        "k = 2. Deviation: distance from the approximate position. Residual: root mean square.",
+        ["station", "x / mm", "y / mm", "z / mm", "dead path / mm", "deviation / mm", "used", "residual / µm"],
         rows,
         [("", 1), ("position", 3), ("", 1), ("", 1), ("readings", 2)],
     )
 
 
 def planned(errors: xr.Dataset, net: Network) -> Block:
-    """Return the table of a plan's stations: where they are set, and where they would be best."""
+    """Return the table of a plan's stations, as set and best."""
     if "best_place" not in errors or errors["best_place"].dims != ("station", "direction"):
         return Text("The plan contains no better positions.", "note")
     best = np.asarray(errors["best_place"].values, float)
     rows: list[list[Cell | str]] = [
-        [name, *(or_dash(fixed(1e3 * v, 0), "not known") for v in (*own, *better))]
+        [name, *(or_dash(fixed(1e3 * v, 0), "unknown") for v in (*own, *better))]
         for name, own, better in zip(net.stations, net.station, best, strict=True)
     ]
     return Table(
-        "Positions of the tracker as set, as drawn above, and the best within the boxes.",
+        "Positions of the tracker as set (drawn above), and the best within the boxes.",
         ["station", *2 * ("x / mm", "y / mm", "z / mm")],
         rows,
         [("", 1), ("as set", 3), ("best", 3)],
@@ -59,11 +59,11 @@ def planned(errors: xr.Dataset, net: Network) -> Block:
 
 
 def residuals(net: Network, key: str) -> Block:
-    """Return the residuals by station, readings that were left out marked."""
+    """Return the residuals by station, with outliers marked."""
     given = np.isfinite(net.residual)
     if not given.any():
-        return Text("The result holds no residuals.", "note")
-    shown = list(range(min(len(net.stations), _MANY)))
+        return Text("The result contains no residuals.", "note")
+    shown = list(range(min(len(net.stations), _MAX_STATIONS)))
     kept = given & (net.left_out == 0)
     top = 1e6 * finite(np.max, np.abs(net.residual[kept])) if kept.any() else 1.0
     top = 1.15 * max(top, 1e6 * 2.2 * net.noise if np.isfinite(net.noise) else 0.0)
@@ -74,12 +74,12 @@ def residuals(net: Network, key: str) -> Block:
         figure.subplots_adjust(left=0.075, right=0.985, top=0.95, bottom=0.2)
         if np.isfinite(net.noise):
             axes.axhspan(-2e6 * net.noise, 2e6 * net.noise, color=canvas.SKY, alpha=0.15, linewidth=0)
-        for place, j in enumerate(shown):
+        for column, j in enumerate(shown):
             colour = canvas.COLOURS[j % len(canvas.COLOURS)]
-            across = place + 0.1 + 0.8 * (np.arange(len(net.targets)) + 0.5) / len(net.targets)
+            across = column + 0.1 + 0.8 * (np.arange(len(net.targets)) + 0.5) / len(net.targets)
             used = np.flatnonzero(kept[j])
-            if used.size > _MOST:
-                used = used[:: -(-used.size // _MOST)]
+            if used.size > _MAX_DRAWN:
+                used = used[:: -(-used.size // _MAX_DRAWN)]
             axes.plot(across[used], 1e6 * net.residual[j, used], ".", color=colour, markersize=3, markeredgewidth=0)
             out = np.flatnonzero(given[j] & ~kept[j])
             axes.plot(
@@ -91,11 +91,15 @@ def residuals(net: Network, key: str) -> Block:
         axes.tick_params(axis="x", length=0)
         axes.grid(visible=False, axis="x")
         axes.set_ylabel("residual / µm")
-        axes.set_xlabel("station; within each, its targets in their order")
+        axes.set_xlabel("station, with its targets in order")
 
     out = int((given & ~kept)[shown].sum())
-    words = "" if not out else " Crosses: left out" + (", at the edge where they lie beyond it." if wild else ".")
-    fewer = f" The first {_MANY} of {len(net.stations)} stations are drawn." if len(net.stations) > _MANY else ""
+    words = "" if not out else " Crosses: ignored" + (", at the edge if beyond it." if wild else ".")
+    fewer = (
+        f" The first {_MAX_STATIONS} of {len(net.stations)} stations are drawn."
+        if len(net.stations) > _MAX_STATIONS
+        else ""
+    )
     band = " Band: twice the noise of a reading." if np.isfinite(net.noise) else ""
     caption = f"Residuals by station: reading minus the distance of the network.{band}{words}{fewer}"
     alt = f"Residuals of {len(shown)} stations; the largest used is {fixed(top / 1.15, 2)} µm."
@@ -103,24 +107,24 @@ def residuals(net: Network, key: str) -> Block:
 
 
 def left_out(net: Network) -> list[Block]:
-    """Name the readings that were not used, and targets that were given up."""
+    """Return the lists of outliers and of excluded targets, and the number of missing readings."""
     found: list[Block] = []
     wrong = np.argwhere((net.left_out == 1).T)
     if len(wrong):
         names = []
-        for i, j in wrong[:_NAMED]:
+        for i, j in wrong[:_MAX_NAMED]:
             by = 1e6 * net.residual[j, i]
             names.append(net.named(j, i) + (f" ({fixed(by, 1, signed=True)} µm)" if np.isfinite(by) else ""))
-        more = f", and {integer(len(wrong) - _NAMED)} more" if len(wrong) > _NAMED else ""
-        found.append(Text(f"Left out, because the others contradict them: {listed(names)}{more}.", "warning"))
-    given_up = np.flatnonzero((net.left_out == 2).any(axis=0))
-    if given_up.size:
-        names = [net.targets[i] for i in given_up[:_NAMED]]
-        more = f", and {integer(given_up.size - _NAMED)} more" if given_up.size > _NAMED else ""
-        words = "Given up, because their readings contradict each other and the wrong one is not determined"
+        more = f", and {integer(len(wrong) - _MAX_NAMED)} more" if len(wrong) > _MAX_NAMED else ""
+        found.append(Text(f"Outliers, ignored: {listed(names)}{more}.", "warning"))
+    excluded = np.flatnonzero((net.left_out == 2).any(axis=0))
+    if excluded.size:
+        names = [net.targets[i] for i in excluded[:_MAX_NAMED]]
+        more = f", and {integer(excluded.size - _MAX_NAMED)} more" if excluded.size > _MAX_NAMED else ""
+        words = "Targets excluded, with contradictory readings of which the wrong one is not determined"
         found.append(Text(f"{words}: {listed(names)}{more}.", "warning"))
     lost = int((~np.isfinite(net.residual) & (net.left_out == 0)).sum())
     if np.isfinite(net.residual).any() and lost:
         missing = f"{integer(lost)} of {integer(net.residual.size)} readings are missing"
-        found.append(Text(f"{missing}: the beam was broken, or the target not visited.", "plain"))
+        found.append(Text(f"{missing}: the beam was interrupted, or the target was not visited.", "plain"))
     return found

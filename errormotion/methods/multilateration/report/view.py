@@ -1,4 +1,4 @@
-"""What a result of multilateration holds, as plain arrays over targets and stations, whatever of it is missing."""
+"""View of a result as arrays over targets and stations; missing quantities are NaN."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _READING = ("station", "target")
 
 @dataclass(frozen=True)
 class Network:
-    """Targets and stations, m; NaN where something is not known.
+    """Targets and stations, m; NaN where unknown.
 
     Attributes
     ----------
     targets, stations : list of str
-    place : (target, 3)
-        Commanded place of the reflector; of the axes where that is not known.
+    position : (target, 3)
+        Commanded position of the reflector; of the axes if that is unknown.
     error : (target, 3)
     covariance : (target, 3, 3)
     station, station_nominal : (station, 3)
@@ -32,14 +32,14 @@ class Network:
     dead_path, dead_path_u : (station,)
     residual : (station, target)
     left_out : (station, target) of int
-        0: used; 1: left out; 2: the target was given up.
+        0: used; 1: outlier; 2: the target was excluded.
     noise : float
         Standard deviation of a reading.
     """
 
     targets: list[str]
     stations: list[str]
-    place: Array
+    position: Array
     error: Array
     covariance: Array
     station: Array
@@ -64,14 +64,14 @@ class Network:
 
     @property
     def worst(self) -> int | None:
-        """Index of the target with the longest error vector; None where none is known."""
+        """Index of the target with the longest error vector; None if none is known."""
         size = self.length
         return int(np.nanargmax(size)) if np.isfinite(size).any() else None
 
     @property
     def drawn(self) -> NDArray[np.intp]:
         """Targets that can be drawn."""
-        return np.flatnonzero(np.isfinite(self.place).all(axis=1))
+        return np.flatnonzero(np.isfinite(self.position).all(axis=1))
 
     @property
     def worst_direction(self) -> Array:
@@ -93,7 +93,7 @@ def is_multilateration(errors: xr.Dataset) -> bool:
 
 
 def network(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Network:
-    """Return the view of a dataset over targets; ``raw`` gives the residuals of excluded readings."""
+    """Return the view of a dataset over targets, with the residuals of ignored readings from ``raw``."""
     m, n = errors.sizes["target"], errors.sizes.get("station", 0)
     sizes = {"target": m, "station": n, "direction": 3, "direction_": 3}
 
@@ -104,13 +104,13 @@ def network(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Network:
         values = np.asarray(errors[name].transpose(*dims).values, float)
         return values if values.shape == shape else np.full(shape, np.nan)
 
-    place = get("target_nominal", "target", "direction")
-    if not np.isfinite(place).any():
-        place = np.stack([get(name, "target") for name in "xyz"], axis=-1)
+    position = get("target_nominal", "target", "direction")
+    if not np.isfinite(position).any():
+        position = np.stack([get(name, "target") for name in "xyz"], axis=-1)
     variance = np.diagonal(get("station_covariance", "station", "direction", "direction_"), axis1=1, axis2=2)
     covariance = np.asarray(errors["covariance"].transpose("target", "dof", "dof_").values, float)[:, :3, :3]
     station, dead_path = get("station_place", "station", "direction"), get("dead_path", "station")
-    residual = get("residual", "station", "target").copy()  # filled in below, and the result stays as it is
+    residual = get("residual", "station", "target").copy()  # filled below
     left_out = np.nan_to_num(get("left_out", "station", "target")).astype(np.int64)
     given = raw["displacement"] if raw is not None and "displacement" in raw else None
     if given is not None and given.dims == _READING and given.shape == residual.shape:
@@ -121,7 +121,7 @@ def network(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Network:
     return Network(
         _names(errors, "target", m),
         _names(errors, "station", n),
-        place,
+        position,
         np.stack([np.asarray(errors[name].values, float) for name in FREEDOMS[:3]], axis=-1),
         covariance,
         station,
@@ -136,7 +136,7 @@ def network(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Network:
 
 
 def scalar(errors: xr.Dataset, name: str) -> float:
-    """Return a number of the dataset; NaN where it holds none."""
+    """Return a scalar of the dataset; NaN if it is missing."""
     if name not in errors or errors[name].ndim or errors[name].dtype.kind not in "iuf":
         return math.nan
     return float(errors[name])
@@ -149,8 +149,8 @@ def _names(errors: xr.Dataset, dim: str, size: int) -> list[str]:
 
 
 def thinned(indices: NDArray[np.intp], most: int, always: int | None = None) -> NDArray[np.intp]:
-    """Return at most so many of the indices, drawn by chance, with one that is always among them."""
-    # By chance and not by a step: no row or layer falls out whole.
+    """Return a random sample of at most ``most`` indices, in any case with ``always``."""
+    # A sample with a constant step could omit whole rows or layers.
     kept = indices[np.random.default_rng(0).permutation(indices.size)[:most]]
     if always is not None and always in indices:
         kept = np.append(kept, always)

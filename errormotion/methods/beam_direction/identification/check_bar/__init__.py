@@ -1,1 +1,1 @@
-"""A check bar measured by a calibrated beam."""
+"""Evaluation of a check bar that is measured with a calibrated beam."""

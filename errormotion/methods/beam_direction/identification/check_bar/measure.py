@@ -1,14 +1,14 @@
-"""A check bar as the verification of a calibrated beam: circle or cylinder through its points, and the residuals.
+"""A check bar for the verification of a calibrated beam: circle or cylinder through its points, and the residuals.
 
 All points have the same weight, as in published tables of such measurements; the covariance is that of this estimate,
 from the noise of each point and from shared sources (`Points.influence`). Outliers are ignored and reported. Residuals
-larger than the noise, and systematic residuals (correlated along the bar), are reported. In this case a correct radius
-is no verification, because a systematic error affects centre and radius without affecting their uncertainty.
+larger than the noise, and systematic residuals (correlated along the bar), are reported. If the residuals are
+systematic, a correct radius does not verify the beam, because a systematic error changes centre and radius but not
+their uncertainty.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,14 +19,14 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
+from errormotion.methods.beam_direction.identification.check_bar.correlation import neighbour_correlation
 from errormotion.methods.beam_direction.identification.check_bar.estimate import (
     FALSE_ALARMS,
-    Judged,
-    judged,
-    settled,
+    Evaluation,
+    evaluate,
+    fit,
     start,
 )
-from errormotion.methods.beam_direction.identification.check_bar.likeness import likeness
 from errormotion.methods.beam_direction.identification.check_bar.scanning import Points, points
 from errormotion.methods.beam_direction.identification.check_bar.surfaces import round_bar
 
@@ -43,38 +43,38 @@ class BarFit:
     centre : ndarray (3,)
         Point of the axis; of a cylinder the one at the middle height of its points.
     centre_covariance : ndarray (3, 3)
-        Across the axis; along it a centre has no variance.
+        Across the axis; 0 along it.
     axis : ndarray (3,)
         Unit vector along the bar: as given for a circle, fitted for a cylinder.
     axis_covariance : ndarray (3, 3)
         0 for a circle.
     radius, radius_u : float
-        Radius and its standard uncertainty: as given where it was held.
+        Radius and its standard uncertainty: the given ones if the radius was fixed.
     free_radius, free_radius_u : float
-        Radius that the points have by themselves.
+        Radius of a fit to the points with free radius.
     covariance : ndarray (p, p)
-        Of `parameter_names`: own and common part.
+        Of `parameter_names`: independent and common part.
     common_covariance : ndarray (p, p)
-        The part that all points share: beam, calibration, a held radius.
+        From sources that all points share: beam, calibration, a fixed radius.
     parameter_names : tuple of str
         ``across_1 across_2`` (along ``kinematics.beams.across(axis)``), for a cylinder ``tilt_1 tilt_2`` (rad), and
-        ``radius`` where it is free.
+        ``radius`` if it is free.
     residuals : ndarray (n,)
-        Of all points, left-out ones included; positive outside. NaN where there was no reading.
+        Of all points, outliers included; positive outside. NaN for missing readings.
     left_out : tuple of int
-        Indices, from 0, of the points that do not belong.
+        Indices of the outliers, from 0.
     rms : float
         Of the residuals of the points that were used.
     explained : float
-        The rms that the stated noise would leave; NaN where none is stated.
+        The rms expected from the stated noise; NaN if none is stated.
     exceeds_noise : bool
-        Whether the residuals are larger than the noise explains.
-    likeness : float
-        Correlation of neighbouring residuals beyond what the fit itself makes; about 0 for noise.
+        Whether the residuals are significantly larger than the stated noise.
+    correlation : float
+        Correlation of neighbouring residuals minus that caused by the fit itself; about 0 for noise.
     systematic : bool
-        Whether neighbours resemble one another more than noise does.
+        Whether this correlation is significant.
     chance : float
-        How often noise alone makes neighbours as much alike.
+        Probability of this correlation or a larger one by noise alone.
     notes : tuple of str
     """
 
@@ -95,7 +95,7 @@ class BarFit:
     rms: float
     explained: float
     exceeds_noise: bool
-    likeness: float
+    correlation: float
     systematic: bool
     chance: float
     notes: tuple[str, ...]
@@ -117,60 +117,60 @@ def fit_bar(
     Parameters
     ----------
     scanned : Points, or array_like (n, 3)
-        m, in the order of the scan. NaN where there was no reading.
+        m, in the order of the scan. NaN for missing readings.
     axis : array_like (3,)
-        Along the bar: known for a circle, about right (20 degrees) for a cylinder.
+        Along the bar: exact for a circle, within about 20 degrees for a cylinder.
     shape : {"circle", "cylinder"}
-        A circle is fitted in the plane across ``axis``; points that spread along the bar allow a cylinder.
+        A circle is fitted in the plane across ``axis``; a cylinder requires points that spread along the bar.
     radius, radius_uncertainty : float, optional
-        Calibrated radius of the bar and its standard uncertainty: the fitted one is compared with it.
+        Calibrated radius of the bar and its standard uncertainty, with which the fitted one is compared.
     hold_radius : bool
-        Fit with ``radius`` as it is given.
+        Fit with ``radius`` fixed.
     robust : bool
         Ignore and report outliers.
     noise : float, optional
-        Standard deviation of each coordinate, m; for bare points, since `Points` have their own.
+        Standard deviation of each coordinate, m; for coordinates only, since `Points` state their noise.
 
     Raises
     ------
     MethodError
         Invalid input.
     FitError
-        Points that do not determine the shape, or do not agree on one.
+        Points that do not determine the shape, or contradict one another.
     """
-    p, own, influence, reading = _given(scanned, noise)
+    p, own, influence, reading = _points(scanned, noise)
     u = np.asarray(axis, float)
     if u.shape != (3,) or not np.linalg.norm(u) > 0:
         raise MethodError(f"axis: expected the direction of the bar, three numbers; found {u.tolist()}.")
     if radius is not None and not radius > 0:
         raise MethodError(f"radius: expected a positive length; found {radius}.")
     if hold_radius and radius is None:
-        raise MethodError("hold_radius: expected a radius to hold; found none.")
+        raise MethodError("hold_radius: expected the radius to be fixed; found none.")
     if shape not in ("circle", "cylinder"):
         raise MethodError(f"shape: expected 'circle' or 'cylinder'; found '{shape}'.")
     u = u / np.linalg.norm(u)
-    there = np.flatnonzero(np.isfinite(p).all(axis=1))
-    near, outside = start(p[there], own[there], u, shape, robust)
-    left_out = tuple(int(there[k]) for k in outside)
-    used = np.setdiff1d(there, left_out)
+    known = np.flatnonzero(np.isfinite(p).all(axis=1))
+    initial, outliers = start(p[known], own[known], u, shape, robust)
+    left_out = tuple(int(known[k]) for k in outliers)
+    used = np.setdiff1d(known, left_out)
 
-    held = radius if hold_radius else None
-    bar = settled(p[used], near, shape, held)
-    free = bar if held is None else settled(p[used], near, shape, None)
-    result = judged(bar, p[used], own[used], influence[:, used], radius_uncertainty if hold_radius else 0.0)
-    by_itself = result if free is bar else judged(free, p[used], own[used], influence[:, used], 0.0)
+    fixed = radius if hold_radius else None
+    bar = fit(p[used], initial, shape, fixed)
+    free = bar if fixed is None else fit(p[used], initial, shape, None)
+    result = evaluate(bar, p[used], own[used], influence[:, used], radius_uncertainty if hold_radius else 0.0)
+    free_result = result if free is bar else evaluate(free, p[used], own[used], influence[:, used], 0.0)
 
     residuals = np.full(len(p), np.nan)
-    residuals[there] = bar.misses(p[there])[0]
+    residuals[known] = bar.residuals(p[known])[0]
     order = np.arange(len(used)) if shape == "cylinder" else bar.around(p[used])
-    alike, chance = likeness(residuals[used][order], result.M[np.ix_(order, order)])
-    verdict = _Verdict(result, alike, chance)
-    C, G = result.covariance, bar.spread()
-    free_u = float(np.sqrt(by_itself.covariance[-1, -1]))
-    notes = [_left_out(k, residuals[k], reading, len(p)) for k in left_out]
-    notes += verdict.notes()
+    correlation, chance = neighbour_correlation(residuals[used][order], result.M[np.ix_(order, order)])
+    systematic = bool(chance < FALSE_ALARMS)
+    C, G = result.covariance, bar.centre_and_axis_jacobian()
+    free_u = float(np.sqrt(free_result.covariance[-1, -1]))
+    notes = [_outlier_note(k, residuals[k], reading, len(p)) for k in left_out]
+    notes += _residual_notes(result, correlation, chance, systematic)
     if radius is not None:
-        notes += _compared(free.radius, free_u, radius, radius_uncertainty)
+        notes += _radius_notes(free.radius, free_u, radius, radius_uncertainty)
     return BarFit(
         shape=shape,
         centre=bar.centre,
@@ -189,8 +189,8 @@ def fit_bar(
         rms=result.rms,
         explained=result.explained,
         exceeds_noise=result.exceeds,
-        likeness=alike,
-        systematic=verdict.systematic,
+        correlation=correlation,
+        systematic=systematic,
         chance=chance,
         notes=tuple(notes),
     )
@@ -211,7 +211,7 @@ def measure_bar(
     robust: bool = True,
     extrapolate: bool = False,
 ) -> tuple[Points, BarFit]:
-    """Return points and bar of the rows ``bar_...`` of a raw dataset, for a beam that is known from elsewhere.
+    """Return points and bar of the rows ``bar_...`` of a raw dataset, for a known beam.
 
     Parameters
     ----------
@@ -220,20 +220,20 @@ def measure_bar(
     origin, direction, covariance
         The beam; see `errormotion.methods.beam_direction.identification.check_bar.scanning.points`.
     calibration, moves, stage_noise, extrapolate
-        See there; the normals are those of a round bar.
+        As of `points`; the normals are those of a round bar.
     shape, radius_uncertainty, hold_radius, robust
         See `fit_bar`.
 
     Raises
     ------
     MethodError
-        No check bar in the dataset; else see `points` and `fit_bar`.
+        No check bar in the dataset, and as of `points` and `fit_bar`.
     FitError
         See `fit_bar`.
     """
     missing = [name for name in ("bar_distance", "bar_stage", "bar_axis") if name not in raw]
     if missing:
-        raise MethodError(f"Expected readings of a check bar in the raw dataset; missing {', '.join(missing)}.")
+        raise MethodError(f"Expected readings of a check bar in the raw dataset; {', '.join(missing)} missing.")
     axis = raw["bar_axis"].values
     speckle = float(raw["speckle"]) if "speckle" in raw else 0.0
     scanned = points(
@@ -264,72 +264,58 @@ def measure_bar(
     )
 
 
-@dataclass(frozen=True)
-class _Verdict:
-    """Whether the residuals are noise, as text."""
-
-    judged: Judged
-    likeness: float
-    chance: float
-
-    @property
-    def systematic(self) -> bool:
-        return bool(self.chance < FALSE_ALARMS)
-
-    def notes(self) -> list[str]:
-        size = f"residual rms {_um(self.judged.rms)}"
-        explained = f", where the stated noise explains {_um(self.judged.explained)}"
-        noise = explained if self.judged.exceeds else ""
-        if self.systematic:
-            return [
-                f"The residuals are systematic: {size}{noise}, and neighbours along the bar are correlated "
-                f"(correlation {self.likeness:.2f}, by chance once in {_rarely(self.chance)}). Centre and radius have "
-                "an error that is not part of their uncertainty."
-            ]
-        if self.judged.exceeds:
-            return [
-                f"The residuals exceed the noise: {size}{noise}. They are random along the bar; the uncertainties were "
-                "raised accordingly. Check the stated noise, the surface of the bar, and vibrations of the stage."
-            ]
-        return []
+def _residual_notes(result: Evaluation, correlation: float, chance: float, systematic: bool) -> list[str]:
+    """Return a note on residuals that are systematic, or larger than the noise."""
+    expected = f", expected from the stated noise {_um(result.explained)}" if result.exceeds else ""
+    size = f"residual rms {_um(result.rms)}{expected}"
+    if systematic:
+        probability = f"once in {1 / chance:.0f}" if chance > 1e-4 else "less than once in 10 000"
+        return [
+            f"The residuals are systematic: {size}; neighbours along the bar are correlated (correlation "
+            f"{correlation:.2f}, by chance {probability}). Centre and radius have an error that is not included in "
+            "their uncertainty."
+        ]
+    if result.exceeds:
+        return [
+            f"The residuals exceed the noise: {size}. They are random along the bar; the uncertainties are increased "
+            "accordingly. Check the stated noise, the surface of the bar, and vibrations of the stage."
+        ]
+    return []
 
 
-def _given(scanned: Points | ArrayLike, noise: float | None) -> tuple[Array, Array, Array, Array | None]:
-    """Return points (n, 3), their own covariance, influence of what they share, and the readings behind them."""
+def _points(scanned: Points | ArrayLike, noise: float | None) -> tuple[Array, Array, Array, Array | None]:
+    """Return points (n, 3), their independent covariance, influence of shared sources, and their readings."""
     if isinstance(scanned, Points):
         if noise is not None:
-            raise MethodError("noise: points of a scan have their own; give it with bare coordinates only.")
+            raise MethodError("noise: expected for coordinates only; the points of a scan state their noise.")
         return scanned.points, scanned.covariance, scanned.influence, scanned.reading
     p = np.asarray(scanned, float)
     if p.ndim != 2 or p.shape[1] != 3:
-        raise MethodError(f"Expected points (n, 3), one a row; found {p.shape}.")
+        raise MethodError(f"Expected points (n, 3), one per row; found {p.shape}.")
     if noise is not None and not noise >= 0:
         raise MethodError(f"noise: expected a standard deviation in m; found {noise}.")
     own = np.broadcast_to((noise or 0.0) ** 2 * np.eye(3), (len(p), 3, 3))
     return p, np.asarray(own), np.zeros((0, len(p), 3)), None
 
 
-def _left_out(k: int, residual: float, reading: Array | None, n: int) -> str:
-    what = "" if reading is None else f", reading {1e3 * reading[k]:.3f} mm"
+def _outlier_note(k: int, residual: float, reading: Array | None, n: int) -> str:
+    shown = "" if reading is None else f", reading {1e3 * reading[k]:.3f} mm"
     side = "outside" if residual > 0 else "inside"
-    where = f"{_um(abs(residual))} {side} the bar"
-    return f"Point {k + 1} of {n} (index {k}{what}) is an outlier and was ignored: it is {where}."
+    return (
+        f"Point {k + 1} of {n} (index {k}{shown}) is an outlier and was ignored: {_um(abs(residual))} {side} the bar."
+    )
 
 
-def _compared(free: float, free_u: float, known: float, known_u: float) -> Sequence[str]:
+def _radius_notes(free: float, free_u: float, known: float, known_u: float) -> list[str]:
     """Return a note on a radius that differs from the calibrated one."""
     u = float(np.hypot(free_u, known_u))
     if not abs(free - known) > 2 * u:
-        return ()
+        return []
     return [
-        f"The points have a radius of {1e3 * free:.4f} mm, which is {1e6 * (free - known):+.1f} um off "
-        f"the calibrated {1e3 * known:.4f} mm; the expanded uncertainty (k = 2) of the difference is {_um(2 * u)}."
+        f"The radius of the points is {1e3 * free:.4f} mm. It differs by {1e6 * (free - known):+.1f} um from the "
+        f"calibrated one, {1e3 * known:.4f} mm; the expanded uncertainty (k = 2) of the difference is {_um(2 * u)}."
     ]
 
 
 def _um(length: float) -> str:
     return f"{1e6 * length:.3g} um"
-
-
-def _rarely(chance: float) -> str:
-    return f"{1 / chance:.0f}" if chance > 1e-4 else "more than 10 000"

@@ -1,4 +1,4 @@
-"""A check bar in a result: with the planes of the beam, or alone with a known beam."""
+"""The check bar in a result: with the planes of the beam, or alone with a known beam."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ log = logging.getLogger(__name__)
 
 
 def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, method: str, version: str) -> xr.Dataset:
-    """Return a result that holds a check bar and no errors of the beam: they are NaN.
+    """Return a result with a check bar only; the errors of the beam are NaN.
 
-    The beam is taken as the data state it, ``nominal_direction`` and ``nominal_origin`` (the stage's zero without).
+    The beam is that stated in the data, ``nominal_direction`` and ``nominal_origin`` (default: the stage's zero).
 
     Parameters
     ----------
     raw : Dataset
         Schema ``errormotion.raw.beam_direction/1``, the check bar alone.
     sensor : Sensor or None
-        How its readings are compensated.
+        For the compensation of its readings.
     settings : Settings
     method, version : str
 
@@ -47,11 +47,11 @@ def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, met
         raise MethodError(f"attribute moves: expected 'sensor' or 'target'; found {moves!r}.")
     u0 = np.asarray(raw["nominal_direction"].values, np.float64)
     p0 = np.asarray(raw["nominal_origin"].values if "nominal_origin" in raw else np.full(3, np.nan), np.float64)
-    notes = ["A check bar alone: the beam is taken as stated, without uncertainty, and its errors are unknown."]
+    notes = ["A check bar only: the stated beam is used, without uncertainty; its errors are unknown."]
     if not np.isfinite(p0).all():
-        notes.append("No nominal_origin in the data: the centre of the bar counts from the zero point of the beam.")
+        notes.append("No nominal_origin in the data: the centre of the bar is relative to the zero point of the beam.")
     if sensor is None:
-        notes.append("No inclination compensation: the readings are taken as they are.")
+        notes.append("No inclination compensation: the readings are not corrected for the inclination error.")
     else:
         notes += sensor.notes
     calibration = sensor.calibration if sensor is not None else None
@@ -73,7 +73,7 @@ def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, met
         machine=str(raw.attrs.get("machine", "unknown")),
         frame=str(raw.attrs.get("frame", "machine")),
         functional_point=np.nan_to_num(p0),
-        reference="nominal beam; a check bar does not tell its errors",
+        reference="nominal beam; its errors are not determined by a check bar",
         method=method,
         method_version=version,
         measured=raw.attrs,
@@ -95,7 +95,7 @@ def bar_extras(
     settings: Settings,
     notes: list[str],
 ) -> dict[str, xr.DataArray]:
-    """Return the check bar of a raw dataset as a beam sees it; ``notes`` get what is to be said of it."""
+    """Return the check bar of a raw dataset, measured with a beam; remarks are appended to ``notes``."""
     points, bar = measure_bar(
         raw,
         origin,

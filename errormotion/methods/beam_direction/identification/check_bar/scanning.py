@@ -1,12 +1,12 @@
-"""Surface points from the readings of a calibrated beam, with their own covariance and common influences.
+"""Surface points from the readings of a calibrated beam, with independent covariance and common influences.
 
-A reading d at the position s of the stage puts a point at p = p0 + s + d u, p0 the zero point, u the unit vector of the
-beam; readings increase with the distance from the sensor. The noise is independent for each point. Errors of the beam
-and of the calibration of its inclination error are common to the whole scan: they are stored as influences, not as
-scatter.
+The point of a reading d at the position s of the stage is p = p0 + s + d u, with the zero point p0 and the unit vector
+u of the beam; readings increase with the distance from the sensor. The noise is independent for each point. Errors of
+the beam and of the calibration of its inclination error are common to the whole scan: they are stored as influences,
+not as scatter.
 
-The inclination error depends on the surface's normal and the normal on the points. Where the normals are not given,
-both are found by iteration until the points no longer change.
+The inclination error depends on the surface's normal and the normal on the points. If the normals are not given, both
+are determined by iteration until the points no longer change.
 """
 
 from __future__ import annotations
@@ -46,23 +46,23 @@ class Points:
     Attributes
     ----------
     points : ndarray (n, 3)
-        m; NaN where there was no reading.
+        m; NaN for missing readings.
     covariance : ndarray (n, 3, 3)
         Independent part of each point: noise of reading and stage, m^2.
     influence : ndarray (source, n, 3)
         Signed effect, m, of one standard uncertainty of each source that all points share.
     sources : tuple of str
-        Names of these sources; scans with the same beam and calibration share the sources of the same name.
+        Names of these sources, common to all scans with the same beam and calibration.
     reading : ndarray (n,)
         Uncorrected readings, m.
     distance : ndarray (n,)
-        With the inclination error corrected, m; the same as `reading` where there is no calibration.
+        With the inclination error corrected, m; the same as `reading` without calibration.
     direction : ndarray (3,)
         Direction of the beam.
     normals : ndarray (n, 3) or None
-        Unit normals towards the sensor, where they are known.
+        Unit normals towards the sensor, if they are known.
     tilt : ndarray (n, 2) or None
-        Tilt vectors of the surface to the beam, where a calibration was used.
+        Tilt vectors of the surface to the beam, if a calibration was used.
     iterations : int
         Number of iterations of the normals.
     notes : tuple of str
@@ -118,14 +118,14 @@ def points(
     noise, stage_noise : float
         Standard deviation of one reading, and of each coordinate of the stage, m.
     calibration : InclinationCalibration, optional
-        Of the sensor; without one the readings are not corrected.
+        Of the sensor; without it the readings are not corrected.
     triangulation_normal : array_like (3,), optional
         Normal of the plane of emitted and received beam; needed with a calibration.
     mid_range : float, optional
         Reading at which the inclination error vanishes, m; default: that of the calibration.
     normals : array_like (n, 3) or Surface, optional
         Unit normals, or a function that returns them from the points: `along_curve`, `over_surface`, `round_bar` or
-        another. By default a scan along one line is taken as a curve in its plane, any other one as a surface.
+        another. By default, `along_curve` in its plane for a scan along one line, `over_surface` for any other.
     moves : {"sensor", "target"}
         What the stage carries; if it is the target, the points are in the target's own frame.
     extrapolate : bool
@@ -143,7 +143,7 @@ def points(
     beam = _beam(origin, direction, covariance)
     measured = np.isfinite(r) & np.isfinite(s).all(axis=1)
     if not measured.any():
-        raise MethodError("Expected readings; found none that is a number.")
+        raise MethodError("Expected readings; found only NaN.")
     if moves not in ("sensor", "target"):
         raise MethodError(f"moves: expected 'sensor' or 'target'; found '{moves}'.")
     positions = s[measured] if moves == "sensor" else -s[measured]
@@ -209,26 +209,26 @@ class _Scan:
         """Return the tilt vectors (n, 2) of a surface with these normals."""
         if self.triangulation_normal is None:
             raise MethodError(
-                "A calibration needs the triangulation normal, which states the rotation of the sensor about its beam: "
-                "the normal of the plane that contains the emitted and the received beam."
+                "Expected triangulation_normal with a calibration: the normal of the plane of the emitted and the "
+                "received beam, which states the rotation of the sensor about its beam."
             )
         return np.asarray(tilt(self.beam[1] if direction is None else direction, self.triangulation_normal, normals))
 
     def facing(self, normals: Array) -> Array:
         """Return normals (n, 3) turned towards the sensor."""
-        way = -(normals @ self.direction)
-        if not (np.abs(way) > _ROUNDING).all():
+        cosine = -(normals @ self.direction)
+        if not (np.abs(cosine) > _ROUNDING).all():
             raise MethodError(
-                "The beam is parallel to the surface at some points and has no reading there. Check the normals."
+                "The beam is parallel to the surface at some points, where no reading is possible. Check the normals."
             )
-        return np.asarray(normals * np.sign(way)[:, None])
+        return np.asarray(normals * np.sign(cosine)[:, None])
 
 
 def _beam(origin: ArrayLike, direction: ArrayLike, covariance: ArrayLike | None) -> tuple[Array, Array, Array | None]:
     p0, u = np.asarray(origin, float), np.asarray(direction, float)
     if p0.shape != (3,) or not np.isfinite(p0).all():
         raise MethodError(
-            f"Expected the beam's origin, three lengths; found {p0.tolist()}. Give 0 0 0 for form and size alone."
+            f"Expected the beam's origin, three lengths; found {p0.tolist()}. State 0 0 0 for form and size only."
         )
     if u.shape != (3,) or not abs(np.linalg.norm(u) - 1) <= _UNIT_NORM:
         raise MethodError(f"Expected the beam's direction, a unit vector of three numbers; found {u.tolist()}.")
@@ -253,18 +253,18 @@ def _surface(
         return scan.facing(N[measured]), ()
     if scan.calibration is None:
         return None, ()
-    away = scan.stage - scan.stage.mean(axis=0)
-    _, spread, ways = np.linalg.svd(away, full_matrices=False)
+    centred = scan.stage - scan.stage.mean(axis=0)
+    _, spread, directions = np.linalg.svd(centred, full_matrices=False)
     if len(spread) > 1 and spread[1] > 1e-3 * spread[0]:
         return over_surface(), ()
-    axis = np.cross(ways[0], scan.direction)
+    axis = np.cross(directions[0], scan.direction)
     if np.linalg.norm(axis) < 1e-3:
         raise MethodError(
-            "The stage moved along the beam alone: the tilt cannot be determined from such a scan. Give the normals."
+            "The stage moved only along the beam: the tilt cannot be determined from such a scan. State the normals."
         )
     note = (
         "The scan is along one line, which determines only the tilt in the plane of the scan; the tilt across it "
-        "was taken as 0. If the surface is inclined across the scan, give its normals or the "
+        "is assumed to be 0. If the surface is inclined across the scan, state its normals or the "
         "surface, such as round_bar(axis)."
     )
     return along_curve(axis / np.linalg.norm(axis)), (note,)
@@ -286,7 +286,7 @@ def _converged(scan: _Scan, surface: Array | Surface | None) -> tuple[Array, Arr
     raise MethodError(
         f"Normals and points do not converge: after {MAX_ITERATIONS} iterations the points still change by "
         f"{1e6 * change:.3g} um. The distance of the neighbours is too small for the noise: use more neighbours, or "
-        "give the surface, such as round_bar(axis)."
+        "state the surface, such as round_bar(axis)."
     )
 
 
@@ -298,51 +298,51 @@ def _compensated(scan: _Scan, normals: Array) -> Array:
 
 
 def _extrapolated(scan: _Scan, normals: Array | None) -> tuple[str, ...]:
-    """Return a note with the number of points compensated at tilts outside the calibration; ``normals`` (n, 3)."""
+    """Return a note with the number of points at tilts outside the calibration; ``normals`` (n, 3)."""
     if scan.calibration is None or normals is None:
         return ()
     beyond = int((~scan.calibration.supported(scan.tilt(normals))).sum())
     if not beyond:
         return ()
     return (
-        f"{beyond} of {len(normals)} points lie at tilts that the calibration '{scan.calibration.name}' does not "
-        "cover: the correction there is extrapolated.",
+        f"{beyond} of {len(normals)} points are at tilts that the calibration '{scan.calibration.name}' does not "
+        "cover: their correction is extrapolated.",
     )
 
 
 def _influences(scan: _Scan, normals: Array | None, distance: Array) -> tuple[Array, tuple[str, ...]]:
     """Return the effect (source, n, 3) of one standard uncertainty of each common source."""
-    found: list[Array] = []
+    effects: list[Array] = []
     sources: list[str] = []
     p0, u, C = scan.beam
     calibration = scan.calibration
 
     def moved(step: Array) -> Array:
-        tipped = u + step[3:]
+        direction = u + step[3:]
         d = distance
         if calibration is not None and normals is not None:
-            q = scan.tilt(normals, tipped)
+            q = scan.tilt(normals, direction)
             d = calibration.compensate(scan.reading, q, scan.mid_range, extrapolate=True).value
-        return scan.position(d, p0 + step[:3], tipped)
+        return scan.position(d, p0 + step[:3], direction)
 
     for k, step in enumerate(factors(C) if C is not None else ()):
-        found.append((moved(step) - moved(-step)) / 2)
+        effects.append((moved(step) - moved(-step)) / 2)
         sources.append(f"beam {k + 1}")
     if calibration is not None and normals is not None:
         q = scan.tilt(normals)
         J = calibration.compensate(scan.reading, q, scan.mid_range, extrapolate=True).jacobian
         for k, step in enumerate(factors(calibration.coefficient_covariance)):
-            found.append((J @ step)[:, None] * u)
+            effects.append((J @ step)[:, None] * u)
             sources.append(f"inclination calibration {k + 1}")
-    return np.array(found).reshape(-1, len(distance), 3), tuple(sources)
+    return np.array(effects).reshape(-1, len(distance), 3), tuple(sources)
 
 
 def factors(covariance: Array) -> Array:
-    """Return independent steps (k, p) of one standard uncertainty each, whose squares add up to a covariance (p, p)."""
+    """Return a square root (k, p) of a covariance (p, p): independent steps of one standard uncertainty each."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(covariance / scale[:, None] / scale)
     if values[0] < -1e-8 * max(values[-1], 1.0):
-        raise MethodError("Expected a covariance; found a matrix with a negative variance in some direction.")
+        raise MethodError("Expected a covariance; found a matrix with a negative eigenvalue.")
     kept = values > 1e-12 * max(values[-1], 0.0)
     return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T * scale)

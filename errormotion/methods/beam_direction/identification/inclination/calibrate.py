@@ -1,7 +1,7 @@
 """Calibration of the inclination error of a point sensor from readings against an interferometer.
 
-``lines`` fits the slope of every setting, ``surface`` a smooth surface to the slopes; this module combines them to a
-calibration dataset, with the prediction error at settings that were left out.
+``lines`` fits the slope of every setting, ``surface`` a smooth surface to the slopes; this module combines them in a
+calibration dataset, with the prediction error at settings that are left out of the fit (cross-validation).
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from errormotion.methods.beam_direction.identification.inclination.surface impor
 from errormotion.methods.beam_direction.schema import INCLINATION_SCHEMA
 
 GAP = 0.6
-"""Diameter of the largest empty circle between calibrated tilts that is covered, relative to the steepest tilt: half a
-wave of a k that changes its sign five times in half a turn about the beam."""
+"""Diameter of the largest empty circle between calibrated tilts that is covered, relative to the steepest tilt: half
+the period of a k that changes its sign five times in half a turn about the beam."""
 MARGIN = 0.05
 """Largest distance of a covered tilt from the calibrated tilts, relative to the steepest tilt."""
 
-_CONTRADICTS = 6.0
-"""Standard deviations from which on a setting contradicts all others."""
-_MOST_CONTRADICTING = 0.1
+_CONTRADICTION = 6.0
+"""Standard deviations from which on a setting contradicts the others."""
+_MAX_CONTRADICTING = 0.1
 """Largest share of such settings."""
-_FEWEST = 4
-"""Fewest different tilts: one more than a plane has coefficients."""
-_FEW = 50
-"""Different tilts below which the intervals are rough."""
-_NAMED = 6
-_SPOILS = 3.5
-"""Size of a hole, in steps of inclination, from which on the intervals next to it hold in only 70 to 90 % of cases."""
-_ALL_AROUND = np.radians(359.0)
+_MIN_TILTS = 4
+"""Different tilts: one more than the number of coefficients of a plane."""
+_FEW_TILTS = 50
+"""Different tilts below which the intervals are approximate."""
+_MAX_LISTED = 6
+_LARGE_HOLE = 3.5
+"""Size of a hole, in steps of inclination, from which on the coverage of intervals next to it is only 70 to 90 %."""
+_FULL_TURN = np.radians(359.0)
 _DRAWS = 1000
-_SEVERAL = 3.0
+_SIGNIFICANT = 3.0
 """Standard uncertainties from which on a deviation of the mid-range from the stated one is reported."""
 
 
 class Settings(BaseModel):
-    """How a calibration is made."""
+    """Settings of a calibration."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -68,8 +68,7 @@ class Settings(BaseModel):
     offsets: Literal["auto", "each", "none"] = Field(
         default="auto", description="whether each setting has its own zero of the interferometer"
     )
-
-    serial_number: str = Field(default="", description="serial number of the sensor; default: as the readings state it")
+    serial_number: str = Field(default="", description="serial number of the sensor; default: that of the readings")
 
 
 def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationCalibration:
@@ -84,7 +83,7 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
     Returns
     -------
     InclinationCalibration
-        Its attribute ``notes`` (text, one note per line) states restrictions of its use.
+        Its attribute ``notes`` (text, one note per line) contains remarks on its use.
 
     Raises
     ------
@@ -120,29 +119,29 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
 
 
 def _serial_number(raw: xr.Dataset, settings: Settings) -> dict[str, str]:
-    """Return the attribute that states the sensor to which the calibration belongs; empty where it is unknown."""
+    """Return the attribute with the serial number of the calibrated sensor; empty if it is unknown."""
     serial = settings.serial_number or owner.serial_number(raw.attrs, "point_lds")
     return {owner.ATTRIBUTE: serial} if serial else {}
 
 
 def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.bool_], Surface]:
-    """Return which settings were used and the surface through them; those that contradict all others are not."""
+    """Return which settings were used, without those that contradict the others, and the surface fitted to them."""
     different = len(np.unique(np.round(q, 6), axis=0))
     fits = [
         order
         for order in range(inclination_surface.HIGHEST_ORDER + 1)
         if len(inclination_surface.degrees_to(order, bool(settings.mirror))) < different
     ]
-    if different < _FEWEST:
+    if different < _MIN_TILTS:
         raise MethodError(
-            f"{different} different tilts of the surface; expected at least {_FEWEST}, for the cross-"
-            "validation. Measure more inclinations and rotations."
+            f"Expected at least {_MIN_TILTS} different tilts of the surface, for the cross-validation; found "
+            f"{different}. Measure more inclinations and rotations."
         )
     if settings.order is not None and settings.order not in fits:
         count = len(inclination_surface.degrees_to(settings.order, bool(settings.mirror)))
         raise MethodError(
-            f"Order {settings.order} has {count} coefficients; expected more different tilts than that, found "
-            f"{different}. Use order {fits[-1]} or less, or measure more settings."
+            f"order: expected fewer coefficients than different tilts, {different}; found {count} at order "
+            f"{settings.order}. Use order {fits[-1]} or less, or measure more settings."
         )
     x = half_tilt(q)
     kept = np.ones(len(q), dtype=bool)
@@ -157,9 +156,9 @@ def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.boo
         )
         z = np.abs(surface.prediction.z)
         z = z / max(NORMAL_MAD * float(np.median(z)), 1e-3)
-        # The worst one first, because it also affects its neighbours.
-        wrong = z > max(_CONTRADICTS, 0.5 * z.max())
-        if not wrong.any() or (~kept).sum() + wrong.sum() > _MOST_CONTRADICTING * len(q):
+        # only the largest deviations, because they also affect their neighbours
+        wrong = z > max(_CONTRADICTION, 0.5 * z.max())
+        if not wrong.any() or (~kept).sum() + wrong.sum() > _MAX_CONTRADICTING * len(q):
             return kept, surface
         kept[np.flatnonzero(kept)[wrong]] = False
 
@@ -178,7 +177,7 @@ def _variables(
     predicted = J @ surface.coefficients
     variance = ((J @ surface.covariance) * J).sum(axis=1)
     predicted[kept], variance[kept] = surface.prediction.slope, surface.prediction.variance
-    missed = (lines.slope - predicted)[kept]
+    prediction_error = (lines.slope - predicted)[kept]
     steepest = float(np.hypot(*q[kept].T).max())
     return {
         "coefficient": surface.coefficients,
@@ -206,16 +205,16 @@ def _variables(
         "group_depth": readings.depth,
         "group_residual": lines.residual,
         "group_left_out": lines.left_out.astype(np.int8),
-        "remaining_error": np.sqrt(np.mean(missed**2)),
-        "remaining_error_interval": _interval(missed),
+        "remaining_error": np.sqrt(np.mean(prediction_error**2)),
+        "remaining_error_interval": _interval(prediction_error),
     }
 
 
-def _interval(missed: Array) -> Array:
+def _interval(error: Array) -> Array:
     """Return the 95 % interval (2,) of a root mean square, by bootstrap over the settings."""
     rng = np.random.default_rng(0)
-    draws = rng.integers(0, len(missed), size=(_DRAWS, len(missed)), dtype=np.int32)
-    return np.asarray(np.quantile(np.sqrt((missed**2)[draws].mean(axis=1)), [0.025, 0.975]))
+    draws = rng.integers(0, len(error), size=(_DRAWS, len(error)), dtype=np.int32)
+    return np.asarray(np.quantile(np.sqrt((error**2)[draws].mean(axis=1)), [0.025, 0.975]))
 
 
 def _notes(
@@ -231,22 +230,22 @@ def _notes(
         for a, b in zip(np.degrees(readings.inclination), np.degrees(readings.rotation), strict=True)
     ]
     if readings.missing:
-        yield f"{_of(readings.missing, 'group')} without a reading {_were(readings.missing)} ignored."
-    wild = np.flatnonzero(lines.left_out)
-    if wild.size:
-        named = [
+        yield f"{counted(readings.missing, 'group')} without a reading {_were(readings.missing)} ignored."
+    outliers = np.flatnonzero(lines.left_out)
+    if outliers.size:
+        listed = [
             f"{settings[readings.setting[k]]}, depth {1e3 * readings.depth[k]:.3f} mm "
             f"({1e6 * lines.residual[k]:+.1f} um)"
-            for k in wild[np.argsort(-np.abs(lines.residual[wild]), kind="stable")][:_NAMED]
+            for k in outliers[np.argsort(-np.abs(lines.residual[outliers]), kind="stable")][:_MAX_LISTED]
         ]
-        yield f"{wild.size} of {lines.left_out.size} readings {_were(wild.size)} left out: {_list(named, wild.size)}."
+        count = outliers.size
+        yield f"{count} of {lines.left_out.size} readings {_were(count)} left out: {_list(listed, count)}."
     wrong = np.flatnonzero(~kept)
     if wrong.size:
-        named = [settings[k] for k in wrong[:_NAMED]]
         contradict = "contradicts" if wrong.size == 1 else "contradict"
         yield (
-            f"{_of(wrong.size, 'setting')} {contradict} all others and {_were(wrong.size)} left out: "
-            f"{_list(named, wrong.size)}."
+            f"{counted(wrong.size, 'setting')} {contradict} the others and {_were(wrong.size)} left out: "
+            f"{_list([settings[k] for k in wrong[:_MAX_LISTED]], wrong.size)}."
         )
     if np.isfinite(readings.noise) and not 0.5 <= lines.noise / max(readings.noise, 1e-12) <= 2.0:
         yield (
@@ -254,16 +253,16 @@ def _notes(
             f"{1e6 * readings.noise:.3g} um. The scatter is used."
         )
     shift = pivot.reading - readings.mid_range
-    if abs(shift) > _SEVERAL * pivot.uncertainty and abs(shift) * np.ptp(lines.slope) > lines.noise:
+    if abs(shift) > _SIGNIFICANT * pivot.uncertainty and abs(shift) * np.ptp(lines.slope) > lines.noise:
         yield (
             f"The lines of the settings meet at a reading of {1e3 * pivot.reading:.4f} mm "
             f"(u = {1e3 * pivot.uncertainty:.4f} mm), not at the stated mid-range, {1e3 * readings.mid_range:.4f} mm."
         )
     different = len(np.unique(np.round(calibration.settings, 6), axis=0))
-    if different < _FEW:
-        yield f"{different} different tilts: with fewer than {_FEW} the calibration between them is uncertain."
+    if different < _FEW_TILTS:
+        yield f"{different} different tilts: with fewer than {_FEW_TILTS} the calibration between them is uncertain."
     if not calibration.serial_number:
-        yield "The serial number of the sensor is unknown: the calibration cannot be refused for another sensor."
+        yield "The serial number of the sensor is unknown: use with another sensor will not be detected."
     yield from _holes(calibration)
 
 
@@ -273,24 +272,25 @@ def _holes(calibration: InclinationCalibration) -> Iterator[str]:
         return
     texts = hole_texts(holes)
     yield (
-        f"Holes between the settings, whose usual step is {np.degrees(step):.3g} deg of inclination; tilts in them are "
-        f"refused: {_list(texts[:_NAMED], len(texts))}."
+        f"Holes between the settings, whose typical step is {np.degrees(step):.3g} deg of inclination; tilts in them "
+        f"are refused: {_list(texts[:_MAX_LISTED], len(texts))}."
     )
-    widest = max((np.ptp(hole.inclination) for hole in holes if np.ptp(hole.rotation) > _ALL_AROUND), default=0.0)
-    if widest > _SPOILS * step:
+    widest = max((np.ptp(hole.inclination) for hole in holes if np.ptp(hole.rotation) > _FULL_TURN), default=0.0)
+    if widest > _LARGE_HOLE * step:
         yield (
-            f"A hole of {np.degrees(widest):.0f} deg at every rotation also affects its surroundings: intervals there "
-            "hold less often than stated. Measure settings in it."
+            f"A hole of {np.degrees(widest):.0f} deg at every rotation also affects its surroundings: the coverage of "
+            "intervals there is smaller than stated. Measure settings in it."
         )
 
 
-def _of(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless it is 1."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def _were(count: int) -> str:
     return "was" if count == 1 else "were"
 
 
-def _list(named: list[str], count: int) -> str:
-    return "; ".join(named) + (f"; and {count - len(named)} more" if count > len(named) else "")
+def _list(items: list[str], count: int) -> str:
+    return "; ".join(items) + (f"; and {count - len(items)} more" if count > len(items) else "")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings, calibrate
+from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings, calibrate, counted
 from errormotion.methods.beam_direction.schema import INCLINATION_SCHEMA
 from errormotion.plugins import Calibration
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def figures(calibration: xr.Dataset) -> dict[str, Any]:
-    """Return the figures of a calibration in field units."""
+    """Return the figures of a calibration, in um and mm."""
     ds = calibration
     depth = float(abs(ds["group_depth"]).max())
     return {
@@ -37,29 +37,23 @@ def figures(calibration: xr.Dataset) -> dict[str, Any]:
 
 
 def text(calibration: xr.Dataset) -> list[str]:
-    """Return the figures of a calibration as lines, the first for its heading."""
-    found = figures(calibration)
-    symmetry = ", symmetric about the triangulation plane" if found["mirror"] else ""
-    low, high = found["remaining_error_um_interval"]
-    pivot = ""
-    if not math.isnan(found["mid_range_found_mm"]):
-        pivot = (
-            f", from the readings {found['mid_range_found_mm']:.4f} mm (u = {found['mid_range_uncertainty_mm']:.4f} mm)"
-        )
+    """Return the figures of a calibration as lines of text, the first one for its heading."""
+    values = figures(calibration)
+    symmetry = ", symmetric about the triangulation plane" if values["mirror"] else ""
+    low, high = values["remaining_error_um_interval"]
+    estimated = ""
+    if not math.isnan(found := values["mid_range_found_mm"]):
+        estimated = f", from the readings {found:.4f} mm (u = {values['mid_range_uncertainty_mm']:.4f} mm)"
     return [
-        f"calibration from {found['readings']} readings at {found['settings']} settings",
-        f"order {found['order']}{symmetry}; left out: {_count(found['readings_left_out'], 'reading')}, "
-        f"{_count(found['settings_left_out'], 'setting')}",
-        f"error at {found['depth_mm']:.3g} mm from mid-range: up to {found['largest_error_um']:.3g} um; "
-        f"remaining at settings that were left out: {found['remaining_error_um']:.3g} um rms "
+        f"calibration from {values['readings']} readings at {values['settings']} settings",
+        f"order {values['order']}{symmetry}; left out: {counted(values['readings_left_out'], 'reading')}, "
+        f"{counted(values['settings_left_out'], 'setting')}",
+        f"error at {values['depth_mm']:.3g} mm from mid-range: up to {values['largest_error_um']:.3g} um; "
+        f"remaining at settings that were left out: {values['remaining_error_um']:.3g} um rms "
         f"(95 %: {low:.3g} to {high:.3g} um)",
-        f"noise {found['noise_um']:.3g} um; mid-range {found['mid_range_mm']:.4g} mm{pivot}",
-        *(f"note: {note}" for note in found["notes"]),
+        f"noise {values['noise_um']:.3g} um; mid-range {values['mid_range_mm']:.4g} mm{estimated}",
+        *(f"note: {note}" for note in values["notes"]),
     ]
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _make(raw: xr.Dataset, settings: Settings) -> xr.Dataset:
@@ -67,4 +61,4 @@ def _make(raw: xr.Dataset, settings: Settings) -> xr.Dataset:
 
 
 CALIBRATIONS = {INCLINATION_SCHEMA: Calibration(Settings, _make, figures, text)}
-"""The calibrations that the method makes."""
+"""The calibrations of the method, by the schema of their readings."""

@@ -1,4 +1,4 @@
-"""Readings against an interferometer, setting by setting: each setting of the surface has a line of errors over depth.
+"""Lines of the errors over depth, one for each setting of the surface, from readings against an interferometer.
 
 The error of a reading is e = r - d = (d - m) k + b: k the slope of the setting, b the zero of its series, because an
 interferometer measures displacements only. Readings that do not fit the line of their setting are left out.
@@ -19,15 +19,15 @@ Indices = NDArray[np.int64]
 
 SAME = 1e-5
 """Angle within which groups belong to one setting, rad."""
-FEWEST_FREE = 30
-"""Degrees of freedom from which on the noise follows from the scatter about the lines."""
+MIN_FREEDOM = 30
+"""Degrees of freedom from which on the noise is estimated from the scatter about the lines."""
 _ENOUGH = 4
-"""Mean number of readings per setting from which on each setting has its own zero."""
+"""Median number of readings per setting from which on each setting has its own zero."""
 _OUTLIER = 5.0
 """Standard deviations from which on a reading does not fit its line."""
-_LEAST_NOISE = 1e-10
-"""m; rounding of readings without noise."""
-_ROUNDS = 20
+_MIN_NOISE = 1e-10
+"""Rounding of readings without noise, m."""
+_MAX_ITERATIONS = 20
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Readings:
     reading : ndarray (group,)
         r, m.
     setting : ndarray (group,)
-        Which setting each group belongs to.
+        Index of the setting of each group.
     inclination, rotation : ndarray (setting,)
         rad.
     noise : float
-        As stated, m; NaN if not.
+        Stated standard deviation, m; NaN if not stated.
     mid_range : float
         m.
     missing : int
@@ -72,11 +72,11 @@ class Lines:
     Attributes
     ----------
     slope, offset : ndarray (setting,)
-        k, and the error at mid range, m; the offset is 0 where it was not free.
+        k, and the error at mid range, m; the offset is 0 if it was not free.
     slope_variance : ndarray (setting,)
         From the noise.
     residual : ndarray (group,)
-        m; of groups that were left out as well.
+        m, including groups that were left out.
     left_out : ndarray of bool (group,)
     noise : float
         Standard deviation of one reading, m.
@@ -130,30 +130,36 @@ def read(raw: xr.Dataset) -> Readings:
 def _check(r: Array, d: Array, m: float) -> None:
     """Refuse implausible readings and references."""
     if np.ptp(d) < 1e-6:
-        raise MethodError(f"The reference stays at {1e3 * d[0]:.4f} mm; expected depths over the range of the sensor.")
-    way = float(np.cov(r, d)[0, 1] / d.var(ddof=1)) if len(d) > 1 else 1.0
-    if abs(way) < 1e-4:
+        raise MethodError(
+            f"The reference is constant, {1e3 * d[0]:.4f} mm; expected depths over the range of the sensor."
+        )
+    ratio = float(np.cov(r, d)[0, 1] / d.var(ddof=1)) if len(d) > 1 else 1.0
+    if abs(ratio) < 1e-4:
         raise MethodError(
             f"The readings stay near {1e3 * np.median(r):.4f} mm while the reference moves by {1e3 * np.ptp(d):.3f} "
-            "mm; expected the same displacement. Check the column."
+            "mm; expected the same displacement. Check the column of the readings."
         )
-    if way < 0:
+    if ratio < 0:
         raise MethodError(
             "The readings decrease where the reference increases. Change the sign of the reference, so that both "
             "increase with the depth."
         )
-    if not 0.8 < way < 1.25:
-        units = {1e3: " Is the reference in mm, written as m?", 1e-3: " Are the readings in mm, written as m?"}
-        hint = next((text for factor, text in units.items() if 0.8 < way * factor < 1.25), " Are the units right?")
+    if not 0.8 < ratio < 1.25:
+        units = {
+            1e3: "whether the reference is in mm, stated as m",
+            1e-3: "whether the readings are in mm, stated as m",
+        }
+        check = next((text for factor, text in units.items() if 0.8 < ratio * factor < 1.25), "the units")
         raise MethodError(
-            f"The readings change {way:.4g} times as much as the reference; expected a ratio of about 1.{hint}"
+            f"The readings change {ratio:.4g} times as much as the reference; expected a ratio of about 1. Check "
+            f"{check}."
         )
     low, high = float(d.min() - m), float(d.max() - m)
     if min(-low, high) < 0.05 * (high - low):
         raise MethodError(
-            f"The depths go from {1e3 * low:.3f} to {1e3 * high:.3f} mm about mid-range ({1e3 * m:.3f} mm), all on one "
-            "side; expected both sides, because the error changes its sign there. Check `mid_range` and the sign of "
-            "the reference."
+            f"The depths are from {1e3 * low:.3f} to {1e3 * high:.3f} mm relative to mid-range ({1e3 * m:.3f} mm), on "
+            "one side; expected both sides, because the error changes its sign there. Check `mid_range` and the sign "
+            "of the reference."
         )
 
 
@@ -165,7 +171,7 @@ def fit(readings: Readings, offsets: str = "auto") -> Lines:
     readings : Readings
     offsets : str
         ``"each"``: every setting has its own zero of the interferometer; ``"none"``: the interferometer has the zero of
-        the sensor; ``"auto"``: the first where the settings have enough readings.
+        the sensor; ``"auto"``: ``"each"`` if the settings have enough readings, else ``"none"``.
 
     Raises
     ------
@@ -177,14 +183,14 @@ def fit(readings: Readings, offsets: str = "auto") -> Lines:
     if offsets == "each" and count.min() < 2:
         k = int(np.argmin(count))
         raise MethodError(
-            f"{_name(readings, k)} has one reading only, which does not determine its own zero; expected at least "
-            "two, or offsets 'none'."
+            f"{_name(readings, k)} has only one reading, which does not determine its zero; expected two readings or "
+            "more, or the setting offsets = 'none'."
         )
     slope, offset = _start(readings, free)
     kept = np.ones(len(readings.error), dtype=bool)
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ITERATIONS):
         residual = readings.error - slope[readings.setting] * readings.depth - offset[readings.setting]
-        before, kept = kept, _belonging(residual, kept, readings, free)
+        before, kept = kept, _inliers(residual, kept, readings, free)
         slope, offset, variance = _solve(readings, kept, free)
         if (before == kept).all():
             break
@@ -213,12 +219,12 @@ def _start(readings: Readings, free: bool) -> tuple[Array, Array]:
     return slope, offset
 
 
-def _belonging(residual: Array, kept: NDArray[np.bool_], readings: Readings, free: bool) -> NDArray[np.bool_]:
-    """Return which readings fit the line of their setting; a setting keeps at least those that its line needs."""
+def _inliers(residual: Array, kept: NDArray[np.bool_], readings: Readings, free: bool) -> NDArray[np.bool_]:
+    """Return which readings fit the line of their setting; settings with few readings keep all of them."""
     count = np.bincount(readings.setting)
     # The residuals of a fitted line are smaller than the errors, by the degrees of freedom of the line.
     share = min(len(count) * (2 if free else 1) / kept.sum(), 0.75)
-    scale = max(NORMAL_MAD * float(np.median(np.abs(residual[kept]))) / np.sqrt(1 - share), _LEAST_NOISE)
+    scale = max(NORMAL_MAD * float(np.median(np.abs(residual[kept]))) / np.sqrt(1 - share), _MIN_NOISE)
     few = count[readings.setting] < (_ENOUGH if free else 2)
     return np.asarray((np.abs(residual) <= _OUTLIER * scale) | few)
 
@@ -244,21 +250,21 @@ def _solve(readings: Readings, kept: NDArray[np.bool_], free: bool) -> tuple[Arr
 def _require_depth(readings: Readings, enough: NDArray[np.bool_]) -> None:
     if not enough.all():
         raise MethodError(
-            f"{_name(readings, int(np.argmin(enough)))} has readings at one depth only; expected several depths, which "
+            f"{_name(readings, int(np.argmin(enough)))} has readings at only one depth; expected several depths, which "
             "determine the slope of the error. Remove the setting or repeat its measurement."
         )
 
 
 def _noise(residual: Array, freedom: int, stated: float) -> float:
-    """Return the standard deviation of one reading: from the lines, or as stated where these are too few."""
-    if freedom >= FEWEST_FREE:
-        return max(float(np.sqrt((residual**2).sum() / freedom)), _LEAST_NOISE)
+    """Return the standard deviation of one reading, by the lines, or the stated one if there are too few readings."""
+    if freedom >= MIN_FREEDOM:
+        return max(float(np.sqrt((residual**2).sum() / freedom)), _MIN_NOISE)
     if not np.isfinite(stated):
         raise MethodError(
-            f"{freedom} readings more than unknowns do not determine the noise of the readings; expected at least "
-            f"{FEWEST_FREE}, or `reading_noise` in the data."
+            f"Expected at least {MIN_FREEDOM} readings more than unknowns to estimate the noise, or `reading_noise` in "
+            f"the data; found {freedom}."
         )
-    return max(stated, _LEAST_NOISE)
+    return max(stated, _MIN_NOISE)
 
 
 def _name(readings: Readings, setting: int) -> str:
@@ -273,14 +279,11 @@ class MidRange:
     Attributes
     ----------
     reading, uncertainty : float
-        m; NaN where the lines do not determine it.
-    scatter : float
-        Standard deviation of the zeros of the settings, m.
+        m; NaN if the lines do not determine it.
     """
 
     reading: float
     uncertainty: float
-    scatter: float
 
 
 def mid_range(readings: Readings, lines: Lines) -> MidRange:
@@ -290,13 +293,13 @@ def mid_range(readings: Readings, lines: Lines) -> MidRange:
     """
     known = len(lines.slope) - 2
     if not lines.free_offsets or known < 3 or np.ptp(lines.slope) < 5 * np.sqrt(np.median(lines.slope_variance)):
-        return MidRange(float("nan"), float("nan"), float("nan"))
+        return MidRange(float("nan"), float("nan"))
     A = np.stack([np.ones(len(lines.slope)), -lines.slope], axis=1)
     good = np.ones(len(lines.slope), dtype=bool)
-    for _ in range(3):  # a zero that was set wrongly does not count
+    for _ in range(3):  # without outliers of the zeros
         (_, shift), *_ = np.linalg.lstsq(A[good], lines.offset[good])
         rest = lines.offset - A @ np.array([np.median(lines.offset + lines.slope * shift), shift])
-        good = np.abs(rest) <= _OUTLIER * max(NORMAL_MAD * float(np.median(np.abs(rest))), _LEAST_NOISE)
+        good = np.abs(rest) <= _OUTLIER * max(NORMAL_MAD * float(np.median(np.abs(rest))), _MIN_NOISE)
     scatter = float(np.sqrt((rest[good] ** 2).sum() / max(int(good.sum()) - 2, 1)))
     C = np.linalg.inv(A[good].T @ A[good]) * scatter**2
-    return MidRange(readings.mid_range + float(shift), float(np.sqrt(C[1, 1])), scatter)
+    return MidRange(readings.mid_range + float(shift), float(np.sqrt(C[1, 1])))

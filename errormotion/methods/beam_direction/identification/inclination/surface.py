@@ -1,14 +1,14 @@
-"""A smooth surface k through the slopes of calibrated settings, its order chosen by leaving settings out.
+"""A smooth surface k through the slopes of calibrated settings, of an order chosen by leave-one-out cross-validation.
 
 k is a sum of products of Legendre polynomials. The coefficients of a smooth function decrease geometrically with their
 degree n, so the prior of each is 0 with the standard deviation s rho^n, and the settings scatter f times as much as
-their noise. The fit of s, rho and f to the data is measured by predictions of settings that were left out, one at a
-time: the sum of the log densities of these predictions (Rasmussen and Williams, Gaussian Processes for Machine
-Learning, section 5.4.2). Few settings determine the three only roughly, so the surface is the average over a grid of
-them, weighted by this density, and its covariance includes their differences.
+their noise. The agreement of s, rho and f with the data is the sum of the log densities of the predictions of each
+setting by all the others (Rasmussen and Williams, Gaussian Processes for Machine Learning, section 5.4.2). A small
+number of settings determines the three only approximately, so the surface is the average over a grid of them, weighted
+by this density, and its covariance includes their differences.
 
-The order is the smallest one that predicts no worse than all degrees together. Higher degrees remain in the fit with
-their prior: they represent the truncation error, and increase the uncertainty where there are no settings.
+The order is the smallest one with predictions no worse than those of all degrees together. Higher degrees remain in the
+fit with their prior: they represent the truncation error, and increase the uncertainty where there are no settings.
 """
 
 from __future__ import annotations
@@ -22,12 +22,11 @@ from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import terms
 
 HIGHEST_ORDER = 12
-"""Highest order that is tried."""
 EXTRA_DEGREES = 3
-"""Additional degrees in the fit."""
+"""Degrees in the fit above the highest order."""
 
 _MAX_SETTINGS = 600
-"""Largest number of settings used to determine s, rho and f; limits the computing time."""
+"""Largest number of settings used to determine s, rho and f, to limit the computing time."""
 _SIZES = 10.0 ** np.arange(-6.0, 1.1, 0.2)
 """Standard deviations of the coefficients of degree `_MIDDLE`, over the largest slope."""
 _MIDDLE = 4
@@ -35,17 +34,17 @@ _DECAYS = 1.4 ** np.arange(-7.0, 1.0)
 """rho, from a tenth up to 1."""
 _SCATTERS = np.array([1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0, 100.0])
 """f."""
-_LEAST_WEIGHT = 1e-3
+_MIN_WEIGHT = 1e-3
 """Weight, relative to the largest, below which a point of the grid is ignored."""
 _ROUNDING = 1e-9
-"""Least share of a slope that its own reading does not determine."""
+"""Lower limit of 1 - leverage."""
 _ON_LINE = 1e-6
 """x2 below which a setting lies on the line of symmetry."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """How a surface predicts each setting from all the others.
+    """Prediction of each setting from all the others.
 
     Attributes
     ----------
@@ -114,29 +113,29 @@ def fit_surface(
     order : int, optional
         Replaces the order chosen by cross-validation; it is then the highest degree.
     mirror : bool, optional
-        Whether k is even in x2; default: if that predicts no worse, and there are settings on both sides.
+        Whether k is even in x2; default: if its predictions are no worse, and there are settings on both sides.
     """
     both_sides = bool((x[:, 1] > _ON_LINE).any() and (x[:, 1] < -_ON_LINE).any())
     last = HIGHEST_ORDER + EXTRA_DEGREES if order is None else order
     problem = _Problem.of(x, slope, variance, degrees_to(last, both_sides if mirror is None else mirror))
-    positions, weights = problem.thinned().grid()
-    prediction = problem.predict(positions[0])
+    points, weights = problem.thinned().grid()
+    prediction = problem.predict(points[0])
     if mirror is None and both_sides:
         free = _Problem.of(x, slope, variance, degrees_to(last, mirror=False))
-        if _worse(prediction.density, free.predict(positions[0]).density):
+        if _worse(prediction.density, free.predict(points[0]).density):
             problem = free
-            positions, weights = problem.thinned().grid()
-            prediction = problem.predict(positions[0])
-    coefficients, covariance = problem.average(positions, weights)
-    # The prior may be wrong: the covariance is no smaller than the errors of the predictions.
+            points, weights = problem.thinned().grid()
+            prediction = problem.predict(points[0])
+    coefficients, covariance = problem.average(points, weights)
+    # In case the prior is wrong, the covariance is no smaller than the errors of the predictions.
     widening = max(1.0, float(np.mean(prediction.z**2)))
     return Surface(
         problem.degrees,
         coefficients,
         covariance * widening,
-        problem.choose_order(positions[0], prediction, highest) if order is None else order,
+        problem.choose_order(points[0], prediction, highest) if order is None else order,
         not (problem.degrees[:, 1] % 2).any(),
-        positions[0].scatter,
+        points[0].scatter,
         Prediction(prediction.density, prediction.slope, prediction.variance * widening, prediction.z),
     )
 
@@ -197,35 +196,35 @@ class _Problem:
         return float(np.max(np.abs(self.y * self.deviation)))
 
     def grid(self) -> tuple[list[_GridPoint], Array]:
-        """Return the points with significant weight, the best first, and their weights, sum 1."""
+        """Return the points with significant weight in decreasing order, and their weights, whose sum is 1."""
         sizes, scatters = (part.ravel() for part in np.meshgrid(_SIZES, _SCATTERS))
         square, noise = (sizes * self.unit()) ** 2, scatters**2
-        suits = np.empty((len(_DECAYS), len(sizes)))
+        densities = np.empty((len(_DECAYS), len(sizes)))
         for row, decay in enumerate(_DECAYS):
             values, vectors = self.spectrum(decay)
             T = (self.Phi * self.prior(decay)) @ vectors
             shrink = square / (square * values[:, None] + noise)
-            suits[row] = _density(self.y[:, None] - T @ (shrink * (T.T @ self.y)[:, None]), T**2 @ shrink, noise)
-        weights = np.exp(suits - suits.max()).ravel()
+            densities[row] = _density(self.y[:, None] - T @ (shrink * (T.T @ self.y)[:, None]), T**2 @ shrink, noise)
+        weights = np.exp(densities - densities.max()).ravel()
         order = np.argsort(-weights, kind="stable")
-        order = order[weights[order] >= _LEAST_WEIGHT]
-        positions = [
+        order = order[weights[order] >= _MIN_WEIGHT]
+        points = [
             _GridPoint(float(sizes[k % len(sizes)]), float(_DECAYS[k // len(sizes)]), float(scatters[k % len(sizes)]))
             for k in order
         ]
-        return positions, weights[order] / weights[order].sum()
+        return points, weights[order] / weights[order].sum()
 
-    def average(self, positions: list[_GridPoint], weights: Array) -> tuple[Array, Array]:
+    def average(self, points: list[_GridPoint], weights: Array) -> tuple[Array, Array]:
         """Return the mean of the coefficients over points of the grid, and their covariance."""
-        means = np.empty((len(positions), len(self.degrees)))
+        means = np.empty((len(points), len(self.degrees)))
         C = np.zeros((len(self.degrees), len(self.degrees)))
-        for decay in {position.decay for position in positions}:
+        for decay in {point.decay for point in points}:
             values, vectors = self.spectrum(decay)
             D = self.prior(decay)
             along = vectors.T @ (D * (self.Phi.T @ self.y))
-            rows = [k for k, position in enumerate(positions) if position.decay == decay]
-            square = np.array([(positions[k].size * self.unit()) ** 2 for k in rows])[:, None]
-            noise = np.array([positions[k].scatter ** 2 for k in rows])[:, None]
+            rows = [k for k, point in enumerate(points) if point.decay == decay]
+            square = np.array([(points[k].size * self.unit()) ** 2 for k in rows])[:, None]
+            noise = np.array([points[k].scatter ** 2 for k in rows])[:, None]
             shrink = square / (square * values + noise)
             means[rows] = D * ((shrink * along) @ vectors.T)
             basis = D[:, None] * vectors
@@ -235,12 +234,12 @@ class _Problem:
         C += off.T @ off
         return mean, (C + C.T) / 2
 
-    def predict(self, position: _GridPoint) -> Prediction:
+    def predict(self, point: _GridPoint) -> Prediction:
         """Return the prediction of each setting by all the others, in closed form."""
         from scipy.linalg import solve_triangular
 
-        square, noise = (position.size * self.unit()) ** 2, position.scatter**2
-        X = self.Phi * (self.prior(position.decay) * np.sqrt(square / noise))
+        square, noise = (point.size * self.unit()) ** 2, point.scatter**2
+        X = self.Phi * (self.prior(point.decay) * np.sqrt(square / noise))
         L = np.linalg.cholesky(X.T @ X + np.eye(X.shape[1]))
         B = solve_triangular(L, X.T, lower=True, check_finite=False)
         rest, leverage = self.y - B.T @ (B @ self.y), (B**2).sum(axis=0)
@@ -253,15 +252,15 @@ class _Problem:
             z,
         )
 
-    def choose_order(self, position: _GridPoint, best: Prediction, highest: int) -> int:
-        """Return the smallest order that predicts no worse than all degrees."""
+    def choose_order(self, point: _GridPoint, best: Prediction, highest: int) -> int:
+        """Return the smallest order with predictions no worse than those of all degrees."""
         for order in range(highest):
-            if not _worse(self.up_to(order).predict(position).density, best.density):
+            if not _worse(self.up_to(order).predict(point).density, best.density):
                 return order
         return highest
 
 
 def _density(rest: Array, leverage: Array, noise: Array) -> Array:
-    """Return the sums of the log densities of left-out slopes, up to a constant, for residuals (setting, position)."""
+    """Return sums of log densities of left-out slopes, without a constant, for residuals (setting, grid point)."""
     free = np.maximum(1.0 - leverage, _ROUNDING)
     return np.asarray(-0.5 * (rest**2 / (noise * free) + np.log(noise / free)).sum(axis=0))

@@ -1,1 +1,1 @@
-"""What distances do not determine, readings that contradict the others, and notes on both."""
+"""Undetermined freedoms, outliers, and notes on both."""

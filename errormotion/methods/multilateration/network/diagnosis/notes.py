@@ -1,4 +1,4 @@
-"""Notes on a network: readings that were excluded, targets without a position, a weak layout, swapped stations."""
+"""Notes on a network: outliers, targets without a position, a weak layout, swapped stations."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from errormotion.methods.multilateration.network.network import Network
 
 
 def notes_of(network: Network) -> tuple[str, ...]:
-    """Return what the operator should know about a network."""
+    """Return the notes on a network for the operator."""
     return (
         *outliers.notes(network.left_out, network.undecided),
-        *determinacy.without_place(network.weight, network.undecided),
-        *determinacy.without_say(network.carries, network.target),
+        *determinacy.without_position(network.weight, network.undecided),
+        *determinacy.outside_datum(network.in_datum, network.target),
         *determinacy.weak_layout(network.target_covariance, network.weight, network.station, network.target),
         *determinacy.weak_targets(network.target, network.target_covariance, network.station),
-        *determinacy.swap_note(network.station, network.rough),
+        *determinacy.swap_note(network.station, network.approximate),
     )

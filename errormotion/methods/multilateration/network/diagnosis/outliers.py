@@ -1,9 +1,9 @@
-"""Readings that contradict the others: which they are, and which of them can be identified.
+"""Outliers: readings that contradict the others.
 
-A reading is judged by its residual over what it should be, sigma sqrt(redundancy). Where a target has two readings too
-many, the wrong one has the largest. With one too many, as with four stations, all of its residuals are equally
-large whichever is wrong: then the one counts as wrong without which the target comes to lie where the machine puts its
-other targets. Where several would do, the target is given up and named.
+A reading is tested by its residual over the expected one, sigma sqrt(redundancy). If a target has two redundant
+readings, the outlier has the largest. With one, as with four stations, all its residuals are equal whichever is wrong:
+the outlier is then the reading without which the error of the target agrees with those of the other targets. If this is
+true of several readings, the target is excluded.
 """
 
 from __future__ import annotations
@@ -20,60 +20,60 @@ from errormotion.methods.multilateration.network.model import directions
 from errormotion.methods.multilateration.network.network import Network
 
 FALSE_ALARMS = 0.01
-"""Probability of leaving out any good reading of a network."""
+"""Probability of ignoring any good reading of a network."""
 CLEAR = 2.5
-"""By so many standard deviations the wrong reading must stand out among those of its target."""
+"""Standard deviations by which an outlier must exceed the other residuals of its target."""
 NEAR = 4.0
-"""Within so many usual deviations a target lies where the machine puts its targets."""
-_WEAK = 1e-3
-_GROSS = 50.0
+"""Robust standard deviations within which the error of a target agrees with those of the others."""
+_MIN_REDUNDANCY = 1e-3
+_GROSS = 50.0  # over the median distance from the nominal one
 _SHOWN = 12
 
 
 @dataclass(frozen=True)
-class Found:
-    """Readings left out (station, target) and targets given up, both from 0."""
+class Outliers:
+    """Outliers (station, target) and excluded targets, both from 0; ``out`` (n, m) are all readings excluded."""
 
     left_out: tuple[tuple[int, int], ...]
     undecided: tuple[int, ...]
     out: NDArray[np.bool_] = field(compare=False, repr=False)
 
     @classmethod
-    def none(cls, weight: Array) -> Found:
-        """Return that nothing was found."""
+    def none(cls, weight: Array) -> Outliers:
+        """Return no outliers, for weights (n, m)."""
         return cls((), (), np.zeros(weight.shape, dtype=bool))
 
     def applied(self, weight: Array) -> Array:
-        """Return the weights (n, m) with what was found at 0."""
+        """Return the weights (n, m), 0 for excluded readings."""
         return np.where(self.out, 0.0, weight)
 
 
 def notes(left_out: tuple[tuple[int, int], ...], undecided: tuple[int, ...]) -> list[str]:
-    """Return notes on readings that were excluded and targets that were given up."""
+    """Return notes on outliers and excluded targets."""
     found = []
     if left_out:
         shown = ", ".join(f"station {j + 1} of target {i + 1}" for j, i in left_out[:_SHOWN])
         more = f" and {len(left_out) - _SHOWN} more" if len(left_out) > _SHOWN else ""
-        found.append(f"wrong readings left out ({len(left_out)}): {shown}{more}")
+        found.append(f"Outliers, ignored ({len(left_out)}): {shown}{more}.")
     if undecided:
         shown = ", ".join(str(i + 1) for i in undecided[:_SHOWN])
         more = f" and {len(undecided) - _SHOWN} more" if len(undecided) > _SHOWN else ""
         found.append(
-            f"targets given up ({len(undecided)}), since one of their readings is wrong and it is not determined "
-            f"which: {shown}{more}; readings from a further station would determine it"
+            f"Targets excluded, with contradictory readings of which the wrong one is not determined "
+            f"({len(undecided)}): {shown}{more}. Readings from a further station would determine it."
         )
     return found
 
 
 def normalised(network: Network) -> Array:
-    """Return residuals over what they should be, (n, m); NaN where a reading is not checked by others."""
-    checked = np.where(network.redundancy > _WEAK, network.redundancy, np.nan)
+    """Return residuals over the expected ones, (n, m); NaN where a reading has no redundancy."""
+    checked = np.where(network.redundancy > _MIN_REDUNDANCY, network.redundancy, np.nan)
     found: Array = network.residual * network.weight / np.sqrt(checked)
     return found
 
 
 def gate(t: Array) -> float:
-    """Return above which normalised residual (n, m) a reading is wrong."""
+    """Return the normalised residual above which a reading is an outlier, from all (n, m)."""
     scale = max(1.0, NORMAL_MAD * float(np.nanmedian(np.abs(t))))
     return scale * _least_gate(int(np.count_nonzero(np.isfinite(t))))
 
@@ -83,42 +83,43 @@ def _least_gate(checks: int) -> float:
 
 
 def _clean(network: Network) -> bool:
-    """Whether no reading is above the lowest gate there is, with noise as it was stated: a quick look at large ones."""
+    """Return whether no reading exceeds the lowest gate, with the stated noise: a fast check of large networks."""
     if len(network.target) < COMPILED_FROM or len(network.station) != 4 or len(network.extra):
         return False
     checks, worst = loops(len(network.target)).screen_targets(
         network.reading, network.weight, network.station, network.dead_path, np.ascontiguousarray(network.target.T),
-        network.factor, _WEAK,
+        network.factor, _MIN_REDUNDANCY,
     )  # fmt: skip
     return bool(worst <= _least_gate(checks))
 
 
-def gross(reading: Array, weight: Array, nominal: Array, place: Array, dead_path: Array) -> Found:
-    """Return the readings (n, m) so far off the nominal targets (m, 3) that no network can bear them.
+def gross(reading: Array, weight: Array, nominal: Array, position: Array, dead_path: Array) -> Outliers:
+    """Return the gross outliers of readings (n, m), by the distances from nominal targets (m, 3).
 
-    Off by more than the stations' rough places (n, 3) and dead paths (n,) make any other reading, by far.
+    These differ from the distances to the approximate stations (n, 3), with their dead paths (n,), by far more than
+    other readings.
     """
     off = np.empty_like(reading)
     for j in range(len(reading)):
-        off[j] = np.abs(np.linalg.norm(nominal - place[j], axis=1) - dead_path[j] - reading[j])
+        off[j] = np.abs(np.linalg.norm(nominal - position[j], axis=1) - dead_path[j] - reading[j])
     off[weight == 0] = np.nan
     out = off > _GROSS * np.nanmedian(off, axis=1, keepdims=True)
-    return Found(tuple((int(j), int(i)) for j, i in np.argwhere(out)), (), out)
+    return Outliers(tuple((int(j), int(i)) for j, i in np.argwhere(out)), (), out)
 
 
-def search(network: Network, weight: Array, nominal: Array, before: Found) -> Found:
-    """Return what was found before, and the grossest of the wrong readings that are still in use.
+def search(network: Network, weight: Array, nominal: Array, before: Outliers) -> Outliers:
+    """Return the known outliers and the largest of those that remain.
 
     Parameters
     ----------
     network : Network
-        Solved without what was found before.
+        Solution without the known outliers.
     weight : ndarray (n, m)
-        Of the readings as if none was wrong.
+        Of all readings, outliers included.
     nominal : ndarray (m, 3)
         Nominal targets, m.
-    before : Found
-        What was found before.
+    before : Outliers
+        Known outliers.
     """
     if _clean(network):
         return before
@@ -128,7 +129,7 @@ def search(network: Network, weight: Array, nominal: Array, before: Found) -> Fo
         return before
     limit = gate(t)
     worst = np.max(np.nan_to_num(t), axis=0)
-    # A gross one makes others look wrong: first those of its size.
+    # A gross outlier increases other residuals: first those of its size.
     targets = np.flatnonzero(worst > max(limit, 0.5 * worst.max()))
     if not len(targets):
         return before
@@ -143,11 +144,11 @@ def search(network: Network, weight: Array, nominal: Array, before: Found) -> Fo
     left_out = before.left_out + tuple(
         (int(j), int(i)) for j, i in zip(which[found], targets[found], strict=True) if weight[j, i] > 0
     )
-    return Found(left_out, tuple(sorted({*before.undecided, *(int(i) for i in targets[~found])})), out)
+    return Outliers(left_out, tuple(sorted({*before.undecided, *(int(i) for i in targets[~found])})), out)
 
 
 def _by_residuals(t: Array, network: Network, targets: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the station whose reading is clearly the worst of each target, -1 where there is none."""
+    """Return the station with the clearly largest residual of each target, -1 where there is none."""
     t = np.nan_to_num(t)
     order = np.sort(t, axis=0)
     clear = order[-1] ** 2 - order[-2] ** 2 > CLEAR**2
@@ -156,7 +157,7 @@ def _by_residuals(t: Array, network: Network, targets: NDArray[np.intp]) -> NDAr
 
 
 def _by_positions(network: Network, nominal: Array, targets: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the station without which each target lies where others do, -1 where none or several would do."""
+    """Return the station without which the error of each target agrees with the others, -1 where none or several."""
     deviation = network.target - nominal
     usual = np.nanmedian(deviation, axis=0)
     spread = NORMAL_MAD * np.nanmedian(np.abs(deviation - usual), axis=0)
@@ -164,7 +165,10 @@ def _by_positions(network: Network, nominal: Array, targets: NDArray[np.intp]) -
     e = directions(network.target[targets], network.stations)
     w, r, share = network.weight[:, targets], network.residual[:, targets], network.redundancy[:, targets]
     with np.errstate(invalid="ignore", divide="ignore"):
-        moved = -np.einsum("tab,jtb->jta", own, e) * (w**2 * r / np.where(share > _WEAK, share, np.nan))[..., None]
+        moved = (
+            -np.einsum("tab,jtb->jta", own, e)
+            * (w**2 * r / np.where(share > _MIN_REDUNDANCY, share, np.nan))[..., None]
+        )
     off = np.linalg.norm((deviation[targets] + moved - usual) / np.maximum(spread, 1e-12), axis=-1) / np.sqrt(3)
     off = np.where(np.isfinite(off), off, np.inf)
     order = np.sort(off, axis=0)

@@ -1,7 +1,7 @@
-"""Targets that their readings hardly determine: excluded, since each would affect the datum of all.
+"""Weakly determined targets: excluded, since each would affect the datum of all.
 
-A target with three readings and its three stations nearly in one plane can move out of that plane by a millimetre
-before its distances change by a micrometre. Such a target does not determine the stations.
+If a target has three readings and is nearly in one plane with the three stations, a displacement of a millimetre out of
+that plane changes its distances by only a micrometre. Such a target does not determine the stations.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 WEAK = 10.0
-"""So many times as uncertain as the middle one, the stations known. Of m targets one of sqrt(m) times is harmless to
-the datum, so that the limit is half of this where it is larger."""
+"""Uncertainty of a weakly determined target over the median one, with the stations known. Of m targets, one with the
+ratio sqrt(m) does not harm the datum: the limit is half of this if that is larger."""
 
 
 def weak_targets(displacement: Array, nominal: Array, station: Array | None, noise: Array) -> NDArray[np.bool_]:
-    """Return which targets (m,) to leave out: those with three readings or more that hardly fix them.
+    """Return which targets (m,) are weakly determined by three readings or more.
 
     Parameters
     ----------
@@ -34,15 +34,15 @@ def weak_targets(displacement: Array, nominal: Array, station: Array | None, noi
     nominal : ndarray (m, 3)
         m.
     station : ndarray (n, 3) or None
-        Rough places, m; without them they are reckoned from the nominal targets.
+        Approximate positions, m; default: calculated from the distances of the nominal targets.
     """
     known = np.isfinite(displacement)
     weight = np.where(known, 1 / noise, 0.0)
     fixed = np.count_nonzero(known, axis=0) >= 3
     if not fixed.any():
         return np.zeros(len(nominal), dtype=bool)
-    place = initial_stations(np.nan_to_num(displacement), weight, nominal, station).place
-    e = directions(nominal, Stations(place, np.zeros(len(place)), np.zeros(0)))
+    position = initial_stations(np.nan_to_num(displacement), weight, nominal, station).position
+    e = directions(nominal, Stations(position, np.zeros(len(position)), np.zeros(0)))
     information = np.einsum("jt,jta,jtb->tab", weight**2, e, e)
     values = np.linalg.eigvalsh(information)
     with np.errstate(divide="ignore"):
@@ -50,17 +50,17 @@ def weak_targets(displacement: Array, nominal: Array, station: Array | None, noi
     return np.asarray(fixed & ~(u <= _limit(len(nominal)) * float(np.median(u[fixed]))), dtype=bool)
 
 
-def carriers(openness: Array) -> NDArray[np.bool_]:
-    """Return which targets (m,) may carry the datum, by the traces (m,) of their covariances, m^2, the stations known.
+def datum_targets(traces: Array) -> NDArray[np.bool_]:
+    """Return which targets (m,) define the datum, by the traces (m,) of their covariances with known stations, m^2.
 
-    Infinite where a target has no place. The middle one is that of an even choice where there are many.
+    A trace is infinite if a target has no position. If there are many targets, the median is that of a sample.
     """
-    return np.asarray(openness <= _limit(len(openness)) ** 2 * _middle(openness, max(1, len(openness) // _SAMPLE)))
+    return np.asarray(traces <= _limit(len(traces)) ** 2 * _middle(traces, max(1, len(traces) // _SAMPLE)))
 
 
-def _middle(openness: Array, every: int) -> float:
-    """Return the median of every so many-th value, of all where none of these is finite; 0 where none is."""
-    for some in (openness[::every], openness):
+def _middle(traces: Array, every: int) -> float:
+    """Return the median of every ``every``-th value, of all if none of these is finite, or 0 if none is."""
+    for some in (traces[::every], traces):
         known = some[some < np.inf]
         if len(known):
             return float(np.median(known))

@@ -1,4 +1,4 @@
-"""Compiled loops over the targets of a large network. `vectorised` does the same for small ones."""
+"""Compiled loops over the targets of a large network. `vectorised` has the same functions for small ones."""
 
 from errormotion.methods.multilateration.network.kernels.examination import datum_sums, examine, residuals
 from errormotion.methods.multilateration.network.kernels.general import reduce_targets, screen_targets, settle_targets

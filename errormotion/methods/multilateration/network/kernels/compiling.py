@@ -1,4 +1,4 @@
-"""How loops over targets are compiled and cut into pieces."""
+"""Compilation of loops over targets, and their division into chunks."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from errormotion.arrays import Array
 from errormotion.compiling import Compiler, in_threads
 
 CHUNK = 1024
-"""Targets that one thread adds up."""
+"""Number of targets in a chunk, which one thread sums."""
 LANES = 64
-"""Targets that are worked at together: a loop over them becomes vector instructions. A part of a chunk."""
+"""Number of targets, a divisor of the chunk, over which an inner loop compiles to vector instructions."""
 MANY = 20_000
-"""More targets than these are shared out to several threads."""
+"""Number of targets above which several threads are used."""
 FAST = {"reassoc", "contract", "nsz", "arcp"}
-"""Sums may be taken in any order (so that they vectorise)."""
+"""Sums may be in any order, so that they vectorise."""
 EXACT = {"contract", "nsz"}
 """Products and sums may be fused."""
 
@@ -24,15 +24,15 @@ compiled = Compiler("the loops for large networks of stations and targets", seco
 
 
 def chunks(targets: int) -> int:
-    """Return into how many chunks so many targets are cut."""
+    """Return the number of chunks of this number of targets."""
     return -(-targets // CHUNK)
 
 
 def in_chunks(work: Callable[..., Any], targets: int, *given: Any) -> None:
-    """Call ``work(*given, first, last)`` for ranges of chunks; where there are many targets, threads share them."""
+    """Call ``work(*given, first, last)`` for ranges of chunks, in several threads if there are many targets."""
     in_threads(work, chunks(targets), targets > MANY, *given)
 
 
 def of_four(station: Array, further: Array) -> bool:
-    """Return whether these are four stations (n, 3) without further parameters (k, ...): `four` has loops for them."""
+    """Return whether these are four stations (n, 3) without further parameters (k, ...), for the loops of `four`."""
     return len(station) == 4 and len(further) == 0

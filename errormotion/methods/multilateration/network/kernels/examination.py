@@ -1,6 +1,7 @@
-"""Compiled loops over the targets at the solution: covariances in the datum, and redundancies.
+"""Compiled loops over the targets of a solution: covariances in the datum, and redundancies.
 
-The equations are those of `network`. Chunks of targets and their order are those of `kernels`, and so are the bits.
+The equations are those of `network`, the arguments of the public functions those of `vectorised`. Chunks of targets and
+their order are those of `general`.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def _add_motions(F: Array, c: Array, out: Array) -> None:  # pragma: no cover - 
 def _add_response(
     e: Array, w: Array, D: Array, c: Array, extra: Array, i: int, v: Array, out: Array
 ) -> None:  # pragma: no cover - compiled
-    """Add G^T F (6, q) to ``out``: F = D E^T (-Q) is how a target moves by the stations' parameters; v (6,) is room."""
+    """Add G^T F (6, q) to ``out``: F = D E^T (-Q), the displacement by the stations' parameters; v (6,) is scratch."""
     n = len(e)
     for j in range(n):
         for a in range(3):
@@ -66,17 +67,17 @@ def _spread_motions(D: Array, c: Array, DG: Array) -> None:  # pragma: no cover 
 
 @compiled()
 def _datum_chunks(
-    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, sums: Array, first: int,
+    weight: Array, station: Array, extra: Array, target: Array, in_datum: Flags, centre: Array, sums: Array, first: int,
     last: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `datum_sums` for some chunks."""
+    """Fill the sums of `datum_sums` for some chunks."""
     n = len(station)
     w, c, e, distance, D = np.empty(n), np.empty(3), np.empty((n, 3)), np.empty(n), np.empty((3, 3))
     v, DG = np.empty(6), np.empty((3, 6))
     for i in range(first * CHUNK, min(last * CHUNK, len(target))):
         for j in range(n):
             w[j] = weight[j, i]
-        if not carries[i] or not sight(w, station, target[i], e, distance, D):
+        if not in_datum[i] or not sight(w, station, target[i], e, distance, D):
             continue
         own = sums[i // CHUNK]
         for k in range(3):
@@ -93,19 +94,15 @@ def _datum_chunks(
 
 
 def datum_sums(
-    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array
+    weight: Array, station: Array, extra: Array, target: Array, in_datum: Flags, centre: Array
 ) -> tuple[Array, Array, Array]:
-    """Return sums over the targets that carry the datum of G^T G (6, 6), G^T D G (6, 6) and G^T F (6, 4 n + k).
-
-    G are a target's motions with the whole about ``centre``, D its covariance with the stations known, F its motion by
-    the stations' parameters.
-    """
+    """Return sums over the targets that define the datum: G^T G (6, 6), G^T D G (6, 6) and G^T F (6, 4 n + k)."""
     sums = np.zeros((chunks(len(target)), 6, 12 + 4 * len(station) + len(extra)))
-    weight = np.ascontiguousarray(weight)  # for another order of memory the loops would be compiled once more
+    weight = np.ascontiguousarray(weight)  # for another memory layout the loops would be compiled again
     if of_four(station, extra):
-        in_chunks(datum_four, len(target), weight, station, target, carries, centre, sums)
+        in_chunks(datum_four, len(target), weight, station, target, in_datum, centre, sums)
     else:
-        in_chunks(_datum_chunks, len(target), weight, station, extra, target, carries, centre, sums)
+        in_chunks(_datum_chunks, len(target), weight, station, extra, target, in_datum, centre, sums)
     total = sums.sum(axis=0)
     return total[:, :6], total[:, 6:12], total[:, 12:]
 
@@ -117,7 +114,7 @@ def _covariance(
     """Fill the covariance (3, 3) of a target in the datum: D + F F^T - D G H G^T - G H G^T D + G K G^T."""
     for a in range(3):
         for k in range(6):
-            # 1/2 G K - D G H: G times its transpose, and the transpose of that, make both sides of the datum.
+            # (1/2 G K - D G H) G^T and its transpose are the terms of the datum.
             s = 0.0
             for b in range(6):
                 s += 0.5 * G[a, b] * K[b, k] - DG[a, b] * H[b, k]
@@ -134,11 +131,11 @@ def _covariance(
 
 @compiled(fastmath=FAST)
 def _examine_chunks(
-    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
+    weight: Array, station: Array, extra: Array, target: Array, in_datum: Flags,
     centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
     first: int, last: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `examine` for some chunks."""
+    """Fill the results of `examine` for some chunks."""
     stations, p = len(station), W.shape[1]
     w, distance, c = np.empty(stations), np.empty(stations), np.empty(3)
     e, D, FW, q = np.empty((stations, 3)), np.empty((3, 3)), np.empty((3, p)), np.empty((stations, p))
@@ -151,7 +148,7 @@ def _examine_chunks(
             continue
         for k in range(3):
             c[k] = target[i, k] - centre[k]
-        if carries[i]:
+        if in_datum[i]:
             _spread_motions(D, c, DG)
         else:
             DG[:] = 0.0
@@ -174,14 +171,14 @@ def _examine_chunks(
                 for k in range(p):
                     FW[a, k] += s * q[j, k]
             redundancy[j, i] = 1.0 - hat
-        # The target has taken its part of a reading, the stations take theirs of what is left.
+        # Redundancy: after the share of the target, that of the stations.
         for j in range(stations):
             taken = 0.0
             for k in range(p):
                 s = q[j, k] + w[j] * (e[j, 0] * FW[0, k] + e[j, 1] * FW[1, k] + e[j, 2] * FW[2, k])
                 taken += s * s
             redundancy[j, i] = redundancy[j, i] - taken if w[j] > 0.0 else np.nan
-        # G times the datum's shift, taken off.
+        # Minus G times the shift of the datum.
         for k in range(p):
             FW[0, k] -= shift[0, k] + shift[4, k] * c[2] - shift[5, k] * c[1]
             FW[1, k] -= shift[1, k] + shift[5, k] * c[0] - shift[3, k] * c[2]
@@ -192,23 +189,13 @@ def _examine_chunks(
 
 
 def examine(
-    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
+    weight: Array, station: Array, extra: Array, target: Array, in_datum: Flags,
     centre: Array, W: Array, shift: Array, H: Array, K: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return covariances (m, 3, 3) of the targets, m^2, and redundancies (n, m) of the readings.
-
-    Parameters
-    ----------
-    W : ndarray (4 n + k, p)
-        Factor of the covariance of the stations' parameters, in any datum.
-    shift : ndarray (6, p)
-        How the datum's fit to the targets moves with the factor.
-    H, K : ndarray (6, 6)
-        Inverse of the sum of G^T G; and H (sum of G^T D G) H.
-    """
+    """Return covariances (m, 3, 3) of the targets, m^2, and redundancies (n, m) of the readings."""
     n, m = weight.shape
     covariance, redundancy = np.empty((m, 3, 3)), np.empty((n, m))
-    found = target, carries, centre, W, shift, H, K, covariance, redundancy
+    found = target, in_datum, centre, W, shift, H, K, covariance, redundancy
     weight = np.ascontiguousarray(weight)
     if of_four(station, extra):
         in_chunks(examine_four, m, weight, station, *found)
@@ -221,7 +208,7 @@ def examine(
 def residuals(
     reading: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array
 ) -> Array:  # pragma: no cover - compiled
-    """Return readings (n, m) less what stations and targets (m, 3) make of them, m."""
+    """Return readings (n, m) minus the model at stations and targets (m, 3), m."""
     left = np.empty(reading.shape)
     for j in range(len(station)):
         x, y, z, d, out = station[j, 0], station[j, 1], station[j, 2], reading[j], left[j]

@@ -1,9 +1,8 @@
-"""The loops of four stations, no further parameters: what nearly every network has, in vector instructions.
+"""Loops for four stations without further parameters, the usual network, in vector instructions.
 
-With four stations the one row that a target's own block leaves over is the vector of minors of its weighted directions
-E (4, 3): four triple products, from two cross products. Targets are worked at a few dozen at a time, every quantity of
-them in a row of its own, so that the compiler makes vector instructions of the loops. Their results are those of
-`kernels`, which does the same for any number of stations.
+With four stations the equation of a target is the vector of minors of its weighted directions E (4, 3): four triple
+products, from two cross products. Loops are over a few dozen targets at a time, with a row of an array for each
+quantity, so that the compiler vectorises them. The results are those of `general`, for any number of stations.
 """
 
 from __future__ import annotations
@@ -16,11 +15,9 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, EXACT, FAST, LANES, compiled
 
-# A target with its directions this close to a plane is not moved, and has no place.
+# As in `vectorised`, with squares of lengths, m^2.
 _FLAT = 1e-13
-_NO_PLACE = 1e-12
-# Steps of a target, and the square of the length, m^2, below which one is the last: in a pass the next pass goes on,
-# and the next step is as the square of this one over the distance.
+_NO_POSITION = 1e-12
 _STEPS = 8
 _SHORT = 1e-6
 _SETTLED = 1e-14
@@ -51,9 +48,17 @@ def _add_products(v: Array, sums: Array) -> None:  # pragma: no cover - compiled
 
 @compiled(inner=True, forceinline=True)
 def _load(
-    reading: Array, weight: Array, dead_path: Array, place: Array, begin: int, count: int, R: Array, W: Array, U: Array
+    reading: Array,
+    weight: Array,
+    dead_path: Array,
+    position: Array,
+    begin: int,
+    count: int,
+    R: Array,
+    W: Array,
+    U: Array,
 ) -> None:  # pragma: no cover - compiled
-    """Fill distances, weights and places of some targets; what is left of the rows counts for nothing."""
+    """Fill distances, weights and positions of some targets; the rest of the rows has a weight of 0."""
     end = begin + count
     for j in range(4):
         ws, ds, dead = weight[j, begin:end], reading[j, begin:end], dead_path[j]
@@ -64,7 +69,7 @@ def _load(
         for t in range(count, LANES):
             W[j, t], R[j, t] = 0.0, 0.0
     for k in range(3):
-        us = place[k, begin:end]
+        us = position[k, begin:end]
         for t in range(count):
             U[k, t] = us[t]
         for t in range(count, LANES):
@@ -75,10 +80,10 @@ def _load(
 def _move(
     R: Array, W: Array, station: Array, U: Array, size: Array, spread: Array
 ) -> float:  # pragma: no cover - compiled
-    """Move targets U (3, LANES) by a Gauss-Newton step on their distances R; return the longest one's square, m^2.
+    """Move targets U (3, LANES) by a Gauss-Newton step on their distances R; return the square of the longest, m^2.
 
-    Fills the squares of the steps' lengths, m^2, and the traces of the targets' covariances, m^2, infinite where the
-    distances leave a direction open.
+    Fill the squares of the lengths of the steps, m^2, and the traces of the targets' covariances, m^2, infinite if a
+    direction is not determined.
     """
     for t in range(LANES):
         a00, a01, a02, a11, a12, a22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -113,7 +118,7 @@ def _move(
         U[1, t] += share * s1
         U[2, t] += share * s2
         # The pivots of the triangular factor: those of `examination`.
-        least = _NO_PLACE * trace
+        least = _NO_POSITION * trace
         whole = (a00 > least) & (c22 > least * a00) & (determinant > least * c22)
         spread[t] = (c00 + c11 + c22) * inverse if whole else math.inf
     far = 0.0
@@ -124,7 +129,7 @@ def _move(
 
 @compiled(inner=True, fastmath=EXACT, forceinline=True)
 def _equate(R: Array, W: Array, station: Array, U: Array, v: Array) -> None:  # pragma: no cover - compiled
-    """Fill the equations v (17, LANES) that are left of targets: derivatives by (U, L) of each station, residual."""
+    """Fill the equations v (17, LANES) of targets: derivatives by (U, L) of each station, and the residual."""
     x0, y0, z0 = station[0, 0], station[0, 1], station[0, 2]
     x1, y1, z1 = station[1, 0], station[1, 1], station[1, 2]
     x2, y2, z2 = station[2, 0], station[2, 1], station[2, 2]
@@ -162,15 +167,15 @@ def _equate(R: Array, W: Array, station: Array, U: Array, v: Array) -> None:  # 
 
 @compiled(fastmath=EXACT)
 def reduce_four(
-    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, sums: Array, moved: Array,
+    reading: Array, weight: Array, station: Array, dead_path: Array, position: Array, sums: Array, moved: Array,
     first: int, last: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `general.reduce_targets` for some chunks: their sums, and the squares of the first steps, m^2."""
+    """Fill the sums of some chunks for `general.reduce_targets`, and the squares of the longest first steps, m^2."""
     R, W, U = np.empty((4, LANES)), np.empty((4, LANES)), np.empty((3, LANES))
     v, size, spread = np.empty((17, LANES)), np.empty(LANES), np.empty(LANES)
-    for begin in range(first * CHUNK, min(last * CHUNK, place.shape[1]), LANES):
-        part, count = begin // CHUNK, min(LANES, place.shape[1] - begin)
-        _load(reading, weight, dead_path, place, begin, count, R, W, U)
+    for begin in range(first * CHUNK, min(last * CHUNK, position.shape[1]), LANES):
+        part, count = begin // CHUNK, min(LANES, position.shape[1] - begin)
+        _load(reading, weight, dead_path, position, begin, count, R, W, U)
         for step in range(_STEPS):
             far = _move(R, W, station, U, size, spread)
             if step == 0:
@@ -179,30 +184,30 @@ def reduce_four(
                 break
         for k in range(3):
             for t in range(count):
-                place[k, begin + t] = U[k, t]
+                position[k, begin + t] = U[k, t]
         _equate(R, W, station, U, v)
         _add_products(v, sums[part])
 
 
 @compiled(fastmath=EXACT)
 def settle_four(
-    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, nominal: Array, centre: Array,
-    openness: Array, sums: Array, first: int, last: int,
+    reading: Array, weight: Array, station: Array, dead_path: Array, position: Array, nominal: Array, centre: Array,
+    traces: Array, sums: Array, first: int, last: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `general.settle_targets` for some chunks."""
+    """Fill the results of `general.settle_targets` for some chunks."""
     R, W, U = np.empty((4, LANES)), np.empty((4, LANES)), np.empty((3, LANES))
     size, spread = np.empty(LANES), np.empty(LANES)
-    for begin in range(first * CHUNK, min(last * CHUNK, place.shape[1]), LANES):
-        count = min(LANES, place.shape[1] - begin)
-        _load(reading, weight, dead_path, place, begin, count, R, W, U)
+    for begin in range(first * CHUNK, min(last * CHUNK, position.shape[1]), LANES):
+        count = min(LANES, position.shape[1] - begin)
+        _load(reading, weight, dead_path, position, begin, count, R, W, U)
         for _ in range(_LAST_STEPS):
             if _move(R, W, station, U, size, spread) < _SETTLED:
                 break
         for t in range(count):
-            openness[begin + t] = spread[t]
+            traces[begin + t] = spread[t]
         for k in range(3):
             for t in range(count):
-                place[k, begin + t] = U[k, t]
+                position[k, begin + t] = U[k, t]
         _add_moments(U, nominal, centre, spread, begin, count, sums[begin // CHUNK])
 
 
@@ -210,7 +215,7 @@ def settle_four(
 def _add_moments(
     U: Array, nominal: Array, centre: Array, spread: Array, begin: int, count: int, sums: Array
 ) -> None:  # pragma: no cover - compiled
-    """Add number, sums and products (16,) of targets and nominal ones about ``centre``, where there is a place."""
+    """Add number, sums and products (16,) of targets with a position and nominal ones about ``centre``."""
     n, sx, sy, sz, sa, sb, sc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     ax, ay, az, bx, by, bz, cx, cy, cz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     wanted = nominal[begin : begin + count]
@@ -254,18 +259,18 @@ def _add_moments(
 
 @compiled(fastmath=EXACT)
 def screen_four(
-    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float,
+    reading: Array, weight: Array, station: Array, dead_path: Array, position: Array, factor: Array, weak: float,
     checked: NDArray[np.int64], largest: Array, first: int, last: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    """Count for some chunks the readings that are checked by others; ``largest`` is the square of the worst residual.
+    """Count for some chunks the readings that others check; ``largest`` is the square of the normalised residual.
 
-    Residuals are over what they should be. With one equation left they are alike for all readings of a target.
+    With one equation the normalised residuals of all readings of a target are equal.
     """
     R, W, U, v = np.empty((4, LANES)), np.empty((4, LANES)), np.empty((3, LANES)), np.empty((17, LANES))
     taken, part = np.empty(LANES), np.empty(LANES)
-    for begin in range(first * CHUNK, min(last * CHUNK, place.shape[1]), LANES):
-        chunk, some = begin // CHUNK, min(LANES, place.shape[1] - begin)
-        _load(reading, weight, dead_path, place, begin, some, R, W, U)
+    for begin in range(first * CHUNK, min(last * CHUNK, position.shape[1]), LANES):
+        chunk, some = begin // CHUNK, min(LANES, position.shape[1] - begin)
+        _load(reading, weight, dead_path, position, begin, some, R, W, U)
         _equate(R, W, station, U, v)
         for t in range(LANES):
             taken[t] = 0.0
@@ -284,7 +289,7 @@ def screen_four(
             for j in range(4):
                 share = v[4 * j + 3, t] / W[j, t] if W[j, t] > 0.0 else 0.0
                 checks += 1 if share * share * left > weak else 0
-            # In squares: no root for those that are not the worst.
+            # Squares: the root is calculated only of the largest.
             taken[t] = v[16, t] * v[16, t] / left if left > weak else 0.0
         checked[chunk] += checks
         worst = largest[chunk]

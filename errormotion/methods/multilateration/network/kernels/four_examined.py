@@ -1,6 +1,6 @@
-"""What `examination` does, for four stations without further parameters, in vector instructions (see `four`).
+"""Loops of `examination` for four stations without further parameters, in vector instructions (see `four`).
 
-With X = G H G^T and Y = G K G^T a target's covariance in the datum is D + F F^T - D X - X D + Y.
+With X = G H G^T and Y = G K G^T the covariance of a target in the datum is D + F F^T - D X - X D + Y.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from errormotion.arrays import Array
 from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, EXACT, FAST, LANES, compiled
 
 Flags = NDArray[np.bool_]
-# Directions to the stations closer to a plane than this, squared, leave a target without a place.
-_NO_PLACE = 1e-12
+# As NO_POSITION in `vectorised`.
+_NO_POSITION = 1e-12
 
 
 @compiled(inner=True, fastmath=EXACT, forceinline=True)
@@ -23,7 +23,7 @@ def _sight(
     weight: Array, station: Array, target: Array, centre: Array, begin: int, count: int, W: Array, E: Array, C: Array,
     D: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    """Fill weights (4, LANES), directions (12,), places about the centre (3,), and D (6,): NaN where there is none."""
+    """Fill weights (4, LANES), directions (12,), positions about the centre (3,), and D (6,): NaN if there is none."""
     end = begin + count
     for j in range(4):
         ws = weight[j, begin:end]
@@ -52,7 +52,7 @@ def _sight(
             a12 += w * y * z
             a22 += w * z * z
         # E^T E = R^T R, and D = R^-1 R^-T.
-        least = _NO_PLACE * (a00 + a11 + a22)
+        least = _NO_POSITION * (a00 + a11 + a22)
         i00 = 1.0 / math.sqrt(a00)
         r01, r02 = a01 * i00, a02 * i00
         p11 = a11 - r01 * r01
@@ -76,20 +76,20 @@ def _sight(
 
 @compiled(fastmath=EXACT)
 def datum_four(
-    weight: Array, station: Array, target: Array, carries: Flags, centre: Array, sums: Array, first: int, last: int
+    weight: Array, station: Array, target: Array, in_datum: Flags, centre: Array, sums: Array, first: int, last: int
 ) -> None:  # pragma: no cover - compiled
-    """Add what the targets of some chunks say to the sums (chunk, 6, 28) of `examination.datum_sums`."""
+    """Add the targets of some chunks to the sums (chunk, 6, 28) of `examination.datum_sums`."""
     W, E, C, D = np.empty((4, LANES)), np.empty((12, LANES)), np.empty((3, LANES)), np.empty((6, LANES))
     own, v, P = np.empty(LANES), np.empty((24, LANES)), np.empty((36, LANES))
     for begin in range(first * CHUNK, min(last * CHUNK, len(target)), LANES):
         count = min(LANES, len(target) - begin)
         _sight(weight, station, target, centre, begin, count, W, E, C, D)
-        says = carries[begin : begin + count]
+        used = in_datum[begin : begin + count]
         for t in range(count):
-            own[t] = 1.0 if says[t] and D[0, t] < math.inf else 0.0
+            own[t] = 1.0 if used[t] and D[0, t] < math.inf else 0.0
         for t in range(count, LANES):
             own[t] = 0.0
-        # What has no say is nought from here on, be it a number or not.
+        # Targets that are not used are 0 from here on, also if they are NaN.
         for k in range(6):
             for t in range(LANES):
                 D[k, t] = D[k, t] if own[t] > 0.0 else 0.0
@@ -197,10 +197,10 @@ def _between(H: Array, C: Array, X: Array) -> None:  # pragma: no cover - compil
 
 @compiled(fastmath=EXACT)
 def examine_four(
-    weight: Array, station: Array, target: Array, carries: Flags, centre: Array, factor: Array, shift: Array,
+    weight: Array, station: Array, target: Array, in_datum: Flags, centre: Array, factor: Array, shift: Array,
     H: Array, K: Array, covariance: Array, redundancy: Array, first: int, last: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `examination.examine` for some chunks."""
+    """Fill the results of `examination.examine` for some chunks."""
     W, E, C, D = np.empty((4, LANES)), np.empty((12, LANES)), np.empty((3, LANES)), np.empty((6, LANES))
     S, R, X, Y = np.empty((12, LANES)), np.empty((4, LANES)), np.empty((6, LANES)), np.empty((6, LANES))
     V, own = np.empty((6, LANES)), np.empty(LANES)
@@ -211,9 +211,9 @@ def examine_four(
         _between(K, C, Y)
         for t in range(LANES):
             own[t] = 0.0
-        says = carries[begin : begin + count]
+        used = in_datum[begin : begin + count]
         for t in range(count):
-            own[t] = 1.0 if says[t] else 0.0
+            own[t] = 1.0 if used[t] else 0.0
         for t in range(LANES):
             d00, d01, d02, d11, d12, d22 = D[0, t], D[1, t], D[2, t], D[3, t], D[4, t], D[5, t]
             x00, x01, x02, x11, x12, x22 = X[0, t], X[1, t], X[2, t], X[3, t], X[4, t], X[5, t]
@@ -227,7 +227,7 @@ def examine_four(
             V[2, t] = d02 + Y[2, t] - k * (left + right)
             left, right = d01 * x02 + d11 * x12 + d12 * x22, d02 * x01 + d12 * x11 + d22 * x12
             V[4, t] = d12 + Y[4, t] - k * (left + right)
-        # How a target moves with each reading, weighed; and what is left of the reading when it has moved.
+        # Weighted displacement of a target by each reading, and the remaining share of that reading.
         for j in range(4):
             for t in range(LANES):
                 x, y, z, w = E[3 * j, t], E[3 * j + 1, t], E[3 * j + 2, t], W[j, t]

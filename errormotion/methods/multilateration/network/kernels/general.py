@@ -1,11 +1,7 @@
-"""Compiled loops over the targets: each is moved to where its distances put it, then its block is eliminated.
+"""Compiled loops over the targets: each is moved to the best fit of its distances, then its block is eliminated.
 
-With E (n, 3) the weighted directions from the stations to a target, N the rows that span what is left of them
-(N E = 0) and Q the weighted derivatives of the readings by the stations, a target says N Q ds = N r about the stations
-and nothing else: n - 3 equations, one with four stations. N comes from Householder reflections, so no digits cancel.
-
-Threads share the targets in chunks. A chunk is summed by one thread and the chunks' sums are added in their order: the
-result has the same bits on any number of threads.
+The equations, and the arguments of the public functions, are those of `vectorised`. A chunk of targets is summed by one
+thread, and the sums of the chunks are added in their order: the result is identical with any number of threads.
 """
 
 from __future__ import annotations
@@ -26,22 +22,19 @@ from errormotion.methods.multilateration.network.kernels.compiling import (
 from errormotion.methods.multilateration.network.kernels.four import reduce_four, screen_four, settle_four
 
 LANES = 128
-"""Equations whose products are added up together."""
-# A target with its directions this close to a plane is not moved.
+"""Number of equations whose products are summed together."""
+# As in `vectorised`; the last one is the root of its NO_POSITION.
 _FLAT = 1e-13
-# Steps of a target in one pass, and below which length, m, one is the last.
 _STEPS = 8
 _SHORT = 1e-3
-# The same where the stations are final.
 _LAST_STEPS = 30
 _SETTLED = 1e-7
-# Directions to the stations closer to a plane than this leave a target without a place.
-_NO_PLACE = 1e-6
+_NO_POSITION = 1e-6
 
 
 @compiled(inner=True)
-def _locate(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragma: no cover - compiled
-    """Move a target ``u`` (3,) by one Gauss-Newton step on its distances ``reach`` (n,); return how far it went, m."""
+def _step(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragma: no cover - compiled
+    """Move a target ``u`` (3,) by one Gauss-Newton step on its distances ``reach`` (n,); return its length, m."""
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     nearest = np.inf
     for j in range(len(station)):
@@ -79,17 +72,17 @@ def _locate(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragm
 
 
 @compiled(inner=True)
-def _place(
+def _locate(
     reach: Array, w: Array, station: Array, u: Array, steps: int, short: float
 ) -> float:  # pragma: no cover - compiled
-    """Move a target to where its distances put it; return how far the first step took it, m."""
-    first = _locate(reach, w, station, u)
+    """Move a target to the best fit of its distances; return the length of the first step, m."""
+    first = _step(reach, w, station, u)
     size = first
     for _ in range(steps):
-        # The next step goes as the square of this one over the distance.
+        # The next step is about the square of this one over the distance.
         if size < short:
             break
-        size = _locate(reach, w, station, u)
+        size = _step(reach, w, station, u)
     return first
 
 
@@ -97,7 +90,7 @@ def _place(
 def reflect(
     reach: Array, w: Array, station: Array, u: Array, e: Array, r: Array, E: Array, Q: Array
 ) -> None:  # pragma: no cover - compiled
-    """Fill directions e (n, 3), weighted residuals r (n,), and the reflections' result: E = Q^T R, Q (n, n)."""
+    """Fill directions e (n, 3), weighted residuals r (n,), and the result of the reflections: E = Q^T R, Q (n, n)."""
     n = len(station)
     for j in range(n):
         x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
@@ -151,7 +144,7 @@ def _add_products(v: Array, count: int, sums: Array) -> None:  # pragma: no cove
 def reach_of(
     reading: Array, weight: Array, dead_path: Array, extra: Array, value: Array, i: int, reach: Array, w: Array
 ) -> None:  # pragma: no cover - compiled
-    """Fill the distances (n,) that target i's readings stand for, and their weights."""
+    """Fill the distances (n,) measured by the readings of target i, and their weights."""
     for j in range(len(reach)):
         w[j] = weight[j, i]
         d = reading[j, i] + dead_path[j]
@@ -163,9 +156,9 @@ def reach_of(
 @compiled()
 def _reduce_chunks(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array, sums: Array, moved: Array, first: int, last: int,
+    position: Array, sums: Array, moved: Array, first: int, last: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `reduce_targets` for some chunks: their sums, and the squares of the first steps, m^2."""
+    """Fill the sums of some chunks for `reduce_targets`, and the squares of the longest first steps, m^2."""
     n, more = len(station), len(value)
     q = 4 * n + more
     reach, w, r, u = np.empty(n), np.empty(n), np.empty(n), np.empty(3)
@@ -173,11 +166,11 @@ def _reduce_chunks(
     v = np.empty((q + 1, LANES))
     for part in range(first, last):
         filled, furthest = 0, 0.0
-        for i in range(part * CHUNK, min((part + 1) * CHUNK, place.shape[1])):
+        for i in range(part * CHUNK, min((part + 1) * CHUNK, position.shape[1])):
             reach_of(reading, weight, dead_path, extra, value, i, reach, w)
-            u[0], u[1], u[2] = place[0, i], place[1, i], place[2, i]
-            furthest = max(furthest, _place(reach, w, station, u, _STEPS, _SHORT))
-            place[0, i], place[1, i], place[2, i] = u[0], u[1], u[2]
+            u[0], u[1], u[2] = position[0, i], position[1, i], position[2, i]
+            furthest = max(furthest, _locate(reach, w, station, u, _STEPS, _SHORT))
+            position[0, i], position[1, i], position[2, i] = u[0], u[1], u[2]
             reflect(reach, w, station, u, e, r, E, Q)
             for a in range(3, n):
                 rest = 0.0
@@ -203,7 +196,7 @@ def _reduce_chunks(
 def sight(
     w: Array, station: Array, u: Array, e: Array, distance: Array, D: Array
 ) -> bool:  # pragma: no cover - compiled
-    """Fill directions e (n, 3), distances (n,) and D (3, 3), the inverse of E^T E; False where that has none."""
+    """Fill directions e (n, 3), distances (n,) and D (3, 3), the inverse of E^T E; return False if there is none."""
     a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(len(station)):
         x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
@@ -219,7 +212,7 @@ def sight(
         a12 += k * y * z
         a22 += k * z * z
     # E^T E = R^T R, and D = R^-1 R^-T.
-    least = _NO_PLACE * _NO_PLACE * (a00 + a11 + a22)
+    least = _NO_POSITION * _NO_POSITION * (a00 + a11 + a22)
     if not a00 > least:
         return False
     r00 = math.sqrt(a00)
@@ -246,21 +239,21 @@ def sight(
 @compiled()
 def _settle_chunks(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array, nominal: Array, centre: Array, openness: Array, sums: Array, first: int, last: int,
+    position: Array, nominal: Array, centre: Array, traces: Array, sums: Array, first: int, last: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `settle_targets` for some chunks."""
+    """Fill the results of `settle_targets` for some chunks."""
     n = len(station)
     reach, w, u, e = np.empty(n), np.empty(n), np.empty(3), np.empty((n, 3))
     distance, D = np.empty(n), np.empty((3, 3))
-    for i in range(first * CHUNK, min(last * CHUNK, place.shape[1])):
+    for i in range(first * CHUNK, min(last * CHUNK, position.shape[1])):
         reach_of(reading, weight, dead_path, extra, value, i, reach, w)
-        u[0], u[1], u[2] = place[0, i], place[1, i], place[2, i]
-        _place(reach, w, station, u, _LAST_STEPS, _SETTLED)
-        place[0, i], place[1, i], place[2, i] = u[0], u[1], u[2]
-        openness[i] = math.inf
+        u[0], u[1], u[2] = position[0, i], position[1, i], position[2, i]
+        _locate(reach, w, station, u, _LAST_STEPS, _SETTLED)
+        position[0, i], position[1, i], position[2, i] = u[0], u[1], u[2]
+        traces[i] = math.inf
         if not sight(w, station, u, e, distance, D):
             continue
-        openness[i] = D[0, 0] + D[1, 1] + D[2, 2]
+        traces[i] = D[0, 0] + D[1, 1] + D[2, 2]
         own = sums[i // CHUNK]
         own[0] += 1.0
         for k in range(3):
@@ -272,72 +265,43 @@ def _settle_chunks(
 
 def reduce_targets(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array,
+    position: Array,
 ) -> tuple[Array, float]:  # fmt: skip
-    """Move every target and add up what the targets say about the stations.
-
-    Parameters
-    ----------
-    reading, weight : ndarray (n, m)
-        Displacements, m, and 1 / standard deviation, 1/m; 0 for what does not count, be it a number or not.
-    station, dead_path : ndarray (n, 3), (n,)
-        m.
-    extra, value : ndarray (k, n, m), (k,)
-        What a unit of each further parameter adds to a reading, and the parameters.
-    place : ndarray (3, m)
-        Targets, m; changed in place.
-
-    Returns
-    -------
-    sums : ndarray (4 n + k + 1, 4 n + k + 1)
-        V V^T; the columns of V are the equations of the targets, derivatives of the readings by (U, L) of every
-        station and by the further parameters, and last the residual.
-    moved : float
-        Longest first step of a target, m.
-    """
-    q, m = 4 * len(station) + len(value) + 1, place.shape[1]
+    """Move every target and return the sums (4 n + k + 1, 4 n + k + 1) of its equations, and the longest step, m."""
+    q, m = 4 * len(station) + len(value) + 1, position.shape[1]
     sums, moved = np.zeros((chunks(m), q, q)), np.zeros(chunks(m))
     if of_four(station, value):
-        in_chunks(reduce_four, m, reading, weight, station, dead_path, place, sums, moved)
+        in_chunks(reduce_four, m, reading, weight, station, dead_path, position, sums, moved)
     else:
-        in_chunks(_reduce_chunks, m, reading, weight, station, dead_path, extra, value, place, sums, moved)
-    total = np.triu(sums.sum(axis=0))  # chunks leave out the lower triangle
+        in_chunks(_reduce_chunks, m, reading, weight, station, dead_path, extra, value, position, sums, moved)
+    total = np.triu(sums.sum(axis=0))  # chunks fill the upper triangle
     return total + np.triu(total, 1).T, math.sqrt(moved.max())
 
 
 def settle_targets(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    place: Array, nominal: Array, centre: Array,
+    position: Array, nominal: Array, centre: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Put every target (3, m) where its distances from the final stations are best fulfilled.
-
-    Returns
-    -------
-    openness : ndarray (m,)
-        Trace of each target's covariance with the stations known, m^2; infinite where readings leave a direction open.
-    moments : ndarray (16,)
-        Of the targets with a place: their number, sums of targets and of nominal ones (m, 3) about ``centre`` (3,), and
-        the sum (3, 3) of nominal times target.
-    """
-    m = place.shape[1]
-    openness, sums = np.empty(m), np.zeros((chunks(m), 16))
-    found = place, nominal, centre, openness, sums
+    """Move every target (3, m) to the best fit; return traces (m,) of covariances, m^2, and moments (16,)."""
+    m = position.shape[1]
+    traces, sums = np.empty(m), np.zeros((chunks(m), 16))
+    found = position, nominal, centre, traces, sums
     if of_four(station, value):
         in_chunks(settle_four, m, reading, weight, station, dead_path, *found)
     else:
         in_chunks(_settle_chunks, m, reading, weight, station, dead_path, extra, value, *found)
-    return openness, sums.sum(axis=0)
+    return traces, sums.sum(axis=0)
 
 
 def screen_targets(
-    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float
+    reading: Array, weight: Array, station: Array, dead_path: Array, position: Array, factor: Array, weak: float
 ) -> tuple[int, float]:
-    """Return how many readings of targets (3, m) seen by four stations are checked, and the worst residual.
+    """Return the number of readings of targets (3, m) that four stations check, and the largest normalised residual.
 
-    Residuals are over what they should be, the stations' factor (16, p) taken into account; readings with a redundancy
-    below ``weak`` are not checked.
+    The expected residuals include the stations' factor (16, p); readings with a redundancy below ``weak`` are not
+    checked.
     """
-    m = place.shape[1]
+    m = position.shape[1]
     checked, largest = np.zeros(chunks(m), dtype=np.int64), np.zeros(chunks(m))
-    in_chunks(screen_four, m, reading, weight, station, dead_path, place, factor, weak, checked, largest)
+    in_chunks(screen_four, m, reading, weight, station, dead_path, position, factor, weak, checked, largest)
     return int(checked.sum()), math.sqrt(largest.max())

@@ -1,4 +1,7 @@
-"""Compiled loops over readings and positions: weights and their numbers, sums for the datum, a motion of the whole."""
+"""Compiled loops over readings and positions: weights and their numbers, sums for the datum, a rigid motion.
+
+The functions are documented in `vectorised`.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,7 @@ from errormotion.methods.multilateration.network.kernels.compiling import compil
 
 @compiled()
 def weigh(d: Array, sigma: Array) -> tuple[Array, Array, bool]:  # pragma: no cover - compiled
-    """Return readings, weights (n, m), and whether the standard deviations ((n, 1) or (n, m)) are positive.
-
-    A target with fewer than three readings has weights of 0.
-    """
+    """Return readings, weights (n, m), and whether the standard deviations ((n, 1) or (n, m)) are positive."""
     n, m = d.shape
     reading, weight, positive = np.empty((n, m)), np.empty((n, m)), True
     number = np.zeros(m, dtype=np.int64)
@@ -59,7 +59,7 @@ def count(weight: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # prag
 
 @compiled()
 def copied(u: Array) -> tuple[Array, Array]:  # pragma: no cover - compiled
-    """Return places (m, 3) of one's own, and their mean (3,)."""
+    """Return a copy of positions (m, 3), and their mean (3,)."""
     own, x, y, z = np.empty(u.shape), 0.0, 0.0, 0.0
     for i in range(len(u)):
         own[i, 0], own[i, 1], own[i, 2] = u[i, 0], u[i, 1], u[i, 2]
@@ -71,15 +71,15 @@ def copied(u: Array) -> tuple[Array, Array]:  # pragma: no cover - compiled
 
 @compiled()
 def moments(
-    place: Array, nominal: Array, used: NDArray[np.bool_], centre: Array
+    position: Array, nominal: Array, used: NDArray[np.bool_], centre: Array
 ) -> Array:  # pragma: no cover - compiled
-    """Return number, sums and products (16,) of targets (3, m) and nominal ones (m, 3) that count, about ``centre``."""
+    """Return number, sums and products (16,) of used targets (3, m) and nominal ones (m, 3), about ``centre``."""
     sums, u, v = np.zeros(16), np.empty(3), np.empty(3)
     for i in range(len(nominal)):
         if used[i]:
             sums[0] += 1.0
             for k in range(3):
-                u[k], v[k] = place[k, i] - centre[k], nominal[i, k] - centre[k]
+                u[k], v[k] = position[k, i] - centre[k], nominal[i, k] - centre[k]
                 sums[1 + k] += u[k]
                 sums[4 + k] += v[k]
             for k in range(3):
@@ -89,12 +89,12 @@ def moments(
 
 
 @compiled()
-def moved(place: Array, a: Array, b: Array, R: Array, openness: Array) -> Array:  # pragma: no cover - compiled
-    """Return R (u - a) + b (m, 3) of targets u (3, m); NaN where the openness (m,) is infinite."""
-    target = np.empty((place.shape[1], 3))
+def moved(position: Array, a: Array, b: Array, R: Array, traces: Array) -> Array:  # pragma: no cover - compiled
+    """Return R (u - a) + b (m, 3) of targets u (3, m); NaN where the traces (m,) is infinite."""
+    target = np.empty((position.shape[1], 3))
     for i in range(len(target)):
-        x, y, z = place[0, i] - a[0], place[1, i] - a[1], place[2, i] - a[2]
+        x, y, z = position[0, i] - a[0], position[1, i] - a[1], position[2, i] - a[2]
         for k in range(3):
             found = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + b[k]
-            target[i, k] = found if openness[i] < np.inf else np.nan
+            target[i, k] = found if traces[i] < np.inf else np.nan
     return target

@@ -6,10 +6,10 @@ import numpy as np
 
 from errormotion.arrays import Array
 
-__all__ = ["likeness"]
+__all__ = ["neighbour_correlation"]
 
 
-def likeness(f: Array, M: Array) -> tuple[float, float]:
+def neighbour_correlation(f: Array, M: Array) -> tuple[float, float]:
     """Return the correlation of neighbouring residuals, and the probability of it or a larger one by noise.
 
     Parameters
@@ -17,26 +17,25 @@ def likeness(f: Array, M: Array) -> tuple[float, float]:
     f : ndarray (m,)
         Residuals in their order in space or time.
     M : ndarray (m, m)
-        What makes residuals of noise, I - J J^+ with J the derivative by the parameters.
+        Projection from noise to residuals, I - J J^+ with J the derivative by the parameters.
 
     Returns
     -------
     float
-        Correlation of neighbours beyond what the fit itself makes; about 0 for noise.
+        Correlation of neighbours minus that caused by the fit itself; about 0 for noise.
     float
-        The chance, from 0 to 1.
+        The probability, from 0 to 1.
 
     Notes
     -----
-    Durbin and Watson's ratio of squared differences to squares, with the mean and variance that it has for the
-    residuals of this very fit, and a beta distribution between its ends 0 and 4 (Biometrika 37 (1950) 409, 38 (1951)
-    159).
+    Durbin and Watson's ratio of squared differences to squares, with its mean and variance for the residuals of this
+    fit, and a beta distribution between its limits 0 and 4 (Biometrika 37 (1950) 409, 38 (1951) 159).
     """
     from scipy.special import betainc
 
     m = len(f)
     freedoms = round(float(np.trace(M)))
-    # Residuals at the level of rounding have no pattern that means anything.
+    # Residuals at the level of rounding errors have no meaningful pattern.
     if freedoms < 3 or not f @ f > 0:
         return 0.0, 1.0
     D = np.diff(np.eye(m), axis=0)

@@ -1,4 +1,4 @@
-"""The datum: the whole, moved as one so that its targets lie on the nominal ones as well as can be."""
+"""Datum: the rigid motion of the network that is the best fit of its targets to the nominal ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from errormotion.methods.multilateration.network.model import Stations
 
 @dataclass(frozen=True)
 class Motion:
-    """A point goes to R (point - a) + b: means (3,) of targets and nominal ones, and the rotation R (3, 3)."""
+    """Rigid motion R (point - a) + b, with the means (3,) of targets and nominal ones and the rotation R (3, 3)."""
 
     a: Array
     b: Array
@@ -22,9 +22,9 @@ class Motion:
 
     @classmethod
     def of(cls, moments: Array, centre: Array) -> Motion:
-        """Return the motion that fits targets to nominal ones best, from their moments (16,) (see `moments`).
+        """Return the best fit of targets to nominal ones, from their moments (16,) (see `vectorised.moments`).
 
-        The rotation is that of Kabsch: from the singular vectors of the targets' cross products.
+        The rotation is that of Kabsch, from the singular vectors of the cross products.
         """
         n, a, b = moments[0], moments[1:4] / moments[0], moments[4:7] / moments[0]
         U, _, Vt = np.linalg.svd(moments[7:].reshape(3, 3) - n * np.outer(b, a))
@@ -34,16 +34,16 @@ class Motion:
 
     def stations(self, stations: Stations) -> Stations:
         """Return the stations moved."""
-        return replace(stations, place=(stations.place - self.a) @ self.R.T + self.b)
+        return replace(stations, position=(stations.position - self.a) @ self.R.T + self.b)
 
 
 def fitted(stations: Stations, target: Array, nominal: Array, used: NDArray[np.bool_]) -> tuple[Stations, Array, Array]:
-    """Return stations and targets (m, 3) moved onto the nominal targets, and the rotation (3, 3).
+    """Return stations and targets (m, 3) fitted to the nominal targets, and the rotation (3, 3).
 
-    ``used`` (m,) are the targets that count.
+    Only the targets ``used`` (m,) determine the fit.
     """
-    place, centre = np.ascontiguousarray(target.T), nominal.mean(axis=0)
+    position, centre = np.ascontiguousarray(target.T), nominal.mean(axis=0)
     of = loops(len(target))
-    motion = Motion.of(of.moments(place, nominal, used, centre), centre)
+    motion = Motion.of(of.moments(position, nominal, used, centre), centre)
     everywhere = np.zeros(len(target))
-    return motion.stations(stations), of.moved(place, motion.a, motion.b, motion.R, everywhere), motion.R
+    return motion.stations(stations), of.moved(position, motion.a, motion.b, motion.R, everywhere), motion.R
