@@ -36,14 +36,14 @@ class _Display(Progress):
 
 
 class Bars:
-    """Progress of a campaign as bars on stderr; where stderr is no terminal, only what will move is printed.
+    """Progress of a campaign as bars on stderr; where stderr is no terminal, only announcements of motions are printed.
 
     Parameters
     ----------
     quiet : bool
-        No bars.
+        Show no bars.
     announcing : bool
-        Print what will move, also without bars.
+        Print the motions of each test before it starts, also without bars.
     """
 
     def __init__(self, quiet: bool = False, *, announcing: bool = False) -> None:
@@ -77,7 +77,7 @@ class Bars:
         self._progress.stop()
 
     def announce(self, text: str) -> None:
-        """Print what a test will do with the machine, on one line."""
+        """Print on one line how a test will move the machine."""
         if self._announcing:
             self._console.print(text, markup=False, soft_wrap=True)
 
@@ -105,7 +105,7 @@ class Bars:
         return self._shown
 
     def note(self, text: str) -> None:
-        """Show an intermediate result behind the bar, and the course of its values as curves below."""
+        """Show an intermediate result beside the bar, and its values as curves below."""
         self._curves.take(text)
         if self._task is not None:
             self._progress.update(self._task, note=text)

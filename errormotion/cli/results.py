@@ -17,21 +17,21 @@ from errormotion.errors import DatasetError, RunError
 def load(
     paths: Sequence[Path], names: Mapping[str, Path], *, every: bool = False
 ) -> tuple[dict[str, xr.Dataset], list[str]]:
-    """Return error datasets by name, and the runs that were left out, one sentence each.
+    """Return error datasets by name, and a sentence for each run that was left out.
 
     Parameters
     ----------
     paths : sequence of Path
-        An error dataset; a run folder; or a folder of runs, which stands for the newest result of each of its tests.
+        Error datasets, run folders, or folders of runs; of such a folder the newest result of each test is taken.
     names : mapping of str to Path
-        Further ones, with their names.
+        Further results by name.
     every : bool
-        A folder of runs stands for all results of each of its tests.
+        Of a folder of runs, all results of each test are taken.
 
     Raises
     ------
     DatasetError, RunError
-        Nothing there, no error dataset, a run without errors.
+        A path does not exist or is no error dataset, or a run has no errors.
     """
     found: dict[str, xr.Dataset] = {}
     left_out: list[str] = []
@@ -57,11 +57,11 @@ def _add(found: dict[str, xr.Dataset], name: str, file: Path) -> None:
 
 
 def _files(path: Path, left_out: list[str], every: bool = False) -> list[tuple[str, Path]]:
-    """Return names and files of the error datasets that a path stands for."""
+    """Return names and files of the error datasets of a file, a run folder or a folder of runs."""
     if path.is_file():
         return [(path.stem, path)]
     if not path.is_dir():
-        raise DatasetError(f"{path}: there is no such file or folder")
+        raise DatasetError(f"{path}: no such file or folder")
     if not is_runs_folder(path):
         folder = RunFolder.open(path)
         return [(str(folder.data["test"]), _errors(folder))]
@@ -78,11 +78,11 @@ def _files(path: Path, left_out: list[str], every: bool = False) -> list[tuple[s
         if test not in newest or created >= newest[test][0]:
             newest[test] = (created, errors)
     if not newest:
-        raise DatasetError(f"{path}: none of its runs has errors; identify them first")
+        raise DatasetError(f"{path}: none of the runs has errors; identify them first")
     return everything if every else [(test, errors) for test, (_, errors) in newest.items()]
 
 
 def _errors(folder: RunFolder) -> Path:
     if folder.errors is None or not folder.errors.is_file():
-        raise RunError(f"{folder.path}: has no errors yet; identify its raw data first")
+        raise RunError(f"{folder.path}: the run has no errors yet; identify its raw data first")
     return folder.errors

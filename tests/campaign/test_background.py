@@ -101,7 +101,7 @@ def test_the_end_is_what_the_process_said_or_that_it_said_nothing(tmp_path: Path
 
 @pytest.mark.parametrize("name", ["", "..", "../..", "20260101T000000Z-0000000g", "20260101T000000Z-00000001"])
 def test_a_name_that_is_none_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(RunError, match="there is no process"):
+    with pytest.raises(RunError, match="no process"):
         processes.stop(tmp_path, name)
 
 

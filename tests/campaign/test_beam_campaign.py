@@ -136,5 +136,5 @@ def test_a_bench_without_a_control_is_refused_before_anything_is_measured(tmp_pa
     control = (
         '[instruments.control]\ndriver = "virtual_controller"\narm = true\naddress = "sim://cframe/controller?seed=3"'
     )
-    with pytest.raises(BenchError, match=r"needs controller; the bench .* offers point_lds"):
+    with pytest.raises(BenchError, match=r"needs controller; the bench .* has point_lds"):
         write(tmp_path, [(control, "")])

@@ -48,7 +48,7 @@ def test_failed_connections_are_reported_as_a_tree_and_nothing_stays_open(bench:
 
 def test_kind_that_is_missing_or_there_twice_is_refused(bench: Callable[..., BenchPlan]) -> None:
     with OpenBench(bench(SECOND)) as table:
-        with pytest.raises(BenchError, match="expected a thermometer; it offers counter"):
+        with pytest.raises(BenchError, match="expected a thermometer; found counter"):
             table.of_kind("thermometer")
         with pytest.raises(BenchError, match="expected one counter; found counter, other"):
             table.of_kind("counter")

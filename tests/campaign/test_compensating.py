@@ -394,7 +394,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_opened(
         made(arm="Mill 6")
     with pytest.raises(CompensationError, match=r"expected a table \[compensator\]"):
         made(replace(plan, compensator=None), arm=MACHINE)
-    with pytest.raises(CompensationError, match="The model is of the machine 'Mill 6'"):
+    with pytest.raises(CompensationError, match="The model is for the machine 'Mill 6'"):
         made(machine="Mill 6")
     with pytest.raises(CompensationError, match="offsets need 'machine'"):
         made(frame="tool")

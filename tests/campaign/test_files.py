@@ -79,7 +79,7 @@ def test_bench_without_the_instruments_of_a_method_is_refused_before_anything_is
     (mistake,) = complaints(path, load_campaign)
     assert (
         mistake
-        == f"test[0]: the method 'ramp' needs thermometer; the bench {path.parent / 'bench.toml'} offers counter"
+        == f"test[0]: the method 'ramp' needs thermometer; the bench {path.parent / 'bench.toml'} has counter"
     )
 
 
@@ -122,7 +122,7 @@ def test_several_instruments_of_a_needed_kind_without_a_choice_are_refused(write
     path = write('name = "a"', bench=SECOND)
     (mistake,) = complaints(path, load_campaign)
     assert mistake == (
-        f"test[0]: the method 'ramp' needs one counter; the bench {path.parent / 'bench.toml'} offers counter, other. "
+        f"test[0]: the method 'ramp' needs one counter; the bench {path.parent / 'bench.toml'} has counter, other. "
         'Choose one: instruments = { counter = "counter" }'
     )
 

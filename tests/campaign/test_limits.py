@@ -58,8 +58,8 @@ def test_a_test_within_the_limits_is_accepted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("limits", "message"),
     [
-        ('X = ["0 m", "3 m"]', r"test\[0\]: X would go from .* mm to 36.* mm; its limits are 0 mm and 3000 mm"),
-        ('Z = ["200 mm", "1 m"]', r"Z would go from 120 mm to .* mm; its limits are 200 mm and 1000 mm"),
+        ('X = ["0 m", "3 m"]', r"test\[0\]: X would move from .* mm to 36.* mm; its limits are 0 mm and 3000 mm"),
+        ('Z = ["200 mm", "1 m"]', r"Z would move from 120 mm to .* mm; its limits are 200 mm and 1000 mm"),
         ('feed = "1 m/min"', r"the feed would be \d+ mm/min; its limit is 1000 mm/min"),
         ('spindle_speed = "8000 /min"', r"the spindle would turn at 9000 /min; its limit is 8000 /min"),
     ],

@@ -193,7 +193,7 @@ def test_a_method_that_writes_programs_and_states_no_motions_is_refused_when_it_
 
 
 def test_a_method_that_states_motions_beyond_the_limits_is_refused_when_it_is_read(write: Write) -> None:
-    with pytest.raises(BenchError, match="X would go from 100 mm to 100 mm"):
+    with pytest.raises(BenchError, match="X would move from 100 mm to 100 mm"):
         load_campaign(write(METHOD + HONEST, limited(BENCH)))
 
 

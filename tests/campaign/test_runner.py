@@ -18,7 +18,7 @@ import pytest
 from errormotion import datasets, plugins
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
-from errormotion.campaign.folder import LOOK_DURATION, RunFolder, list_runs
+from errormotion.campaign.folder import CHECK_DURATION, RunFolder, list_runs
 from errormotion.campaign.storage.journal import journal
 from errormotion.campaign.storage.store import RawStore
 from errormotion.errors import BenchError, RunError
@@ -232,7 +232,7 @@ def test_whoever_only_looks_at_a_lock_does_not_hold_it_against_a_run(plan: Plan,
     (folder,) = runner.run(plan('name = "a"'))
     looking = os.open(folder.path, os.O_RDONLY)
     fcntl.flock(looking, fcntl.LOCK_SH)
-    timer = threading.Timer(LOOK_DURATION / 2, os.close, [looking])
+    timer = threading.Timer(CHECK_DURATION / 2, os.close, [looking])
     timer.start()
     with RunFolder.open(folder.path).locked():
         timer.join()

@@ -244,9 +244,9 @@ def test_doctor_finds_this_machine_well_and_says_what_is_not(
 ) -> None:
     from errormotion.cli.commands import doctor as examination
 
-    monkeypatch.setattr(examination, "LEAST_DISK", 0)
+    monkeypatch.setattr(examination, "MIN_FREE_DISK", 0)
     assert answer("doctor")["ok"] is True
-    monkeypatch.setattr(examination, "LEAST_DISK", 2**60)
+    monkeypatch.setattr(examination, "MIN_FREE_DISK", 2**60)
     assert "BAD  disk here" in run("doctor", code=1).stdout
 
 

@@ -45,7 +45,7 @@ def test_mistakes_are_those_of_the_files_and_nothing_is_written(run: Run, tmp_pa
     assert said.rstrip().endswith("Nothing was written.")
     assert "Did you mean 'spindle_drift'" in run("init", *FRAME, "--test", "a=spindle_drft", code=1).stderr
     assert "name of an instrument or a test (frame)" in run("init", *FRAME, "--set", "b.c=1", code=1).stderr
-    assert "no terminal to ask" in run("init", "new", code=2).stderr
+    assert "no terminal for questions" in run("init", "new", code=2).stderr
     assert not list(tmp_path.glob("*.toml"))
     assert not (tmp_path / "new").exists()
 

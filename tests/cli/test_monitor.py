@@ -16,7 +16,7 @@ from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.campaign.storage.store import RawStore
 from errormotion.cli.app import app
-from errormotion.cli.commands.instruments.monitor import LEAST_SPAN, Screen, clock
+from errormotion.cli.commands.instruments.monitor import MIN_SPAN, Screen, clock
 from errormotion.cli.curves import bars
 
 BENCH = """\
@@ -163,7 +163,7 @@ def test_the_page_shows_temperatures_parameters_alarms_and_who_is_silent() -> No
 
 def test_bars_leave_a_blank_for_what_is_not_known() -> None:
     assert bars([20.0, math.nan, 28.0]) == "▁ █"
-    assert bars([20.0, 20.001], LEAST_SPAN) == "▁▁"  # a thousandth of a kelvin is no mountain
+    assert bars([20.0, 20.001], MIN_SPAN) == "▁▁"  # a thousandth of a kelvin is no mountain
     assert bars([math.nan]) == ""
 
 

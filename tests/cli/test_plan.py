@@ -30,4 +30,4 @@ def test_every_test_of_a_campaign_is_planned_for_a_program_too(answer):
 
 def test_wrong_calls_say_what_was_expected(run, tmp_path):
     assert "expected one of the tests beam; found 'bean'" in run("plan", BEAM, "--test", "bean", code=1).stderr
-    assert "name it with --test" in run("plan", GANTRY, "--out", tmp_path / "plan.nc", code=1).stderr
+    assert "choose it with --test" in run("plan", GANTRY, "--out", tmp_path / "plan.nc", code=1).stderr

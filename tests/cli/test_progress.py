@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from errormotion.cli.curves import MOST_CURVES, MOST_POINTS, Curves
+from errormotion.cli.curves import MAX_CURVES, MAX_POINTS, Curves
 from errormotion.cli.progress import Bars
 
 
@@ -91,10 +91,10 @@ def test_a_long_curve_keeps_its_course_in_bounded_memory() -> None:
     (line,) = curves.lines(80)
     assert len(line.plain) <= 80
     assert re.search(r"▁▁?▂.*▇▇*█", line.plain)
-    assert len(curves._courses["EX"].points) < MOST_POINTS
+    assert len(curves._courses["EX"].points) < MAX_POINTS
     for k in range(100):
         curves.take(f"name{k} +1 um")
-    assert len(list(curves.lines(80))) == MOST_CURVES
+    assert len(list(curves.lines(80))) == MAX_CURVES
     plain = Curves()
     plain.take("12 of 300 values undecided, v1.2.3")
     assert not plain.shown

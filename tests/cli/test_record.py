@@ -182,7 +182,7 @@ def test_a_note_replaces_an_earlier_one(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["record", "bench.toml", "sensor"], "there are: air, dead"),
+        (["record", "bench.toml", "sensor"], "expected one of the instruments air, dead"),
         (["record", "bench.toml", "air", "--for", "2 h"], "at most 3600 s"),
         (["record", "bench.toml", "air", "--for", "soon"], "--for"),
         (["record", "bench.toml", "air", "--out", "bench.toml"], "exists already"),

@@ -66,7 +66,7 @@ def test_the_token_is_asked_for(page: Any, accessible: Callable[[], None], open_
     accessible()
     page.keyboard.type("wrong")
     page.keyboard.press("Enter")
-    page.wait_for_selector("text=This is not the token")
+    page.wait_for_selector("text=The token is wrong")
     page.fill("#token", open_to_the_network.access.token)
     page.keyboard.press("Enter")
     page.wait_for_selector("h1:text('Results')")
@@ -160,7 +160,7 @@ def test_two_results_are_compared(
     assert "contradict each other" in page.inner_text("h2.bad")
     accessible()
     page.click("text=Compensate")
-    page.click("text=What a compensation took off")
+    page.click("text=Effect of a compensation")
     for name, number in (("before", 1), ("after", 2)):
         page.select_option(f"#{name}", index=number)
     page.click("button:has-text('Compare')")

@@ -102,11 +102,11 @@ def test_a_shadow_then_armed_then_zero(
 
     page.expected_errors = ("400",)
     served.enter(page, "compensate")
-    assert page.locator("#none").inner_text() == "No compensation is at work."
+    assert page.locator("#none").inner_text() == "No compensation is running."
 
     # A shadow writes nothing.
     page.click("button:has-text('Start')")
-    page.wait_for_selector(".at-work:has-text('shadow: nothing is written')")
+    page.wait_for_selector(".at-work:has-text('shadow mode: nothing is written')")
     page.wait_for_selector(".states li.here.following")
     assert page.inner_text("#inputs tr th") == SENSOR
     page.wait_for_selector("#curves[data-drawn] canvas")

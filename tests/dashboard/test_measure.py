@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
 
 from errormotion.campaign.background import processes
+from errormotion.dashboard.cache import TimedCache
 from errormotion.dashboard.campaigns import hash_of
-from errormotion.dashboard.kept import Lately
 from errormotion.dashboard.pages import measure
 
 BENCH = """\
@@ -181,7 +181,7 @@ def test_a_request_that_is_none_is_refused(reading: Any, body: str) -> None:
 
 def test_many_clients_do_not_keep_the_server_at_work() -> None:
     made: list[int] = []
-    lately: Lately[int] = Lately(1000.0, most=2)
+    lately: TimedCache[int] = TimedCache(1000.0, most=2)
 
     def make() -> int:
         made.append(len(made))
@@ -189,4 +189,4 @@ def test_many_clients_do_not_keep_the_server_at_work() -> None:
 
     assert [lately.get("a", make) for _ in range(20)] == [0] * 20
     assert [lately.get(key, make) for key in "bca"] == [1, 2, 3]
-    assert Lately(0.0).get("a", make) == 4
+    assert TimedCache(0.0).get("a", make) == 4

@@ -81,7 +81,7 @@ def test_the_token_opens_and_no_log_holds_it(open_to_the_network: Any, caplog: p
     )
     status, headers, text = served.ask("/login", "POST", urlencode({"token": token[:-1]}), **origin)
     assert (status, "Set-Cookie" in headers) == (403, False)
-    assert "This is not the token" in text
+    assert "The token is wrong" in text
     status, headers, _ = served.ask("/login", "POST", urlencode({"token": token}), **origin)
     assert status == 302
     cookie = headers["Set-Cookie"]
@@ -153,7 +153,7 @@ def test_a_certificate_needs_its_key(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <socket")
 def test_an_address_in_use_is_named(open_to_this_computer: Any, tmp_path: Path) -> None:
     port = int(open_to_this_computer.address.rstrip("/").rpartition(":")[2])
-    with pytest.raises(RunError, match=f"port {port}: cannot be listened on"):
+    with pytest.raises(RunError, match=f"port {port}: the server cannot listen"):
         run(Options(tmp_path, port=port), lambda *_: None)
     gc.collect()  # tornado leaves the socket that it could not bind to the collector
 

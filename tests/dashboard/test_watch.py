@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from errormotion.campaign.background.recorded import Value
+from errormotion.campaign.claims import claimed
 from errormotion.campaign.files import load_bench
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
-from errormotion.campaign.turns import claimed
 from errormotion.dashboard.watch import Present, Watch
 from errormotion.errors import BenchError
 
@@ -129,14 +129,14 @@ def test_instruments_are_lent_to_who_measures_and_taken_again(make: Callable[...
         # The claim is given once the instruments are closed here: nobody else has them now.
         assert [source._driver for source in watch._monitor.sources] == [None]
         present = wait(watch, lambda now: now.lent.startswith("A run <i>"))
-        assert "recorded nothing yet" in present.lent
+        assert "recorded no samples yet" in present.lent
         assert [each.state for each in present.instruments] == ["lent"]
         with other:
             records(other.folder.path)
             for snapshot in other.watch():
                 present = watch.present()
                 value = present.temperatures[0].value
-                if "it records" in present.lent and math.isfinite(value):
+                if "its record" in present.lent and math.isfinite(value):
                     break
                 assert snapshot.time < 30
         assert (present.run, present.rows > 0) == (other.folder.path.name, True)

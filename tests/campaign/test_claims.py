@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from errormotion.campaign import runner, turns
-from errormotion.campaign.background.elsewhere import measuring_elsewhere
+from errormotion.campaign import claims, runner
+from errormotion.campaign.background.other_processes import runs_of_other_processes
 from errormotion.campaign.background.recorded import recorded
+from errormotion.campaign.claims import Claim, claimed, holder, watching
 from errormotion.campaign.files import CampaignPlan
-from errormotion.campaign.turns import Claim, claimed, holder, watching
 from errormotion.errors import RunError
 
 pytestmark = pytest.mark.usefixtures("lab")
@@ -22,7 +22,7 @@ def test_a_run_claims_its_machine_and_is_seen_from_outside(plan: Callable[..., C
 
     class Looking(runner.Quiet):
         def advance(self, done: float) -> None:
-            seen.append((holder(campaign.bench.machine), measuring_elsewhere(tmp_path / "runs", ())))
+            seen.append((holder(campaign.bench.machine), runs_of_other_processes(tmp_path / "runs", ())))
 
     (folder,) = runner.run(campaign, progress=Looking())
     claim, (found,) = seen[-1]
@@ -34,12 +34,12 @@ def test_a_run_claims_its_machine_and_is_seen_from_outside(plan: Callable[..., C
         {"a": folder.path.name},
     )
     assert found.expected > 0
-    assert (holder(campaign.bench.machine), measuring_elsewhere(tmp_path / "runs", ())) == (None, [])
+    assert (holder(campaign.bench.machine), runs_of_other_processes(tmp_path / "runs", ())) == (None, [])
     record = recorded(folder.path)
     assert (record.title, record.samples) == ("a of Ramps", folder.data["samples"]["count"])
     assert record.values
     with folder.locked():  # a finished run whose report is made again is not measuring
-        assert measuring_elsewhere(tmp_path / "runs", ()) == []
+        assert runs_of_other_processes(tmp_path / "runs", ()) == []
 
 
 def test_a_claim_waits_until_who_watches_has_left_and_ends_by_itself() -> None:
@@ -67,11 +67,11 @@ def test_a_claim_waits_until_who_watches_has_left_and_ends_by_itself() -> None:
         end.set()
         thread.join()
     assert holder("Mill") is None
-    assert not list(turns._folder().glob("*.claim"))
+    assert not list(claims._folder().glob("*.claim"))
 
 
 def test_a_watch_that_does_not_leave_does_not_prevent_a_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(turns, "RELEASE_TIMEOUT", 0.1)
+    monkeypatch.setattr(claims, "RELEASE_TIMEOUT", 0.1)
     with watching("Mill"), claimed("Mill", "a run"):
         assert holder("Mill") == Claim("a run")
 
