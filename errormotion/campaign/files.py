@@ -529,11 +529,11 @@ def _trials_mistakes(test: TestTable, place: tuple[str | int, ...]) -> list[str]
     """Return why the Monte Carlo evaluation that a test requests is not possible."""
     if test.monte_carlo is None:
         return []
-    from errormotion.montecarlo.evaluation import FEWEST
+    from errormotion.montecarlo.evaluation import MIN_TRIALS
 
     where = tomlfile.dotted((*place, "monte_carlo"))
-    if test.monte_carlo != "auto" and test.monte_carlo < FEWEST:
-        return [f"{where}: expected 'auto' or at least {FEWEST} trials; found {test.monte_carlo}"]
+    if test.monte_carlo != "auto" and test.monte_carlo < MIN_TRIALS:
+        return [f"{where}: expected 'auto' or at least {MIN_TRIALS} trials; found {test.monte_carlo}"]
     try:
         method = plugins.get("methods", test.method)
     except PluginError:

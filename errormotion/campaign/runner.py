@@ -442,14 +442,14 @@ class _Session:
 
     def _evaluate(self, folder: RunFolder, test: TestPlan) -> None:
         """Evaluate the result by the Monte Carlo method; a failure is only logged, as for the report."""
-        from errormotion.montecarlo.beside import evaluate_beside, file_beside
+        from errormotion.montecarlo.saving import evaluate_and_save, evaluation_file
 
         file = folder.errors
-        if file is None or file_beside(file).exists():
+        if file is None or evaluation_file(file).exists():
             return
         trials = None if test.monte_carlo == "auto" else test.monte_carlo
         try:
-            evaluate_beside(
+            evaluate_and_save(
                 folder.raw, test.method.info.id, test.settings, datasets.load(file), file, trials=trials,
                 progress=self.progress,
             )  # fmt: skip

@@ -13,7 +13,7 @@ from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 from errormotion.record.runs.entry import Entry, read_entry
 from errormotion.record.runs.listing import DEEPEST, list_runs
-from errormotion.record.text import FIELD, LONG
+from errormotion.record.text import FIELD, MM_FROM
 from errormotion.report.text import DASH, rounded, signs
 
 MAX_KEY = 600
@@ -155,7 +155,7 @@ class Lab:
 def figure_text(figure: FigureOfMerit) -> tuple[str, str, str]:
     """Return value, expanded uncertainty (k = 2) and printed unit of a figure of merit."""
     factor, unit = FIELD.get(figure.unit, (1.0, figure.unit))
-    if figure.unit == "m" and abs(figure.value) >= LONG:
+    if figure.unit == "m" and abs(figure.value) >= MM_FROM:
         factor, unit = 1e3, "mm"
     value, expanded = rounded(factor * figure.value, factor * figure.expanded_uncertainty)
     return value, expanded, signs(unit)

@@ -63,7 +63,7 @@ def test_a_request_waits_for_its_own_answer(tmp_path: Path) -> None:
             processes.Request(1, "Mount <b>the bar</b>."),
             60.0,
         )
-        with pytest.raises(RunError, match="does not wait"):
+        with pytest.raises(RunError, match="is not open"):
             processes.answer(tmp_path, NAME, 2)
         assert asking.is_alive()
         listed = CliRunner().invoke(app, ["background", "list", str(tmp_path)])
@@ -118,7 +118,7 @@ def test_a_damaged_state_is_shown_as_far_as_it_goes(tmp_path: Path, text: str) -
 
 def test_one_machine_is_measured_by_one_process(tmp_path: Path, write: Callable[..., Path], lab: None) -> None:
     campaign = write('name = "a"')
-    with living(tmp_path / "runs"), pytest.raises(RunError, match="'Ramps' is measuring on lab machine"):
+    with living(tmp_path / "runs"), pytest.raises(RunError, match="'Ramps' has been measuring on lab machine"):
         processes.start(campaign, tmp_path / "runs")
 
 

@@ -158,7 +158,7 @@ def test_a_calibration_that_is_not_there_is_reported_when_the_campaign_is_read(t
 def test_a_file_of_another_kind_is_named_as_that(tmp_path: Path) -> None:
     (tmp_path / "bench.toml").write_text('schema = "errormotion.bench/1"\nname = "b"\nmachine = "M"\n')
     (tmp_path / "campaign.toml").write_text('schema = "errormotion.campaign/1"\nname = "c"\nbench = "bench.toml"\n')
-    with pytest.raises(BenchError, match=r"expected a campaign file; found a file of kind 'bench'. .* the campaign"):
+    with pytest.raises(BenchError, match=r"expected a campaign file; found a file of kind 'bench'. .* a campaign"):
         load_campaign(tmp_path / "bench.toml")
     with pytest.raises(BenchError, match="expected a bench file; found a file of kind 'campaign'"):
         load_bench(tmp_path / "campaign.toml")

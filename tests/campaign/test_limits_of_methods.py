@@ -231,7 +231,7 @@ def test_a_bench_that_is_not_armed_moves_nothing(write: Write, tmp_path: Path) -
 
 def test_a_driver_that_moves_and_holds_no_limits_is_not_opened(write: Write, tmp_path: Path) -> None:
     bench = BENCH.replace("virtual_controller", "mill").replace("arm = true\n", "")
-    with pytest.raises(BenchError, match="'mill' can move or change a machine and holds no limits"):
+    with pytest.raises(BenchError, match="'mill' can move or change a machine and does not check limits"):
         runner.run(load_campaign(write(METHOD + HONEST, bench)), runs=tmp_path / "runs")
 
 

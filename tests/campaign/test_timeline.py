@@ -110,17 +110,17 @@ def test_a_schedule_that_contradicts_the_timeline_is_refused(write: Write) -> No
 
 def test_a_run_without_timeline_states_no_truth(write: Write) -> None:
     (folder,) = run(write(drift("drift"), timeline=""))
-    with pytest.raises(RunError, match=r"expected a run of a campaign with a table \[timeline\]"):
+    with pytest.raises(RunError, match=r"expected a run of a campaign on a virtual machine with a table \[timeline\]"):
         truth_of(folder)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"timeline": ""}, r"test\[0\].at: expected a table \[timeline\]; found none"),
+        ({"timeline": ""}, r"test\[0\].at: needs a table \[timeline\]; found none"),
         ({"control": ""}, r"\[timeline\]: expected a controller of a virtual machine"),
         ({"timeline": TIMELINE.replace("+01:00", "")}, "expected an instant such as"),
-        ({"timeline": TIMELINE.replace("[{", '[{ at = "20 min", spindle_speed = "0 /min" }, {')}, "times that rise"),
+        ({"timeline": TIMELINE.replace("[{", '[{ at = "20 min", spindle_speed = "0 /min" }, {')}, "times in ascending order"),
     ],
 )
 def test_mistakes_of_a_timeline_are_found_when_the_campaign_is_read(

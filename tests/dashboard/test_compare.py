@@ -62,7 +62,7 @@ def test_the_report_of_a_comparison_is_in_a_sandbox(served: Any, pair_of_runs: t
 def test_what_cannot_be_compared_is_said_beside_the_choice(served: Any, pair_of_runs: tuple[Path, list[str]]) -> None:
     keys = pair_of_runs[1]
     for query, message in (
-        (_query(keys[:1]), "Choose one more result"),
+        (_query(keys[:1]), "Select at least one more result"),
         (_query([*keys, "nowhere"]), "There is no run"),
         (urlencode({"history_machine": "nobody", "figure": "EZ"}), 'role="alert"'),
     ):

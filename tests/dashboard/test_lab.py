@@ -51,7 +51,7 @@ def test_a_folder_that_is_not_there_yet_is_an_empty_table(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("key", ["", ".", "..", "../{name}", "/etc", "{name}/.", "{name}/../{name}", "a\0b", "a" * 700])
 def test_a_key_leads_nowhere_else(lab: Lab, runs: Path, key: str) -> None:
-    with pytest.raises(RunError, match="There is no run"):
+    with pytest.raises(RunError, match="No run"):
         lab.folder(key.format(name=next(path.name for path in runs.iterdir() if path.is_dir())))
 
 

@@ -152,7 +152,7 @@ def test_a_file_is_saved_once_and_not_over_the_work_of_others(controlling: Any, 
     order = {"file": "other.toml", "text": text, "before": ""}
     assert _post(controlling, "/measure/save", **order) == (200, {"file": "other.toml", "before": hash_of(text)})
     changed = {**order, "text": text.replace("1 min", "2 min")}
-    assert "was changed by others" in _post(controlling, "/measure/save", **changed)[1]["error"]
+    assert "was changed by another program" in _post(controlling, "/measure/save", **changed)[1]["error"]
     assert _post(controlling, "/measure/save", **{**changed, "before": hash_of(text)})[0] == 200
     assert (folder / "other.toml").read_text() == changed["text"]
     for name in ("../x.toml", "x.txt", ".x.toml", "a/b.toml", "bench.toml"):
@@ -170,7 +170,7 @@ def test_without_control_no_other_files_are_looked_at(reading: Any, folder: Path
     asked = itertools.product(("drift.toml", "", "none.toml", "../drift.toml"), ("/etc/hostname", "../b.toml", "C:/x"))
     for name, path in asked:
         status, found = _post(reading, "/measure/form.json", file=name, text=text.replace("bench.toml", path))
-        assert (status, "looks at files of its folder only" in found["error"]) == (400, True)
+        assert (status, "reads files of its folder only" in found["error"]) == (400, True)
 
 
 @pytest.mark.parametrize("body", ["", "[]", "{}", '{"file": 1, "text": "x"}', "[" * 100_000, "\xff"])

@@ -46,7 +46,7 @@ def _lines(found: Any) -> Any:
 
 def test_arrows_are_the_errors_at_the_functional_point(volume: xr.Dataset) -> None:
     found = drawing(volume)
-    factor = int(re.search(r"(\d+) times enlarged", found.caption).group(1))  # type: ignore[union-attr]
+    factor = int(re.search(r"enlarged (\d+) times", found.caption).group(1))  # type: ignore[union-attr]
     ends = _lines(found)
     known = np.isfinite(volume["EX"].values)
     assert len(ends) == known.sum() == 26

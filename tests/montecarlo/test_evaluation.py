@@ -236,7 +236,7 @@ def test_refused_trials_are_counted_and_named(measured, tmp_path, monkeypatch):
     monkeypatch.setattr(trials, "trial", refuses)
     found = _evaluate(measured, tmp_path / "trials", scheduler="sync")
     assert int(found["missing"].max()) == TRIALS // 5
-    assert any("8 trials were refused: no luck" in note for note in found.attrs["notes"])
+    assert any("8 trials failed: no luck" in note for note in found.attrs["notes"])
     assert {line.word for line in lines(found)} == {"undecided"}
 
 

@@ -1,4 +1,4 @@
-"""Decisions on the tolerances of runs in the record, with other limits than those that the runs state."""
+"""Decisions on the tolerances of runs in the record, with limits other than those of the runs."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from errormotion.tolerances.conformity import Conformity, judge, judge_figures
 from errormotion.tolerances.table import Tolerances
 
 MOST_READ = 1000
-"""Error datasets that one call opens, the newest first; limits of freedoms need them."""
+"""Largest number of error datasets that one call reads, newest first; limits of freedoms need them."""
 
 
 def judge_runs(runs: Sequence[tuple[Path, Entry]], tolerances: Tolerances) -> list[Conformity | None]:
     """Return the decision on each run, newest first; None for a run without errors.
 
-    A run whose error dataset cannot be read, or is beyond MOST_READ, is not decided; ``failure`` states why.
+    The decision on a run whose error dataset cannot be read, or is beyond `MOST_READ`, is open; ``failure`` states why.
     """
     found = list[Conformity | None]()
     read = 0

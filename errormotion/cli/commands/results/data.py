@@ -88,18 +88,18 @@ def _evaluated(
     bars: Bars,
 ) -> dict[Path, xr.Dataset | str]:
     """Return the Monte Carlo evaluation of each result, or why it failed; existing evaluations are kept."""
-    from errormotion.montecarlo.beside import evaluate_beside, file_beside
+    from errormotion.montecarlo.saving import evaluate_and_save, evaluation_file
 
     found = dict[Path, Any]()
     for outcome in outcomes:
         if outcome.reason or outcome.errors is None:
             continue
-        file = file_beside(outcome.errors)
+        file = evaluation_file(outcome.errors)
         try:
             found[outcome.raw] = (
                 datasets.load(file)
                 if file.exists()
-                else evaluate_beside(
+                else evaluate_and_save(
                     raw_of(outcome.raw), method_id, settings, datasets.load(outcome.errors), outcome.errors,
                     trials=trials.number, digits=trials.digits, seed=trials.seed, scheduler=scheduler, workers=workers,
                     progress=bars,
@@ -190,7 +190,7 @@ def _identify_one(
     method, evaluation, file = plugins.get("methods", method_id), None, out
     if trials is not None:
         from errormotion.cli.commands.results import monte_carlo
-        from errormotion.montecarlo.beside import evaluate_beside
+        from errormotion.montecarlo.saving import evaluate_and_save
 
         file = monte_carlo.beside(out)
     with Bars(as_json) as bars:
@@ -200,7 +200,7 @@ def _identify_one(
                 errors = noted(method().identify(dataset, settings), dataset)
         datasets.validate(errors)
         if trials is not None:
-            evaluation = evaluate_beside(
+            evaluation = evaluate_and_save(
                 raw, method_id, settings, errors, out, trials=trials.number, digits=trials.digits, seed=trials.seed,
                 scheduler=scheduler or "threads", workers=workers, progress=bars,
             )  # fmt: skip

@@ -45,7 +45,7 @@ def identify(
         ),
     ] = None,
     digits: Annotated[
-        int, typer.Option(min=1, max=2, help="For --monte-carlo: significant digits of a standard uncertainty.")
+        int, typer.Option(min=1, max=2, help="For --monte-carlo: meaningful digits of a standard uncertainty.")
     ] = 1,
     seed: Annotated[int, typer.Option(min=0, help="For --monte-carlo: seed of the random numbers.")] = 0,
     json_: options.Json = False,

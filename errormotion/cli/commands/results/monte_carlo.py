@@ -11,8 +11,8 @@ from errormotion.cli.output import show, table
 from errormotion.cli.page import new_files
 from errormotion.cli.summary import notes_of
 from errormotion.errors import DatasetError, MethodError
-from errormotion.montecarlo.beside import file_beside
 from errormotion.montecarlo.result import lines
+from errormotion.montecarlo.saving import evaluation_file
 
 
 def trials_of(text: str) -> int | None:
@@ -27,7 +27,7 @@ def trials_of(text: str) -> int | None:
 
 def beside(out: Path) -> Path:
     """Return the file of the evaluation of a result; DatasetError if it exists already or has no folder."""
-    file = file_beside(out)
+    file = evaluation_file(out)
     if not out.parent.is_dir():
         raise DatasetError(f"{out.parent}: no such folder, which --out states for the result")
     new_files(None, file)

@@ -78,7 +78,7 @@ def _values(ds: xr.Dataset) -> str:
         value, U = rounded(
             factor * float(ds["value"][k]), factor * float(ds["expanded_uncertainty"][k]), signed=False, digits=2
         )
-        remarks = [word for name, word in (("outside", "outside"), ("departing", "departs alone")) if ds[name][k]]
+        remarks = [word for name, word in (("outside", "outside"), ("departing", "outlier")) if ds[name][k]]
         shown = [value.replace("−", "-"), U, unit, ", ".join(remarks), str(run)]
         rows.append([date(ds, float(ds["time"][k])), *shown])
     head = ["started (UTC)", "value", "U (k=2)", "unit", "limits", "run"]
