@@ -13,7 +13,7 @@
 ``generated/``  raw data and true errors of the kit's subjects, seeds 0 to 2 (without --raw, or with --generate)
 ``errors/``     the error dataset of each input, the plans, and the thermal model of the probing campaigns
 ``digests.json``  SHA-256 of each variable and attribute of each raw dataset as loaded, how an item failed, and the
-                digests of the campaigns measured over the wire (without --raw, or with --measure)
+                digests of the campaigns measured over the network (without --raw, or with --measure)
 
 ``compare`` needs no errormotion. Names, dims, dtypes, values (NaN equal to NaN) and attributes of variables and
 coordinates are compared, JSON in attributes key by key. Left out are the attributes of ``LEFT_OUT`` and those given by

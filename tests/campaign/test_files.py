@@ -78,8 +78,7 @@ def test_bench_without_the_instruments_of_a_method_is_refused_before_anything_is
     monkeypatch.setattr(method, "needs", plugins.Needs(("counter", "thermometer"), "errormotion.raw.ramp/1"))
     (mistake,) = complaints(path, load_campaign)
     assert (
-        mistake
-        == f"test[0]: the method 'ramp' needs thermometer; the bench {path.parent / 'bench.toml'} has counter"
+        mistake == f"test[0]: the method 'ramp' needs thermometer; the bench {path.parent / 'bench.toml'} has counter"
     )
 
 

@@ -407,7 +407,12 @@ def test_an_evaluation_that_fails_harms_no_measurement(plan: Plan, monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    ("key", "message"), [("3", "at least 40 trials; found 3"), ("'often'", "monte_carlo"), ("60", "does not support the Monte Carlo evaluation")]
+    ("key", "message"),
+    [
+        ("3", "at least 40 trials; found 3"),
+        ("'often'", "monte_carlo"),
+        ("60", "does not support the Monte Carlo evaluation"),
+    ],
 )
 def test_an_evaluation_that_cannot_be_is_refused(
     plan: Plan, monkeypatch: pytest.MonkeyPatch, key: str, message: str

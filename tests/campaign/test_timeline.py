@@ -120,7 +120,10 @@ def test_a_run_without_timeline_states_no_truth(write: Write) -> None:
         ({"timeline": ""}, r"test\[0\].at: needs a table \[timeline\]; found none"),
         ({"control": ""}, r"\[timeline\]: expected a controller of a virtual machine"),
         ({"timeline": TIMELINE.replace("+01:00", "")}, "expected an instant such as"),
-        ({"timeline": TIMELINE.replace("[{", '[{ at = "20 min", spindle_speed = "0 /min" }, {')}, "times in ascending order"),
+        (
+            {"timeline": TIMELINE.replace("[{", '[{ at = "20 min", spindle_speed = "0 /min" }, {')},
+            "times in ascending order",
+        ),
     ],
 )
 def test_mistakes_of_a_timeline_are_found_when_the_campaign_is_read(

@@ -61,7 +61,7 @@ def test_json_has_files_and_figures(run, folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("y.nc", "--for", "fagor", "--axis", "Y"), "No format of tables 'fagor'; there are: fanuc, generic"),
+        (("y.nc", "--for", "fagor", "--axis", "Y"), "Unknown table format 'fagor'; available: fanuc, generic"),
         (("y.nc", "--for", "siemen", "--axis", "Y"), "Did you mean 'siemens'"),
         (("y.nc", "--for", "generic", "--axis", "Q"), "axis: expected X, Y or Z; found 'Q'"),
         (("y.nc", "--for", "generic", "--axis", "X"), "y.nc: The errors have no positions of X"),

@@ -50,7 +50,7 @@ def test_one_bar_in_two_runs_is_one_draw(record):
     apart = compare({"first": first, "second": other}, causes=False)
     assert json.loads(shared.attrs["shared_sources"]) == ["certificate K-7: bar, radius"]
     assert json.loads(apart.attrs["shared_sources"]) == []
-    assert "Taken as one draw in several datasets: certificate K-7: bar, radius." in verdict(shared)
+    assert "Treated as fully correlated between datasets: certificate K-7: bar, radius." in verdict(shared)
     assert not any("one draw" in line for line in verdict(apart))
     one, both = (np.diagonal(each["difference_covariance"].values[0, -1]) for each in (shared, apart))
     assert (both > one).any()

@@ -171,9 +171,9 @@ def test_one_interferometer_in_both_volumes_is_one_draw():
         (lambda a, v: (a, v.assign_attrs(chain="workpiece-bed-X-Z-tool")), "has no axis Y"),
         (lambda a, v: (a, v.assign_attrs(chain="workpiece-C-X-Y-bed-Z-tool")), "no commanded position of C"),
         (lambda a, v: (a, v.drop_vars("x")), "no commanded position of X"),
-        (lambda a, v: (a.assign_coords(y=a["y"] + 3.0), v), "nothing is extrapolated"),
+        (lambda a, v: (a.assign_coords(y=a["y"] + 3.0), v), "errors are not extrapolated"),
         (lambda a, v: (a, v.isel(target=slice(0, 27, 4))), "measure more targets"),
-        (lambda a, v: (a.drop_vars("y"), v), "no coordinate y along position"),
+        (lambda a, v: (a.drop_vars("y"), v), "no coordinate y along the dimension position"),
     ],
 )  # fmt: skip
 def test_what_is_missing_is_named(change, message):

@@ -109,7 +109,7 @@ def test_the_page_is_in_the_language_and_a_pdf_beside_it(run, files, monkeypatch
     Path("d.pdf").write_text("mine")
     again = run("compare", "drift.nc", "probing.nc", *FEW, "--report", "d.html", "--pdf", code=1)
     assert "d.pdf: exists already" in again.stderr
-    assert "no page is asked for" in run("compare", "drift.nc", "probing.nc", *FEW, "--pdf", code=1).stderr
+    assert "--pdf: allowed with a page only" in run("compare", "drift.nc", "probing.nc", *FEW, "--pdf", code=1).stderr
 
 
 def test_a_result_is_never_overwritten(run, files):
@@ -195,7 +195,7 @@ ALTERED = {
         (("drift.nc", "raw.nc"), 1, "raw.nc: The dataset breaks its schema"),
         (("drift.nc", "c.nc"), 1, "'c': '.em.names' belongs to error datasets"),
         (("drift.nc", "probing.nc", "--since", "1e9"), 1, "since: expected a time from"),
-        (("drift.nc", "moment.nc"), 1, "depend on different things ('drift': time; 'moment': none)"),
+        (("drift.nc", "moment.nc"), 1, "depend on different dimensions ('drift': time; 'moment': none)"),
     ],
 )
 def test_refusals_say_what_was_expected(run, results, arguments, code, message):
@@ -226,7 +226,8 @@ def test_results_over_two_dimensions_are_compared_over_one(tmp_path, run):
         run("compare", "a.nc", "b.nc", "--over", "time", "--select", "position=2", "--same-start", "--json").output
     )
     assert found["ok"]
-    assert "'a' has position 0 to 2" in run("compare", "a.nc", "b.nc", "--select", "position=3", code=1).output
+    text = "'a' has the elements position=0 to position=2"
+    assert text in run("compare", "a.nc", "b.nc", "--select", "position=3", code=1).output
     assert "--select 3" in run("compare", "a.nc", "b.nc", "--select", "3", code=1).output
     words = run("compare", "a.nc", "b.nc", "--over", "target", "--select", "position=0", "--same-start", code=1).output
     assert "compared over time" in words

@@ -219,7 +219,7 @@ def test_one_dataset_twice_one_alone_and_other_dims_are_refused():
     with pytest.raises(DatasetError, match="at least two"):
         compare({"a": ds})
     single = ds.em.mean("time")
-    with pytest.raises(DatasetError, match="depend on different things"):
+    with pytest.raises(DatasetError, match="depend on different dimensions"):
         compare({"a": ds, "b": single})
     assert compare({"a": ds, "b": made(T2, rng, start="", name="b")}, same_start=True)["p"].item() > 1e-4
 
@@ -282,7 +282,7 @@ def test_no_two_interpolated_values_share_a_measured_one(monkeypatch):
         found = compare({"a": made(T2, rng), "b": made(between, rng, name="b")}, causes=False)
         p.append(found["p"].item())
     assert found.sizes["time"] == 15
-    assert "14 of 29 instants are left out" in found.attrs["notes"][0]
+    assert "14 of 29 times are left out" in found.attrs["notes"][0]
     assert kstest(p, "uniform").pvalue > 0.01
 
 

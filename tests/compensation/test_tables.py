@@ -212,7 +212,7 @@ def test_a_table_that_the_control_would_refuse_is_not_written(
 
 def test_fanuc_refuses_what_its_values_cannot_hold(machine: VirtualMachine) -> None:
     with pytest.raises(
-        DatasetError, match=r"changes by 1[45]\d\d\.\d um between two points; FANUC holds at most 700 um"
+        DatasetError, match=r"changes by 1[45]\d\d\.\d um between two points; FANUC accepts at most 700 um"
     ):
         export(axis_table(steep(machine), "Y", step=0.05), get("fanuc"))
     with pytest.raises(DatasetError, match="reference point at position 0, which is none of the points"):

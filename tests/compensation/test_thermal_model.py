@@ -11,7 +11,7 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.compensation.online.settings import Limits
 from errormotion.compensation.thermal_model import Settings, ThermalModel, check, fit
-from errormotion.compensation.thermal_model.fitting import FEWEST_SAMPLES
+from errormotion.compensation.thermal_model.fitting import MIN_SAMPLES
 from errormotion.compensation.thermal_model.model import ROWS
 from errormotion.compensation.thermal_model.plugin import ThermalModelDataset
 from errormotion.datasets.schemas import DOF
@@ -196,7 +196,7 @@ def test_campaigns_that_do_not_belong_together_are_refused(pair: list[xr.Dataset
         fit([first, changed(second, machine="Another")])
     with pytest.raises(DatasetError, match=r"Campaign 2: expected the functional point .* Move the errors"):
         fit([first, changed(second, functional_point=np.array([0.0, 0.0, 0.3]))])
-    with pytest.raises(DatasetError, match=f"at least {FEWEST_SAMPLES} known values"):
+    with pytest.raises(DatasetError, match=f"at least {MIN_SAMPLES} known values"):
         fit([first.isel(time=slice(0, 4))])
     with pytest.raises(DatasetError, match=r"sensors: expected sensors of all campaigns .*; found nose"):
         fit(pair, Settings(sensors=("nose",)))

@@ -69,7 +69,10 @@ def foreign(monkeypatch: pytest.MonkeyPatch) -> None:
         ('freedoms = { EX = "-10 um" }', "above 0; found '-10 um'"),
         ('freedoms = { EX = "nan" }', "tolerances.freedoms.EX"),
         ('freedoms = { EX = { lower = "5 um", upper = "1 um" } }', "expected 'lower' below 'upper'"),
-        ('freedoms = { EX = { lower = "5 um", upper = "1 rad" } }', "expected the same unit for 'lower' and 'upper'; found m and rad"),
+        (
+            'freedoms = { EX = { lower = "5 um", upper = "1 rad" } }',
+            "same unit for 'lower' and 'upper'; found m and rad",
+        ),
         ("freedoms = { EX = {} }", "expected 'lower', 'upper' or both"),
         ('freedoms = { EX = { uper = "5 um" } }', "did you mean 'upper'?"),
         ('rule = "iso14253"\nfreedoms = { EX = "1 um" }', "tolerances.rule: expected 'iso 14253-1'"),

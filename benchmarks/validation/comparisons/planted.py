@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import chi2, kstest, ncx2
 
 from errormotion.compare import compare, explain
-from errormotion.compare.diagnosis import CLOSE
+from errormotion.compare.diagnosis import SCORE_MARGIN
 from errormotion.compare.ground import common_ground
 from errormotion.compare.low_rank import whitener
 from errormotion.compare.pairs import pair as judged
@@ -195,7 +195,7 @@ def section(seeds: int, pool: Pool) -> list[str]:
         f"{POWER:.0%} at the level {LEVEL:g}. Sizes are those of this power on the first machine; where a mistake has "
         "no size, all uncertainties are multiplied by the factor instead. `margin`: by how much the score of the "
         "planted cause (twice the logarithm of the likelihood ratio, less the penalties) exceeds that of the next one "
-        f"without noise; below {CLOSE:g} the two cannot be told apart at this size. `right first`: among those "
+        f"without noise; below {SCORE_MARGIN:g} the two cannot be told apart at this size. `right first`: among those "
         "detected, the planted cause has the first rank; `or alike`: it has, or the first one is said to be "
         "indistinguishable from it.",
         "",

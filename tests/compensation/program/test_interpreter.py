@@ -126,7 +126,7 @@ def test_offsets_tools_and_switches_survive() -> None:
 def test_refuses_what_neither_understands(
     lines: list[str], why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(canonical, "MOST_COMMANDS", 2000)
+    monkeypatch.setattr(canonical, "MAX_COMMANDS", 2000)
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_text("\n".join([*HEAD, *lines, "M2"]) + "\n")
     with pytest.raises(ProgramError, match=why):
@@ -156,7 +156,7 @@ def test_a_loop_that_prints_nothing_is_ended(monkeypatch: pytest.MonkeyPatch) ->
 )
 def test_an_expansion_invents_no_position(lines: list[str], tmp_path: Path) -> None:
     head = HEAD if "G38" in lines[0] else ["G21 G54 F100"]
-    with pytest.raises(ProgramError, match="not known"):
+    with pytest.raises(ProgramError, match="unknown"):
         expanded([*head, "#1=1 #2=2", *lines, "M2"])
 
 

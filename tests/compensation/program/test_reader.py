@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from nc_paths import ORIGINS, moves_of
 
-from errormotion.compensation.program.reading.items import Left, Text
+from errormotion.compensation.program.reading.items import Text, Unchanged
 from errormotion.compensation.program.reading.offsets import Offsets, read_parameters, read_tools
 from errormotion.compensation.program.reading.reader import Reader
-from errormotion.compensation.program.reading.words import LONGEST_LINE
+from errormotion.compensation.program.reading.words import MAX_LINE
 from errormotion.errors import ProgramError
 
 HEAD = ["G21 G90 G17", "G0 X0 Y0 Z0"]
@@ -28,13 +28,13 @@ HEAD = ["G21 G90 G17", "G0 X0 Y0 Z0"]
         ("G1 A10", "the word A"),
         ("M101", "M101 is not known"),
         ("G1 X1 (never closed", "expected words"),
-        ("G1 X1 X2", "stands twice"),
+        ("G1 X1 X2", "is repeated"),
         ("G0 G1 X1", "two motions"),
-        ("G1.5 X1", "not known"),
+        ("G1.5 X1", "not supported"),
         ("G2 X10 Y0 I4", "radii at start and end differ"),
         ("G2 X10 R4", "too small"),
         ("G2 X10", "without a centre"),
-        ("G43 H9", "length of tool 9 is not known"),
+        ("G43 H9", "length of tool 9 is unknown"),
         ("/G1 X1", "block delete"),
         ("G53 G1 X1", "G53"),
         ("G93 G1 X1", "G93 without F"),
@@ -42,10 +42,10 @@ HEAD = ["G21 G90 G17", "G0 X0 Y0 Z0"]
         ("G1 X1 G92 Y1", "two|uses its axis words"),
         ("X1", "without a motion"),
         ("G28.1", "stores a position"),
-        ("G2 I5 P2 M62 P1", "stands twice"),
+        ("G2 I5 P2 M62 P1", "is repeated"),
         ("G2 I5 M62 P1", "share a word"),
         ("G2 X10 R5 M19", "share a word"),
-        ("G1 X1" + " " * LONGEST_LINE, "at most"),
+        ("G1 X1" + " " * MAX_LINE, "at most"),
         ("G1 X1\x00", "control characters"),
     ],
 )
@@ -111,7 +111,7 @@ def test_skipped_blocks_do_nothing() -> None:
 
 def test_moves_of_the_machine_are_left() -> None:
     items = list(Reader(ORIGINS).items([*HEAD, "G53 G0 Z0", "G28 X0", "G1 X1 F1"]))
-    assert [item.kind for item in items if isinstance(item, Left)] == ["machine", "machine"]
+    assert [item.kind for item in items if isinstance(item, Unchanged)] == ["machine", "machine"]
     end = items[-1].frame.machine(items[-1].start)
     assert np.allclose(end, [0.0, 0.001, 0.0])  # home of G28 in X; Y of the program's start; Z of G53
 

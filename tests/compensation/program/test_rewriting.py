@@ -148,7 +148,7 @@ def test_moves_that_stay_are_counted_with_their_lines() -> None:
     lines = ["G21 G90", "G0 Z50", "G0 X0 Y0", "G1 Z0 F100", "G53 G0 Z0", "G1 X5", "G38.2 Z-5"]
     made = Rewriting(Reader(ORIGINS), shift)
     new = list(made.lines(lines))
-    assert made.summary.left == {"unknown": (1, 2), "machine": (1, 5), "probe": (1, 7)}
+    assert made.summary.unchanged == {"unknown": (1, 2), "machine": (1, 5), "probe": (1, 7)}
     assert [new[k] for k in (1, 4, 6)] == [lines[k] for k in (1, 4, 6)]
 
 
@@ -167,14 +167,14 @@ def test_the_summary_states_what_was_done() -> None:
     assert found.unfed == 1
     assert found.length == pytest.approx(0.201)
     assert found.largest == pytest.approx(math.hypot(12.345e-6, 3e-6, 8e-6))
-    assert len(found.places) == 5
+    assert len(found.positions) == 5
     assert np.allclose(found.offsets, [1.2345e-5, -3e-6, 8e-6])
 
 
 def test_the_path_for_the_page_is_bounded() -> None:
     made = Rewriting(Reader(ORIGINS), bent)
     list(made.lines([*HEAD, *(f"G1 X{k % 90} Y{k % 70}.5" for k in range(9_000))]))
-    assert 1000 < len(made.summary.places) <= 4000
+    assert 1000 < len(made.summary.positions) <= 4000
 
 
 def test_places_outside_of_what_was_measured_are_counted() -> None:
@@ -189,7 +189,7 @@ def test_places_outside_of_what_was_measured_are_counted() -> None:
 
 
 def test_corrections_that_are_not_known_are_refused() -> None:
-    with pytest.raises(ProgramError, match="not known"):
+    with pytest.raises(ProgramError, match="unknown"):
         rewritten([*HEAD, "G1 X1"], field(lambda p: np.full_like(p, np.nan)))
 
 
@@ -200,7 +200,7 @@ def test_refuses_settings_without_sense(wrong: dict[str, float]) -> None:
 
 
 def test_too_many_pieces_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dividing, "MOST_PIECES", 50)
+    monkeypatch.setattr(dividing, "MAX_PIECES", 50)
     noise = field(lambda p: 1e-3 * np.sin(p * 1e7))
     with pytest.raises(ProgramError, match="at most"):
         rewritten([*HEAD, "G2 X0 I0.1"], noise, tolerance=1e-8, step=1e-5)
@@ -217,12 +217,12 @@ def test_the_points_for_the_page_have_the_correction_that_acts_there() -> None:
         made = Rewriting(Reader(ORIGINS), bent)
         list(made.lines(Programs(Random(seed)).lines(40)))
         found = made.summary
-        assert np.abs(found.offsets - waves(found.places)).max() < 2e-6
+        assert np.abs(found.offsets - waves(found.positions)).max() < 2e-6
         assert found.largest <= np.linalg.norm(found.offsets, axis=1).max() + 2e-6
 
 
 def test_a_line_does_not_become_longer_than_controls_read() -> None:
-    with pytest.raises(ProgramError, match=r"line 4 would get longer"):
+    with pytest.raises(ProgramError, match=r"line 4 would exceed"):
         rewritten([*HEAD, "G1 X1 (" + "x" * 240 + ")"], shift)
 
 

@@ -17,7 +17,7 @@ from errormotion.cli.options import quantity
 from errormotion.cli.output import show, show_json
 from errormotion.cli.page import Page
 from errormotion.compensation.correction import Correction, correction
-from errormotion.compensation.program import LEFT, ByTool, Offsets, Outcome, Settings, compensate
+from errormotion.compensation.program import UNCHANGED, ByTool, Offsets, Outcome, Settings, compensate
 from errormotion.compensation.program.reading.offsets import read_parameters, read_tools
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.units import Length, Time
@@ -86,16 +86,16 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
         outcome = compensate(part, target, by_tool, offsets, settings, head=head)
     summary = outcome.summary
     expanded = np.empty((0, 3))
-    if len(summary.places):
-        pick = slice(None, None, max(1, len(summary.places) // 400))
-        covariance = by_tool.values(summary.places[pick], summary.tools[pick], covariance=True).covariance
+    if len(summary.positions):
+        pick = slice(None, None, max(1, len(summary.positions) // 400))
+        covariance = by_tool.values(summary.positions[pick], summary.tools[pick], covariance=True).covariance
         assert covariance is not None
         variance = np.diagonal(covariance, axis1=1, axis2=2)
         expanded = 2 * np.sqrt(np.where(variance >= 0, variance, np.nan))
         if choice.page is not None:
             from errormotion.compensation.program.report import write_program_report
 
-            at = np.arange(len(summary.places))
+            at = np.arange(len(summary.positions))
             uncertainty = np.stack([np.interp(at, at[pick], expanded[:, k] / 2) for k in range(3)], axis=1)
             write_program_report(
                 choice.page.file,
@@ -175,7 +175,7 @@ def _show(
                 "unfed",
             )
         }
-        counted = {name: {"number": count, "first_line": line} for name, (count, line) in summary.left.items()}
+        counted = {name: {"number": count, "first_line": line} for name, (count, line) in summary.unchanged.items()}
         more = {
             name: {"number": value[0], "first_line": value[1]}
             for name, value in (("outside", summary.outside), ("uncorrected", summary.uncorrected))
@@ -206,8 +206,8 @@ def _show(
         show(f"  expanded by LinuxCNC's interpreter, because of {outcome.why}")
     if outcome.checked:
         show(f"  LinuxCNC's interpreter reads the new program as planned: {outcome.checked} moves")
-    for kind, (count, line) in sorted(summary.left.items()):
-        show(f"  not corrected: {count} {LEFT[kind]}, the first in line {line}")
+    for kind, (count, line) in sorted(summary.unchanged.items()):
+        show(f"  not corrected: {count} {UNCHANGED[kind]}, the first in line {line}")
     if summary.uncorrected[0]:
         show(f"  WARNING: {summary.uncorrected[0]} cuts start uncorrected, the first in line {summary.uncorrected[1]}")
     if summary.outside[0]:

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from errormotion.compensation.correction import correction
-from errormotion.compensation.correction.places import Grid, Scattered, of_targets
+from errormotion.compensation.correction.nodes import Grid, Scattered, of_targets
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import DatasetError
 from errormotion.twin import VirtualMachine
@@ -69,8 +69,8 @@ def test_places_that_no_instant_knows_are_left_out() -> None:
     gone = errors.assign({name: errors[name].where(~lost) for name in ("EX", "EY", "EZ", "EA", "EB", "EC")})
     made = correction(gone)
     assert [note.split(": ")[1] for note in made.notes] == [
-        "1 of 3 times have no errors and are bridged by their neighbours.",
-        "1 of 5 places lack errors and are bridged by their neighbours.",
+        "1 of 3 times have no errors; interpolated from their neighbours.",
+        "1 of 5 positions lack errors; interpolated from their neighbours.",
     ]
     here = np.array([[0.0, 0.02, 0.0]])
     assert np.abs(made.at(here, 700.0).offset - correction(errors).at(here, 700.0).offset).max() < 1e-9
@@ -122,8 +122,8 @@ def test_one_target_stands_for_itself() -> None:
 def test_a_grid_is_recognised_in_any_order_and_with_gaps_it_is_none() -> None:
     x = np.stack(np.meshgrid([0.0, 0.3, 0.4], [0.0, 1.0], [2.0], indexing="ij"), axis=-1).reshape(-1, 3)
     mixed = x[np.random.default_rng(2).permutation(len(x))] + 1e-12
-    places, order = of_targets(mixed)
-    assert isinstance(places, Grid)
+    found, order = of_targets(mixed)
+    assert isinstance(found, Grid)
     assert np.abs(mixed[order] - x).max() < 1e-9
     assert isinstance(of_targets(mixed[1:])[0], Scattered)
     assert isinstance(of_targets(np.concatenate([mixed[:-1], mixed[:1]]))[0], Scattered)  # one target twice
