@@ -163,9 +163,7 @@ def identify_runs(
     try:
         _work(tasks, name, workers, done)
     except KeyboardInterrupt as error:
-        raise KeyboardInterrupt(
-            f"{len(outcomes)} of {len(found)} runs are done; repeat the command to continue."
-        ) from error
+        raise KeyboardInterrupt(f"{len(outcomes)} of {len(found)} runs are done; repeat the command") from error
     return [outcomes[raw] for raw, _ in found]
 
 

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import asdict, dataclass
-from types import TracebackType
 from typing import Any, Self
 
 from errormotion.campaign.files import BenchInstrument, BenchPlan
@@ -51,6 +50,17 @@ class Answer:
             "settings": self.instrument.settings.model_dump(mode="json"),
             "identity": asdict(self.identity) if self.identity else None,
         }
+
+
+def connect(driver: Any) -> Identity:
+    """Open a driver and return the identity of its instrument; close it after an error."""
+    try:
+        driver.open()
+        identity: Identity = driver.identify()
+    except BaseException:
+        driver.close()
+        raise
+    return identity
 
 
 class OpenBench:
@@ -103,12 +113,7 @@ class OpenBench:
             try:
                 driver = instrument.driver(instrument.address, instrument.settings)
                 self._bind(driver)
-                try:
-                    driver.open()
-                    identity = driver.identify()
-                except BaseException:
-                    driver.close()
-                    raise
+                identity = connect(driver)
             except Exception as error:
                 log.exception("instrument %s could not be opened", instrument.name)
                 self.answers.append(Answer(instrument, error=cause_of(error)))
@@ -144,9 +149,7 @@ class OpenBench:
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property

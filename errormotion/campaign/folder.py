@@ -14,12 +14,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from errormotion.datasets.files.runfile import SCHEMA, read_run
 from errormotion.datasets.files.writing import sync
-from errormotion.datasets.provenance import plain
+from errormotion.datasets.provenance import make, plain
 from errormotion.errors import RunError
+
+if TYPE_CHECKING:
+    from errormotion.campaign.files import BenchPlan
 
 RESERVE_BYTES = 2**18
 """Disk space reserved during a measurement, bytes; released at its end, so that run.json and the log can be written."""
@@ -28,6 +31,23 @@ CHECK_DURATION = 0.2
 """Longest time for which `is_locked` holds a lock, s; a lock held longer means that another process uses the run."""
 
 log = logging.getLogger(__name__)
+
+
+def new_entries(bench: BenchPlan) -> dict[str, Any]:
+    """Return the entries of ``run.json`` of a new measurement with a bench."""
+    return {
+        "status": "running",
+        "reason": "",
+        "acquired": False,
+        "bench": {"name": bench.name, "machine": bench.machine, "file": bench.source.name, "text": bench.text},
+        "software": make({}, None, None)["software"],
+        "samples": {},
+        "raw": "raw.zarr",
+        "errors": None,
+        "report": None,
+        "log": "log.jsonl",
+        "steps": [],
+    }
 
 
 class FolderGoneError(RunError):
@@ -64,7 +84,7 @@ class Presence:
         """
         if self._identity is None or self._found() != self._identity:
             raise FolderGoneError(
-                f"The folder {self.path} is gone: it was moved or deleted while data were written to it."
+                f"The folder {self.path} is missing: it was moved or deleted while data were written."
             )
 
     @contextmanager

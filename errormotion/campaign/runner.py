@@ -25,7 +25,7 @@ from errormotion import datasets
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.claims import claimed
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
-from errormotion.campaign.folder import FolderGoneError, RunFolder, list_runs, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, list_runs, new_entries, now
 from errormotion.campaign.sections import head
 from errormotion.campaign.sections.limits import NO_MOTIONS, announcement, steps_of
 from errormotion.campaign.sections.timeline import follower
@@ -293,45 +293,25 @@ class _Session:
         plan = self.campaign
         info = test.method.info
         settings = provenance.plain(test.settings.model_dump(mode="json"))
-        folder = RunFolder.create(
-            self.runs,
-            test.name,
-            self.run_id,
-            {
-                "status": "running",
-                "reason": "",
-                "acquired": False,
-                "campaign": {
-                    "name": plan.name,
-                    "file": plan.source.name,
-                    "folder": str(plan.folder),
-                    "sha256": plan.sha256,
-                    "tests": [entry.name for entry in plan.tests],
-                    "text": plan.text,
-                },
-                "bench": {
-                    "name": plan.bench.name,
-                    "machine": plan.bench.machine,
-                    "file": plan.bench.source.name,
-                    "text": plan.bench.text,
-                },
-                "method": {"id": info.id, "version": info.version, "status": info.status},
-                "settings": settings,
-                "settings_hash": settings_hash(settings, info.id, info.version),
-                "tolerances": plan.tolerances.model_dump(mode="json") if plan.tolerances else None,
-                "inputs": {},
-                "operator": plan.operator,
-                "head": head.stated(plan.bench.laboratory, plan.report, plan.bench.calibrated_until, test.certificates),
-                "instruments": [answer.record() for answer in self.bench.chosen(test.instruments).answers],
-                "software": provenance.make({}, None, None)["software"],
-                "samples": {},
-                "raw": "raw.zarr",
-                "errors": None,
-                "report": None,
-                "log": "log.jsonl",
-                "steps": [],
+        data = new_entries(plan.bench) | {
+            "campaign": {
+                "name": plan.name,
+                "file": plan.source.name,
+                "folder": str(plan.folder),
+                "sha256": plan.sha256,
+                "tests": [entry.name for entry in plan.tests],
+                "text": plan.text,
             },
-        )
+            "method": {"id": info.id, "version": info.version, "status": info.status},
+            "settings": settings,
+            "settings_hash": settings_hash(settings, info.id, info.version),
+            "tolerances": plan.tolerances.model_dump(mode="json") if plan.tolerances else None,
+            "inputs": {},
+            "operator": plan.operator,
+            "head": head.stated(plan.bench.laboratory, plan.report, plan.bench.calibrated_until, test.certificates),
+            "instruments": [answer.record() for answer in self.bench.chosen(test.instruments).answers],
+        }
+        folder = RunFolder.create(self.runs, test.name, self.run_id, data)
         if plan.bench.laboratory is not None and plan.bench.laboratory.logo:
             logo.copy(plan.bench.source.parent / plan.bench.laboratory.logo, folder.path)
         return folder

@@ -14,7 +14,7 @@ import typer
 
 from errormotion.cli import options
 from errormotion.cli.demo import COMPENSATED, CONTROLLERS
-from errormotion.cli.guard import ERROR, USAGE, guarded
+from errormotion.cli.guard import ERROR, USAGE
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.root import app, bench_app, compensate_app, model_app, plugins_app
 from errormotion.cli.wording import share
@@ -39,7 +39,6 @@ def root(
 
 
 @app.command()
-@guarded
 def demo(
     runs: Annotated[Path, typer.Option(help="Folder for the run folders.")] = Path("runs"),
     controller: Annotated[
@@ -66,7 +65,6 @@ for _group in GROUPS:
 
 
 @app.command()
-@guarded
 def dashboard(
     runs: Annotated[Path, typer.Argument(help="The folder of runs.")] = Path("runs"),
     bench: Annotated[Path | None, typer.Option(help="A bench file; its thermometers and controller are read.")] = None,
@@ -95,7 +93,6 @@ def dashboard(
 
 
 @app.command()
-@guarded
 def doctor(json_: options.Json = False) -> None:
     """Check that this computer has what errormotion needs."""
     from errormotion.cli.commands import doctor as command

@@ -11,19 +11,15 @@ import typer
 from errormotion.cli.guard import USAGE
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
-Runs = Annotated[
-    Path | None, typer.Option("--runs", help="Folder for run folders; default: the folder that the campaign states.")
-]
+Runs = Annotated[Path | None, typer.Option("--runs", help="Folder for run folders; default: that of the campaign.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting; may be repeated.")]
 SettingsFile = Annotated[Path | None, typer.Option(help="A TOML file of settings.")]
 At = Annotated[str | None, typer.Option(help="Functional point 'x,y,z', mm; default: that of the first dataset.")]
 Over = Annotated[str | None, typer.Option(metavar="DIM", help="Dimension of the comparison: time, position or target.")]
-Select = Annotated[
-    list[str] | None, typer.Option(help="One element of another dimension, counted from 0, such as position=3.")
-]
+Select = Annotated[list[str] | None, typer.Option(help="Element of another dimension, from 0, such as position=3.")]
 Freedoms = Annotated[str | None, typer.Option(help="Freedoms, such as EX,EZ; default: all that are known.")]
 Tolerances = Annotated[
-    Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the campaign.")
+    Path | None, typer.Option("--tolerances", help="TOML file of limits; default: those of the campaign.")
 ]
 Limits = Annotated[Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on each result.")]
 Report = Annotated[Path | None, typer.Option(help="Write a page (.html).")]

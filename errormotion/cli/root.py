@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import typer
 
-app = typer.Typer(
+from errormotion.cli.guard import guarded
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+class _Group(typer.Typer):
+    """A group whose commands end with a message and an exit code after an exception."""
+
+    def command(self, *args: Any, **options: Any) -> Callable[[Command], Command]:
+        register: Any = super().command(*args, **options)
+        return lambda function: register(guarded(function))
+
+
+app = _Group(
     name="errormotion",
     help="Measure the error motions of machine tools.",
     no_args_is_help=True,
@@ -14,8 +30,8 @@ app = typer.Typer(
 )
 
 
-def _group(name: str, text: str) -> typer.Typer:
-    group = typer.Typer(no_args_is_help=True, help=text, rich_markup_mode=None)
+def _group(name: str, text: str) -> _Group:
+    group = _Group(no_args_is_help=True, help=text, rich_markup_mode=None)
     app.add_typer(group, name=name)
     return group
 

@@ -182,9 +182,7 @@ def _check(name: str, ds: xr.Dataset) -> None:
     except DatasetError as error:
         raise DatasetError(f"'{name}': {error}") from None
     if ds.em.names != DOF:
-        raise DatasetError(
-            f"'{name}': its errors are known along one direction only (deviation), which cannot be compared"
-        )
+        raise DatasetError(f"'{name}': errors along one direction only (deviation) cannot be compared")
     variance = np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1)
     known = np.isfinite(variance)
     if known.any() and not (variance[known] > 0).any():
@@ -370,9 +368,7 @@ def _points(name: str, ds: xr.Dataset, dim: str) -> list[Any]:
         return list(np.stack([ds[axis].values for axis in axes], axis=-1))
     if dim in ds.coords:
         return list(ds[dim].values.tolist())
-    raise DatasetError(
-        f"'{name}': its {dim} has no coordinate, so that its values cannot be matched with those of the others"
-    )
+    raise DatasetError(f"'{name}': its {dim} has no coordinate; its values cannot be matched with those of the others")
 
 
 def _match(point: Any, points: list[Any]) -> int | None:

@@ -210,9 +210,7 @@ def evaluate(
         )
     if (summary.missing[np.isfinite(linear.ravel())] == summary.trials).any():
         reason = max(run.reasons, key=run.reasons.__getitem__, default="unknown")
-        raise MethodError(
-            f"None of {summary.trials} trials had a value at every place where the result has one: {reason}"
-        )
+        raise MethodError(f"None of {summary.trials} trials had a value at all positions of the result: {reason}")
     verdict = validate_linear(linear.ravel(), u.ravel(), summary, floor=FLOOR)
     found = build(errors, where, linear, u, summary, verdict, seed, list(redrawing.sources), run.reasons)
     if not keep:

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -69,9 +68,7 @@ class Store:
             raise RunError(f"{self.folder}: expected a writable folder for the trials; {error}") from error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Keep the trials, from which an interrupted evaluation is continued."""
 
     def block(self, number: int, size: int) -> Array | None:

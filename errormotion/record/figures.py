@@ -285,9 +285,7 @@ def _series(found: list[Reading]) -> Series:
     """Return readings as a series; sources of a single run are part of its uncertainty."""
     units = {each.unit for each in found}
     if len(units) > 1:
-        raise RunError(
-            f"The figure has several units: {', '.join(sorted(units))}. State a name that matches one figure only"
-        )
+        raise RunError(f"The figure has several units: {', '.join(sorted(units))}. State a name of one figure only")
     counts = Counter(identity for each in found for identity, effect in each.influence.items() if effect)
     shared = sorted(identity for identity, count in counts.items() if count > 1)
     F = np.array([[each.influence.get(identity, 0.0) for each in found] for identity in shared])

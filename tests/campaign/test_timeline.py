@@ -79,7 +79,7 @@ def run(campaign: Path) -> list[RunFolder]:
     return runner.run(load_campaign(campaign), runs=campaign.parent / "runs")
 
 
-def test_tests_at_one_time_meet_one_machine_and_others_follow_each_other(write: Write) -> None:
+def test_simultaneous_tests_share_one_machine_and_others_are_sequential(write: Write) -> None:
     folders = run(write(drift("first", "10 min", FROM_REST), drift("again", "10 min", FROM_REST), drift("next")))
     first, again, after = (datasets.load(folder.raw) for folder in folders)
     assert first.attrs["start"] == again.attrs["start"] == "2026-03-02T06:10:00+00:00"
@@ -141,7 +141,7 @@ class Interrupting(runner.Quiet):
         raise KeyboardInterrupt
 
 
-def test_an_interrupted_test_goes_on_at_its_time(write: Write) -> None:
+def test_an_interrupted_test_continues_at_its_time(write: Write) -> None:
     longer = drift("drift", "10 min", FROM_REST).replace('"20 s"', '"4 min"')
     plan = load_campaign(write(longer))
     runs = plan.source.parent / "runs"

@@ -1,4 +1,4 @@
-"""Who may ask: names, token, origin."""
+"""Access control: host names, token, origin."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from errormotion.dashboard.access import Access, access_for
 NETWORK = access_for("0.0.0.0", ["Lab-PC.example"])
 
 
-def test_only_loopback_without_control_needs_no_token() -> None:
+def test_only_loopback_without_control_requires_no_token() -> None:
     assert access_for("127.0.0.1", control=True).token
     assert not any(access_for(host).token for host in ("127.0.0.1", "::1", "localhost", "127.9.9.9"))
     tokens = [access_for(host).token for host in ("0.0.0.0", "::", "192.168.1.5", "lab-pc", "0.0.0.0")]

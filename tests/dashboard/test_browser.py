@@ -1,4 +1,4 @@
-"""The dashboard in Chromium: what a person sees, without a request to others or an error in the console."""
+"""The dashboard in Chromium: its content, without external requests or errors in the console."""
 
 import time
 from collections.abc import Callable
@@ -60,7 +60,7 @@ def test_results_and_a_run_at_another_functional_point(
     assert page.evaluate("window.taken") is None
 
 
-def test_the_token_is_asked_for(page: Any, accessible: Callable[[], None], open_to_the_network: Any) -> None:
+def test_the_token_is_requested(page: Any, accessible: Callable[[], None], open_to_the_network: Any) -> None:
     page.expected_errors = ("403",)
     page.goto(open_to_the_network.address + "results")
     accessible()
@@ -73,7 +73,7 @@ def test_the_token_is_asked_for(page: Any, accessible: Callable[[], None], open_
     assert open_to_the_network.access.session not in page.evaluate("document.cookie")
 
 
-def test_values_live_and_a_sensor_that_is_unplugged(
+def test_live_values_and_a_disconnected_sensor(
     page: Any,
     accessible: Callable[[], None],
     serving: Callable[..., Any],
@@ -122,7 +122,7 @@ def test_values_live_and_a_sensor_that_is_unplugged(
 
 
 def _shows_the_same(page: Any, address: str) -> None:
-    """Require that another client shows the same values for the same rows of the log, if not at the same instant."""
+    """Require that another client shows the same values for the same rows of the log."""
     shown = "() => [document.querySelector('#clock').innerText, document.querySelector('#temperatures').innerText]"
     other = page.context.new_page()
     other.goto(address)

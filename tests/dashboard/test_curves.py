@@ -35,7 +35,7 @@ def test_one_outlier_in_a_million_stays() -> None:
     assert 654321 in thin(values)
 
 
-def test_the_course_at_another_point_is_that_of_the_accessor(runs: object, key: str) -> None:
+def test_the_curves_at_another_point_are_those_of_the_accessor(runs: object, key: str) -> None:
     ds = datasets.load(Lab(runs).file(key, "errors"))  # type: ignore[arg-type]
     point = (0.0, 0.0, -0.2)
     here, there = curves_of(ds), curves_of(ds, point)
@@ -69,7 +69,7 @@ def test_text_in_a_table_is_no_formula() -> None:
 
 
 @pytest.mark.parametrize(("count", "dots"), [(1, True), (30, False)])
-def test_a_curve_of_one_value_is_a_dot_and_rounding_errors_are_no_course(count: int, dots: bool) -> None:
+def test_a_curve_of_one_value_is_a_dot_and_rounding_errors_are_not_drawn(count: int, dots: bool) -> None:
     curve = Curve("EX", "EX", "µm", np.full(count, 1e-13), np.zeros(count))
     text = json.dumps(errors_item(CurveSet("time / min", np.arange(float(count)), (), (curve,), np.zeros(3), {})))
     assert ('"Scatter"' in text) is dots

@@ -1,4 +1,4 @@
-"""The page of the effect of a compensation over HTTP: words and figures are those of the functions."""
+"""The page of the effect of a compensation over HTTP: texts and figures are those of the functions."""
 
 from collections.abc import Callable
 from html import escape

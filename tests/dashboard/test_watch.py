@@ -1,4 +1,4 @@
-"""What a bench says now, and its history in memory."""
+"""Present readings of a bench, and their history in memory."""
 
 import math
 import time
@@ -91,7 +91,7 @@ def test_an_emergency_stop_is_an_alarm(make: Callable[..., Watch]) -> None:
     assert watch.present().alarms == ("emergency stop",)
 
 
-def test_a_monitor_that_ends_says_why(make: Callable[..., Watch], tmp_path: Path) -> None:
+def test_a_monitor_reports_the_reason_of_its_end(make: Callable[..., Watch], tmp_path: Path) -> None:
     (tmp_path / "runs").write_text("a file, where the folder of runs should be")
     present = wait(make(), lambda now: not now.running)
     assert present.error
@@ -113,7 +113,7 @@ def test_memory_is_a_ring_and_reduction_keeps_a_peak(make: Callable[..., Watch])
     assert times[-1] - times[0] == pytest.approx(28_799)
 
 
-def test_a_bench_without_anything_to_read_is_refused(make: Callable[..., Watch]) -> None:
+def test_a_bench_without_readable_instruments_is_an_error(make: Callable[..., Watch]) -> None:
     with pytest.raises(BenchError, match="expected thermometers, a controller, or both"):
         make(
             MODULES.partition("[instruments")[0]
@@ -121,7 +121,9 @@ def test_a_bench_without_anything_to_read_is_refused(make: Callable[..., Watch])
         )
 
 
-def test_instruments_are_lent_to_who_measures_and_taken_again(make: Callable[..., Watch], tmp_path: Path) -> None:
+def test_instruments_are_released_for_a_measurement_and_opened_again(
+    make: Callable[..., Watch], tmp_path: Path
+) -> None:
     watch = make()
     wait(watch, lambda now: now.rows >= 2)
     other = Monitor(watch.plan, tmp_path / "others", 0.1)

@@ -131,7 +131,7 @@ def test_the_step_is_named_by_the_note_between_its_runs(lab: Path, call: Callabl
     assert [note["text"] for note in found["notes_on_machine"]] == ["coolant off", "hit the vice"]
 
 
-def test_a_shared_source_is_one_draw_for_a_freedom_and_for_a_figure_of_merit(lab: Path) -> None:
+def test_a_common_source_is_fully_correlated_between_a_freedom_and_a_figure_of_merit(lab: Path) -> None:
     runs = list_runs([lab]).runs[:3]
     for figure in ("EZ after 60 min", "EZ after*"):
         series = figure_over_time(runs, figure).series
@@ -142,7 +142,7 @@ def test_a_shared_source_is_one_draw_for_a_freedom_and_for_a_figure_of_merit(lab
     assert figure_over_time(runs, "EX after 60 min").series.identities == []
 
 
-def test_the_influence_that_a_method_states_for_its_figure_counts(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_influence_stated_by_a_method_for_its_figure_is_used(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
         return [replace(figure, influence={"bar": BAR / 2}) for figure in figures_of(errors)]
 
@@ -198,7 +198,7 @@ def test_dataset_and_page(lab: Path, call: Callable[..., Any], tmp_path: Path) -
         (lambda ds: ds.assign_attrs(start="soon"), "attribute 'start'"),
     ],
 )
-def test_a_history_that_breaks_its_schema_is_refused(
+def test_a_history_that_violates_its_schema_is_an_error(
     stored_history: xr.Dataset, change: Callable[[xr.Dataset], xr.Dataset], expected: str
 ) -> None:
     (first, *_) = datasets.violations(change(stored_history))
@@ -216,7 +216,7 @@ def test_a_history_without_steps_and_notes_is_stored(tmp_path: Path, call: Calla
     assert np.isnan(found["trend"])
 
 
-def test_what_is_unknown_is_answered_with_what_there_is(lab: Path, call: Callable[..., Any]) -> None:
+def test_an_unknown_name_is_reported_with_the_available_ones(lab: Path, call: Callable[..., Any]) -> None:
     shown = call(lab, "--figure", "hysteresis", code=1)
     assert "'EZ after 60.0 min'" in shown
     assert "EX to EC" in shown
@@ -239,7 +239,7 @@ def test_short_forms_name_the_figure_of_a_standard(tmp_path: Path) -> None:
     for short in ("d(Z)60", "d(Z) 60", "d(Z) within", "d(Z)*"):
         assert figure_over_time(runs, short).series.names == [names[0]]
     for wrong in ("d(Z)61", "60", "d(Y)60"):
-        with pytest.raises(RunError, match="There are"):
+        with pytest.raises(RunError, match="Known figures"):
             figure_over_time(runs, wrong)
 
 
@@ -262,7 +262,7 @@ def test_errors_at_a_position_and_at_a_target(tmp_path: Path) -> None:
         figure_over_time(runs, "EY")
 
 
-def test_what_cannot_be_read_is_left_out_by_name(lab: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
+def test_unreadable_runs_are_omitted_and_named(lab: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
     for k in range(4):
         save(tmp_path, k, errors({"EX": 1e-6 * k}, ("time",), {"time": [0.0, 60.0]}))
     (tmp_path / "run-01" / "errors" / "a" / "errors.nc").write_bytes(b"damaged")
@@ -273,7 +273,7 @@ def test_what_cannot_be_read_is_left_out_by_name(lab: Path, tmp_path: Path, call
     assert "run-02" in found["skipped"][0]
 
 
-def test_values_of_several_components_are_remarked(tmp_path: Path, call: Callable[..., Any]) -> None:
+def test_values_of_several_components_have_a_remark(tmp_path: Path, call: Callable[..., Any]) -> None:
     for k, component in enumerate(("spindle", "tool")):
         point = (0, 0, 0.1 * k)
         result = errors({"EX": 1e-6}, ("time",), {"time": [0.0]}, component=component, functional_point=point)

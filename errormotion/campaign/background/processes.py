@@ -188,9 +188,7 @@ def _start(runs: Path, campaign: str, machine: str, arguments: list[str]) -> str
         with _exclusive(root):
             for each in found(runs):
                 if each.alive and each.machine == machine:
-                    raise RunError(
-                        f"'{each.campaign}' has been measuring on {machine} since {each.started}; stop it first"
-                    )
+                    raise RunError(f"'{each.campaign}' has used {machine} since {each.started}; stop it first")
             _tidy(root)
             name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{uuid4().hex[:8]}"
             _spawn(root / name, runs, {"campaign": campaign, "machine": machine, "started": now()}, arguments)

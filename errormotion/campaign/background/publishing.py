@@ -11,7 +11,6 @@ import os
 import time
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from errormotion.datasets.files.reading import read_bytes
@@ -47,9 +46,7 @@ class Published:
         self._write()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         stopped = isinstance(error, KeyboardInterrupt)
         self._set(
             ended="finished" if error is None else "interrupted" if stopped else "failed",

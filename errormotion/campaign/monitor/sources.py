@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from errormotion.campaign.bench import Answer
+from errormotion.campaign.bench import Answer, connect
 from errormotion.campaign.files import BenchInstrument
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.storage.journal import cause_of
@@ -144,13 +144,7 @@ class Source:
         if self._driver is not None:
             return
         driver = self._unopened()
-        try:
-            driver.open()
-            identity = driver.identify()
-        except BaseException:
-            driver.close()
-            raise
-        self.answer, self._driver = Answer(self.instrument, driver, identity), driver
+        self.answer, self._driver = Answer(self.instrument, driver, connect(driver)), driver
 
     def _close(self) -> None:
         driver, self._driver = self._driver, None

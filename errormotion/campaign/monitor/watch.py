@@ -24,7 +24,7 @@ import xarray as xr
 
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
-from errormotion.campaign.folder import FolderGoneError, RunFolder, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, new_entries, now
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.campaign.monitor.sources import Source
@@ -294,26 +294,7 @@ class Monitor:
             source.join()
 
     def _new_folder(self) -> RunFolder:
-        data = {
-            "status": "running",
-            "reason": "",
-            "acquired": False,
-            "bench": {
-                "name": self.plan.name,
-                "machine": self.plan.machine,
-                "file": self.plan.source.name,
-                "text": self.plan.text,
-            },
-            "settings": {"interval": self.interval},
-            "instruments": [],
-            "software": provenance.make({}, None, None)["software"],
-            "samples": {},
-            "raw": "raw.zarr",
-            "errors": None,
-            "report": None,
-            "log": "log.jsonl",
-            "steps": [],
-        }
+        data = new_entries(self.plan) | {"settings": {"interval": self.interval}, "instruments": []}
         return RunFolder.create(self.runs, self.test, uuid4().hex[:8], data)
 
 

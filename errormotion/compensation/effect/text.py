@@ -36,9 +36,7 @@ def verdict(found: Effect) -> list[str]:
     lines += [f"{', '.join(of[WORSE])}: larger with the compensation."] if of[WORSE] else []
     lines += [f"{', '.join(of[OPEN])}: no significant change."] if of[OPEN] else []
     if none_left := [part.name for part in found.parts if part.correctable and part.after.low == 0]:
-        lines.append(
-            f"{', '.join(none_left)}: the remaining error cannot be distinguished from the measurement uncertainty."
-        )
+        lines.append(f"{', '.join(none_left)}: the remaining error is not significant compared with the uncertainty.")
     return lines + limits(found)
 
 

@@ -34,9 +34,5 @@ class Limits(BaseModel):
     period: Time = Field(default=1.0, ge=0.05, le=10.0, description="interval between two offsets")
     oldest: Time = Field(default=10.0, gt=0, le=600.0, description="maximum age of a reading")
     uncertainty: Length = Field(default=20e-6, gt=0, description="largest expanded uncertainty of an offset, k = 2")
-    hold: Time = Field(
-        default=60.0, ge=0, le=3600.0, description="time for which an offset is held without a prediction"
-    )
-    settle: Time = Field(
-        default=10.0, ge=0, le=3600.0, description="time of valid predictions that ends a ramp to zero"
-    )
+    hold: Time = Field(default=60.0, ge=0, le=3600.0, description="time of a constant offset without a prediction")
+    settle: Time = Field(default=10.0, ge=0, le=3600.0, description="time of valid predictions to end a ramp to zero")

@@ -96,9 +96,7 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     records = [read_record(ds, f"campaign {number + 1}") for number, ds in enumerate(campaigns)]
     seen = [k for k in range(6) if sum(int(np.isfinite(r.errors[:, k]).sum()) for r in records) >= MIN_SAMPLES]
     if not seen:
-        raise DatasetError(
-            f"Expected at least {MIN_SAMPLES} known values of an error in all campaigns together; found fewer."
-        )
+        raise DatasetError(f"Expected at least {MIN_SAMPLES} known values of an error in all campaigns; found fewer.")
     columns = regression.Columns(records)
     best, tried = _chosen(columns, seen, settings)
     return _made(campaigns, columns, seen, best, tried, settings)

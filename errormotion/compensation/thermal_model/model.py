@@ -39,9 +39,7 @@ ROWS = (
     Row("coefficient_covariance", ("dof", "feature", "feature_"), "", *_FREE, "of the coefficients of each error"),
     Row("misfit", ("dof",), "", *_POSITIVE, "standard uncertainty of a prediction, from campaigns that were left out"),
     Row("strength", ("dof",), "", *_POSITIVE, "of the regularisation, from cross-validation"),
-    Row(
-        "removed", ("dof",), "1", -1e3, 1.0, "removed fraction of the RMS of the error at campaigns that were left out"
-    ),
+    Row("removed", ("dof",), "1", -1e3, 1.0, "removed fraction of the RMS of the error at left-out campaigns"),
     Row("feature_power", ("feature",), "", 1, 2, "power of the working parameter"),
     Row("feature_lag", ("feature",), "s", *_POSITIVE, "lag"),
     Row("feature_time_constant", ("feature",), "s", *_POSITIVE, "of the first-order response; 0: the value itself"),

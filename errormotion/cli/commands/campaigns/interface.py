@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from errormotion.cli import options
-from errormotion.cli.guard import USAGE, guarded
+from errormotion.cli.guard import USAGE
 from errormotion.cli.root import app, background_app
 
 Process = Annotated[str | None, typer.Option(help="Name of the process; needed if there are several.")]
@@ -16,13 +16,10 @@ OfRuns = Annotated[Path, typer.Argument(help="The folder of runs.")]
 
 
 @app.command()
-@guarded
 def init(
     folder: Annotated[Path, typer.Argument(help="The folder for bench.toml and campaign.toml.")] = Path(),
     machine: Annotated[str, typer.Option(help="Name of the machine.")] = "",
-    chain: Annotated[
-        str, typer.Option(help="Kinematic chain of the machine, such as workpiece-X-Y-bed-Z-spindle-tool.")
-    ] = "",
+    chain: Annotated[str, typer.Option(help="Kinematic chain, such as workpiece-X-Y-bed-Z-spindle-tool.")] = "",
     travel: Annotated[
         list[str] | None,
         typer.Option(metavar="AXIS=LOW,HIGH", help="Travel of an axis of the chain, such as X=-300mm,300mm."),
@@ -30,9 +27,7 @@ def init(
     instrument: Annotated[
         list[str] | None, typer.Option(metavar="NAME=ID@ADDRESS", help="An instrument of the bench; may be repeated.")
     ] = None,
-    test: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=ID", help="A test of the campaign; may be repeated.")
-    ] = None,
+    test: Annotated[list[str] | None, typer.Option(metavar="NAME=ID", help="A test; may be repeated.")] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME.KEY=VALUE", help="One setting of an instrument or of a test."),
@@ -49,7 +44,6 @@ def init(
 
 
 @app.command()
-@guarded
 def run(
     campaign: Annotated[
         Path | None,
@@ -62,9 +56,7 @@ def run(
     yes: Annotated[bool, typer.Option("--yes", help="Treat every request to the operator as done.")] = False,
     report: Annotated[bool, typer.Option(help="Write a report for each test.")] = True,
     tolerances: options.Tolerances = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Report path and duration only; nothing is opened or moved.")
-    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report path and duration, without motion.")] = False,
     out: Annotated[Path | None, typer.Option(help="With --dry-run: folder for drawings of the path.")] = None,
     detach: Annotated[
         bool, typer.Option("--detach", help="Run in a separate process, which continues after this terminal is closed.")
@@ -98,7 +90,6 @@ def run(
 
 
 @background_app.command("list")
-@guarded
 def background_list(runs: OfRuns = Path("runs"), json_: options.Json = False) -> None:
     """List the processes of a folder of runs with their progress and their requests to the operator."""
     from errormotion.cli.commands.campaigns import background as command
@@ -107,7 +98,6 @@ def background_list(runs: OfRuns = Path("runs"), json_: options.Json = False) ->
 
 
 @background_app.command("answer")
-@guarded
 def background_answer(runs: OfRuns = Path("runs"), process: Process = None) -> None:
     """State that the open request to the operator is done."""
     from errormotion.cli.commands.campaigns import background as command
@@ -116,7 +106,6 @@ def background_answer(runs: OfRuns = Path("runs"), process: Process = None) -> N
 
 
 @background_app.command("stop")
-@guarded
 def background_stop(runs: OfRuns = Path("runs"), process: Process = None) -> None:
     """Stop a campaign, as Ctrl-C does; it can be resumed."""
     from errormotion.cli.commands.campaigns import background as command
@@ -125,7 +114,6 @@ def background_stop(runs: OfRuns = Path("runs"), process: Process = None) -> Non
 
 
 @app.command()
-@guarded
 def plan(
     campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
     test: Annotated[str | None, typer.Option(help="One test; default: every test.")] = None,
@@ -139,7 +127,6 @@ def plan(
 
 
 @app.command()
-@guarded
 def program(
     campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
     out: Annotated[Path, typer.Option(help="The folder for the programs; existing files are not replaced.")],

@@ -8,13 +8,11 @@ from typing import Annotated
 import typer
 
 from errormotion.cli import options
-from errormotion.cli.guard import guarded
 from errormotion.cli.page import page_of
 from errormotion.cli.root import compensate_app, model_app
 
 
 @model_app.command("fit")
-@guarded
 def model_fit(
     campaigns: Annotated[list[Path], typer.Argument(help="Errors over time with temperatures: NetCDF or run folders.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="File of the model (.nc); it must not exist.")],
@@ -29,7 +27,6 @@ def model_fit(
 
 
 @model_app.command("predict")
-@guarded
 def model_predict(
     model: Annotated[Path, typer.Argument(help="A thermal model.")],
     data: Annotated[Path, typer.Argument(help="Temperatures over time: NetCDF, Zarr, or a run folder.")],
@@ -43,12 +40,9 @@ def model_predict(
 
 
 @model_app.command("check")
-@guarded
 def model_check(
     model: Annotated[Path, typer.Argument(help="A thermal model.")],
-    errors: Annotated[
-        Path, typer.Argument(help="Measured errors that the model was not fitted to: NetCDF or a run folder.")
-    ],
+    errors: Annotated[Path, typer.Argument(help="Measured errors not used in the fit: NetCDF or a run folder.")],
     report: Annotated[Path | None, typer.Option(help="Write a report of the comparison (.html).")] = None,
     pdf: options.Pdf = False,
     paper: options.Paper = None,
@@ -62,11 +56,8 @@ def model_check(
 
 
 @compensate_app.command("run")
-@guarded
 def compensate_run(
-    bench: Annotated[
-        Path, typer.Argument(help="A bench file with thermometers; to write offsets, with a table [compensator].")
-    ],
+    bench: Annotated[Path, typer.Argument(help="A bench file with thermometers and, for --arm, [compensator].")],
     model: Annotated[Path, typer.Option("--model", "-m", help="A thermal model of the machine.")],
     arm: Annotated[
         str | None,
@@ -95,9 +86,8 @@ def compensate_run(
 
 
 @compensate_app.command("status")
-@guarded
 def compensate_status(
-    folder: Annotated[Path, typer.Argument(help="A folder of runs, or the run folder of one compensation.")] = Path(
+    folder: Annotated[Path, typer.Argument(help="A folder of runs, or the run folder of a compensation.")] = Path(
         "runs"
     ),
     json_: options.Json = False,
@@ -109,7 +99,6 @@ def compensate_status(
 
 
 @compensate_app.command("stop")
-@guarded
 def compensate_stop(
     folder: Annotated[Path, typer.Argument(help="The run folder of a compensation.")],
     json_: options.Json = False,
@@ -121,11 +110,8 @@ def compensate_stop(
 
 
 @compensate_app.command("effect")
-@guarded
 def compensate_effect(
-    before: Annotated[
-        Path, typer.Argument(help="Errors without the compensation: NetCDF, run folder, or folder of runs.")
-    ],
+    before: Annotated[Path, typer.Argument(help="Errors without compensation: NetCDF, run folder, or folder of runs.")],
     after: Annotated[Path, typer.Argument(help="Errors of the same machine with the compensation.")],
     at: Annotated[str | None, typer.Option(help="Functional point 'x,y,z', mm; default: that of BEFORE.")] = None,
     over: options.Over = None,
@@ -161,14 +147,11 @@ def compensate_effect(
 
 
 @compensate_app.command("table")
-@guarded
 def compensate_table(
     errors: Annotated[Path, typer.Argument(help="Errors over position or targets: NetCDF or a run folder.")],
     for_: Annotated[
         str,
-        typer.Option(
-            "--for", metavar="CONTROL", help="Format, such as siemens or generic; an unknown name lists all formats."
-        ),
+        typer.Option("--for", metavar="CONTROL", help="Format, such as siemens; an unknown name lists all formats."),
     ],
     axis: Annotated[str, typer.Option(help="Axis along which the points of the table lie: X, Y or Z.")],
     component: Annotated[str, typer.Option(help="Axis that is corrected; default: the same axis.")] = "",
@@ -194,7 +177,6 @@ def compensate_table(
 
 
 @compensate_app.command("program")
-@guarded
 def compensate_program(
     part: Annotated[Path, typer.Argument(help="An NC program, RS-274 (ISO 6983).")],
     with_: Annotated[
@@ -203,22 +185,12 @@ def compensate_program(
             "--with", help="Errors (NetCDF or run folder) or a thermal model; the errors of several are added."
         ),
     ],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The new program; default: PART.corrected.ngc.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="New program; default: PART.corrected.ngc.")] = None,
     temperatures: Annotated[Path | None, typer.Option(help="Temperatures over time, for a thermal model.")] = None,
-    time: Annotated[
-        str | None, typer.Option(help="Instant of errors over time, such as '90 min'; default: the last.")
-    ] = None,
-    tolerance: Annotated[
-        str, typer.Option(help="Largest deviation of the new program from the corrected path.")
-    ] = "1um",
-    sampling: Annotated[
-        str, typer.Option(help="Largest distance between the points at which the path is examined.")
-    ] = "2mm",
-    parameters: Annotated[
-        Path | None, typer.Option(help="Parameter file of LinuxCNC (.var): work offsets, G92, G28.")
-    ] = None,
+    time: Annotated[str | None, typer.Option(help="Time of errors over time, such as '90 min'; default: last.")] = None,
+    tolerance: Annotated[str, typer.Option(help="Largest deviation from the corrected path.")] = "1um",
+    sampling: Annotated[str, typer.Option(help="Largest distance between examined points of the path.")] = "2mm",
+    parameters: Annotated[Path | None, typer.Option(help="LinuxCNC parameter file (.var): work offsets, G28.")] = None,
     offset: Annotated[
         list[str] | None, typer.Option(metavar="G54=X,Y,Z", help="Origin of a work offset in machine coordinates, mm.")
     ] = None,
@@ -236,22 +208,16 @@ def compensate_program(
     block_delete: Annotated[
         str | None, typer.Option("--block-delete", help="skip or run: how blocks that start with '/' are treated.")
     ] = None,
-    reader: Annotated[
-        str, typer.Option(help="Reader of the program: auto, plain, or interpreter (that of LinuxCNC).")
-    ] = "auto",
-    check: Annotated[
-        bool, typer.Option("--check", help="Check the new program with the interpreter of LinuxCNC.")
-    ] = False,
+    reader: Annotated[str, typer.Option(help="Reader: auto, plain, or interpreter (that of LinuxCNC).")] = "auto",
+    check: Annotated[bool, typer.Option("--check", help="Check the new program with LinuxCNC's interpreter.")] = False,
     partial: Annotated[bool, typer.Option("--partial", help="Leave out unknown freedoms.")] = False,
-    report: Annotated[
-        Path | None, typer.Option(help="Write a page (.html) with the correction along the path.")
-    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html) with path and correction.")] = None,
     pdf: options.Pdf = False,
     paper: options.Paper = None,
     language: options.Language = None,
     json_: options.Json = False,
 ) -> None:
-    """Write a corrected NC program: with the errors of the machine its cuts are where they were meant."""
+    """Write a corrected NC program, so that the tool follows the programmed path despite errors of the machine."""
     from errormotion.cli.commands.compensation import program as command
 
     origins = []

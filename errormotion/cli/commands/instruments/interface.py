@@ -8,13 +8,12 @@ from typing import Annotated
 import typer
 
 from errormotion.cli import options
-from errormotion.cli.guard import ERROR, INVALID, guarded
+from errormotion.cli.guard import ERROR, INVALID
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.root import app, bench_app
 
 
 @bench_app.command("validate")
-@guarded
 def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: options.Json = False) -> None:
     """Check a bench file; nothing is opened."""
     from errormotion.campaign.files import load_bench
@@ -40,7 +39,6 @@ def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], 
 
 
 @bench_app.command("probe")
-@guarded
 def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: options.Json = False) -> None:
     """Open, identify and read every instrument once."""
     from errormotion.cli.commands.instruments import bench as command
@@ -50,7 +48,6 @@ def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], jso
 
 
 @app.command()
-@guarded
 def calibrate(
     data: Annotated[Path, typer.Argument(help="Readings of a sensor against a reference: NetCDF or CSV.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="File of the calibration (.nc); it must not exist.")],
@@ -65,7 +62,6 @@ def calibrate(
 
 
 @app.command()
-@guarded
 def monitor(
     bench: Annotated[Path, typer.Argument(help="A bench file with thermometers, a controller, or both.")],
     runs: Annotated[Path, typer.Option(help="Folder for the run folder of the log.")] = Path("runs"),
@@ -80,14 +76,11 @@ def monitor(
 
 
 @app.command()
-@guarded
 def simulate(
     plugin: Annotated[str, typer.Argument(help="The id of an instrument or a compensator.")],
     port: Annotated[
         int | None,
-        typer.Option(
-            min=0, max=65535, help="Port of the device; a second line uses the next port. Default: a free port."
-        ),
+        typer.Option(min=0, max=65535, help="Port; a second line uses the next one. Default: a free port."),
     ] = None,
     host: Annotated[
         str | None, typer.Option(help="Address on which the device listens; default: 127.0.0.1, this computer only.")
@@ -119,14 +112,11 @@ def simulate(
 
 
 @app.command()
-@guarded
 def record(
     bench: Annotated[Path, typer.Argument(help="A bench file.")],
     instrument: Annotated[str, typer.Argument(help="The name of one of its instruments.")],
     for_: Annotated[str, typer.Option("--for", metavar="TIME", help="Duration of the session.")] = "10 s",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File of the recording; default: INSTRUMENT-TIME.rec.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File; default: INSTRUMENT-TIME.rec.")] = None,
     mask_serial: Annotated[bool, typer.Option("--mask-serial", help="Mask the serial number.")] = False,
     json_: options.Json = False,
 ) -> None:
@@ -138,7 +128,6 @@ def record(
 
 
 @app.command()
-@guarded
 def replay(
     recording: Annotated[Path, typer.Argument(help="A recording made by 'errormotion record'.")],
     json_: options.Json = False,

@@ -8,12 +8,11 @@ from typing import Annotated, Literal
 import typer
 
 from errormotion.cli import options
-from errormotion.cli.guard import INVALID, guarded
+from errormotion.cli.guard import INVALID
 from errormotion.cli.root import plugins_app
 
 
 @plugins_app.command("list")
-@guarded
 def plugins_list(json_: options.Json = False) -> None:
     """List all plugins, including those that cannot be loaded."""
     from errormotion.cli.commands.plugins import listing as command
@@ -22,7 +21,6 @@ def plugins_list(json_: options.Json = False) -> None:
 
 
 @plugins_app.command("show")
-@guarded
 def plugins_show(plugin: Annotated[str, typer.Argument(help="Id of the plugin.")], json_: options.Json = False) -> None:
     """Show the description of a plugin and its settings."""
     from errormotion.cli.commands.plugins import listing as command
@@ -31,7 +29,6 @@ def plugins_show(plugin: Annotated[str, typer.Argument(help="Id of the plugin.")
 
 
 @plugins_app.command("check")
-@guarded
 def plugins_check(
     plugin: Annotated[str, typer.Argument(help="Id of the plugin.")],
     address: Annotated[str | None, typer.Option(help="Address of a real instrument; default: its simulator.")] = None,
@@ -48,11 +45,8 @@ def plugins_check(
 
 
 @plugins_app.command("new")
-@guarded
 def plugins_new(
-    what: Annotated[
-        Literal["instrument", "method", "compensator"], typer.Argument(help="instrument, method or compensator.")
-    ],
+    what: Annotated[Literal["instrument", "method", "compensator"], typer.Argument(help="Kind of plugin.")],
     name: Annotated[str, typer.Argument(help="Name of the plugin; its id is made from it.")],
     out: Annotated[Path | None, typer.Option(help="Folder to write; default: errormotion-NAME.")] = None,
     json_: options.Json = False,

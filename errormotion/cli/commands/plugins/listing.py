@@ -88,7 +88,7 @@ def group_of(plugin_id: str) -> plugins.Group:
         return found[0]
     if found:
         raise PluginError(
-            f"'{plugin_id}' is the id of a plugin of each of the groups {' and '.join(found)}; rename one of them"
+            f"'{plugin_id}' is the id of a plugin in each of the groups {' and '.join(found)}; rename one"
         )
     from errormotion.datasets.files.tomlfile import nearest
 

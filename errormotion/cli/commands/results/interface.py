@@ -8,30 +8,25 @@ from typing import Annotated, Literal
 import typer
 
 from errormotion.cli import options
-from errormotion.cli.guard import INVALID, guarded
+from errormotion.cli.guard import INVALID
 from errormotion.cli.output import show, show_json
 from errormotion.cli.page import page_of
 from errormotion.cli.root import app
 
 
 @app.command()
-@guarded
 def identify(
     raw: Annotated[
         list[Path],
         typer.Argument(help="Raw datasets: NetCDF, Zarr, CSV of readings, run folders, or a folder of runs."),
     ],
     out: Annotated[Path, typer.Option(help="File of the errors (.nc); it must not exist. For several runs: a folder.")],
-    method: Annotated[
-        str | None, typer.Option(help="The id of a method plugin; default: the method of the raw data.")
-    ] = None,
+    method: Annotated[str | None, typer.Option(help="Id of a method plugin; default: that of the raw data.")] = None,
     set_: options.Set = None,
     settings: options.SettingsFile = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(
-            help="For several runs or --monte-carlo: processes, threads, sync, or a Dask scheduler, tcp://host:port."
-        ),
+        typer.Option(help="For several runs or --monte-carlo: processes, threads, sync, or a Dask scheduler (tcp://)."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Number of processes or threads; default: one for each processor.")
@@ -44,9 +39,7 @@ def identify(
             help="Evaluate the uncertainty by N Monte Carlo trials (JCGM 101) as well; auto: adaptive number.",
         ),
     ] = None,
-    digits: Annotated[
-        int, typer.Option(min=1, max=2, help="For --monte-carlo: meaningful digits of a standard uncertainty.")
-    ] = 1,
+    digits: Annotated[int, typer.Option(min=1, max=2, help="For --monte-carlo: digits of a standard uncertainty.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="For --monte-carlo: seed of the random numbers.")] = 0,
     json_: options.Json = False,
 ) -> None:
@@ -62,7 +55,6 @@ def identify(
 
 
 @app.command("import")
-@guarded
 def import_(
     log: Annotated[Path, typer.Argument(help="A log with columns: CSV or TSV.")],
     map_: Annotated[Path, typer.Option("--map", help="A TOML file that describes the columns.")],
@@ -76,7 +68,6 @@ def import_(
 
 
 @app.command()
-@guarded
 def report(
     run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
     out: Annotated[Path | None, typer.Option(help="File of the page; default: report.html in the run folder.")] = None,
@@ -85,10 +76,10 @@ def report(
     csv: Annotated[bool, typer.Option("--csv", help="Write every table as CSV into a folder beside the page.")] = False,
     xlsx: Annotated[bool, typer.Option("--xlsx", help="Write every table into a workbook beside the page.")] = False,
     paper: Annotated[
-        Literal["A4", "Letter"] | None, typer.Option(help="Paper; default: that of the campaign, else A4.")
+        Literal["A4", "Letter"] | None, typer.Option(help="Paper; default: of the campaign, or A4.")
     ] = None,
     language: Annotated[
-        Literal["en", "de"] | None, typer.Option(help="Language; default: that of the campaign, else en.")
+        Literal["en", "de"] | None, typer.Option(help="Language; default: of the campaign, or en.")
     ] = None,
     json_: options.Json = False,
 ) -> None:
@@ -100,7 +91,6 @@ def report(
 
 
 @app.command()
-@guarded
 def validate(
     file: Annotated[Path, typer.Argument(help="A dataset (.nc, .zarr), a run folder, a bench or a campaign file.")],
     json_: options.Json = False,
@@ -119,7 +109,6 @@ def validate(
 
 
 @app.command()
-@guarded
 def compare(
     results: Annotated[
         list[Path] | None,
@@ -145,13 +134,11 @@ def compare(
         list[str] | None,
         typer.Option(help="Origin of the frame of a result in machine coordinates with all axes at zero, mm."),
     ] = None,
-    chain: Annotated[
-        str | None, typer.Option(help="Kinematic chain of the machine, for results that do not state it.")
-    ] = None,
+    chain: Annotated[str | None, typer.Option(help="Kinematic chain, for results that do not state it.")] = None,
     by: Annotated[
         Literal["test", "operator", "instrument", "method"] | None,
         typer.Option(
-            help="Group the results for repeatability and reproducibility; of a folder of runs, all results are taken."
+            help="Group the results for repeatability and reproducibility; uses all results of a folder of runs."
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the comparison as a dataset (.nc).")] = None,
@@ -174,7 +161,6 @@ def compare(
 
 
 @app.command("open")
-@guarded
 def open_(
     place: Annotated[
         Path, typer.Argument(help="A run folder, a folder of runs (its newest run with a report), or a page.")
@@ -189,7 +175,6 @@ def open_(
 
 
 @app.command()
-@guarded
 def export(
     result: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
     out: Annotated[Path, typer.Option(help="File to write: .csv, .xlsx, .nc or .zarr; it must not exist.")],

@@ -8,13 +8,11 @@ from typing import Annotated
 import typer
 
 from errormotion.cli import options
-from errormotion.cli.guard import guarded
 from errormotion.cli.page import page_of
 from errormotion.cli.root import app
 
 
 @app.command()
-@guarded
 def runs(
     folders: Annotated[
         list[Path] | None, typer.Argument(help="Run folders, or folders of runs; default: runs.", show_default=False)
@@ -34,7 +32,6 @@ def runs(
 
 
 @app.command()
-@guarded
 def truth(
     run: Annotated[Path, typer.Argument(help="Run folder of a campaign with a [timeline] on a virtual machine.")],
     out: Annotated[Path, typer.Option(help="File of the error dataset (.nc).")],
@@ -46,14 +43,11 @@ def truth(
 
 
 @app.command()
-@guarded
 def note(
     folder: Annotated[Path, typer.Argument(help="A run folder, or a folder of runs with --machine and --at.")],
     text: Annotated[str, typer.Argument(help="What happened, on one line.")],
     machine: Annotated[str | None, typer.Option(help="Name of the machine, for a note without a run.")] = None,
-    at: Annotated[
-        str | None, typer.Option(metavar="DATE", help="Time of the event, UTC; default: the time of the run.")
-    ] = None,
+    at: Annotated[str | None, typer.Option(metavar="DATE", help="Time of the event, UTC; default: of the run.")] = None,
     by: Annotated[str, typer.Option(metavar="NAME", help="Author of the note.")] = "",
     json_: options.Json = False,
 ) -> None:
@@ -64,15 +58,10 @@ def note(
 
 
 @app.command()
-@guarded
 def history(
     machine: Annotated[str, typer.Option(help="Name of the machine.")],
-    figure: Annotated[
-        str, typer.Option(help="A figure of merit (* stands for any characters), or a freedom such as EZ.")
-    ],
-    folders: Annotated[
-        list[Path] | None, typer.Argument(help="Folders of runs; default: runs.", show_default=False)
-    ] = None,
+    figure: Annotated[str, typer.Option(help="A figure of merit (* replaces any characters), or a freedom.")],
+    folders: Annotated[list[Path] | None, typer.Argument(help="Folders; default: runs.", show_default=False)] = None,
     at: Annotated[str | None, typer.Option(help="Functional point of the freedom 'x,y,z', mm.")] = None,
     method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
     test: Annotated[str | None, typer.Option(help="Only the runs of this test.")] = None,

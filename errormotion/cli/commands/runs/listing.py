@@ -117,9 +117,9 @@ def _remarks(found: Listing, machine: str | None, method: str | None) -> list[st
             if wanted is not None and wanted.casefold() not in map(str.casefold, known):
                 lines.append(f"{option} {wanted}: not found; {nearest(wanted, known)}")
     if found.undated:
-        lines.append(f"{found.undated} runs without a known time: not compared with --since")
+        lines.append(f"runs without a known time, not compared with --since: {found.undated}")
     if found.waiting:
-        lines.append(f"{found.waiting} runs: figures of merit not read yet from the error datasets; repeat the command")
+        lines.append(f"runs whose figures are not read yet from the errors: {found.waiting}; repeat the command")
     if found.skipped:
-        lines += [f"{len(found.skipped)} runs could not be read:", *(f"  {reason}" for reason in found.skipped)]
+        lines += [f"unreadable runs: {len(found.skipped)}", *(f"  {reason}" for reason in found.skipped)]
     return lines

@@ -209,9 +209,7 @@ class Reader:
         elif code == 490:
             self._change(replace(self._frame, tool=(0.0, 0.0, 0.0)))
         elif code in _CYCLES:
-            raise refusal(
-                block.line, block.text, f"G{code // 10} is a canned cycle, which the plain reader does not support"
-            )
+            raise refusal(block.line, block.text, f"G{code // 10} is a canned cycle, not supported by the plain reader")
         elif code in (410, 411, 420, 421):
             raise refusal(block.line, block.text, f"G{code / 10:g} (cutter compensation) changes the path")
         elif code not in _HARMLESS and code not in _PATH:

@@ -79,9 +79,7 @@ def split(line: int, text: str) -> Block:
 def unknown(line: int, text: str, what: str) -> ProgramError:
     """Return the error of a line that is not supported."""
     if _OTHER.search(what) or text.lstrip().lower().startswith("o"):
-        return refusal(
-            line, text, "an expression, a variable or a control word (O), which the plain reader does not support"
-        )
+        return refusal(line, text, "an expression, a variable or a control word (O), not supported by the plain reader")
     return refusal(line, text, f"expected words (letter and number) and comments; found '{what[:20]}'")
 
 

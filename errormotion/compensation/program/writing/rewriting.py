@@ -150,12 +150,10 @@ class Rewriting:
                 number += 1
                 summary.written += len(made)
                 if summary.written > MAX_WRITTEN:
-                    raise ProgramError(
-                        f"the new program would have more than {MAX_WRITTEN} lines: increase the tolerance"
-                    )
+                    raise ProgramError(f"the new program would exceed {MAX_WRITTEN} lines: increase the tolerance")
                 if max(map(len, made)) > MAX_BLOCK >= len(item.block.text):
                     raise ProgramError(
-                        f"line {item.block.line} would exceed the {MAX_BLOCK} characters that a control reads"
+                        f"line {item.block.line} would exceed {MAX_BLOCK} characters, which controls do not read"
                     )
                 yield from made
                 continue
