@@ -39,17 +39,17 @@ class Curves:
     """
 
     def __init__(self) -> None:
-        self._courses: dict[str, _Course] = {}
+        self._curves: dict[str, _Curve] = {}
         self._units: dict[str, str] = {}
 
-    def take(self, note: str) -> None:
+    def add(self, note: str) -> None:
         """Add the values of a note: signed numbers, each after its name."""
         waiting = []
         for found in _VALUES.finditer(note):
             name, value = found[1], float(found[2])
-            if name not in self._courses and len(self._courses) >= MAX_CURVES:
+            if name not in self._curves and len(self._curves) >= MAX_CURVES:
                 continue
-            self._courses.setdefault(name, _Course()).add(value)
+            self._curves.setdefault(name, _Curve()).add(value)
             waiting.append(name)
             unit = _UNIT.match(note, found.end())
             if unit is not None:  # one unit for all values since the last
@@ -59,23 +59,23 @@ class Curves:
     @property
     def shown(self) -> bool:
         """Whether there is at least one curve."""
-        return bool(self._courses)
+        return bool(self._curves)
 
     def lines(self, width: int) -> Iterator[Text]:
         """Yield a line for each curve: name, block characters, last value, and range."""
-        for name, course in self._courses.items():
-            shown = course.points[-MAX_POINTS:]
+        for name, curve in self._curves.items():
+            shown = curve.points[-MAX_POINTS:]
             room = max(width - len(name) - 44, 10)
             step = -(-len(shown) // room)
             thinned = [sum(part) / len(part) for part in (shown[k : k + step] for k in range(0, len(shown), step))]
-            low, high = course.extremes
-            last = f"{course.last:+.4g} {self._units.get(name, '')}".rstrip()
+            low, high = curve.extremes
+            last = f"{curve.last:+.4g} {self._units.get(name, '')}".rstrip()
             yield Text(
                 f"  {name}  {bars(thinned)}  {last}  ({low:+.4g} to {high:+.4g})", no_wrap=True, overflow="ellipsis"
             )
 
 
-class _Course:
+class _Curve:
     """One curve; each point is the mean of the same number of notes."""
 
     def __init__(self) -> None:

@@ -92,7 +92,7 @@ class Bars:
         self._task = self._progress.add_task(self._name + name, total=total, note="")
 
     def advance(self, done: float) -> None:
-        """Show how much of the stage is done."""
+        """Show the completed part of the stage."""
         if self._task is not None:
             self._progress.update(self._task, completed=done)
 
@@ -103,7 +103,7 @@ class Bars:
 
     def note(self, text: str) -> None:
         """Show an intermediate result beside the bar, and its values as curves below."""
-        self._curves.take(text)
+        self._curves.add(text)
         if self._task is not None:
             self._progress.update(self._task, note=text)
 

@@ -17,16 +17,16 @@ from errormotion.errors import DatasetError, RunError
 def load(
     paths: Sequence[Path], names: Mapping[str, Path], *, every: bool = False
 ) -> tuple[dict[str, xr.Dataset], list[str]]:
-    """Return error datasets by name, and a sentence for each run that was left out.
+    """Return error datasets by name, and a message for each omitted run.
 
     Parameters
     ----------
     paths : sequence of Path
-        Error datasets, run folders, or folders of runs; of such a folder the newest result of each test is taken.
+        Error datasets, run folders, or folders of runs; such a folder selects the newest result of each test.
     names : mapping of str to Path
         Further results by name.
     every : bool
-        Of a folder of runs, all results of each test are taken.
+        Select all results of each test in a folder of runs.
 
     Raises
     ------
@@ -34,16 +34,16 @@ def load(
         A path does not exist or is no error dataset, or a run has no errors.
     """
     found: dict[str, xr.Dataset] = {}
-    left_out: list[str] = []
+    omitted: list[str] = []
     for path in paths:
-        for name, file in _files(path, left_out, every):
+        for name, file in _files(path, omitted, every):
             _add(found, name, file)
     for name, path in names.items():
-        files = _files(path, left_out)
+        files = _files(path, omitted)
         if len(files) != 1:
             raise DatasetError(f"{path}: expected one error dataset for the name '{name}'; found {len(files)}")
         _add(found, name, files[0][1])
-    return found, left_out
+    return found, omitted
 
 
 def _add(found: dict[str, xr.Dataset], name: str, file: Path) -> None:
@@ -56,7 +56,7 @@ def _add(found: dict[str, xr.Dataset], name: str, file: Path) -> None:
         datasets.validate(found[own])
 
 
-def _files(path: Path, left_out: list[str], every: bool = False) -> list[tuple[str, Path]]:
+def _files(path: Path, omitted: list[str], every: bool = False) -> list[tuple[str, Path]]:
     """Return names and files of the error datasets of a file, a run folder or a folder of runs."""
     if path.is_file():
         return [(path.stem, path)]
@@ -72,7 +72,7 @@ def _files(path: Path, left_out: list[str], every: bool = False) -> list[tuple[s
             folder = RunFolder.open(file.parent)
             test, created, errors = str(folder.data["test"]), str(folder.data["created"]), _errors(folder)
         except (RunError, KeyError) as error:
-            left_out.append(f"left out: {error}")
+            omitted.append(f"omitted: {error}")
             continue
         everything.append((test, errors))
         if test not in newest or created >= newest[test][0]:

@@ -12,7 +12,7 @@ from errormotion.datasets.files.runfile import FILE
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 from errormotion.record.runs.entry import Entry, read_entry
-from errormotion.record.runs.listing import DEEPEST, list_runs
+from errormotion.record.runs.listing import MAX_DEPTH, list_runs
 from errormotion.record.text import FIELD, MM_FROM
 from errormotion.report.text import DASH, rounded, signs
 
@@ -109,7 +109,7 @@ class Lab:
             The key is not that of a run in the folder of runs.
         """
         parts = key.split("/")
-        if len(key) <= MAX_KEY and key.isprintable() and "\\" not in key and 0 < len(parts) <= DEEPEST + 1:
+        if len(key) <= MAX_KEY and key.isprintable() and "\\" not in key and 0 < len(parts) <= MAX_DEPTH + 1:
             root = self.runs.resolve()
             path = root.joinpath(*parts)
             if not any(part in ("", ".", "..") for part in parts) and _inside(path / FILE, root):

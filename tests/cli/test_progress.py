@@ -89,14 +89,14 @@ def test_values_of_notes_become_curves_on_a_terminal_only(terminal: Callable[[],
 def test_a_long_curve_keeps_its_shape_in_bounded_memory() -> None:
     curves = Curves()
     for k in range(100_000):
-        curves.take(f"EX {k:+} um")
+        curves.add(f"EX {k:+} um")
     (line,) = curves.lines(80)
     assert len(line.plain) <= 80
     assert re.search(r"▁▁?▂.*▇▇*█", line.plain)
     assert len(curves._courses["EX"].points) < MAX_POINTS
     for k in range(100):
-        curves.take(f"name{k} +1 um")
+        curves.add(f"name{k} +1 um")
     assert len(list(curves.lines(80))) == MAX_CURVES
     plain = Curves()
-    plain.take("12 of 300 values undecided, v1.2.3")
+    plain.add("12 of 300 values undecided, v1.2.3")
     assert not plain.shown

@@ -232,7 +232,7 @@ def test_figures_of_older_versions_are_computed_from_the_error_dataset(
         path = make(tmp_path, number, results="none", errors="errors.nc")
         datasets.save(errors, path / "errors.nc")
     make(tmp_path, 3, results=None, errors="lost.nc")
-    monkeypatch.setattr(listing, "MOST_READ", 3)
+    monkeypatch.setattr(listing, "MAX_READ", 3)
     found = listing.list_runs([tmp_path])
     assert found.waiting == 1
     assert "figures of merit cannot be read" in found.skipped[0]

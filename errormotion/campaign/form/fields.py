@@ -22,7 +22,7 @@ from errormotion.datasets.files.tomlfile import Key, dotted, options_of, parse_t
 from errormotion.datasets.files.tomltext import value, value_of, with_table, with_value, without_table
 from errormotion.errors import BenchError, DatasetError, PluginError
 
-DEEPEST = 3
+MAX_DEPTH = 3
 """Number of levels of tables whose keys become separate fields."""
 _CAMPAIGN = ("name", "bench", "operator")
 _TEST = ("name", "method", "at", "inputs", "instruments", "monte_carlo")
@@ -204,7 +204,7 @@ def _fields(
         key = field.alias or name
         stated = data.get(key)
         inner = _table(field)
-        if inner is not None and len(label.split(".")) < DEEPEST and (stated is None or isinstance(stated, dict)):
+        if inner is not None and len(label.split(".")) < MAX_DEPTH and (stated is None or isinstance(stated, dict)):
             yield from _fields(inner, (*place, key), stated or {}, label=f"{label}{key}.")
         else:
             yield _field(field, (*place, key), f"{label}{key}", stated)

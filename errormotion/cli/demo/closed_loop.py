@@ -29,7 +29,7 @@ DISPLACEMENTS = ("EX", "EY", "EZ")
 TRUTH_STEP = 60.0
 """Interval of the true errors, s."""
 
-LEAST_RISE = 1.0
+MIN_RISE = 1.0
 """Smallest change of a temperature in the training for the use of its sensor, K; it excludes noise and air."""
 
 SMALL = ModelSettings(variant="dynamics", most_sensors=2, time_constants=(600.0, 3600.0))
@@ -156,10 +156,10 @@ def _measured(
 
 
 def with_warm_sensors(errors: xr.Dataset) -> xr.Dataset:
-    """Return errors without the temperatures that changed by less than `LEAST_RISE`."""
+    """Return errors without the temperatures that changed by less than `MIN_RISE`."""
     temperature = errors["temperature"]
     change = (temperature.max("time") - temperature.min("time")).values
-    return errors.isel(sensor=np.flatnonzero(change >= LEAST_RISE))
+    return errors.isel(sensor=np.flatnonzero(change >= MIN_RISE))
 
 
 def _truth(machine: VirtualMachine, duty: Duty, point: Sequence[float]) -> tuple[Array, Array]:

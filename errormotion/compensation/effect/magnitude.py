@@ -31,7 +31,7 @@ from errormotion.arrays import Array
 ENDS = (0.025, 0.975)
 """Probabilities below the ends of the intervals."""
 
-LARGEST_RATIO = 1e6
+MAX_RATIO = 1e6
 """Ratios above are unbounded."""
 
 NORMAL = 1e-4
@@ -247,7 +247,7 @@ def _ends(value: float, curve: Curve, probability: Callable[[float, float], floa
     top = max(value, math.sqrt(curve.expected)) if value == 0 else value
     while probability(top, square) > low_p:
         top *= 2.0
-        if top > LARGEST_RATIO * max(1.0, value):
+        if top > MAX_RATIO * max(1.0, value):
             return low, math.inf
     bottom = 0.0 if value == 0 else value
     return low, float(brentq(lambda v: probability(v, square) - low_p, bottom, top, rtol=1e-6, xtol=1e-12 * top))

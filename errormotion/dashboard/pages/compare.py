@@ -78,7 +78,7 @@ class Compare(_Comparing):
     async def get(self) -> None:
         """Show the list of runs, and the comparison of the selected ones."""
         selection, machine = self.selection(), self.value("machine")
-        asked = {"machine": self.value("history_machine"), "figure": self.value("figure")}
+        requested = {"machine": self.value("history_machine"), "figure": self.value("figure")}
         table = await self.in_thread(self.context.lab.table, Choice(machine=machine))
         found, wrong, wrong_history = None, "", ""
         try:
@@ -88,8 +88,8 @@ class Compare(_Comparing):
         except ErrormotionError as error:
             wrong = str(error)
         try:
-            if all(asked.values()):
-                await self.in_slow_thread(_followed, self.context.lab.runs, *asked.values())
+            if all(requested.values()):
+                await self.in_slow_thread(_history_of, self.context.lab.runs, *requested.values())
         except ErrormotionError as error:
             wrong_history = str(error)
         self.show(
@@ -106,9 +106,11 @@ class Compare(_Comparing):
             found=_stated(found) if found is not None else None,
             wrong=wrong[:MAX_MESSAGE],
             figures=sorted({row.figure for row in table.rows if row.figure}),
-            asked=asked,
+            requested=requested,
             wrong_history=wrong_history[:MAX_MESSAGE],
-            history="/compare/history.html?" + urlencode(asked) if all(asked.values()) and not wrong_history else "",
+            history="/compare/history.html?" + urlencode(requested)
+            if all(requested.values()) and not wrong_history
+            else "",
         )
 
 
@@ -136,7 +138,9 @@ class History(Guarded):
 
     async def get(self) -> None:
         """Send the report."""
-        found = await self.in_slow_thread(_followed, self.context.lab.runs, self.value("machine"), self.value("figure"))
+        found = await self.in_slow_thread(
+            _history_of, self.context.lab.runs, self.value("machine"), self.value("figure")
+        )
         self.set_header("Content-Security-Policy", REPORT_POLICY)
         self.finish(await self.in_slow_thread(_page, write_history, found))
 
@@ -200,7 +204,7 @@ def _stated(ds: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def _followed(runs: Path, machine: str, figure: str) -> xr.Dataset:
+def _history_of(runs: Path, machine: str, figure: str) -> xr.Dataset:
     return history(list_runs([runs], machine=machine), machine, figure)
 
 

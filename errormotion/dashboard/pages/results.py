@@ -22,7 +22,7 @@ from errormotion.dashboard.space import Drawing, drawing, has_volume
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
-from errormotion.record.runs.entry import MOST_FIGURES
+from errormotion.record.runs.entry import MAX_FIGURES
 
 PAGE = 100
 """Number of runs on one page of the table."""
@@ -185,7 +185,7 @@ def _stated(path: Path) -> dict[str, Any]:
     point = [f"{1e3 * each:.10g}" for each in found.point]
     others = {dim: size - 1 for dim, size in found.others.items()}
     return {
-        "figures": figures_of(ds)[:MOST_FIGURES],
+        "figures": figures_of(ds)[:MAX_FIGURES],
         "freedoms": names,
         "point": point,
         "movable": ds.attrs.get("component") != "beam",

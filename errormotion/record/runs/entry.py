@@ -21,7 +21,7 @@ MAX_FILE = 16 << 20
 """Largest size of a ``run.json``, bytes."""
 MAX_TEXT = 200
 """Longest text, characters."""
-MOST_FIGURES = 200
+MAX_FIGURES = 200
 """Largest number of figures of merit of a run."""
 
 
@@ -74,7 +74,7 @@ class Entry:
 
     def with_figures(self, figures: list[FigureOfMerit]) -> Entry:
         """Return the entry with figures from its error dataset."""
-        return replace(self, figures=tuple(figures[:MOST_FIGURES]))
+        return replace(self, figures=tuple(figures[:MAX_FIGURES]))
 
     def plain(self) -> dict[str, Any]:
         """Return the entry for a JSON file."""
@@ -143,7 +143,7 @@ def figures_from(data: Any) -> tuple[FigureOfMerit, ...] | None:
     if not isinstance(data, list):
         return None
     found = []
-    for entry in data[:MOST_FIGURES]:
+    for entry in data[:MAX_FIGURES]:
         if not isinstance(entry, dict):
             return None
         limit = _number(entry.get("limit"))

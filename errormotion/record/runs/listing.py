@@ -15,11 +15,11 @@ from errormotion.record.runs import index
 from errormotion.record.runs.entry import Entry, read_entry
 from errormotion.record.runs.index import Stamp
 
-DEEPEST = 3
+MAX_DEPTH = 3
 """Largest depth of a run folder below the given folder."""
-MOST_RUNS = 200_000
+MAX_RUNS = 200_000
 """Largest number of run folders of one call."""
-MOST_READ = 100
+MAX_READ = 100
 """Largest number of error datasets that one call reads, for runs without figures of merit in ``run.json``."""
 SETTLING_TIME = 2_000_000_000
 """Age from which a modification time is reliable, ns: a younger file may change again within the same time stamp."""
@@ -125,7 +125,7 @@ def list_runs(
     Raises
     ------
     RunError
-        A path does not exist, or contains more than `MOST_RUNS` runs.
+        A path does not exist, or contains more than `MAX_RUNS` runs.
     """
     folders = []
     for path, (names, whole) in _found(paths).items():
@@ -205,9 +205,9 @@ def _same(wanted: str | None, found: str) -> bool:
 
 
 def _complete(chosen: Iterable[tuple[Folder, Entry]]) -> int:
-    """Read figures of merit from at most `MOST_READ` error datasets; return how many runs are still without figures."""
+    """Read figures of merit from at most `MAX_READ` error datasets; return how many runs are still without figures."""
     lacking = [(folder, entry) for folder, entry in chosen if entry.lacks_figures]
-    for folder, entry in lacking[:MOST_READ]:
+    for folder, entry in lacking[:MAX_READ]:
         from errormotion import datasets  # takes 0.5 s to import
         from errormotion.datasets.results.merit import figures_of
 
@@ -218,7 +218,7 @@ def _complete(chosen: Iterable[tuple[Folder, Entry]]) -> int:
             kind = "" if isinstance(error, ErrormotionError) else f"{type(error).__name__}: "
             name = f"{entry.folder} (figures)"
             folder.skipped[name] = f"{folder.path / entry.folder}: figures of merit cannot be read: {kind}{error}"
-    return max(0, len(lacking) - MOST_READ)
+    return max(0, len(lacking) - MAX_READ)
 
 
 def _found(paths: Sequence[Path]) -> dict[Path, tuple[list[str], bool]]:
@@ -231,11 +231,11 @@ def _found(paths: Sequence[Path]) -> dict[Path, tuple[list[str], bool]]:
             raise RunError(f"{path}: no such folder; expected a run folder or a folder of runs")
         single = (path / "run.json").exists()
         for parent, name in (
-            [(path.resolve().parent, path.resolve().name)] if single else _walk(path.resolve(), DEEPEST)
+            [(path.resolve().parent, path.resolve().name)] if single else _walk(path.resolve(), MAX_DEPTH)
         ):
             count += 1
-            if count > MOST_RUNS:
-                raise RunError(f"{path}: expected at most {MOST_RUNS} runs; choose a folder with fewer runs")
+            if count > MAX_RUNS:
+                raise RunError(f"{path}: expected at most {MAX_RUNS} runs; choose a folder with fewer runs")
             found.setdefault(parent, {})[name] = None
             if not single:
                 whole.add(parent)

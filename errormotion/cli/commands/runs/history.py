@@ -62,7 +62,7 @@ def history(
         show(line)
     for name in ("notes", "left_out"):
         for text in filter(None, found.attrs[name]):
-            show(f"left out: {text}" if name == "left_out" else text)
+            show(f"omitted: {text}" if name == "left_out" else text)
     if runs.waiting:
         show(f"{runs.waiting} runs: figures of merit not read yet from the error datasets; repeat the command")
     for reason in runs.skipped:
