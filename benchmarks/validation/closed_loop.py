@@ -121,5 +121,5 @@ def rows(name: str, loop: Loop) -> Iterator[str]:
         measured = f"{1 - gained.value:.1%} ({1 - gained.high:.1%} to {1 - gained.low:.1%})"
         yield (
             f"| {name} | {sensors} | {number} | {sizes[0]:.2f} | {sizes[1]:.2f} | {each.remaining:.1%} "
-            f"| {'XYZ'[worst]} {axes[worst]:.0%} | {measured} | {each.offsets.share('following'):.0%} |"
+            f"| {'XYZ'[worst]} {axes[worst]:.0%} | {measured} | {each.offsets.fraction('following'):.0%} |"
         )

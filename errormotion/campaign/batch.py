@@ -35,10 +35,10 @@ from errormotion.parallel import CPU_COUNT, SCHEDULERS, Workers, checked_schedul
 from errormotion.plugins import PluginSettings
 
 log = logging.getLogger(__name__)
-_turn = threading.Lock()
+_lock = threading.Lock()
 
 MARK = "identified_from"
-"""Attribute of a result: hashes of the raw dataset and of the settings, from which a batch recognises its results."""
+"""Attribute of a result: hashes of the raw dataset and of the settings, by which a batch identifies its results."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ class Outcome:
     raw : Path
         The raw dataset, or the run folder that contains it.
     errors : Path or None
-        The error dataset; None where there is none.
+        The error dataset; None after a failure.
     reason : str
-        Cause of the failure; empty where there is none.
+        Cause of the failure; empty without one.
     seconds : float
         Duration, s.
     stepped_over : bool
@@ -99,7 +99,7 @@ def identify_runs(
     method_id : str
         The method plugin.
     settings : PluginSettings
-        For all of them.
+        Settings of the method, for all runs.
     out : path
         The folder; it is created if missing. An existing result of the same raw data, settings and method is skipped;
         any other is never overwritten.
@@ -119,10 +119,10 @@ def identify_runs(
     Raises
     ------
     RunError
-        The batch cannot be executed: no run, an unknown scheduler or one that does not answer, workers with another
-        version of errormotion, Dask missing.
+        The batch cannot be executed: no runs, an unknown scheduler, no answer from the scheduler, workers with another
+        version of errormotion, or Dask is missing.
     PluginError
-        There is no such method.
+        The method is unknown.
     KeyboardInterrupt
         The operator stopped the batch; finished results are kept.
     """
@@ -163,9 +163,7 @@ def identify_runs(
     try:
         _work(tasks, name, workers, done)
     except KeyboardInterrupt as error:
-        raise KeyboardInterrupt(
-            f"{len(outcomes)} of {len(found)} runs are done; repeat the command to continue."
-        ) from error
+        raise KeyboardInterrupt(f"{len(outcomes)} of {len(found)} runs are done; repeat the command") from error
     return [outcomes[raw] for raw, _ in found]
 
 
@@ -179,7 +177,7 @@ def choose_scheduler(wanted: str | None) -> tuple[str, str]:
     Raises
     ------
     RunError
-        There is no such scheduler.
+        The scheduler is unknown.
     """
     if wanted is not None:
         checked_scheduler(wanted)
@@ -227,7 +225,7 @@ def _runs(folder: Path, method_id: str) -> list[tuple[Path, str]]:
 
 
 def _names(raws: Sequence[Path]) -> list[str]:
-    """Return a name for each: its own without suffix, preceded by those of its folders where names are equal."""
+    """Return a name for each path: its own without suffix, preceded by those of its folders if names are equal."""
     parts = [(*raw.resolve().parts[1:-1], raw.resolve().name if raw_of(raw) != raw else raw.stem) for raw in raws]
     depth = [1] * len(parts)
     while True:
@@ -291,7 +289,7 @@ def _identify_or_raise(task: Task) -> bool:
                 f"{path}: exists already, from other raw data, other settings or another version of the method, and "
                 "a result is never overwritten; specify another folder with --out"
             )
-        with _turn if one_thread_at_a_time() else nullcontext(), explained(task.raw, dataset):
+        with _lock if one_thread_at_a_time() else nullcontext(), explained(task.raw, dataset):
             errors = noted(method().identify(dataset, settings), dataset)
         mark = {"raw": datasets.hash_dataset(dataset), "settings": settings_mark}
     datasets.validate(errors)
@@ -302,11 +300,11 @@ def _identify_or_raise(task: Task) -> bool:
 
 @contextmanager
 def _local_locks() -> Iterator[None]:
-    """Prevent xarray on a worker from requesting a lock of the cluster: a file composed in memory has none."""
+    """Prevent xarray on a worker from requesting a lock of the cluster, which a file in memory does not have."""
     if "distributed" not in sys.modules:
         yield
         return
     from dask import config
 
-    with _turn, config.set(scheduler="synchronous"):
+    with _lock, config.set(scheduler="synchronous"):
         yield

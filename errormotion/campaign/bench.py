@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import asdict, dataclass
-from types import TracebackType
 from typing import Any, Self
 
 from errormotion.campaign.files import BenchInstrument, BenchPlan
@@ -53,6 +52,17 @@ class Answer:
         }
 
 
+def connect(driver: Any) -> Identity:
+    """Open a driver and return the identity of its instrument; close it after an error."""
+    try:
+        driver.open()
+        identity: Identity = driver.identify()
+    except BaseException:
+        driver.close()
+        raise
+    return identity
+
+
 class OpenBench:
     """The instruments of a bench, opened and closed together.
 
@@ -67,7 +77,7 @@ class OpenBench:
     Attributes
     ----------
     answers : list of Answer
-        What each instrument said, once open.
+        Result of opening each instrument.
     """
 
     def __init__(self, plan: BenchPlan, ask: Callable[[str], None] | None = None) -> None:
@@ -83,7 +93,7 @@ class OpenBench:
         Raises
         ------
         BenchError
-            The tree of opened and failed instruments with causes. All instruments are tried; none remains open.
+            At least one instrument failed. The message lists all instruments and causes of failures; none remains open.
         """
         try:
             self.try_open()
@@ -103,20 +113,15 @@ class OpenBench:
             try:
                 driver = instrument.driver(instrument.address, instrument.settings)
                 self._bind(driver)
-                try:
-                    driver.open()
-                    identity = driver.identify()
-                except BaseException:
-                    driver.close()
-                    raise
+                identity = connect(driver)
             except Exception as error:
                 log.exception("instrument %s could not be opened", instrument.name)
                 self.answers.append(Answer(instrument, error=cause_of(error)))
             else:
                 self.answers.append(Answer(instrument, driver, identity))
 
-    def hold(self, forbidden: str = "") -> None:
-        """Have every instrument hold the limits of the bench from now on; ``forbidden``: why none may move anything."""
+    def set_limits(self, forbidden: str = "") -> None:
+        """Apply the limits of the bench to every driver; ``forbidden``: why no motion at all is allowed."""
         for answer in self.answers:
             if answer.driver is not None:
                 self._bind(answer.driver, forbidden)
@@ -126,12 +131,12 @@ class OpenBench:
             driver.bound(self.plan.limits.of_machine(forbidden))
         elif changes_machine(driver):
             raise BenchError(
-                f"The driver '{driver.info.id}' can move or change a machine and holds no limits: it lacks the method "
-                "'bound'. 'errormotion plugins check' lists what such a driver needs"
+                f"The driver '{driver.info.id}' can move or change a machine and does not check limits: it has no "
+                "method 'bound'. 'errormotion plugins check' lists the requirements for such a driver"
             )
 
     def close(self) -> None:
-        """Close every instrument in reverse order, also if one of them fails."""
+        """Close every instrument in reverse order, even if one of them fails."""
         for answer in reversed(self.answers):
             if answer.driver is None:
                 continue
@@ -144,9 +149,7 @@ class OpenBench:
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
@@ -155,7 +158,7 @@ class OpenBench:
         return all(answer.identity is not None and answer.identity.simulated for answer in self.answers)
 
     def chosen(self, choice: Mapping[str, str]) -> OpenBench:
-        """Return the open bench with one instrument of each kind in ``choice`` (kind to name), and all of others."""
+        """Return the open bench with one instrument for each kind in ``choice`` (kind to name), and all others."""
         found = copy(self)
         kinds = [(answer, answer.instrument.driver.info.kind) for answer in self.answers]
         found.answers = [
@@ -173,7 +176,7 @@ class OpenBench:
         Raises
         ------
         BenchError
-            There is none, or there are several.
+            The bench has none, or several.
         """
         found = [answer for answer in self.answers if answer.instrument.driver.info.kind == kind]
         if len(found) == 1:
@@ -185,7 +188,7 @@ class OpenBench:
                 f'instruments = {{ {kind} = "{found[0].instrument.name}" }}.'
             )
         raise BenchError(
-            f"Bench '{self.plan.name}': expected a {kind}; it offers {', '.join(self.plan.kinds)}. "
+            f"Bench '{self.plan.name}': expected a {kind}; found {', '.join(self.plan.kinds)}. "
             f"Add one to {self.plan.source}."
         )
 
@@ -199,7 +202,7 @@ class OpenBench:
             return
         if self._ask is None:
             raise BenchError(
-                f"A request to the operator is necessary ({message}). Run the command in a terminal, or with --yes."
+                f"A request to the operator cannot be shown ({message}). Run the command in a terminal, or with --yes."
             )
         log.info("request to the operator: %s", message)
         self._ask(message)

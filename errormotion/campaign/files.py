@@ -58,7 +58,7 @@ class InstrumentTable(BaseModel):
 
 
 class CompensatorTable(BaseModel):
-    """``[compensator]``: what writes offsets into the machine, its address, its settings, and the limits."""
+    """``[compensator]``: driver that writes offsets to the machine, its address, its settings, and the limits."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
     driver: str = Field(description="the id of a compensator plugin; 'errormotion plugins list' shows them")
@@ -110,7 +110,7 @@ class CampaignTable(BaseModel):
     bench: str = Field(description="the path of a bench file, relative to this file")
     runs: str = "runs"
     test: list[TestTable] = Field(min_length=1)
-    operator: str = Field(default="", max_length=200, description="who measures")
+    operator: str = Field(default="", max_length=200, description="name of the operator")
     certificates: Certificates = {}
     report: head.ReportTable | None = None
     tolerances: Tolerances | None = None
@@ -125,7 +125,7 @@ class CampaignTable(BaseModel):
 
 
 class MistakesError(BenchError):
-    """A file with mistakes, each of which begins with its key; ``more`` is the message of a second file."""
+    """A file with mistakes, each of which starts with its key; ``more`` is the message of a second file."""
 
     def __init__(self, source: Path, mistakes: Sequence[str], more: str = "") -> None:
         super().__init__("\n".join(filter(None, [tomlfile.report(source, mistakes), more])))
@@ -154,10 +154,10 @@ class BenchCompensator:
 
 @dataclass(frozen=True)
 class BenchPlan:
-    """A checked bench file; nothing is opened yet.
+    """A checked bench file; no instrument is open.
 
-    ``machine`` is the name of the machine tool, ``description`` what the table ``[machine]`` states (None without it).
-    ``limits`` are those of the file, and the travel where the file has none.
+    ``machine`` is the name of the machine tool, ``description`` the content of the table ``[machine]`` or None.
+    ``limits`` are those of the file, or the travel for an axis without limits.
     """
 
     name: str
@@ -193,7 +193,7 @@ class TestPlan:
     """One checked test of a campaign.
 
     ``inputs`` maps the method's name of an input to an earlier test, ``instruments`` a kind to a name on the bench.
-    ``certificates`` are those of bench, campaign and test, the last one first.
+    ``certificates`` are those of bench, campaign and test; that of the test has priority.
     """
 
     __test__ = False
@@ -219,7 +219,7 @@ class CampaignPlan:
     source: Path
     text: str
     folder: Path
-    """Folder of the files that the settings name."""
+    """Folder to which paths in the settings are relative."""
     tolerances: Tolerances | None = None
     operator: str = ""
     timeline: Timeline | None = None
@@ -261,12 +261,12 @@ def load_campaign(path: str | Path) -> CampaignPlan:
 
 
 def campaign_of(text: str, path: Path) -> CampaignPlan:
-    """Check the text of a campaign file, and the bench file that it names; ``path`` is where it stands or will stand.
+    """Check the text of a campaign file, and the bench file that it names; ``path`` is the path of the campaign file.
 
     Raises
     ------
     BenchError
-        The bench file cannot be read, or one of both contains errors; all errors of a file in one message.
+        The bench file cannot be read, or one of the files contains errors; all errors of a file in one message.
     """
     data = tomlfile.parse_toml(text, path, error=BenchError)
     _refuse_other(path, data, "campaign")
@@ -285,22 +285,22 @@ def campaign_of(text: str, path: Path) -> CampaignPlan:
             raise
         raise MistakesError(path, error.mistakes, str(bench_error)) from None
     except BenchError:
-        raise bench_error or BenchError(f"{path}: the bench cannot be read") from None
+        raise bench_error or BenchError(f"{path}: the bench file cannot be read") from None
     if mistakes := list(_missing(campaign)):
         raise MistakesError(path, mistakes)
     return campaign
 
 
 _KINDS = {
-    "bench": "It holds the instruments of a machine; name the file of the campaign that uses it",
-    "campaign": "It holds the tests of a campaign; name the file of its bench",
-    "tolerances": "It holds limits; name it with --tolerances",
+    "bench": "It describes the instruments of a machine; state the file of a campaign that uses it",
+    "campaign": "It describes the tests of a campaign; state the file of its bench",
+    "tolerances": "It contains limits; state it with --tolerances",
 }
-"""What other files hold, and what to do, by the name in their schema."""
+"""Content of each kind of file, and what to do, by the name in its schema."""
 
 
 def _refuse_other(path: Path, data: Mapping[str, Any], expected: str) -> None:
-    """Refuse a file of another kind in one sentence, before all its keys are called unknown."""
+    """Raise BenchError for a file of another kind; otherwise all its keys would be reported as unknown."""
     found = str(data.get("schema", "")).removeprefix("errormotion.").partition("/")[0]
     if found != expected and found in _KINDS:
         raise BenchError(f"{path}: expected a {expected} file; found a file of kind '{found}'. {_KINDS[found]}")
@@ -317,7 +317,7 @@ def _missing(campaign: CampaignPlan) -> Iterator[str]:
 
 
 def parse_bench(text: str, source: Path) -> BenchPlan:
-    """Check the text of a bench file; ``source`` is for the messages."""
+    """Check the text of a bench file; ``source`` is its path for messages."""
     data = tomlfile.parse_toml(text, source, error=BenchError)
     description, mistakes, machine = None, list[str](), data.get("machine")
     if isinstance(machine, dict):
@@ -371,7 +371,7 @@ def _compensator(entry: Any, table: BenchTable | None) -> tuple[BenchCompensator
 
 
 def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> CampaignPlan:
-    """Check the text of a campaign file against its bench; ``source`` is for the messages.
+    """Check the text of a campaign file against its bench; ``source`` is its path for messages.
 
     Without a bench, BenchError reports the missing bench with all other errors.
     """
@@ -415,7 +415,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
 def _timeline_mistakes(table: CampaignTable, bench: BenchPlan | None) -> list[str]:
     if table.timeline is None:
         stated = [number for number, test in enumerate(table.test) if test.at is not None]
-        return [f"{tomlfile.dotted(('test', n, 'at'))}: expected a table [timeline]; found none" for n in stated]
+        return [f"{tomlfile.dotted(('test', n, 'at'))}: needs a table [timeline]; found none" for n in stated]
     try:
         if bench is not None:
             follower(each.driver for each in bench.instruments)
@@ -440,7 +440,7 @@ def _address_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...]) ->
 
 
 def _tables(value: Any) -> list[tuple[str | int, dict[str, Any]]]:
-    """Return the tables below a key with their keys or numbers, also of a file with errors."""
+    """Return the tables below a key with their keys or numbers, even of a file with errors."""
     pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [(key, entry) for key, entry in pairs if isinstance(entry, dict)]
 
@@ -460,14 +460,14 @@ def _method_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...], ben
         if lacking:
             mistakes.append(
                 f"{tomlfile.dotted(place)}: the method '{entry['method']}' needs {' and '.join(lacking)}; "
-                f"the bench {bench.source} offers {', '.join(bench.kinds)}"
+                f"the bench {bench.source} has {', '.join(bench.kinds)}"
             )
         for kind in plugins.get("methods", entry["method"]).needs.instruments:
             names = [each.name for each in bench.instruments if each.driver.info.kind == kind]
             if len(names) > 1:
                 mistakes.append(
                     f"{tomlfile.dotted(place)}: the method '{entry['method']}' needs one {kind}; the bench "
-                    f'{bench.source} offers {", ".join(names)}. Choose one: instruments = {{ {kind} = "{names[0]}" }}'
+                    f'{bench.source} has {", ".join(names)}. Choose one: instruments = {{ {kind} = "{names[0]}" }}'
                 )
         method = plugins.get("methods", entry["method"])
         found = completed(method, found, bench.description)
@@ -507,7 +507,7 @@ def _limit_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[s
     except MethodError as error:
         return [f"{where}: {error}"]
     if steps is None and hasattr(plugins.get("methods", method), "programs"):
-        return [f"{where}: {NO_MOTIONS.format(method)}, and it writes NC programs"]
+        return [f"{where}: {NO_MOTIONS.format(method)}, although it writes NC programs"]
     broken = violations(extent(steps), bench.limits) if steps else []
     tables = "[limits]" if bench.description is None else "[limits] and [machine]"
     return [f"{where}: {text} ({tables} of {bench.source})" for text in broken]
@@ -526,21 +526,21 @@ def _name_mistakes(test: TestTable, place: tuple[str | int, ...], earlier: list[
 
 
 def _trials_mistakes(test: TestTable, place: tuple[str | int, ...]) -> list[str]:
-    """Return why there is no Monte Carlo evaluation where a test wants one."""
+    """Return why the Monte Carlo evaluation that a test requests is not possible."""
     if test.monte_carlo is None:
         return []
-    from errormotion.montecarlo.evaluation import FEWEST
+    from errormotion.montecarlo.evaluation import MIN_TRIALS
 
     where = tomlfile.dotted((*place, "monte_carlo"))
-    if test.monte_carlo != "auto" and test.monte_carlo < FEWEST:
-        return [f"{where}: expected 'auto' or a number of trials from {FEWEST} on; found {test.monte_carlo}"]
+    if test.monte_carlo != "auto" and test.monte_carlo < MIN_TRIALS:
+        return [f"{where}: expected 'auto' or at least {MIN_TRIALS} trials; found {test.monte_carlo}"]
     try:
         method = plugins.get("methods", test.method)
     except PluginError:
         return []  # reported with its settings
     if hasattr(method, "redrawing"):
         return []
-    return [f"{where}: the method '{test.method}' does not state how its sources are drawn anew (redrawing)"]
+    return [f"{where}: the method '{test.method}' does not support the Monte Carlo evaluation (it has no 'redrawing')"]
 
 
 def _settings(

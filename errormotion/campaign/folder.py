@@ -14,20 +14,40 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from errormotion.datasets.files.runfile import SCHEMA, read_run
 from errormotion.datasets.files.writing import sync
-from errormotion.datasets.provenance import plain
+from errormotion.datasets.provenance import make, plain
 from errormotion.errors import RunError
 
-RESERVE_BYTES = 2**18
-"""Reserved during a measurement and released at its end, so that run.json and the log fit on a full disk, bytes."""
+if TYPE_CHECKING:
+    from errormotion.campaign.files import BenchPlan
 
-LOOK_DURATION = 0.2
-"""Time for which whoever only looks may hold a lock, s; beyond it another process works on the run."""
+RESERVE_BYTES = 2**18
+"""Disk space reserved during a measurement, bytes; released at its end, so that run.json and the log can be written."""
+
+CHECK_DURATION = 0.2
+"""Longest time for which `is_locked` holds a lock, s; a lock held longer means that another process uses the run."""
 
 log = logging.getLogger(__name__)
+
+
+def new_entries(bench: BenchPlan) -> dict[str, Any]:
+    """Return the entries of ``run.json`` of a new measurement with a bench."""
+    return {
+        "status": "running",
+        "reason": "",
+        "acquired": False,
+        "bench": {"name": bench.name, "machine": bench.machine, "file": bench.source.name, "text": bench.text},
+        "software": make({}, None, None)["software"],
+        "samples": {},
+        "raw": "raw.zarr",
+        "errors": None,
+        "report": None,
+        "log": "log.jsonl",
+        "steps": [],
+    }
 
 
 class FolderGoneError(RunError):
@@ -35,7 +55,7 @@ class FolderGoneError(RunError):
 
 
 class Presence:
-    """A folder that must remain where it is, and the same, while data are written to it.
+    """A folder that must not be moved, deleted or replaced while data are written to it.
 
     Parameters
     ----------
@@ -60,11 +80,11 @@ class Presence:
         Raises
         ------
         FolderGoneError
-            It is not there, or another folder is.
+            The folder is gone, or another folder has its path.
         """
         if self._identity is None or self._found() != self._identity:
             raise FolderGoneError(
-                f"The folder {self.path} is gone: it was moved or deleted while data were written to it."
+                f"The folder {self.path} is missing: it was moved or deleted while data were written."
             )
 
     @contextmanager
@@ -140,7 +160,7 @@ class RunFolder:
         Raises
         ------
         RunError
-            It is damaged, or gone.
+            The file is damaged or gone.
         """
         self.data = read_run(self.path)
 
@@ -165,7 +185,7 @@ class RunFolder:
 
     @property
     def present(self) -> bool:
-        """Whether the folder is still where it was created or opened."""
+        """Whether the folder still exists at its path."""
         return (self.path / "run.json").exists()
 
     @property
@@ -175,7 +195,7 @@ class RunFolder:
         Raises
         ------
         RunError
-            It is a link out of this folder.
+            It is a link to a target outside the folder.
         """
         return self._inside("raw.zarr")
 
@@ -186,12 +206,12 @@ class RunFolder:
 
     @property
     def errors(self) -> Path | None:
-        """The error dataset of the last identification; None where there is none.
+        """The error dataset of the last identification; None before it.
 
         Raises
         ------
         RunError
-            ``run.json`` names no file of this folder.
+            ``run.json`` states a file outside the folder.
         """
         name = self.data.get("errors")
         if name is None or name == "":
@@ -201,12 +221,12 @@ class RunFolder:
         raise RunError(f"{self.path / 'run.json'}: errors: expected a file in this folder; found {name!r:.100}")
 
     def _inside(self, name: str) -> Path:
-        """Return a path in this folder; RunError for one that a link leads out of it."""
+        """Return a path in this folder; RunError if a link leads out of the folder."""
         path = self.path / name
         try:
             if path.resolve().is_relative_to(self.path.resolve()):
                 return path
-        except (OSError, RuntimeError) as error:  # a link to itself, a name that is too long
+        except (OSError, RuntimeError) as error:  # a link to itself, or a name that is too long
             raise RunError(f"{path}: cannot be followed: {error}") from error
         raise RunError(f"{path}: expected a file in this folder; it is a link to {path.resolve()}")
 
@@ -226,12 +246,12 @@ class RunFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder against other processes, once; the lock ends with the process.
+        """Lock the folder against other processes; the lock ends with the process. A nested call has no effect.
 
         Raises
         ------
         RunError
-            Another process works on this run.
+            Another process uses this run.
         """
         try:
             import fcntl
@@ -243,7 +263,7 @@ class RunFolder:
             return
         descriptor = os.open(self.path, os.O_RDONLY)
         try:
-            end = time.monotonic() + LOOK_DURATION
+            end = time.monotonic() + CHECK_DURATION
             while not self._is_locked:
                 try:
                     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -251,9 +271,9 @@ class RunFolder:
                 except BlockingIOError as error:
                     if time.monotonic() > end:
                         raise RunError(
-                            f"{self.path}: another process is working on this run; wait until it ends, or stop it"
+                            f"{self.path}: another process is using this run; wait until it ends, or stop it"
                         ) from error
-                    time.sleep(LOOK_DURATION / 10)
+                    time.sleep(CHECK_DURATION / 10)
             yield
         finally:
             self._is_locked = False
@@ -261,7 +281,7 @@ class RunFolder:
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether a process holds the lock of a file or folder; looking does not hold it against others who look."""
+    """Return whether a process holds the lock of a file or folder; simultaneous checks do not affect each other."""
     import fcntl
 
     try:

@@ -23,15 +23,15 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.campaign.bench import OpenBench
+from errormotion.campaign.claims import claimed
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
-from errormotion.campaign.folder import FolderGoneError, RunFolder, list_runs, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, list_runs, new_entries, now
 from errormotion.campaign.sections import head
 from errormotion.campaign.sections.limits import NO_MOTIONS, announcement, steps_of
 from errormotion.campaign.sections.timeline import follower
 from errormotion.campaign.storage.journal import cause_of, journal
 from errormotion.campaign.storage.recorder import DiskFullError, Recorder
 from errormotion.campaign.storage.store import committed_length
-from errormotion.campaign.turns import claimed
 from errormotion.datasets import provenance
 from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.clock import noted
@@ -44,8 +44,8 @@ from errormotion.report.page import logo
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
 
-MOST_RESULTS = 200
-"""Figures of merit in a run.json."""
+MAX_RESULTS = 200
+"""Largest number of figures of merit in ``run.json``."""
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ class Progress(Protocol):
     """Receives the progress of a campaign."""
 
     def announce(self, text: str) -> None:
-        """State what a test will do with the machine; before the bench is opened."""
+        """State how a test will move the machine, before the bench is opened."""
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
         """Start a test, or skip a finished one."""
@@ -167,7 +167,7 @@ def resume(
     groups: dict[str, list[RunFolder]] = {}
     skipped: list[str] = []
     for folder in list_runs(runs, skipped):
-        if "campaign" not in folder.data or (run_id and folder.data["id"] != run_id):  # a log, or another one
+        if "campaign" not in folder.data or (run_id and folder.data["id"] != run_id):  # a log, or another campaign
             continue
         groups.setdefault(str(folder.data["id"]), []).append(folder)
     changed = ""
@@ -182,32 +182,32 @@ def resume(
                 continue
             plan = stored_plan(folders[0])
         except (ErrormotionError, KeyError, TypeError, AttributeError) as error:
-            if campaign and isinstance(error, ErrormotionError):  # it is the one that was asked for
+            if campaign and isinstance(error, ErrormotionError):  # the requested campaign
                 raise
-            skipped.append(f"{folders[0].path / 'run.json'}: is no complete record of a run ({cause_of(error)})")
+            skipped.append(f"{folders[0].path / 'run.json'}: is not a complete record of a run ({cause_of(error)})")
             log.warning("skipped: %s", skipped[-1])
             continue
         session = _Session(plan, runs, run_id, progress, ask, report)
         with folders[0].locked():  # one process at a time continues a campaign
             for reason in skipped:
                 session.progress.announce(f"skipped: {reason}")
-            return session.work(_as_it_is(runs, run_id, folders, [test.name for test in plan.tests]))
+            return session.work(_folders_by_test(runs, run_id, folders, [test.name for test in plan.tests]))
     if changed and campaign:
         raise RunError(
             f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Continue with the "
-            "stored files: 'errormotion run --resume' without the campaign. Or start again: without --resume."
+            "stored files: 'errormotion run --resume' without the campaign. Or start a new run, without --resume."
         )
     message = f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished."
     raise RunError("\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]))
 
 
-def _as_it_is(runs: Path, run_id: str, known: Sequence[RunFolder], tests: Sequence[str]) -> dict[str, RunFolder]:
-    """Return the run folders of a campaign by their tests, read again: another process may have continued it meanwhile.
+def _folders_by_test(runs: Path, run_id: str, known: Sequence[RunFolder], tests: Sequence[str]) -> dict[str, RunFolder]:
+    """Return the run folders of a campaign by test, read again, since another process may have continued it.
 
     Raises
     ------
     RunError
-        It is not clear which test a run folder is of: this test would be measured again.
+        The test of a run folder is unclear, and would be measured again.
     """
     by_path = {folder.path: folder for folder in known}
     found: dict[str, RunFolder] = {}
@@ -227,7 +227,7 @@ def _as_it_is(runs: Path, run_id: str, known: Sequence[RunFolder], tests: Sequen
         found.setdefault(test, folder)
     if unclear:
         what = (
-            "The campaign cannot be continued: it is not clear which of its tests were measured. Restore run.json from "
+            "The campaign cannot be continued, because it is unclear which tests were measured. Restore run.json from "
             f"a copy, or move the folder out of {runs} to measure its test again:"
         )
         raise RunError("\n  - ".join([what, *unclear]))
@@ -277,7 +277,9 @@ class _Session:
                     folder = folders[test.name] = self._new_folder(test)
                 self.records(folder.path)
                 self.progress.test(test.name, folder.path, number, len(self.campaign.tests))
-                opened.enter_context(folder.locked())  # to the end: nobody continues the campaign between two tests
+                opened.enter_context(
+                    folder.locked()
+                )  # until the end: no other process continues the campaign between two tests
                 with journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
                     self._test(folder, test, folders)
         return [folders[test.name] for test in self.campaign.tests]
@@ -291,45 +293,25 @@ class _Session:
         plan = self.campaign
         info = test.method.info
         settings = provenance.plain(test.settings.model_dump(mode="json"))
-        folder = RunFolder.create(
-            self.runs,
-            test.name,
-            self.run_id,
-            {
-                "status": "running",
-                "reason": "",
-                "acquired": False,
-                "campaign": {
-                    "name": plan.name,
-                    "file": plan.source.name,
-                    "folder": str(plan.folder),
-                    "sha256": plan.sha256,
-                    "tests": [entry.name for entry in plan.tests],
-                    "text": plan.text,
-                },
-                "bench": {
-                    "name": plan.bench.name,
-                    "machine": plan.bench.machine,
-                    "file": plan.bench.source.name,
-                    "text": plan.bench.text,
-                },
-                "method": {"id": info.id, "version": info.version, "status": info.status},
-                "settings": settings,
-                "settings_hash": settings_hash(settings, info.id, info.version),
-                "tolerances": plan.tolerances.model_dump(mode="json") if plan.tolerances else None,
-                "inputs": {},
-                "operator": plan.operator,
-                "head": head.stated(plan.bench.laboratory, plan.report, plan.bench.calibrated_until, test.certificates),
-                "instruments": [answer.record() for answer in self.bench.chosen(test.instruments).answers],
-                "software": provenance.make({}, None, None)["software"],
-                "samples": {},
-                "raw": "raw.zarr",
-                "errors": None,
-                "report": None,
-                "log": "log.jsonl",
-                "steps": [],
+        data = new_entries(plan.bench) | {
+            "campaign": {
+                "name": plan.name,
+                "file": plan.source.name,
+                "folder": str(plan.folder),
+                "sha256": plan.sha256,
+                "tests": [entry.name for entry in plan.tests],
+                "text": plan.text,
             },
-        )
+            "method": {"id": info.id, "version": info.version, "status": info.status},
+            "settings": settings,
+            "settings_hash": settings_hash(settings, info.id, info.version),
+            "tolerances": plan.tolerances.model_dump(mode="json") if plan.tolerances else None,
+            "inputs": {},
+            "operator": plan.operator,
+            "head": head.stated(plan.bench.laboratory, plan.report, plan.bench.calibrated_until, test.certificates),
+            "instruments": [answer.record() for answer in self.bench.chosen(test.instruments).answers],
+        }
+        folder = RunFolder.create(self.runs, test.name, self.run_id, data)
         if plan.bench.laboratory is not None and plan.bench.laboratory.logo:
             logo.copy(plan.bench.source.parent / plan.bench.laboratory.logo, folder.path)
         return folder
@@ -375,7 +357,7 @@ class _Session:
         if test.certificates:
             attrs[ATTRIBUTE] = json.dumps(dict(test.certificates))
         own = self._set_clock(folder, test)
-        bench.hold("" if hasattr(method, "motions") else NO_MOTIONS.format(method.info.id))
+        bench.set_limits("" if hasattr(method, "motions") else NO_MOTIONS.format(method.info.id))
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         follow = getattr(method, "follow", None) if self.progress.shown else None
@@ -400,7 +382,7 @@ class _Session:
                 "dropped": recorder.attrs.get("dropped", 0),
                 "invalid": json.loads(recorder.attrs.get("invalid", "{}")),
             }
-            with suppress(OSError):  # of a disk that takes no more changes: the recorder states the cause
+            with suppress(OSError):  # of a disk that cannot be written; the recorder states the cause
                 if recorder.committed == 0 and folder.raw.exists():  # created, but without samples
                     shutil.rmtree(folder.raw)
                 folder.give_reserve()
@@ -439,15 +421,15 @@ class _Session:
         log.info("identified", extra={"data": {"errors": path}})
 
     def _evaluate(self, folder: RunFolder, test: TestPlan) -> None:
-        """Evaluate the result by the Monte Carlo method; a failure is only logged, as that of a report."""
-        from errormotion.montecarlo.beside import evaluate_beside, file_beside
+        """Evaluate the result by the Monte Carlo method; a failure is only logged, as for the report."""
+        from errormotion.montecarlo.saving import evaluate_and_save, evaluation_file
 
         file = folder.errors
-        if file is None or file_beside(file).exists():
+        if file is None or evaluation_file(file).exists():
             return
         trials = None if test.monte_carlo == "auto" else test.monte_carlo
         try:
-            evaluate_beside(
+            evaluate_and_save(
                 folder.raw, test.method.info.id, test.settings, datasets.load(file), file, trials=trials,
                 progress=self.progress,
             )  # fmt: skip
@@ -473,7 +455,7 @@ class _Session:
 
 
 class _Chunks:
-    """The datasets of the method, with a ``close`` for any kind of iterator."""
+    """The datasets that the method yields, with a ``close`` for any kind of iterator."""
 
     def __init__(self, chunks: Iterator[xr.Dataset]) -> None:
         self._chunks = chunks
@@ -502,11 +484,11 @@ def _failures(folder: RunFolder) -> Iterator[None]:
         reason = cause_of(error)
         log.exception("failed")
         if isinstance(error, FolderGoneError) or not folder.present:
-            # Nothing is written where it was: this would look like a run.
+            # Nothing is written to the former path: the new folder would look like a run.
             raise FolderGoneError(
                 f"Test '{folder.data['test']}' ended: its folder {folder.path} is gone. It was moved or deleted "
-                f"during the run. {_kept(folder)} in it. If it was moved, continue where it is now, with 'errormotion "
-                "run --resume --runs' and the folder that contains it."
+                f"during the run. {_kept(folder)} in it. If it was moved, continue with 'errormotion run --resume "
+                "--runs' and the folder that contains it now."
             ) from error
         marked = f"disk full: {reason}" if isinstance(error, DiskFullError) else reason
         folder.step("stop", "failed", reason=marked)
@@ -538,7 +520,7 @@ def _continuation(folder: RunFolder) -> str:
 
 @contextmanager
 def _in_order() -> Iterator[None]:
-    """Let the first Ctrl-C or request to end stop the measurement; ignore more until the last samples are written."""
+    """Stop the measurement at the first Ctrl-C or SIGTERM, and ignore others until the last samples are written."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -559,12 +541,12 @@ def _in_order() -> Iterator[None]:
 
 
 def results_of(errors: xr.Dataset) -> list[dict[str, Any]] | None:
-    """Return the figures of merit for ``run.json``, SI, at most MOST_RESULTS; None if the method fails to state them.
+    """Return the figures of merit for ``run.json``, SI, at most MAX_RESULTS; None if the method fails to state them.
 
     A failure is only logged, since the measurement is valid without them.
     """
     try:
-        return [stored(figure) for figure in figures_of(errors)[:MOST_RESULTS]]
+        return [stored(figure) for figure in figures_of(errors)[:MAX_RESULTS]]
     except Exception:
         log.exception("the figures of merit failed")
         return None

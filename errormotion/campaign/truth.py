@@ -1,4 +1,4 @@
-"""The truth behind a run on a virtual machine, as an error dataset that is compared like any other."""
+"""The true errors during a run on a virtual machine, as an error dataset."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ if TYPE_CHECKING:
     from errormotion.twin import VirtualMachine
 
 EXACTNESS = 1e-10
-"""Standard uncertainty of a truth, m and rad: readings of the virtual machine follow from it to 0.1 nm."""
+"""Standard uncertainty of true errors, m and rad: readings of the virtual machine agree with them within 0.1 nm."""
 
 
 def truth_of(folder: RunFolder) -> xr.Dataset:
-    """Return the true errors where a run states errors, with standard uncertainties of 0.1 nm and 0.1 nrad.
+    """Return the true errors at the places of the result of a run, with standard uncertainties of 0.1 nm and 0.1 nrad.
 
-    The run is one of a campaign with a timeline, which states where the clock of the machine was.
+    The campaign of the run must have a timeline, which states the clock of the machine.
 
     Raises
     ------
     RunError
-        No timeline, no virtual machine or several, no errors, or a method that states no truth.
+        The run has no timeline, no or several virtual machines, no errors, or its method does not state the truth.
     """
     machine, clock = machine_of(folder), folder.data["clock"]
     if folder.errors is None:
-        raise RunError(f"{folder.path}: has no errors yet; identify its raw data first")
+        raise RunError(f"{folder.path}: the run has no errors yet; identify its raw data first")
     method = plugins.get("methods", str(folder.data["method"]["id"]))
     truth = getattr(method, "truth", None)
     with datasets.load(folder.errors) as errors:
         if truth is None or errors.attrs["component"] == "beam":
-            raise RunError(f"{folder.path}: no truth is stated for these errors, of {errors.attrs['component']}")
+            raise RunError(f"{folder.path}: the method does not state the true errors of {errors.attrs['component']}")
         start = str(errors.attrs.get("start") or later(clock["start"], clock["time"]))
         found: xr.Dataset = truth(machine, errors, between(clock["start"], start))
         found = found.assign_attrs(
@@ -49,25 +49,24 @@ def truth_of(folder: RunFolder) -> xr.Dataset:
     try:
         datasets.validate(found)
     except DatasetError as error:
-        raise RunError(f"{folder.path}: the truth is no error dataset: {error}") from error
+        raise RunError(f"{folder.path}: the true errors are no valid error dataset: {error}") from error
     return found
 
 
 def machine_of(folder: RunFolder) -> VirtualMachine:
-    """Return the virtual machine of a run, under the schedule of its timeline; its clock is in ``folder.data``.
+    """Return the virtual machine of a run, with the schedule of its timeline; its clock is in ``folder.data``.
 
     Raises
     ------
     RunError
-        No timeline, no virtual machine or several.
+        The run has no timeline, or no or several virtual machines.
     """
     from errormotion.twin import Event, VirtualMachine
 
     clock, bench = folder.data.get("clock"), folder.data["bench"]
     if not isinstance(clock, dict):
         raise RunError(
-            f"{folder.path}: expected a run of a campaign with a table [timeline] on a virtual machine, which states "
-            "the time of its clock; found none"
+            f"{folder.path}: expected a run of a campaign on a virtual machine with a table [timeline]; found none"
         )
     plan = parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})")
     addresses = [parse_address(each.address) for each in plan.instruments if each.address]

@@ -1,4 +1,4 @@
-"""The command line as a whole: the groups of commands, and what belongs to none of them.
+"""The command line: the groups of commands, and the commands that belong to no group.
 
 Modules called ``interface`` state the arguments of commands; each command imports what it needs when it is called, so
 that ``--help`` is fast.
@@ -12,10 +12,11 @@ from typing import Annotated
 
 import typer
 
+from errormotion.cli import options
 from errormotion.cli.demo import COMPENSATED, CONTROLLERS
-from errormotion.cli.guard import ERROR, USAGE, guarded
+from errormotion.cli.guard import ERROR, USAGE
 from errormotion.cli.output import show, show_json, table
-from errormotion.cli.root import Json, app, bench_app, compensate_app, model_app, plugins_app
+from errormotion.cli.root import app, bench_app, compensate_app, model_app, plugins_app
 from errormotion.cli.wording import share
 
 
@@ -38,7 +39,6 @@ def root(
 
 
 @app.command()
-@guarded
 def demo(
     runs: Annotated[Path, typer.Option(help="Folder for the run folders.")] = Path("runs"),
     controller: Annotated[
@@ -46,9 +46,9 @@ def demo(
         typer.Option(help=f"Controller of the machine: {', '.join(CONTROLLERS)}. All but the first must be installed."),
     ] = next(iter(CONTROLLERS)),
     compensate: Annotated[
-        bool, typer.Option("--compensate", help="Fit a model to a warm-up, and compensate further ones.")
+        bool, typer.Option("--compensate", help="Fit a thermal model to one warm-up, and compensate further warm-ups.")
     ] = False,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
     """Measure a virtual machine and compare the result with the truth."""
     shown = COMPENSATED if compensate else CONTROLLERS
@@ -65,35 +65,35 @@ for _group in GROUPS:
 
 
 @app.command()
-@guarded
 def dashboard(
     runs: Annotated[Path, typer.Argument(help="The folder of runs.")] = Path("runs"),
-    bench: Annotated[Path | None, typer.Option(help="A bench file: its thermometers and controller are read.")] = None,
-    interval: Annotated[str, typer.Option(help="Of the readings of the bench, such as '1 s'.")] = "1 s",
+    bench: Annotated[Path | None, typer.Option(help="A bench file; its thermometers and controller are read.")] = None,
+    interval: Annotated[str, typer.Option(help="Interval between readings of the bench, such as '1 s'.")] = "1 s",
     host: Annotated[
-        str, typer.Option(help="Address to listen on. Others than 127.0.0.1 are open to the network: with a token.")
+        str,
+        typer.Option(help="Address to listen on. Any other than 127.0.0.1 is open to the network and needs a token."),
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to listen on.")] = 5006,
     name: Annotated[
-        list[str] | None, typer.Option(help="A further name by which browsers reach this computer; repeatable.")
+        list[str] | None,
+        typer.Option(metavar="HOST", help="Another host name by which browsers reach this computer; may be repeated."),
     ] = None,
-    cert: Annotated[Path | None, typer.Option(help="Certificate (PEM) of an encrypted connection.")] = None,
-    key: Annotated[Path | None, typer.Option(help="Key (PEM) of the certificate.")] = None,
+    cert: Annotated[Path | None, typer.Option(help="Certificate (PEM) for an encrypted connection.")] = None,
+    key: Annotated[Path | None, typer.Option(help="Private key (PEM) of the certificate.")] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser of this computer.")] = True,
     campaigns: Annotated[Path, typer.Option(help="The folder of the campaign files.")] = Path(),
     allow_control: Annotated[
-        bool, typer.Option("--allow-control", help="Let the pages start and stop what moves or changes a machine.")
+        bool, typer.Option("--allow-control", help="Allow the pages to start and stop campaigns and compensations.")
     ] = False,
 ) -> None:
-    """Show runs, and the instruments of a bench, in a browser, until Ctrl-C."""
+    """Show runs and the instruments of a bench in a browser, until Ctrl-C."""
     from errormotion.cli.commands import dashboard as command
 
     command.run(runs, bench, interval, host, port, name or [], cert, key, browser, campaigns, allow_control)
 
 
 @app.command()
-@guarded
-def doctor(json_: Json = False) -> None:
+def doctor(json_: options.Json = False) -> None:
     """Check that this computer has what errormotion needs."""
     from errormotion.cli.commands import doctor as command
 

@@ -1,4 +1,4 @@
-"""Curves in the terminal: a line of blocks for each value that a running measurement reports."""
+"""Curves in the terminal: a line of block characters for each value that a running measurement reports."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from rich.text import Text
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 
-MOST_POINTS = 240
-"""Points of a curve that are kept; when they are reached, neighbours are joined."""
+MAX_POINTS = 240
+"""Largest number of points of a curve; a full curve is halved by averaging neighbours."""
 
-MOST_CURVES = 8
+MAX_CURVES = 8
 
 _VALUES = re.compile(r"\b([A-Za-z]\w{0,11}) ([+-]\d+(?:\.\d+)?)(?![\w.])")
 _UNIT = re.compile(r"\s*([A-Za-z/]+)?(?:,|$)")
 
 
 def bars(values: list[float], least: float = 0.0) -> str:
-    """Return a line of blocks from the lowest to the highest value, or to ``least`` above the lowest.
+    """Return values as block characters, scaled from the lowest to the highest value, or at least over ``least``.
 
     Unknown values are blank.
     """
@@ -33,23 +33,23 @@ def bars(values: list[float], least: float = 0.0) -> str:
 
 
 class Curves:
-    """The course of the values in notes such as ``EX +1.2 EY -0.3 um, EA +4.0 arcsec``, from the start of a stage.
+    """Curves of the values in notes such as ``EX +1.2 EY -0.3 um, EA +4.0 arcsec``, from the start of a stage.
 
-    Memory and width are bounded: a curve that is full joins neighbours, and takes every second note from then on.
+    Memory and width are bounded: a full curve averages neighbouring points, and then twice as many notes per point.
     """
 
     def __init__(self) -> None:
-        self._courses: dict[str, _Course] = {}
+        self._curves: dict[str, _Curve] = {}
         self._units: dict[str, str] = {}
 
-    def take(self, note: str) -> None:
+    def add(self, note: str) -> None:
         """Add the values of a note: signed numbers, each after its name."""
         waiting = []
         for found in _VALUES.finditer(note):
             name, value = found[1], float(found[2])
-            if name not in self._courses and len(self._courses) >= MOST_CURVES:
+            if name not in self._curves and len(self._curves) >= MAX_CURVES:
                 continue
-            self._courses.setdefault(name, _Course()).add(value)
+            self._curves.setdefault(name, _Curve()).add(value)
             waiting.append(name)
             unit = _UNIT.match(note, found.end())
             if unit is not None:  # one unit for all values since the last
@@ -58,25 +58,25 @@ class Curves:
 
     @property
     def shown(self) -> bool:
-        """Whether there is a curve."""
-        return bool(self._courses)
+        """Whether there is at least one curve."""
+        return bool(self._curves)
 
     def lines(self, width: int) -> Iterator[Text]:
-        """Yield a line for each curve: name, blocks, last value, and the range."""
-        for name, course in self._courses.items():
-            shown = course.points[-MOST_POINTS:]
+        """Yield a line for each curve: name, block characters, last value, and range."""
+        for name, curve in self._curves.items():
+            shown = curve.points[-MAX_POINTS:]
             room = max(width - len(name) - 44, 10)
             step = -(-len(shown) // room)
             thinned = [sum(part) / len(part) for part in (shown[k : k + step] for k in range(0, len(shown), step))]
-            low, high = course.extremes
-            last = f"{course.last:+.4g} {self._units.get(name, '')}".rstrip()
+            low, high = curve.extremes
+            last = f"{curve.last:+.4g} {self._units.get(name, '')}".rstrip()
             yield Text(
                 f"  {name}  {bars(thinned)}  {last}  ({low:+.4g} to {high:+.4g})", no_wrap=True, overflow="ellipsis"
             )
 
 
-class _Course:
-    """One curve: points of equal numbers of notes."""
+class _Curve:
+    """One curve; each point is the mean of the same number of notes."""
 
     def __init__(self) -> None:
         self.points: list[float] = []
@@ -93,6 +93,6 @@ class _Course:
             return
         self.points.append(self._sum / self._count)
         self._sum, self._count = 0.0, 0
-        if len(self.points) >= MOST_POINTS:
+        if len(self.points) >= MAX_POINTS:
             self.points = [(a + b) / 2 for a, b in zip(self.points[::2], self.points[1::2], strict=True)]
             self._joined *= 2

@@ -1,4 +1,4 @@
-"""Errors of commands: one message for a person, the traceback in a log, an exit code."""
+"""Errors of commands: a message for the user, the traceback in a log file, an exit code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from errormotion.errors import ErrormotionError
 
 OK, ERROR, USAGE, INVALID, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 70, 130
 NONCONFORMING, UNDECIDED = 4, 5
-"""Decisions on tolerances; see ``commands.tolerances``."""
+"""Exit codes of decisions on tolerances; see ``errormotion.cli.tolerances``."""
 
 P = ParamSpec("P")
 
@@ -85,7 +85,7 @@ class _LogHandler(RotatingFileHandler):
 
 @contextmanager
 def _log() -> Iterator[None]:
-    """Send warnings and errors to the log file, 1 MB and one older file at most, and not to the terminal."""
+    """Write warnings and errors to the log file, not to the terminal; 1 MB at most, and one older file."""
     path = log_file()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,7 @@ def _log() -> Iterator[None]:
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Treat a request to end (SIGTERM) like Ctrl-C."""
+    """Handle SIGTERM like Ctrl-C."""
     before = signal.signal(signal.SIGTERM, _stop)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Output of commands: text in columns for a person, JSON for a program."""
+"""Output of commands: text and tables for users, JSON for programs."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from typing import Any
 
 import typer
 
-LEAST_WIDTH = 12
-"""Characters; a column of text is not made narrower."""
+MIN_WIDTH = 12
+"""Smallest width of a column of text, characters."""
 
 
 NOTICE_DELAY = 1.0
-"""Time after which a line states what takes so long, s."""
+"""Duration after which a line states what the command is doing, s."""
 
 
 def show(text: str = "") -> None:
-    """Print for a person."""
+    """Print a text."""
     typer.echo(text)
 
 
@@ -35,7 +35,7 @@ def show_json(value: Any) -> None:
 
 @contextmanager
 def working(what: str) -> Iterator[None]:
-    """Print on a terminal, after `NOTICE_DELAY`, what takes its time."""
+    """Print on a terminal what the command is doing, if the block takes longer than `NOTICE_DELAY`."""
     timer = threading.Timer(NOTICE_DELAY, lambda: typer.echo(f"{what} ...", err=True))
     timer.daemon = True
     if sys.stderr.isatty():
@@ -47,9 +47,9 @@ def working(what: str) -> Iterator[None]:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return rows in columns under a head, numbers to the right.
+    """Return a table with aligned columns; numbers are aligned to the right.
 
-    On a terminal the table keeps to its width: the widest columns of text are wrapped. Where that is not enough, each
+    On a terminal the widest columns of text are wrapped to fit its width. Where that is not enough, each
     row becomes a block with a line for each column.
     """
     cells = [[str(cell) for cell in row] for row in (head, *rows)]
@@ -76,10 +76,10 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _fit(widths: Sequence[int], right: Sequence[bool], room: int) -> list[int] | None:
-    """Return widths that fit into the room, the widest columns of text reduced first; None where there are none."""
+    """Return column widths that fit into the room, the widest columns of text reduced first; None where none fit."""
     found = list(widths)
     while sum(found) + 2 * (len(found) - 1) > room:
-        wide = [k for k, width in enumerate(found) if not right[k] and width > LEAST_WIDTH]
+        wide = [k for k, width in enumerate(found) if not right[k] and width > MIN_WIDTH]
         if not wide:
             return None
         found[max(wide, key=lambda k: found[k])] -= 1
@@ -87,14 +87,14 @@ def _fit(widths: Sequence[int], right: Sequence[bool], room: int) -> list[int] |
 
 
 def _blocks(cells: Sequence[Sequence[str]], room: int) -> str:
-    """Return the rows below each other, a line for each column that is not empty."""
+    """Return each row as a block, with a line for each cell that is not empty."""
     head, *rows = cells
     label = max(map(len, head)) + 2
     blocks = []
     for row in rows:
         lines = []
         for name, cell in zip(head, row, strict=True):
-            pieces = _wrap(cell, max(room - label, LEAST_WIDTH)) if cell.strip() else []
+            pieces = _wrap(cell, max(room - label, MIN_WIDTH)) if cell.strip() else []
             lines += [f"{name if n == 0 else '':<{label}}{piece}" for n, piece in enumerate(pieces)]
         blocks.append("\n".join(lines))
     return "\n\n".join(blocks)

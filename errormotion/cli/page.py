@@ -1,4 +1,4 @@
-"""The page that a command writes, and what is written beside it."""
+"""The files that a command writes: a page, its further forms beside it, and datasets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Page:
-    """A page: its file, and its form."""
+    """A page: its file and its form."""
 
     file: Path
     form: Form
@@ -26,20 +26,48 @@ class Page:
 
 
 def page_of(file: Path | None, pdf: bool, paper: str | None, language: str | None) -> Page | None:
-    """Return the page that the options of a command ask for; None where none is asked for.
+    """Return the page that the options of a command request, or None.
 
     Raises
     ------
     DatasetError
-        The name is not that of a page, or the form of a page is given without the page.
+        The name does not end in .html, or a form of the page is requested without a page.
     """
     if file is None:
         given = [name for name, value in (("--pdf", pdf), ("--paper", paper), ("--language", language)) if value]
         if given:
-            raise DatasetError(f"{', '.join(given)}: form of a page, and no page is asked for; add --report PAGE.html")
+            raise DatasetError(f"{', '.join(given)}: allowed with a page only; add --report PAGE.html")
         return None
     if file.suffix != ".html":
-        raise DatasetError(f"{file}: expected a name that ends in .html (a page)")
+        raise DatasetError(f"{file}: expected a name that ends in .html")
     from errormotion.report import Form
 
     return Page(file, Form(language or "", paper or "", ("pdf",) if pdf else ()))
+
+
+def new_files(page: Page | None, *others: Path | None) -> list[Path]:
+    """Return the files that a command writes: those that are given, and those of its page.
+
+    Raises
+    ------
+    DatasetError
+        One of them exists already.
+    """
+    files = [*(each for each in others if each is not None), *(page.files if page is not None else ())]
+    for path in files:
+        if path.exists():
+            raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
+    return files
+
+
+def new_dataset(out: Path) -> None:
+    """Check the name of a dataset that a command writes.
+
+    Raises
+    ------
+    DatasetError
+        The name does not end in .nc, or the file exists already.
+    """
+    if out.suffix != ".nc":
+        raise DatasetError(f"{out}: expected a name that ends in .nc (NetCDF-4 file)")
+    new_files(None, out)

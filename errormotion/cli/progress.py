@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from rich.console import Console, RenderableType
@@ -36,14 +35,14 @@ class _Display(Progress):
 
 
 class Bars:
-    """Progress of a campaign as bars on stderr; where stderr is no terminal, only what will move is printed.
+    """Progress of a campaign as bars on stderr; where stderr is no terminal, only announcements of motions are printed.
 
     Parameters
     ----------
     quiet : bool
-        No bars.
+        Show no bars.
     announcing : bool
-        Print what will move, also without bars.
+        Print the motions of each test before it starts, also without bars.
     """
 
     def __init__(self, quiet: bool = False, *, announcing: bool = False) -> None:
@@ -70,14 +69,12 @@ class Bars:
         self._progress.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._finish(error is None)
         self._progress.stop()
 
     def announce(self, text: str) -> None:
-        """Print what a test will do with the machine, on one line."""
+        """Print on one line how a test will move the machine."""
         if self._announcing:
             self._console.print(text, markup=False, soft_wrap=True)
 
@@ -95,7 +92,7 @@ class Bars:
         self._task = self._progress.add_task(self._name + name, total=total, note="")
 
     def advance(self, done: float) -> None:
-        """Show how much of the stage is done."""
+        """Show the completed part of the stage."""
         if self._task is not None:
             self._progress.update(self._task, completed=done)
 
@@ -105,8 +102,8 @@ class Bars:
         return self._shown
 
     def note(self, text: str) -> None:
-        """Show an intermediate result behind the bar, and the course of its values as curves below."""
-        self._curves.take(text)
+        """Show an intermediate result beside the bar, and its values as curves below."""
+        self._curves.add(text)
         if self._task is not None:
             self._progress.update(self._task, note=text)
 

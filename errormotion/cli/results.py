@@ -17,33 +17,33 @@ from errormotion.errors import DatasetError, RunError
 def load(
     paths: Sequence[Path], names: Mapping[str, Path], *, every: bool = False
 ) -> tuple[dict[str, xr.Dataset], list[str]]:
-    """Return error datasets by name, and the runs that were left out, one sentence each.
+    """Return error datasets by name, and a message for each omitted run.
 
     Parameters
     ----------
     paths : sequence of Path
-        An error dataset; a run folder; or a folder of runs, which stands for the newest result of each of its tests.
+        Error datasets, run folders, or folders of runs; such a folder selects the newest result of each test.
     names : mapping of str to Path
-        Further ones, with their names.
+        Further results by name.
     every : bool
-        A folder of runs stands for all results of each of its tests.
+        Select all results of each test in a folder of runs.
 
     Raises
     ------
     DatasetError, RunError
-        Nothing there, no error dataset, a run without errors.
+        A path does not exist or is no error dataset, or a run has no errors.
     """
     found: dict[str, xr.Dataset] = {}
-    left_out: list[str] = []
+    omitted: list[str] = []
     for path in paths:
-        for name, file in _files(path, left_out, every):
+        for name, file in _files(path, omitted, every):
             _add(found, name, file)
     for name, path in names.items():
-        files = _files(path, left_out)
+        files = _files(path, omitted)
         if len(files) != 1:
             raise DatasetError(f"{path}: expected one error dataset for the name '{name}'; found {len(files)}")
         _add(found, name, files[0][1])
-    return found, left_out
+    return found, omitted
 
 
 def _add(found: dict[str, xr.Dataset], name: str, file: Path) -> None:
@@ -56,12 +56,12 @@ def _add(found: dict[str, xr.Dataset], name: str, file: Path) -> None:
         datasets.validate(found[own])
 
 
-def _files(path: Path, left_out: list[str], every: bool = False) -> list[tuple[str, Path]]:
-    """Return names and files of the error datasets that a path stands for."""
+def _files(path: Path, omitted: list[str], every: bool = False) -> list[tuple[str, Path]]:
+    """Return names and files of the error datasets of a file, a run folder or a folder of runs."""
     if path.is_file():
         return [(path.stem, path)]
     if not path.is_dir():
-        raise DatasetError(f"{path}: there is no such file or folder")
+        raise DatasetError(f"{path}: no such file or folder")
     if not is_runs_folder(path):
         folder = RunFolder.open(path)
         return [(str(folder.data["test"]), _errors(folder))]
@@ -72,17 +72,17 @@ def _files(path: Path, left_out: list[str], every: bool = False) -> list[tuple[s
             folder = RunFolder.open(file.parent)
             test, created, errors = str(folder.data["test"]), str(folder.data["created"]), _errors(folder)
         except (RunError, KeyError) as error:
-            left_out.append(f"left out: {error}")
+            omitted.append(f"omitted: {error}")
             continue
         everything.append((test, errors))
         if test not in newest or created >= newest[test][0]:
             newest[test] = (created, errors)
     if not newest:
-        raise DatasetError(f"{path}: none of its runs has errors; identify them first")
+        raise DatasetError(f"{path}: none of the runs has errors; identify them first")
     return everything if every else [(test, errors) for test, (_, errors) in newest.items()]
 
 
 def _errors(folder: RunFolder) -> Path:
     if folder.errors is None or not folder.errors.is_file():
-        raise RunError(f"{folder.path}: has no errors yet; identify its raw data first")
+        raise RunError(f"{folder.path}: the run has no errors yet; identify its raw data first")
     return folder.errors

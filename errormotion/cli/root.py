@@ -1,15 +1,26 @@
-"""The application, its groups of commands, and the options that several commands share."""
+"""The application and its groups of commands."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import typer
 
-from errormotion.cli.guard import USAGE
+from errormotion.cli.guard import guarded
 
-app = typer.Typer(
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+class _Group(typer.Typer):
+    """A group whose commands end with a message and an exit code after an exception."""
+
+    def command(self, *args: Any, **options: Any) -> Callable[[Command], Command]:
+        register: Any = super().command(*args, **options)
+        return lambda function: register(guarded(function))
+
+
+app = _Group(
     name="errormotion",
     help="Measure the error motions of machine tools.",
     no_args_is_help=True,
@@ -19,8 +30,8 @@ app = typer.Typer(
 )
 
 
-def _group(name: str, text: str) -> typer.Typer:
-    group = typer.Typer(no_args_is_help=True, help=text, rich_markup_mode=None)
+def _group(name: str, text: str) -> _Group:
+    group = _Group(no_args_is_help=True, help=text, rich_markup_mode=None)
     app.add_typer(group, name=name)
     return group
 
@@ -30,25 +41,3 @@ bench_app = _group("bench", "Check a bench file, or the instruments of a bench."
 model_app = _group("model", "Thermal models: errors predicted from temperatures.")
 compensate_app = _group("compensate", "Compensate measured errors.")
 background_app = _group("background", "Campaigns that 'errormotion run --detach' or the dashboard has started.")
-
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
-Runs = Annotated[
-    Path | None, typer.Option("--runs", help="Folder for run folders; default: the folder that the campaign names.")
-]
-Tolerances = Annotated[
-    Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the campaign.")
-]
-Paper = Annotated[Literal["A4", "Letter"] | None, typer.Option(help="Paper; default: A4.")]
-Language = Annotated[Literal["en", "de"] | None, typer.Option(help="Language; default: en.")]
-Pdf = Annotated[bool, typer.Option("--pdf", help="Print the page as PDF beside it.")]
-Limits = Annotated[Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on each result.")]
-
-
-def millimetres(option: str, text: str) -> tuple[float, float, float]:
-    """Return the point that an option states in mm, m."""
-    try:
-        x, y, z = (float(part) / 1e3 for part in text.split(","))
-    except ValueError:
-        typer.echo(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", err=True)
-        raise typer.Exit(USAGE) from None
-    return x, y, z

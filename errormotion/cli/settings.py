@@ -19,14 +19,14 @@ def read_settings(model: Any, file: Path | None, assignments: Sequence[str]) -> 
     model : type of PluginSettings
         The settings class.
     file : Path, optional
-        A TOML file with the settings at its top.
+        A TOML file with the settings at its top level.
     assignments : sequence of str
         ``key=value``, dotted keys for tables; the value in TOML, else text.
 
     Raises
     ------
     MethodError
-        All mistakes at once.
+        The settings are invalid; the message states all mistakes.
     """
     data = tomlfile.read_toml(file, error=MethodError) if file else {}
     for assignment in assignments:
@@ -34,12 +34,12 @@ def read_settings(model: Any, file: Path | None, assignments: Sequence[str]) -> 
         if not sign or not key.strip():
             raise MethodError(f"--set {assignment}: expected key=value, such as --set average='0.5 s'")
         *tables, name = key.strip().split(".")
-        place = data
+        target = data
         for table in tables:
-            place = place.setdefault(table, {})
-            if not isinstance(place, dict):
+            target = target.setdefault(table, {})
+            if not isinstance(target, dict):
                 raise MethodError(f"--set {assignment}: '{table}' is a value, not a table")
-        place[name] = value_of(text.strip())
+        target[name] = value_of(text.strip())
     settings, mistakes = tomlfile.check(data, model)
     if settings is None:
         raise MethodError(tomlfile.report(file or "--set", mistakes))

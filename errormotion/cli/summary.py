@@ -13,15 +13,15 @@ from errormotion.cli.output import table
 from errormotion.plugins import FigureOfMerit
 
 FIELD_UNITS = {"m": (1e6, "um"), "rad": (648000 / np.pi, "arcsec")}
-"""Factor and name of the unit in which a quantity is printed, by its SI unit."""
-LONG = 1e-3
-"""Lengths from here on are printed in mm, m."""
+"""Factor and name of the printed unit, by SI unit."""
+MM_FROM = 1e-3
+"""Smallest length that is printed in mm, m."""
 
 
 def as_printed(figure: FigureOfMerit) -> dict[str, Any]:
-    """Return a figure in the field's unit: name, value, expanded_uncertainty (k = 2), unit, limit."""
+    """Return a figure in its printed unit: name, value, expanded_uncertainty (k = 2), unit, limit."""
     factor, unit = FIELD_UNITS.get(figure.unit, (1.0, figure.unit))
-    if figure.unit == "m" and abs(figure.value) >= LONG:
+    if figure.unit == "m" and abs(figure.value) >= MM_FROM:
         factor, unit = 1e3, "mm"
     return {
         "name": figure.name,
@@ -33,14 +33,14 @@ def as_printed(figure: FigureOfMerit) -> dict[str, Any]:
 
 
 def digits_of(figure: dict[str, Any]) -> tuple[str, str]:
-    """Return value and expanded uncertainty of a printed figure, to the digits of the uncertainty."""
+    """Return value and expanded uncertainty of a printed figure, rounded by the uncertainty."""
     u = figure["expanded_uncertainty"]
     digits = max(0, 1 - math.floor(math.log10(u))) if math.isfinite(u) and u > 0 else 2
     return f"{figure['value']:.{digits}f}", f"{u:.{digits}f}" if math.isfinite(u) else "unknown"
 
 
 def figure_table(figures: Sequence[dict[str, Any]]) -> str:
-    """Return printed figures as a table, each value to the digits of its uncertainty."""
+    """Return printed figures as a table; each value is rounded by its uncertainty."""
     rows = []
     for figure in figures:
         value, stated = digits_of(figure)

@@ -1,4 +1,4 @@
-"""Decisions on tolerances, as the command line shows them, and the exit code that a script acts on."""
+"""Decisions on tolerances in the output of commands, and their exit codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all commands have in common on the command line: ``-o`` for ``--out``, and words for what is expected."""
+"""What all commands share: ``-o`` for ``--out``, and placeholders for the values of options."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand
 from typer.models import ArgumentInfo, OptionInfo
 
-_WORDS = {
+_PLACEHOLDERS = {
     "axis": "AXIS",
     "chain": "CHAIN",
     "component": "AXIS",
@@ -38,17 +38,17 @@ _WORDS = {
     "unit": "UNIT",
     "machine_unit": "UNIT",
 }
-"""What an option expects, by its name."""
+"""Placeholder of an option, by its name."""
 
 _FOLDER = re.compile(r"(With --dry-run: )?((a|the|run) )?folder", re.IGNORECASE)
 _ARGUMENTS = {"folders": "FOLDER", "results": "RESULT", "plugin": "ID"}
 
 _POINTS = ("at", "functional_point", "gauge_point", "point", "gauge", "start")
-"""Options that expect three coordinates, mm."""
+"""Options whose value is three coordinates, mm."""
 
 
 def share(*apps: typer.Typer) -> None:
-    """Give all commands of these applications ``-o`` beside ``--out``, and words for what they expect."""
+    """Add ``-o`` beside ``--out``, and placeholders, to all commands of these applications."""
     for app in apps:
         for command in app.registered_commands:
             command.cls = _Command
@@ -57,7 +57,7 @@ def share(*apps: typer.Typer) -> None:
 
 
 class _Command(TyperCommand):
-    """A command whose arguments are shown by their words alone, without a type of Python."""
+    """A command whose help shows only the placeholders of arguments, not their Python types."""
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
@@ -81,15 +81,16 @@ def _adapt(callback: Any) -> None:
                 if name == "out" and "-o" not in (note.param_decls or ()):
                     note.param_decls = ("--out", "-o")
                 kinds = {kind, *get_args(kind)}
+                kinds |= {each for outer in kinds for each in get_args(outer)}
                 if note.metavar is None and bool not in kinds:
-                    note.metavar = _word(name.rstrip("_"), kinds, note.help or "")
+                    note.metavar = _placeholder(name.rstrip("_"), kinds, note.help or "")
             elif isinstance(note, ArgumentInfo) and note.metavar is None and get_origin(kind) is not Literal:
                 note.metavar = _ARGUMENTS.get(name.rstrip("_"), name.rstrip("_").upper())
-    # Evaluated, so that the words stay; the signature is that of the function inside its decorators.
+    # Evaluated, so that the placeholders are kept; the signature is that of the function inside its decorators.
     callback.__annotations__ = inspect.unwrap(callback).__annotations__ = hints
 
 
-def _word(name: str, kinds: set[Any], meaning: str) -> str | None:
+def _placeholder(name: str, kinds: set[Any], meaning: str) -> str | None:
     if any(get_origin(kind) is Literal for kind in kinds):
         return None  # the choices themselves
     if Path in kinds:
@@ -98,4 +99,4 @@ def _word(name: str, kinds: set[Any], meaning: str) -> str | None:
         return "X,Y,Z"
     if str not in kinds:
         return "N" if int in kinds else "NUMBER"
-    return _WORDS.get(name, "TEXT")
+    return _PLACEHOLDERS.get(name, "TEXT")

@@ -1,4 +1,4 @@
-"""Comparison of error datasets: do several methods agree on one machine, where not, and what explains it."""
+"""Comparison of error datasets of one machine: agreement of several methods, and causes of differences."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from errormotion.errors import DatasetError
 
 __all__ = ["compare", "explain"]
 
-SUSPICIOUS = 0.05
-"""Probability of a pair below which causes are looked for, divided by the number of pairs."""
-MOST_FOR_ALL_PAIRS = 40
-"""Number of datasets up to which every one is compared with every other: the pairs grow with its square."""
+DISAGREEMENT_P = 0.05
+"""Probability of a pair, divided by the number of pairs, below which causes are searched."""
+MAX_FOR_ALL_PAIRS = 40
+"""Largest number of datasets for which all pairs are compared; the number of pairs grows with its square."""
 
 
 def compare(
@@ -46,16 +46,16 @@ def compare(
     datasets : mapping of str to Dataset
         Name to error dataset; at least two.
     at, freedoms, since, same_start
-        As of `errormotion.compare.ground.common_ground`.
+        As for `errormotion.compare.ground.common_ground`.
     causes : bool, optional
-        Whether causes are looked for. Default: for pairs that do not agree; not for repeats (``groups``).
+        Whether causes are searched. Default: for pairs that do not agree; not for repeats (``groups``).
     against : str, optional
-        Dataset that each of the others is compared with. Default: all pairs of up to 40 datasets; of more, the first
-        dataset with each of the others. The consensus is that of all datasets.
+        Dataset with which each of the others is compared. Default: all pairs of up to 40 datasets; for more, the
+        first one with each of the others. The consensus includes all datasets.
     groups : mapping of str to str, optional
-        Group of each dataset, such as its operator (`errormotion.compare.repeats.labels`): the result then holds
-        repeatability within groups, and reproducibility. With ``same_start`` the datasets are repeats of one procedure
-        at different times: time 0 of all of them counts as one instant, whatever their start.
+        Group of each dataset, such as its operator (`errormotion.compare.repeats.labels`): the result then
+        contains repeatability within groups, and reproducibility. With ``same_start`` the datasets are repeats of one
+        procedure at different times: time 0 of all datasets is treated as one instant, even if their starts differ.
 
     Returns
     -------
@@ -65,9 +65,9 @@ def compare(
     Raises
     ------
     DatasetError
-        The datasets cannot be compared; what is missing.
+        The datasets cannot be compared; the message states what is missing.
     """
-    if groups and same_start:  # repeats on other days
+    if groups and same_start:  # repeats at different dates
         datasets = {name: ds.copy() for name, ds in datasets.items()}
         for ds in datasets.values():
             ds.attrs.pop("start", None)
@@ -76,14 +76,14 @@ def compare(
     by_name = {each.name: each for each in ground.estimates}
     found: list[list[Cause]] = []
     for each in pairs:
-        wanted = groups is None and each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
+        wanted = groups is None and each.joint.p < DISAGREEMENT_P / len(pairs) if causes is None else causes
         found.append(explain(by_name[each.a], by_name[each.b], datasets, ground) if wanted else [])
     spread = repeats(ground.estimates, [groups[each.name] for each in ground.estimates]) if groups else None
     return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found, spread)
 
 
 def explain(a: Estimate, b: Estimate, datasets: Mapping[str, xr.Dataset], ground: Ground) -> list[Cause]:
-    """Return the causes that could explain the difference of two estimates on common ground."""
+    """Return the possible causes of the difference of two estimates on common ground."""
     time = np.asarray(ground.coords["time"].values, dtype=float) if ground.dim == "time" else None
     records = {each.name: ground.records[each.name] for each in (a, b) if each.name in ground.records}
     courses = {name: course for name, ds in records.items() if (course := course_of(ds, ground.freedoms))}
@@ -95,7 +95,7 @@ def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:
     estimates = ground.estimates
     if against and against not in (names := [each.name for each in estimates]):
         raise DatasetError(f"against: expected one of the datasets {', '.join(names)}; found '{against}'")
-    if not against and len(estimates) > MOST_FOR_ALL_PAIRS:
+    if not against and len(estimates) > MAX_FOR_ALL_PAIRS:
         against = estimates[0].name
         ground.notes.append(f"Pairs: '{against}' with each of the others, of {len(estimates)} datasets.")
     if not against:
@@ -105,7 +105,7 @@ def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:
 
 
 def _temperatures(datasets: Mapping[str, xr.Dataset], ground: Ground) -> dict[str, Array]:
-    """Return the recorded temperatures of all datasets at the instants of the grid, by name."""
+    """Return the recorded temperatures of all datasets at the times of the grid, by name."""
     if ground.dim != "time":
         return {}
     from errormotion.datasets.timing import between

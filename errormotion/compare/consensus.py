@@ -1,4 +1,4 @@
-"""Consensus of several estimates by generalised least squares, and which of them does not fit."""
+"""Consensus of several estimates by generalised least squares, and a test of each estimate."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from errormotion.compare.stack import Estimate
 
 @dataclass(frozen=True)
 class Consensus:
-    """What several estimates say together.
+    """Consensus of several estimates, with tests.
 
     Attributes
     ----------
     estimate : Estimate
         Generalised least squares.
     fit : ChiSquare
-        Of the residuals.
+        Chi-square of the residuals.
     without : list of ChiSquare
-        For each dataset: how much the sum of squares falls without it, a chi-square of its own number of values.
+        For each dataset: decrease of the sum of squares without it, a chi-square with its number of values.
     p : list of float
-        For each dataset: probability of such a fall, corrected for the number of datasets (Holm).
+        For each dataset: probability of such a decrease, corrected for the number of datasets (Holm).
     rest : list of ChiSquare
-        For each dataset: of the residuals of the others without it.
+        For each dataset: chi-square of the residuals of the others.
     """
 
     estimate: Estimate
@@ -46,7 +46,7 @@ class Consensus:
 def consensus(estimates: Sequence[Estimate]) -> Consensus:
     """Return the consensus of estimates on one grid, with a test of each of them.
 
-    Values that are exactly zero by definition (a reference state) take no part; they stay zero in the result.
+    Values that are exactly zero by definition (a reference state) are not used; they are zero in the result.
     """
     keys = {key: k for k, key in enumerate(dict.fromkeys(key for each in estimates for key in each.source))}
     parts = [Information.of(each, keys) for each in estimates]
@@ -73,7 +73,7 @@ def consensus(estimates: Sequence[Estimate]) -> Consensus:
 
 def _estimate(found: Solution, estimates: Sequence[Estimate]) -> Estimate:
     value, own, influence = np.where(found.seen, found.value, np.nan), found.own.copy(), found.influence.copy()
-    for each in estimates:  # the zero of the reference state
+    for each in estimates:  # zero by definition in the reference state
         zero = (each.known & (each.variance() == 0) & ~found.seen).any(axis=1)
         value[zero] = np.where(np.isnan(value[zero]), 0.0, value[zero])
         own[zero] = 0.0
@@ -96,7 +96,7 @@ def _holm(p: Sequence[float]) -> list[float]:
 
 
 def random_effects(estimates: Sequence[Estimate]) -> tuple[Array, Array, Array]:
-    """Return the robust alternative: a mean with a variance between datasets (DerSimonian and Laird 1986).
+    """Return a robust mean with a variance between datasets (DerSimonian and Laird 1986).
 
     The variance between datasets is estimated for each freedom from all points together.
 

@@ -1,4 +1,4 @@
-"""Common ground: the same errors, at the same point, in the same frame, since the same state, on the same grid."""
+"""Common ground: the same errors, functional point, frame, reference state and grid."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from errormotion.errors import DatasetError
 from errormotion.kinematics.iso import DOF
 
 SAME_POINT = 1e-6
-"""Distance below which two commanded positions are the same, m."""
+"""Distance below which two commanded positions are regarded as equal, m."""
 SAME_MOTION = {"spindle": "tool", "tool": "tool"}
-"""Components that are the same motion, the tool relative to the workpiece: a bar in the spindle shows it."""
+"""Components with the same motion, that of the tool relative to the workpiece, as measured on a bar in the spindle."""
 UNKNOWN = ("", "unknown")
-"""What stands for a machine or a frame that is not stated."""
+"""Values of an unknown machine or frame."""
 COORDINATES = {"position": ("x", "y", "z"), "target": ("x", "y", "z")}
 
 
@@ -36,9 +36,9 @@ class Ground:
     Attributes
     ----------
     estimates : list of Estimate
-        One for each dataset, (n, d): the points of the grid, and ``freedoms``.
+        An estimate for each dataset, (n, d): points of the grid, and ``freedoms``.
     dim : str
-        ``time``, ``position``, ``target``, a declared dimension, or empty for a single position.
+        ``time``, ``position``, ``target``, a declared dimension, or empty for a single place.
     coords : dict
         Coordinates along ``dim``.
     freedoms : tuple of str
@@ -46,14 +46,14 @@ class Ground:
     point : ndarray, (3,)
         Functional point, m.
     since : float or None
-        Time of the common reference state, s on ``time``; None where the errors have no common reference in time.
+        Time of the common reference state on ``time``, s; None if the errors have no common reference in time.
     notes : list of str
     turns : dict of str to ndarray (n, 3)
-        Rotations of each dataset that states any, rad, 0 where unknown; also where they are not compared.
+        Rotations of each dataset that states any, rad, 0 if unknown; also if they are not compared.
     records : dict of str to Dataset
-        The datasets over time as they are, at the functional point and on the common time axis.
+        Complete datasets over time, at the functional point and on the common time axis.
     labels : dict of str to str
-        Identity of a source to its name.
+        Names of sources by identity.
     """
 
     estimates: list[Estimate]
@@ -80,7 +80,7 @@ def common_ground(
     since: float | None = None,
     same_start: bool = False,
 ) -> Ground:
-    """Bring error datasets to common ground.
+    """Transform error datasets to common ground.
 
     Parameters
     ----------
@@ -89,17 +89,17 @@ def common_ground(
     at : array_like, (3,), optional
         Functional point in the common frame, m. Default: that of the first dataset.
     freedoms : sequence of str, optional
-        Which of the six are compared. Default: all that every dataset sees.
+        Freedoms to compare. Default: all that are known in every dataset.
     since : float, optional
-        Time of the common reference state, s after the start of the first dataset. Default: the first common instant.
+        Time of the common reference state, s after the start of the first dataset. Default: the first common time.
     same_start : bool
-        Take time 0 of all datasets as the same instant where they do not state their start.
+        Treat time 0 of all datasets as the same instant if they do not state their start.
 
     Raises
     ------
     DatasetError
-        Fewer than two datasets, one twice, another machine, component or frame, dimensions that do not fit, no start,
-        no overlap, no common freedom: what is missing, and in which dataset.
+        There are fewer than two datasets, a dataset is given twice, machines, components, frames or dimensions differ,
+        a start is missing, or datasets have no common time, position or freedom.
     """
     names = list(datasets)
     if len(names) < 2:
@@ -121,10 +121,10 @@ def common_ground(
     if frame in UNKNOWN:
         raise DatasetError(
             f"{', '.join(map(repr, names))}: their frame is unknown (attribute 'frame': '{frame}'), so that their axes "
-            "may have other directions. State it"
+            "may have different directions. State the frame"
         )
     if machine in UNKNOWN:
-        notes.append(f"No dataset states its machine ('{machine}'): they are taken as those of one machine.")
+        notes.append(f"No dataset states its machine ('{machine}'); they are treated as datasets of one machine.")
     dim = _dimension(datasets)
     point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
     moved = {
@@ -178,19 +178,17 @@ def common_ground(
 def _check(name: str, ds: xr.Dataset) -> None:
     try:
         validate(ds)
-        ds.em.names  # noqa: B018 - refuses what is no error dataset
+        ds.em.names  # noqa: B018 - raises if it is no error dataset
     except DatasetError as error:
         raise DatasetError(f"'{name}': {error}") from None
     if ds.em.names != DOF:
-        raise DatasetError(
-            f"'{name}': its errors are known along one direction only (deviation), which cannot be compared"
-        )
+        raise DatasetError(f"'{name}': errors along one direction only (deviation) cannot be compared")
     variance = np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1)
     known = np.isfinite(variance)
     if known.any() and not (variance[known] > 0).any():
         raise DatasetError(
-            f"'{name}': its covariance is 0 everywhere; expected the uncertainty of its errors. State a small one for "
-            "values that are exact, such as a truth"
+            f"'{name}': its covariance is 0 everywhere; expected the uncertainty of its errors. State a small "
+            "uncertainty for exact values, such as true errors"
         )
 
 
@@ -203,7 +201,7 @@ def _check_dimensions(name: str, ds: xr.Dataset) -> None:
 
 
 def _once(datasets: Mapping[str, xr.Dataset]) -> None:
-    """Refuse one dataset under two names; only those with the same values are compared as a whole."""
+    """Raise DatasetError for one dataset under two names."""
     seen: dict[bytes, list[str]] = {}
     for name, ds in datasets.items():
         alike = seen.setdefault(b"".join(ds[freedom].values.tobytes() for freedom in DOF), [])
@@ -219,9 +217,9 @@ def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str
     if len(values) > 1:
         stated = "; ".join(f"'{name}': {value}" for name, value in found.items())
         hint = {
-            "frame": ". Bring one to the frame of the other with ds.em.in_frame(pose, name), or state the origin of "
+            "frame": ". Transform one to the frame of the other by ds.em.in_frame(pose, name), or state the origin of "
             "its frame in machine coordinates (attribute frame_origin, --origin NAME=x,y,z)",
-            "component": ". The errors of an axis and of the tool need the kinematic chain; predict one from the other",
+            "component": ". A comparison of the errors of an axis and of the tool needs the kinematic chain",
         }.get(attribute, "")
         raise DatasetError(f"The datasets have different attributes '{attribute}' ({stated}){hint}")
     return values.pop()
@@ -237,28 +235,28 @@ def _at(name: str, ds: xr.Dataset, point: Array) -> xr.Dataset:
 
 
 def _check_rotations(datasets: Mapping[str, xr.Dataset], freedoms: Sequence[str]) -> None:
-    """Refuse rotations of different bodies: of the tool, and of the frame of the axes that a probe sees."""
+    """Raise DatasetError for rotations of different bodies: of the tool, and of the frame of the axes."""
     turns = [name for name in freedoms if name in DOF[3:]]
     levers = {name: str(ds.attrs.get("lever_axes", "XYZ")) for name, ds in datasets.items()}
     if turns and len(set(levers.values())) > 1:
         stated = "; ".join(f"'{name}': {axes}" for name, axes in levers.items())
         raise DatasetError(
             f"The rotations ({', '.join(turns)}) are those of different bodies (attribute lever_axes: {stated}): XYZ "
-            "is one rigid motion of the tool, anything less the frame of the axes that carry the tool. Compare the "
+            "means a rigid motion of the tool, fewer axes mean the frame of the axes that carry the tool. Compare the "
             f"displacements: {_displacements(freedoms)}"
         )
 
 
 def _displacements(freedoms: Sequence[str]) -> str:
     left = [name for name in freedoms if name in DOF[:3]]
-    return f"--freedoms {','.join(left)}" if left else "these datasets have none in common"
+    return f"--freedoms {','.join(left)}" if left else "these datasets have no common displacements"
 
 
 def _dimension(datasets: Mapping[str, xr.Dataset]) -> str:
     dims = {name: ds["EX"].dims for name, ds in datasets.items()}
     if len(set(dims.values())) > 1:
         stated = "; ".join(f"'{name}': {', '.join(map(str, each)) or 'none'}" for name, each in dims.items())
-        raise DatasetError(f"The errors of the datasets depend on different things ({stated})")
+        raise DatasetError(f"The errors of the datasets depend on different dimensions ({stated})")
     found = next(iter(dims.values()))
     return str(found[0]) if found else ""
 
@@ -271,11 +269,11 @@ def _on_one_axis(datasets: Mapping[str, xr.Dataset], same_start: bool, notes: li
     if missing and not same_start:
         raise DatasetError(
             f"{', '.join(repr(name) for name in missing)}: no attribute 'start' (UTC of time 0), so that its times "
-            "have no relation to the others. State it, or state that all start at the same instant "
+            "cannot be related to those of the others. State it, or state that all start at the same instant "
             "(same_start, --same-start)"
         )
     if missing:
-        notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} without start.")
+        notes.append(f"Time 0 of all datasets is treated as the same instant: {', '.join(missing)} without start.")
     offset = {name: 0.0 if missing else between(starts[names[0]], start) for name, start in starts.items()}
     return {
         name: ds.assign_coords(time=("time", ds["time"].values + offset[name], ds["time"].attrs))
@@ -286,14 +284,14 @@ def _on_one_axis(datasets: Mapping[str, xr.Dataset], same_start: bool, notes: li
 def _in_time(
     shifted: Mapping[str, xr.Dataset], since: float | None, notes: list[str]
 ) -> tuple[dict[str, Placed], Array]:
-    """Return the datasets on the instants of the sparsest one, as changes since a common instant, and the instants."""
+    """Return the datasets at the times of the sparsest one, as changes since a common time, and these times."""
     names = list(shifted)
     known = {name: ds["time"].values[_known(ds)] for name, ds in shifted.items()}
     first = max((times[0] if times.size else np.inf) for times in known.values())
     last = min((times[-1] if times.size else -np.inf) for times in known.values())
     if first > last:
         spans = "; ".join(
-            f"'{name}': {times[0]:g} s to {times[-1]:g} s" if times.size else f"'{name}': nothing known"
+            f"'{name}': {times[0]:g} s to {times[-1]:g} s" if times.size else f"'{name}': no known values"
             for name, times in known.items()
         )
         raise DatasetError(f"The datasets do not overlap in time (s after the start of '{names[0]}'): {spans}")
@@ -309,13 +307,13 @@ def _in_time(
     kept = _apart(grid, [shifted[name]["time"].values for name in others])
     if (~kept).any():
         notes.append(
-            f"{int((~kept).sum())} of {grid.size} instants are left out, so that no two interpolated values share a "
-            "measured one."
+            f"{int((~kept).sum())} of {grid.size} times are left out, so that no two interpolated values depend on the "
+            "same measured value."
         )
         grid = grid[kept]
     if grid.size < 2:
-        raise DatasetError("The datasets have fewer than two common instants; a change needs a reference and a value")
-    notes.append(f"Grid: the {grid.size} instants of '{sparse}'; interpolated: {', '.join(others)}.")
+        raise DatasetError("The datasets have fewer than two common times; a change needs a reference and a value")
+    notes.append(f"Grid: the {grid.size} times of '{sparse}'; interpolated: {', '.join(others)}.")
     placed = {name: Placed.of(ds).at_times(ds["time"].values, grid) for name, ds in shifted.items()}
     for name, each in placed.items():
         if not np.isfinite(each.value[0])[np.isfinite(each.value).any(axis=0)].all():
@@ -326,8 +324,8 @@ def _in_time(
 
 
 def _apart(grid: Array, times: Sequence[Array]) -> NDArray[np.bool_]:
-    """Return which instants of a grid are kept so that each value of a dataset serves for one of them at most."""
-    used = np.array([bracket(t, grid) for t in times])  # (dataset, before and after, instant)
+    """Return which times of a grid are kept, so that each value of a dataset is used for at most one of them."""
+    used = np.array([bracket(t, grid) for t in times])  # (dataset, before and after, time)
     kept = np.ones(grid.size, dtype=bool)
     if (used[:, 0, 1:] > used[:, 1, :-1]).all():
         return kept
@@ -339,7 +337,7 @@ def _apart(grid: Array, times: Sequence[Array]) -> NDArray[np.bool_]:
 
 
 def _in_place(datasets: Mapping[str, xr.Dataset], dim: str, notes: list[str]) -> dict[str, xr.Dataset]:
-    """Return the datasets at the points that all have."""
+    """Return the datasets at their common points."""
     names = list(datasets)
     points = {name: _points(name, ds, dim) for name, ds in datasets.items()}
     first = points[names[0]]
@@ -364,13 +362,13 @@ def _in_place(datasets: Mapping[str, xr.Dataset], dim: str, notes: list[str]) ->
 
 
 def _points(name: str, ds: xr.Dataset, dim: str) -> list[Any]:
-    """Return what tells the points of a dimension apart: coordinates, or labels."""
+    """Return the identification of the points of a dimension: coordinates, or labels."""
     axes = [axis for axis in COORDINATES.get(dim, ()) if axis in ds.variables and ds[axis].dims == (dim,)]
     if axes:
         return list(np.stack([ds[axis].values for axis in axes], axis=-1))
     if dim in ds.coords:
         return list(ds[dim].values.tolist())
-    raise DatasetError(f"'{name}': its {dim} has no coordinate, so that its values cannot be assigned to the others'")
+    raise DatasetError(f"'{name}': its {dim} has no coordinate; its values cannot be matched with those of the others")
 
 
 def _match(point: Any, points: list[Any]) -> int | None:

@@ -1,13 +1,12 @@
-"""Normal equations of a consensus: each dataset is reduced to its information once, whichever datasets are combined.
+"""Normal equations of a consensus: each dataset is reduced to its information once, for all combinations of datasets.
 
 The covariance of a dataset is ``D + F F'``. Its sources are nuisance parameters z with variance 1 beside the errors x:
 
     x-x: W = D^-1        x-z: W F        z-z: 1 + F' W F        right-hand sides: W y, F' W y
 
-They are summed over the datasets. W is block diagonal. The normal matrix of x is inverted by points, and what remains
-are the sources: memory and time are linear in the points. Where the datasets have more sources than values (many short
-datasets), the sources that only one dataset has are eliminated first, and what remains are the values and the shared
-sources.
+They are summed over the datasets. W is block diagonal. The normal matrix of x is inverted point by point, and the
+sources remain: memory and time are linear in the points. If the datasets have more sources than values (many short
+datasets), sources of a single dataset are eliminated first, and values and shared sources remain.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ from errormotion.arrays import Array, filled
 from errormotion.compare.stack import Estimate
 
 FLOOR = 1e-9
-"""Variance of its own that every known value gets at least, as a share of its total variance."""
-MOST_VALUES = 6000
-"""Number of values (points by freedoms) up to which a matrix of all of them is formed: 300 MB."""
+"""Smallest variance of a known value without sources, as a fraction of its total variance."""
+MAX_VALUES = 6000
+"""Largest number of values (points times freedoms) for which a matrix of all values is formed: 300 MB."""
 CONVERGED = 1e-10
-"""Residual at which the conjugate gradients of the datasets left out end, relative to the right-hand side."""
+"""Residual at which the conjugate gradient iterations end, relative to the right-hand side."""
 
 
 @dataclass(frozen=True)
@@ -43,20 +42,20 @@ class Solution:
 
 @dataclass(frozen=True)
 class Information:
-    """What one dataset says: ``W`` (n, d, d), sources ``F`` (n, d, s) in the columns ``place``, values (n, d)."""
+    """Information of one dataset: ``W`` (n, d, d), sources ``F`` (n, d, s) in ``columns``, values (n, d)."""
 
     W: Array
     F: Array
     WF: Array
     inner: Array  # F' W F
-    place: NDArray[np.intp]
+    columns: NDArray[np.intp]
     y: Array
     Wy: Array
     known: NDArray[np.bool_]
 
     @classmethod
     def of(cls, each: Estimate, keys: dict[str, int]) -> Information:
-        """Reduce an estimate; a value without any variance is exact by definition, and says nothing."""
+        """Reduce an estimate; values without any variance are exact by definition, and are not used."""
         total = filled(each.variance())
         known = each.known & (total > 0)
         own = filled(each.own) + FLOOR * total[:, :, None] * np.eye(total.shape[1])
@@ -64,11 +63,11 @@ class Information:
         F = np.where(known[..., None], filled(np.moveaxis(each.influence, 0, -1)), 0.0)
         WF = np.matmul(W, F)
         y = np.where(known, filled(each.value), 0.0)
-        place = np.array([keys[key] for key in each.source], dtype=np.intp)
+        columns = np.array([keys[key] for key in each.source], dtype=np.intp)
         s = F.shape[-1]
-        n = F.shape[0] * F.shape[1]  # -1 is undefined where there is no source
+        n = F.shape[0] * F.shape[1]  # -1 is undefined without sources
         inner = F.reshape(n, s).T @ WF.reshape(n, s)
-        return cls(W, F, WF, inner, place, y, np.matmul(W, y[..., None])[..., 0], known)
+        return cls(W, F, WF, inner, columns, y, np.matmul(W, y[..., None])[..., 0], known)
 
     @property
     def square(self) -> float:
@@ -77,16 +76,16 @@ class Information:
 
 
 def solve(parts: Sequence[Information], sources: int) -> Solution:
-    """Return the generalised least squares of some datasets, by elimination of the values."""
+    """Return the generalised least squares estimate of datasets, by elimination of the values."""
     n, d = parts[0].y.shape
     A, right = np.zeros((n, d, d)), np.zeros((n, d))
     B, M, moved = np.zeros((n, d, sources)), np.eye(sources), np.zeros(sources)
     for each in parts:
         A += each.W
         right += each.Wy
-        B[..., each.place] += each.WF
-        M[np.ix_(each.place, each.place)] += each.inner
-        moved[each.place] += each.F.reshape(n * d, -1).T @ each.Wy.ravel()
+        B[..., each.columns] += each.WF
+        M[np.ix_(each.columns, each.columns)] += each.inner
+        moved[each.columns] += each.F.reshape(n * d, -1).T @ each.Wy.ravel()
     seen = np.diagonal(A, axis1=1, axis2=2) > 0
     own = _inverse(A, seen)
     AB = np.matmul(own, B)
@@ -103,17 +102,17 @@ def solve(parts: Sequence[Information], sources: int) -> Solution:
 
 
 def short(parts: Sequence[Information], sources: int) -> bool:
-    """Whether `Reduced` is quicker: many datasets of few values; its memory grows with the square of the values."""
+    """Return whether `Reduced` is faster: many datasets of few values. Its memory grows with their square."""
     m, size = len(parts), parts[0].y.size
-    rounds = 10  # of the conjugate gradients
+    rounds = 10  # iterations of the conjugate gradients
     by_sources = m * sources**2 * size * 2
     by_values = size**3 / 3 + sources * size**2 + rounds * m * size**2 * 4
-    return m > 2 and size <= MOST_VALUES and by_values < by_sources
+    return m > 2 and size <= MAX_VALUES and by_values < by_sources
 
 
 @dataclass(frozen=True)
 class Reduced:
-    """Datasets whose own sources are eliminated: values and shared sources remain, (n d + g)."""
+    """Datasets whose unshared sources are eliminated: values and shared sources remain, (n d + g)."""
 
     W: Array  # (m, n, d, d)
     U: Array  # (m, n d, p): the information of a dataset is W - U U'
@@ -128,16 +127,16 @@ class Reduced:
     def of(cls, parts: Sequence[Information], sources: int) -> Reduced:
         """Reduce the datasets and solve for all of them."""
         n, d = parts[0].y.shape
-        count = np.bincount(np.concatenate([each.place for each in parts]), minlength=sources)
+        count = np.bincount(np.concatenate([each.columns for each in parts]), minlength=sources)
         common = np.flatnonzero(count > 1)
-        own = [count[each.place] == 1 for each in parts]
+        own = [count[each.columns] == 1 for each in parts]
         U = np.zeros((len(parts), n * d, max(int(mask.sum()) for mask in own)))
         S = np.zeros((len(parts), n * d, len(common)))
         for i, (each, mask) in enumerate(zip(parts, own, strict=True)):
             k = int(mask.sum())
             root = np.linalg.cholesky(np.eye(k) + each.inner[np.ix_(mask, mask)])
             U[i, :, :k] = each.WF[..., mask].reshape(n * d, k) @ np.linalg.inv(root).T
-            S[i][:, np.searchsorted(common, each.place[~mask])] = each.F[..., ~mask].reshape(n * d, -1)
+            S[i][:, np.searchsorted(common, each.columns[~mask])] = each.F[..., ~mask].reshape(n * d, -1)
         W, y = np.array([each.W for each in parts]), np.array([each.y.ravel() for each in parts])
         size = n * d
         flat = np.swapaxes(U, 0, 1).reshape(size, -1)
@@ -159,7 +158,7 @@ class Reduced:
         return cls(W, U, S, y, factor, x, seen, float((y * Wy).sum() - right @ x))
 
     def solution(self) -> Solution:
-        """Return the result as a low rank covariance of the values alone."""
+        """Return the solution with the covariance of the values as a low-rank matrix."""
         n, d = self.seen.shape
         rows = solve_triangular(self.factor, np.eye(len(self.x))[:, : n * d], lower=True)
         influence = rows.reshape(-1, n, d)
@@ -167,11 +166,11 @@ class Reduced:
         return Solution(self.x[: n * d].reshape(n, d), np.zeros((n, d, d)), influence, self.seen, self.square)
 
     def falls(self) -> Array:
-        """Return by how much the sum of squares falls without each dataset, (m,).
+        """Return the decrease of the sum of squares without each dataset, (m,).
 
-        With the residuals r and the information V of a dataset, ``T = (1, S)`` and the normal matrix N of all, the fall
-        is ``r' V r + w' (N - T' V T)^-1 w`` with ``w = T' V r``. The systems are solved together by conjugate gradients
-        with N as the preconditioner: it differs from each matrix by the share of one dataset.
+        With the residuals r and the information V of a dataset, ``T = (1, S)`` and the normal matrix N of all, the
+        decrease is ``r' V r + w' (N - T' V T)^-1 w`` with ``w = T' V r``. The systems are solved together by conjugate
+        gradients with N as the preconditioner, which differs from each matrix by the contribution of one dataset.
         """
         residual = self._values(np.broadcast_to(self.x, (len(self.y), len(self.x)))) - self.y
         weighted = _applied(self.W, self.U, residual)
@@ -194,7 +193,7 @@ class Reduced:
         return found
 
     def _values(self, x: Array) -> Array:
-        """Return what each dataset should state for parameters (m, n d + g)."""
+        """Return the expected values of each dataset for parameters (m, n d + g)."""
         size = self.y.shape[1]
         found: Array = x[:, :size] + np.matmul(self.S, x[:, size:, None])[..., 0]
         return found
@@ -203,7 +202,7 @@ class Reduced:
         return np.concatenate([weighted, np.matmul(np.swapaxes(self.S, 1, 2), weighted[..., None])[..., 0]], axis=1)
 
     def _product(self, p: Array) -> Array:
-        """Return the normal matrix without each dataset times its row of (m, n d + g)."""
+        """Return the product of the normal matrix without each dataset and its row of (m, n d + g)."""
         whole = (self.factor @ (self.factor.T @ p.T)).T
         return whole - self._gradient(_applied(self.W, self.U, self._values(p)))
 
@@ -218,7 +217,7 @@ def _applied(W: Array, U: Array, v: Array) -> Array:
 
 
 def _inverse(matrices: Array, kept: NDArray[np.bool_]) -> Array:
-    """Return the inverses (n, d, d) over the kept rows and columns, 0 elsewhere."""
+    """Return the inverses (n, d, d) over the kept rows and columns, otherwise 0."""
     both = kept[:, :, None] & kept[:, None, :]
     scale = np.sqrt(np.where(kept, np.diagonal(matrices, axis1=1, axis2=2), 1.0))
     outer = scale[:, :, None] * scale[:, None, :]

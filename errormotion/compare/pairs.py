@@ -1,4 +1,4 @@
-"""Differences of two estimates: the normalised error at every point, and one test of the whole curve."""
+"""Differences of two estimates: normalised error at every point, and a joint test of all points."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COVERAGE_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class ChiSquare:
-    """A sum of squares with its degrees of freedom; ``p`` is the probability of a larger one if both agree."""
+    """A sum of squares with its degrees of freedom; ``p`` is the probability of a larger value if both agree."""
 
     value: float
     degrees: int
@@ -30,20 +30,20 @@ class ChiSquare:
 
 @dataclass(frozen=True)
 class Pair:
-    """What two estimates say about each other.
+    """Comparison of two estimates.
 
     Attributes
     ----------
     a, b : str
         Names.
     difference : Estimate
-        a less b.
+        a minus b.
     en : ndarray, (n, d)
-        Difference over its expanded uncertainty (k = 2), with sign; NaN where unknown or exactly zero by definition.
+        Difference divided by its expanded uncertainty (k = 2), with sign; NaN if unknown or exactly zero by definition.
     joint : ChiSquare
-        Over all points and freedoms.
+        Test of all points and freedoms.
     curve : list of ChiSquare
-        Over all points, for each freedom.
+        Test of all points, for each freedom.
     """
 
     a: str
@@ -55,7 +55,7 @@ class Pair:
 
 
 def pair(a: Estimate, b: Estimate) -> Pair:
-    """Compare two estimates on one grid; what both share, by the keys of their sources, cancels."""
+    """Compare two estimates on one grid; the effects of shared sources, by their keys, cancel."""
     d = difference(a, b)
     u = np.sqrt(np.maximum(d.variance(), 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):

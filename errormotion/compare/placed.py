@@ -1,4 +1,4 @@
-"""Errors of one dataset as arrays, and their way to a common grid."""
+"""Errors of one dataset as arrays, and their transfer to a common grid."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Placed:
         return filled(self.value[:, 3:])
 
     def at_times(self, time: Array, grid: Array) -> Placed:
-        """Return the errors at other instants."""
+        """Return the errors at other times."""
         E, C, F, _ = interpolated(
             np.asarray(time, dtype=float), self.value, self.total, self.influence, grid, starting=True
         )
@@ -58,7 +58,7 @@ class Placed:
         return Placed(E, C, F, [*self.source, *further], [*self.identity, *[""] * len(further)])
 
     def estimate(self, name: str, freedoms: Sequence[str]) -> Estimate:
-        """Return some freedoms as an estimate; a source without identity is of this dataset alone."""
+        """Return freedoms as an estimate; sources without an identity are specific to this dataset."""
         k = [DOF.index(freedom) for freedom in freedoms]
         F = self.influence[..., k]
         own = self.total[:, k][:, :, k] - products(F)

@@ -2,9 +2,9 @@
 
 One-way analysis of variance of each freedom (ISO 5725-2), over all points: with N datasets in G groups, ``MS_w`` is
 the mean square within groups and ``MS_b`` that of the unweighted group means times the harmonic mean h of the group
-sizes. ``E MS_w = s_r^2`` and ``E MS_b = s_r^2 + h s_L^2``. Points share sources, so that they are no independent
-repeats: the degrees of freedom are those of Box, ``v (tr S)^2 / tr S^2``, S the covariance between points as the
-repeats show it. Intervals are those of chi-square, and modified large-sample intervals for sums and differences
+sizes. ``E MS_w = s_r^2`` and ``E MS_b = s_r^2 + h s_L^2``. Points share sources, so that they are not
+independent repeats: the degrees of freedom are those of Box, ``v (tr S)^2 / tr S^2``, where S is the covariance between
+points from the repeats. Intervals are those of chi-square, and modified large-sample intervals for sums and differences
 (Burdick and Graybill 1992, Confidence Intervals on Variance Components; Ting et al. 1990).
 """
 
@@ -25,32 +25,32 @@ from errormotion.errors import DatasetError
 
 KINDS = ("repeatability", "between groups", "reproducibility")
 BY = ("test", "operator", "instrument", "method")
-"""What datasets can be grouped by."""
+"""Attributes by which datasets can be grouped."""
 ENDS = (0.025, 0.975)
 """Probabilities below the ends of the intervals."""
 
 ROUNDING = 1e-9
-"""Share of a mean square below which a difference is rounding."""
+"""Fraction of a mean square below which a difference is regarded as a rounding error."""
 
 
 @dataclass(frozen=True)
 class Repeats:
-    """Standard deviations of each freedom, (kind, d), kinds as `KINDS`; unknown ones are NaN.
+    """Standard deviations of each freedom, (kind, d), kinds as in `KINDS`; NaN if unknown.
 
     Attributes
     ----------
     groups : list of str
-        Of each dataset.
+        Group of each dataset.
     value, low, high : ndarray
-        Found, with its interval of 95 %; m and rad.
+        Standard deviation, with its 95 % interval; m and rad.
     degrees : ndarray
         Effective degrees of freedom; NaN for a difference of mean squares.
     stated : ndarray
-        What the stated uncertainties let expect, shared sources considered.
+        Expected from the stated uncertainties, taking shared sources into account.
     p : ndarray
-        Probability of a larger spread if the stated uncertainties are right.
+        Probability of a larger spread if the stated uncertainties are correct.
     common : ndarray, (d,)
-        Stated standard uncertainty that all groups share, and that no repeat shows.
+        Stated standard uncertainty that all groups share, which repeats do not show.
     """
 
     groups: list[str]
@@ -64,20 +64,20 @@ class Repeats:
 
 
 def labels(datasets: Mapping[str, xr.Dataset], by: str) -> dict[str, str]:
-    """Return the group of each dataset by what it states: operator, instrument or method.
+    """Return the group of each dataset by operator, instrument or method.
 
     Raises
     ------
     DatasetError
-        A dataset does not state it.
+        A dataset does not state this.
     """
     if by not in BY[1:]:
         raise DatasetError(f"Expected groups by {', '.join(BY)}; found '{by}'")
     found = {name: _label(ds, by) for name, ds in datasets.items()}
     if missing := [name for name, label in found.items() if not label]:
         raise DatasetError(
-            f"{', '.join(map(repr, missing))}: no {by} is stated, so that it belongs to no group. "
-            + ("The provenance names no serial number" if by == "instrument" else f"Set the attribute '{by}'")
+            f"{', '.join(map(repr, missing))}: no {by} is stated, so that it cannot be assigned to a group. "
+            + ("The provenance states no serial number" if by == "instrument" else f"Set the attribute '{by}'")
         )
     return found
 
@@ -99,14 +99,14 @@ def repeats(estimates: Sequence[Estimate], groups: Sequence[str]) -> Repeats:
     Parameters
     ----------
     estimates : sequence of Estimate
-        N of them, (n, d).
+        N estimates, (n, d).
     groups : sequence of str
-        Of each.
+        Group of each estimate.
 
     Raises
     ------
     DatasetError
-        No repeat: fewer than two datasets.
+        There are fewer than two datasets.
     """
     if len(estimates) < 2:
         raise DatasetError(f"Repeats need at least two datasets; found {len(estimates)}")
@@ -133,7 +133,7 @@ def repeats(estimates: Sequence[Estimate], groups: Sequence[str]) -> Repeats:
 
 @dataclass(frozen=True)
 class _Square:
-    """A mean square with its effective degrees of freedom, and its expectation by the stated uncertainties."""
+    """A mean square with its effective degrees of freedom, and its expectation from the stated uncertainties."""
 
     value: float
     degrees: float
@@ -171,11 +171,11 @@ def _mean_square(B: Array, Y: Array, V: Array) -> _Square | None:
 
 
 def _independent(one: float, two: float, v: int, n: int) -> float:
-    """Return how many independent points n points are worth: (tr S)^2 / tr S^2 (Box 1954), with S = E'E / v.
+    """Return the number of independent points equivalent to n points: (tr S)^2 / tr S^2 (Box 1954), S = E'E / v.
 
-    The trace of S^2 also holds the scatter of S itself: the number is too small rather than too large, at most v, and
-    the intervals hold the truth with at least their probability. An estimate without this bias scatters so much with
-    few repeats that the intervals would be too narrow.
+    The trace of S^2 includes the scatter of S, so that the number tends to be too small, at most v, and the intervals
+    have at least the stated coverage. The scatter of an unbiased estimate would be so large with few repeats that the
+    intervals would be too narrow.
     """
     return float(np.clip(one**2 / two, 1.0, n)) if v > 1 and two > 0 else 1.0
 
@@ -191,7 +191,7 @@ def _components(w: _Square | None, b: _Square | None, h: float) -> dict[str, Arr
 
     if w is not None:
         put(0, w.value, _chi_square(w.value, w.degrees), w.degrees, w.stated, _larger(w))
-    if b is not None and w is None:  # no repeat within a group: only the sum is seen
+    if b is not None and w is None:  # no repeats within a group: only the sum is determined
         put(2, b.value, _chi_square(b.value, b.degrees), b.degrees, b.stated, _larger(b))
     if b is not None and w is not None:
         apart = b.stated - w.stated
@@ -202,7 +202,7 @@ def _components(w: _Square | None, b: _Square | None, h: float) -> dict[str, Arr
         spread = sum((share * each.value) ** 2 / each.degrees for each, share in parts)
         stated = sum(share * each.stated for each, share in parts)
         degrees = total**2 / spread if spread > 0 else np.nan
-        # A negative variance between groups counts as 0 (ISO 5725-2).
+        # A negative variance between groups is set to 0 (ISO 5725-2).
         put(2, max(total, w.value), _sum(parts), degrees, stated, _larger(_Square(total, degrees, stated)))
     return rows
 
@@ -262,19 +262,19 @@ def _between_datasets(estimates: Sequence[Estimate], k: int) -> Array:
 def interval_coverage(
     groups: int, size: int, trials: int, seed: int, *, ratio: float = 1.0, points: int = 1, shared: float = 0.0
 ) -> dict[str, float]:
-    """Return the share of intervals that hold the truth, by kind, in simulated repeats.
+    """Return the coverage of the intervals by kind, from simulated repeats.
 
     Parameters
     ----------
     groups, size : int
-        Groups, and datasets in each.
+        Number of groups, and of datasets in each group.
     trials, seed : int
     ratio : float
-        Standard deviation between groups over that within.
+        Standard deviation between groups divided by that within groups.
     points : int
-        Points of each dataset.
+        Number of points of each dataset.
     shared : float
-        Share of the variances that all points of a dataset have in common, 0 to 1.
+        Fraction of the variances that all points of a dataset have in common, 0 to 1.
     """
     rng = np.random.default_rng(seed)
     label = [str(k) for k in np.repeat(np.arange(groups), size)]

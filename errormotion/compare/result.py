@@ -21,7 +21,7 @@ from errormotion.errors import DatasetError
 
 SCHEMA = "errormotion.comparison/1"
 CAUSES = 5
-"""Causes that are kept for each pair."""
+"""Number of causes that are stored for each pair."""
 
 #: Variable to its dimensions (``...``: the common dimension, if there is one), and its meaning.
 TABLE: dict[str, tuple[tuple[str, ...], str]] = {

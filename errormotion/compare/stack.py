@@ -1,4 +1,4 @@
-"""Several estimates of the same errors on one grid: what every statistic of a comparison works on."""
+"""Estimates of the same errors on one grid, the input of all statistics of a comparison."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class Estimate:
     Attributes
     ----------
     name : str
-        Of the dataset.
+        Name of the dataset.
     value : ndarray, (n, d)
-        m and rad.
+        Values, m and rad.
     own : ndarray, (n, d, d)
-        Covariance of what is drawn anew at every point.
+        Covariance of contributions that are independent between points.
     influence : ndarray, (s, n, d)
         Effect of one standard uncertainty of each source.
     source : tuple of str
-        Key of each source: the same key in two estimates is the same draw.
+        Key of each source; sources with the same key in two estimates are fully correlated.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Estimate:
 
 
 def difference(a: Estimate, b: Estimate) -> Estimate:
-    """Return a less b: a source that both have, by its key, is one draw and counts with its difference."""
+    """Return a minus b; the effect of a source that both share, by its key, is the difference of its effects."""
     keys = tuple(dict.fromkeys((*a.source, *b.source)))
     return Estimate(
         name=f"{a.name} - {b.name}",
@@ -75,22 +75,22 @@ def difference(a: Estimate, b: Estimate) -> Estimate:
 def _gathered_difference(a: Estimate, b: Estimate, keys: Sequence[str]) -> Array:
     nothing = np.where(a.known & b.known, 0.0, np.nan)
     found = np.broadcast_to(nothing, (len(keys), *nothing.shape)).copy()
-    place = {key: k for k, key in enumerate(keys)}
+    row_of = {key: k for k, key in enumerate(keys)}
     for estimate, add in ((a, np.add), (b, np.subtract)):
         for key, row in zip(estimate.source, estimate.influence, strict=True):
-            add(found[place[key]], row, out=found[place[key]])
+            add(found[row_of[key]], row, out=found[row_of[key]])
     return found
 
 
 def gathered(estimate: Estimate, keys: Sequence[str]) -> Array:
-    """Return the influence of sources by key, (key, n, d): 0 for a source that the estimate does not have."""
+    """Return the influence of sources by key, (key, n, d): 0 for a source that is not in the estimate."""
     rows = dict(zip(estimate.source, estimate.influence, strict=True))
     nothing = np.where(estimate.known, 0.0, np.nan)
     return np.array([rows.get(key, nothing) for key in keys]).reshape(len(keys), *estimate.value.shape)
 
 
 def shared(estimates: Sequence[Estimate]) -> list[str]:
-    """Return the keys of the sources that more than one estimate has, in order."""
+    """Return the keys of the sources of more than one estimate, in order."""
     seen: dict[str, int] = {}
     for estimate in estimates:
         for key in set(estimate.source):

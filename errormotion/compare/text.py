@@ -1,4 +1,4 @@
-"""A comparison in words: the verdict, and causes with their sizes in the field's units."""
+"""A comparison as text: verdict, and causes with their sizes in printed units."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import xarray as xr
 LIMIT = 0.05
 """Probability below which datasets contradict each other."""
 FIELD = {"m": (1e3, "mm"), "rad": (648000 / np.pi, "arcsec"), "s": (1.0, "s"), "1": (1.0, "")}
-SHORT = 1e-3
-"""Lengths below are printed in um, m: errors; those above are coordinates."""
+UM_BELOW = 1e-3
+"""Lengths below are printed in um (errors), others in mm (coordinates), m."""
 FIELD |= {"m/K": (1e6, "um/K"), "rad/K": (648000 / np.pi, "arcsec/K")}
 
 
-MOST_SHARED = 6
-"""Shared sources that are named."""
+MAX_SHARED = 6
+"""Number of shared sources that are listed."""
 
 
 class Spread(NamedTuple):
-    """One component of the spread of a freedom, ready to be printed."""
+    """One component of the spread of a freedom, as text."""
 
     freedom: str
     kind: str
@@ -33,7 +33,7 @@ class Spread(NamedTuple):
 
 
 def spreads(ds: xr.Dataset) -> list[Spread]:
-    """Return repeatability and reproducibility of a comparison with groups; nothing without groups."""
+    """Return repeatability and reproducibility of a comparison with groups; empty without groups."""
     if "spread" not in ds.variables:
         return []
     found = []
@@ -58,7 +58,7 @@ SPREAD_HEAD = ["freedom", "standard deviation", "found", "95 % interval", "state
 
 
 class CauseText(NamedTuple):
-    """One cause, ready to be printed."""
+    """One cause, as text."""
 
     name: str
     size: str
@@ -68,7 +68,7 @@ class CauseText(NamedTuple):
 
 
 def probability(p: float) -> str:
-    """Return a probability as a person reads it."""
+    """Return a probability as text."""
     if not np.isfinite(p):
         return "unknown"
     return "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.01 else f"{p:.2f}"
@@ -80,12 +80,12 @@ def _p(p: float) -> str:
 
 
 def verdict(ds: xr.Dataset) -> list[str]:
-    """Return the result of a comparison in sentences, the most important one first."""
+    """Return the result of a comparison as sentences, the most important one first."""
     names = [str(name) for name in ds["dataset"].values]
     p = float(ds.attrs["fit_p"])
     lines = []
     if not np.isfinite(p):
-        lines.append("Nothing can be said: no value is known in all datasets with an uncertainty.")
+        lines.append("No conclusion is possible: no value is known with an uncertainty in all datasets.")
     elif p >= LIMIT:
         lines.append(f"The {len(names)} datasets agree within their uncertainties ({_p(p)}).")
     else:
@@ -98,7 +98,7 @@ def verdict(ds: xr.Dataset) -> list[str]:
         if len(names) > 2:
             lines += [f"Without '{name}' the others agree." for name in alone]
         if len(names) > 2 and not alone:
-            lines.append("Whichever one is left out, the others still contradict each other.")
+            lines.append("The contradiction remains if any single dataset is left out.")
     for j, pair in enumerate(ds["pair"].values):
         first = cause_text(ds, j, 0)
         if first is None:
@@ -106,16 +106,16 @@ def verdict(ds: xr.Dataset) -> list[str]:
         if first.p < 1e-3:
             lines.append(f"{pair}: no single cause explains the difference; the nearest is {first.name} {first.size}.")
         else:
-            more = f" These data cannot tell it from: {first.alike}." if first.alike else ""
+            more = f" Indistinguishable from: {first.alike}." if first.alike else ""
             lines.append(f"{pair}: most likely {first.name}{' ' + first.size if first.size else ''}.{more}")
     if shared := _shared(ds):
-        more = f" and {len(shared) - MOST_SHARED} more" if len(shared) > MOST_SHARED else ""
-        lines.append(f"Taken as one draw in several datasets: {'; '.join(shared[:MOST_SHARED])}{more}.")
+        more = f" and {len(shared) - MAX_SHARED} more" if len(shared) > MAX_SHARED else ""
+        lines.append(f"Treated as fully correlated between datasets: {'; '.join(shared[:MAX_SHARED])}{more}.")
     return lines
 
 
 def _shared(ds: xr.Dataset) -> list[str]:
-    """Return the sources that count as one draw: the certificate, or the name of what one calibration gave."""
+    """Return the shared sources: their certificate, or the name of the result of a calibration."""
     keys = json.loads(ds.attrs.get("shared_sources", "[]"))
     names = json.loads(ds.attrs.get("shared_names", "[]")) or keys
     hashed = zip(keys, names, strict=True)
@@ -123,7 +123,7 @@ def _shared(ds: xr.Dataset) -> list[str]:
 
 
 def cause_text(ds: xr.Dataset, pair: int, rank: int) -> CauseText | None:
-    """Return a cause of a pair in words; None where there is none of this rank."""
+    """Return a cause of a pair as text; None if there is no cause of this rank."""
     at = {"pair": pair, "rank": rank}
     one = ds[["cause", "alike", "size", "size_u", "size_name", "cause_p", "log_likelihood_ratio"]].isel(at)
     name = str(one["cause"].values)
@@ -134,7 +134,7 @@ def cause_text(ds: xr.Dataset, pair: int, rank: int) -> CauseText | None:
         if str(label):
             what, _, unit = str(label).removesuffix(")").rpartition(" (")
             factor, field = FIELD.get(unit, (1.0, unit))
-            if unit == "m" and abs(value) < SHORT:
+            if unit == "m" and abs(value) < UM_BELOW:
                 factor, field = 1e6, "um"
             parts.append(f"{what} {factor * value:.4g} ± {2 * factor * u:.2g} {field}".rstrip())
     return CauseText(

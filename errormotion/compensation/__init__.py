@@ -1,1 +1,1 @@
-"""What is done against the errors: models that predict them."""
+"""Compensation of errors: thermal models, corrections, compensation tables and programs, online compensation."""

@@ -1,6 +1,6 @@
-"""The dashboard: runs, instruments and comparisons in a browser; a thin layer over functions of the other packages.
+"""The dashboard: runs, instruments and comparisons in a browser.
 
-``access`` decides who may ask, ``lab`` finds runs and their files, ``course`` reduces results to curves, ``figures``
-draws them, ``pages`` holds the handlers, ``server`` puts them together. Nothing here needs bokeh or tornado before
-``server`` is imported.
+``access`` contains the rules of access, ``lab`` the runs and their files, ``curves`` the reduction of results to
+curves, ``figures`` the drawings, ``pages`` the request handlers, ``server`` the server. The packages bokeh and tornado
+are imported with ``server`` only.
 """

@@ -1,4 +1,4 @@
-"""Who may ask the dashboard: names of the server, the token, and the origin of a request."""
+"""Rules of access: names of the server, token, origin of a request."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class Access:
     Attributes
     ----------
     names : frozenset of str
-        Names under which browsers reach the server, lower case. Addresses are always allowed: a foreign page can give
-        its own name the address of this computer, but it cannot make a browser send an address in its place.
+        Host names of the server, lower case. IP addresses are always allowed: a foreign page can resolve its name to
+        the address of this computer (DNS rebinding), but it cannot make a browser send an address instead.
     token : str
-        What a client must present once; empty where none is required.
+        Token that a browser must present once; empty if none is required.
     secure : bool
         Whether the connection is encrypted.
     session : str
-        Secret that a browser keeps after it has presented the token; new at every start.
+        Secret that a browser receives in return for the token; new at every start.
     """
 
     names: frozenset[str]
@@ -36,13 +36,13 @@ class Access:
     secure: bool = False
     session: str = field(default_factory=lambda: secrets.token_urlsafe(32))
 
-    def admits(self, host: str) -> bool:
+    def allows_host(self, host: str) -> bool:
         """Return whether the header ``Host`` of a request names this server."""
         name = _name(host)
         return name in self.names or _is_address(name)
 
     def same_origin(self, origin: str | None, host: str) -> bool:
-        """Return whether a request that changes something comes from a page of this server: header ``Origin``."""
+        """Return whether the header ``Origin`` is that of this server; required for requests that change something."""
         if origin is None:
             return False
         try:
@@ -50,20 +50,20 @@ class Access:
         except ValueError:
             return False
 
-    def opens(self, token: str) -> bool:
-        """Return whether this is the token; the time that it takes does not depend on where they differ."""
+    def accepts_token(self, token: str) -> bool:
+        """Return whether a token is valid; compared in constant time."""
         return bool(self.token) and _equal(token, self.token)
 
-    def knows(self, session: str | None) -> bool:
-        """Return whether a request may read: no token is required, or its browser has presented it."""
+    def accepts_session(self, session: str | None) -> bool:
+        """Return whether a request may read: no token is required, or its browser has presented the token."""
         return not self.token or _equal(session or "", self.session)
 
 
 def access_for(host: str, names: Iterable[str] = (), *, secure: bool = False, control: bool = False) -> Access:
-    """Return the rules of a server that listens on an address.
+    """Return the rules of access of a server that listens on an address.
 
-    A new token is required where other computers reach it, and where it may start what moves a machine: every user of
-    this computer reaches loopback.
+    A new token is required if other computers reach the server, or if it may start motions of a machine: every user of
+    this computer can reach the loopback address.
     """
     known = {"localhost", host, platform.node(), *names}
     return Access(
@@ -74,7 +74,7 @@ def access_for(host: str, names: Iterable[str] = (), *, secure: bool = False, co
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address is reached from this computer only."""
+    """Return whether an address can be reached from this computer only."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -82,13 +82,13 @@ def is_loopback(host: str) -> bool:
 
 
 def _equal(given: str, expected: str) -> bool:
-    """Compare hashes, so that neither length nor content shows in the time."""
+    """Compare hashes, so that the duration depends on neither length nor content."""
     first, second = (sha256(text.encode("utf-8", "surrogatepass")).digest() for text in (given, expected))
     return hmac.compare_digest(first, second)
 
 
 def _name(host: str) -> str:
-    """Return the name in a header ``Host``, lower case, without port and brackets; empty if it is none."""
+    """Return the name in a header ``Host``, lower case, without port and brackets; empty if it is invalid."""
     try:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:

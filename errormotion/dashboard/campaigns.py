@@ -25,12 +25,12 @@ from errormotion.datasets.files.tomltext import LONGEST_TEXT, value
 from errormotion.errors import BenchError, ErrormotionError
 from errormotion.report.text import rounded, signs
 
-MOST_FILES = 200
-"""Campaign files that are offered."""
-MOST_LOOKED_AT = 2000
-"""Files of the folder that are looked at."""
+MAX_FILES = 200
+"""Number of campaign files that are listed."""
+MAX_EXAMINED = 2000
+"""Number of files of the folder that are examined."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,80}\.toml")
-"""Of a file that a page may write."""
+"""Name of a file that a page may write."""
 DPI = 100
 NEW = """\
 schema = "errormotion.campaign/1"
@@ -45,10 +45,10 @@ method = ""
 
 @dataclass(frozen=True)
 class Campaigns:
-    """A folder of campaign files; ``control``: whether pages may write into it.
+    """A folder of campaign files; ``control`` states whether pages may write into it.
 
-    Without control, a text may name files outside the folder only where the saved file of this name does, so that
-    nobody learns of other files by checking texts.
+    Without control, a text may name only those files outside the folder that the saved file of this name states, so
+    that a page cannot probe for other files.
     """
 
     folder: Path
@@ -57,22 +57,22 @@ class Campaigns:
 
     def names(self) -> list[str]:
         """Return the names of the campaign files."""
-        looked_at = sorted(self.folder.glob("*.toml"))[:MOST_LOOKED_AT]
-        return [path.name for path in looked_at if _is_campaign(path)][:MOST_FILES]
+        examined = sorted(self.folder.glob("*.toml"))[:MAX_EXAMINED]
+        return [path.name for path in examined if _is_campaign(path)][:MAX_FILES]
 
     def read(self, name: str) -> str:
-        """Return the text of a file; of no name, that of a new campaign.
+        """Return the text of a file, or without a name that of a new campaign.
 
         Raises
         ------
         NotFoundError
-            There is no such campaign file.
+            The campaign file does not exist.
         """
         if not name:
             bench = "bench.toml" if self.bench is None else os.path.relpath(self.bench, self.folder)
             return NEW.format(bench=value(bench))
         if Path(name).name != name or "\0" in name or not _is_campaign(self.folder / name):
-            raise NotFoundError(f"There is no campaign file {name[:100]!r} in {self.folder}.")
+            raise NotFoundError(f"No campaign file {name[:100]!r} in {self.folder}.")
         try:
             return read_bytes(self.folder / name, LONGEST_TEXT).decode("utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
@@ -87,14 +87,14 @@ class Campaigns:
         return self.form(name, without_test(self._short(text), number))
 
     def form(self, name: str, text: str, place: tuple[Key, ...] = (), written: str = "") -> Form:
-        """Return the form of a text, after a field was changed where ``place`` is not empty.
+        """Return the form of a text; if ``place`` is not empty, after the change of a field.
 
         Raises
         ------
         DatasetError
-            The text is too long, or the field cannot be changed alone.
+            The text is too long, or the field cannot be changed separately.
         BenchError
-            It names files that this page may not look at.
+            The text names files that this page may not read.
         """
         text = self._short(text)
         if place:
@@ -103,17 +103,15 @@ class Campaigns:
         return form_of(text, self._path(name))
 
     def plan(self, name: str, text: str) -> list[dict[str, Any]]:
-        """Return what each test will do and how well it will measure, as text and pictures.
+        """Return motions and expected uncertainty of each test, as text and drawings.
 
         Raises
         ------
         BenchError
             The text has mistakes.
         """
-        form = self.form(name, text)
-        if form.plan is None:
-            raise BenchError(f"The campaign has {form.count} mistakes; correct them first.")
-        return [_planned(form.plan, test) for test in form.plan.tests]
+        plan = self._valid(name, text)
+        return [_planned(plan, test) for test in plan.tests]
 
     def save(self, name: str, text: str, before: str) -> Path:
         """Write a campaign file without mistakes; ``before`` is the hash of the text that was edited.
@@ -121,25 +119,29 @@ class Campaigns:
         Raises
         ------
         BenchError
-            The name is none for such a file, the text has mistakes, or the file was changed by others.
+            The name is invalid, the text has mistakes, or the file was changed since it was opened.
         """
         if not NAME.fullmatch(name):
             raise BenchError(f"expected a file name such as drift.toml; found {name[:100]!r}")
-        form = self.form(name, text)
-        if form.plan is None:
-            raise BenchError(f"The campaign has {form.count} mistakes; correct them first.")
+        self._valid(name, text)
         path = self._path(name)
         if path.exists() or path.is_symlink():
             found = self.read(name)
             if found == text:
                 return path
             if hash_of(found) != before:
-                raise BenchError(f"{name} was changed by others since it was opened here; choose another name")
+                raise BenchError(f"{name} was changed by another program since it was opened; choose another name")
         try:
             replace_text(path, text)
         except OSError as error:
             raise BenchError(f"{path}: cannot be written: {error.strerror}") from error
         return path
+
+    def _valid(self, name: str, text: str) -> CampaignPlan:
+        form = self.form(name, text)
+        if form.plan is None:
+            raise BenchError(f"The campaign has {form.count} mistakes; correct them first.")
+        return form.plan
 
     @staticmethod
     def _short(text: str) -> str:
@@ -156,20 +158,20 @@ class Campaigns:
         try:
             new = set(_strings(parse_toml(text, "text")))
         except ErrormotionError:
-            return  # the form states what is wrong with it
-        with suppress(ErrormotionError):  # of a file that there is not, nothing is known
+            return  # the form states the mistake
+        with suppress(ErrormotionError):  # a file that does not exist states no files
             new -= set(_strings(parse_toml(self.read(name), "text")))
         for each in new:
             windows = PureWindowsPath(each)
             if PurePosixPath(each).is_absolute() or windows.drive or windows.root or ".." in windows.parts:
                 raise BenchError(
-                    f"{each[:100]!r}: this dashboard was started without --allow-control, and looks at files of its "
+                    f"{each[:100]!r}: this dashboard was started without --allow-control, and reads files of its "
                     "folder only"
                 )
 
 
 def hash_of(text: str) -> str:
-    """Return the hash of a text, by which a later change is seen."""
+    """Return the hash of a text, by which a change is detected."""
     return sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
@@ -188,19 +190,19 @@ def _strings(content: Any) -> Iterator[str]:
             yield from _strings(each)
 
 
-def _limits(plan: CampaignPlan, asked: Motions) -> list[list[str]]:
-    return [[signs(text) for text in row] for row in beside_limits(asked.extent, plan.bench.limits)]
+def _limits(plan: CampaignPlan, found: Motions) -> list[list[str]]:
+    return [[signs(text) for text in row] for row in beside_limits(found.extent, plan.bench.limits)]
 
 
 def _planned(plan: CampaignPlan, test: TestPlan) -> dict[str, Any]:
-    """Return the plan of a test; what a method cannot tell is stated in its place."""
+    """Return the plan of a test; unknown parts are replaced by the reason."""
     found: dict[str, Any] = {"test": test.name, "method": test.method.info.id, "notes": []}
     try:
-        asked = motions(plan, test)
+        planned_motions = motions(plan, test)
         drawn = io.BytesIO()
-        picture(plan, asked).savefig(drawn, format="png", dpi=DPI)
+        picture(plan, planned_motions).savefig(drawn, format="png", dpi=DPI)
         image = base64.b64encode(drawn.getvalue()).decode()
-        found |= {"headline": headline(asked), "limits": _limits(plan, asked)}
+        found |= {"headline": headline(planned_motions), "limits": _limits(plan, planned_motions)}
         found |= {"picture": f"data:image/png;base64,{image}"}
     except ErrormotionError as error:
         found |= {"headline": str(error), "limits": [], "picture": ""}
@@ -211,5 +213,5 @@ def _planned(plan: CampaignPlan, test: TestPlan) -> dict[str, Any]:
         found["expected"] = [[row["name"], text, signs(row["unit"])] for row, text in zip(rows, texts, strict=True)]
         found["notes"] = [signs(str(note)) for note in errors.em.notes]
     except ErrormotionError as error:
-        found |= {"expected": [], "notes": [f"The uncertainty to expect is not known: {error}"]}
+        found |= {"expected": [], "notes": [f"The expected uncertainty is unknown: {error}"]}
     return found

@@ -1,6 +1,6 @@
-"""Compensations for the dashboard: benches and models to choose from, starts, and what each compensation does.
+"""Compensations for the dashboard: choice of benches and models, starts, and the state of each compensation.
 
-A compensation is a command of its own. It is found by its run folder, whoever started it.
+A compensation runs in a separate process. It is found by its run folder, independent of the program that started it.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from errormotion.campaign.compensation.following import AUDIT, STATUS, Status, c
 from errormotion.campaign.files import BenchPlan, load_bench
 from errormotion.compensation.online.audit import AuditReader
 from errormotion.compensation.online.prediction import predictor
-from errormotion.dashboard.kept import Kept, stamp
+from errormotion.dashboard.cache import Cache, stamp
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import CompensationError, ErrormotionError
 
 SHOWN = 20
-"""Compensations in the list, the newest; those at work are always in it."""
+"""Number of ended compensations in the list, from the newest on; running ones are always listed."""
 ENTRIES = 200
-"""Last entries of an audit log on the page: those that change state or cause."""
+"""Number of last entries of an audit log on the page: those that change state or cause."""
 POINTS = 20_000
-"""Last entries of an audit log in the curves."""
-READ_AT_ONCE = 20_000
-"""Entries of an audit log that are checked for one answer."""
-MOST_FILES = 300
-"""Files of a folder that are offered, at most."""
-LARGEST_MODEL = 64 << 20
-"""Bytes of a file that is looked at whether it is a model."""
-LONGEST_NAME = 255
-"""Bytes of the name of a folder, at most."""
+"""Number of last entries of an audit log in the curves."""
+ENTRIES_PER_READ = 20_000
+"""Number of entries of an audit log that are checked in one request."""
+MAX_FILES = 300
+"""Number of files of a folder that are listed."""
+MAX_MODEL = 64 << 20
+"""Largest size of a model file, bytes."""
+MAX_NAME = 255
+"""Longest name of a folder, bytes."""
 
 
 @dataclass(frozen=True)
 class Bench:
-    """A bench file that can be chosen; ``plan`` is None where it has mistakes, ``wrong`` says which."""
+    """A bench file that can be chosen; ``plan`` is None if it has mistakes, which ``wrong`` states."""
 
     name: str
     path: Path
@@ -65,7 +65,7 @@ class Model:
 
 @dataclass
 class Following:
-    """One compensation, read again at each question: its state, its entries, its curves."""
+    """One compensation, updated at each request: state, entries of the audit log, curves."""
 
     folder: Path
     reader: AuditReader = field(init=False)
@@ -81,14 +81,14 @@ class Following:
         self.reader = AuditReader(self.folder / AUDIT)
 
     def read(self) -> None:
-        """Check and take what was written since the last time, up to a bound."""
+        """Check and take new entries of the audit log, at most `ENTRIES_PER_READ`."""
         with self.lock:
             try:
-                new = self.reader.read(READ_AT_ONCE)
+                new = self.reader.read(ENTRIES_PER_READ)
             except CompensationError as error:
                 self.broken, self.complete = str(error), True
                 return
-            self.complete = len(new) < READ_AT_ONCE
+            self.complete = len(new) < ENTRIES_PER_READ
             for entry in new:
                 self.first = self.first or entry
                 if "offset" in entry and "elapsed" in entry:
@@ -101,7 +101,7 @@ class Following:
 
 @dataclass
 class Start:
-    """A command that this dashboard started; ``code`` is None while it works."""
+    """A command that this dashboard started; ``code`` is None while it runs."""
 
     bench: str
     model: str
@@ -112,22 +112,22 @@ class Start:
 
     @property
     def code(self) -> int | None:
-        """Exit code; None while it works."""
+        """Exit code; None while it runs."""
         return self.process.poll()
 
     def printed(self) -> str:
-        """Return the end of what it printed."""
+        """Return the end of its output."""
         return printed(self.output)
 
 
 class Compensations:
-    """Of one folder of runs.
+    """Compensations of one folder of runs.
 
     Parameters
     ----------
     runs : Path
     folder : Path
-        Of the bench files and models that are offered.
+        Folder of bench files and models.
     bench : Path, optional
         A further bench file.
     """
@@ -135,9 +135,9 @@ class Compensations:
     def __init__(self, runs: Path, folder: Path, bench: Path | None = None) -> None:
         self.runs, self.folder, self.bench = runs, folder, bench
         self.starts: deque[Start] = deque(maxlen=10)
-        self._following: Kept[Following] = Kept(SHOWN)
-        self._models: Kept[Model | None] = Kept(MOST_FILES)
-        self._benches: Kept[Bench] = Kept(MOST_FILES)
+        self._following: Cache[Following] = Cache(SHOWN)
+        self._models: Cache[Model | None] = Cache(MAX_FILES)
+        self._benches: Cache[Bench] = Cache(MAX_FILES)
 
     def following(self, key: str) -> Following:
         """Return a compensation by the name of its run folder.
@@ -145,15 +145,15 @@ class Compensations:
         Raises
         ------
         CompensationError
-            There is none.
+            The compensation does not exist.
         """
-        fits = 0 < len(key.encode("utf-8", "surrogatepass")) <= LONGEST_NAME and key == Path(key).name
+        fits = 0 < len(key.encode("utf-8", "surrogatepass")) <= MAX_NAME and key == Path(key).name
         if not fits or not (self.runs / key / AUDIT).is_file():
-            raise CompensationError(f"There is no compensation {key[:100]!r} in {self.runs}.")
+            raise CompensationError(f"No compensation {key[:100]!r} in {self.runs}.")
         return self._following.get(key, lambda: Following(self.runs / key))
 
     def listed(self) -> list[tuple[str, bool, Status | None, str]]:
-        """Return name, whether it is at work, state and what is wrong with it; those at work first, then the newest."""
+        """Return name, whether it is running, state and mistake of each; running ones first, then the newest."""
         found: list[tuple[str, bool, Status | None, str]] = []
         for folder in compensations(self.runs):
             working = is_working(folder)
@@ -182,24 +182,24 @@ class Compensations:
         return [each for each in found if each is not None]
 
     def start(self, bench: str, model: str, arm: str | None) -> Start:
-        """Start ``errormotion compensate run`` as a process of its own, which goes on when the dashboard ends.
+        """Start ``errormotion compensate run`` in a separate process, which continues when the dashboard ends.
 
         Parameters
         ----------
         bench, model : str
-            Of those that are offered.
+            Names of a listed bench and a listed model.
         arm : str, optional
-            Name of the machine as a person typed it; without it the compensation is a shadow.
+            Name of the machine, as typed by the user; without it the compensation runs in shadow mode.
 
         Raises
         ------
         CompensationError
-            They are not offered, or the machine has another name. Nothing is started.
+            Bench or model are not listed, or the name of the machine is wrong. Nothing is started.
         """
         benches = {each.name: each for each in self.benches()}
         models = {each.name: each for each in self.models()}
         if bench not in benches or model not in models:
-            raise CompensationError("Choose a bench and a model of those that are offered.")
+            raise CompensationError("Choose a bench and a model from the lists.")
         plan = benches[bench].plan
         if plan is None:
             raise CompensationError(benches[bench].wrong)
@@ -218,10 +218,10 @@ class Compensations:
 
 
 def _files(folder: Path, ending: str) -> Sequence[Path]:
-    """Return the files of a folder by their names, as many as are offered."""
+    """Return the first `MAX_FILES` files of a folder by name."""
     if not folder.is_dir():
         return ()
-    return sorted(path for path in folder.glob(f"*{ending}") if path.is_file())[:MOST_FILES]
+    return sorted(path for path in folder.glob(f"*{ending}") if path.is_file())[:MAX_FILES]
 
 
 def _states(path: Path, schema: str) -> bool:
@@ -242,7 +242,7 @@ def _bench(name: str, path: Path) -> Bench:
 
 def _model(name: str, path: Path) -> Model | None:
     try:
-        if path.stat().st_size > LARGEST_MODEL:
+        if path.stat().st_size > MAX_MODEL:
             return None
         with reading(path), datasets.load(path) as found:
             inputs = predictor(found)

@@ -1,4 +1,4 @@
-"""Figures for the browser: curves with bands of U (k = 2), hover and zoom, as JSON that BokehJS draws."""
+"""Interactive figures for the browser: curves with bands of U (k = 2), as JSON for BokehJS."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from bokeh.plotting import figure
 
 from errormotion.compare.pairs import COVERAGE_FACTOR
 from errormotion.compare.report.picture import abscissa, common, field
-from errormotion.dashboard.course import Course, Curve, thin
+from errormotion.dashboard.curves import Curve, CurveSet, thin
 from errormotion.report.canvas import COLOURS, DASHES
 
 HEIGHT = 300
 """Height of one panel, pixels."""
-SMALLEST_MARGIN = 0.05
-"""Above and below the values, in field units: rounding errors of a computer are not drawn as a course."""
+MIN_MARGIN = 0.05
+"""Smallest margin above and below the values, in um or arcsec, so that rounding errors do not fill the ordinate."""
 FEW = 20
-"""Values of a curve up to which each is a dot as well."""
-LONGEST = 40
-"""Characters of a name at an axis."""
+"""Largest number of values of a curve that are marked by dots."""
+MAX_NAME = 40
+"""Longest name at an axis, characters."""
 FONT = "system-ui, 'Segoe UI', 'Liberation Sans', Arial, sans-serif"
 INK, SOFT, LINE = "#1b252d", "#44525c", "#dfe5e9"
 
 
-def errors_item(found: Course, freedoms: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the figure of a result: one panel for each unit, with the freedoms that are chosen; all without a choice.
+def errors_item(found: CurveSet, freedoms: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the figure of a result: one panel for each unit, with the chosen freedoms, by default all.
 
-    Each freedom keeps its colour and its dashes whatever is chosen.
+    Colour and dashes of a freedom do not depend on the choice.
     """
     looks = {each.freedom: k for k, each in enumerate(found.curves)}
     chosen = [each for each in found.curves if not freedoms or each.freedom in freedoms]
@@ -41,7 +41,7 @@ def errors_item(found: Course, freedoms: Sequence[str] = ()) -> dict[str, Any]:
     panels: list[figure] = []
     for unit in units:
         own = [each for each in chosen if each.unit == unit]
-        plot = _panel(found, unit, _reach(own), last=unit == units[-1])
+        plot = _panel(found, unit, _ordinate(own), last=unit == units[-1])
         for curve in own:
             _draw(plot, found, curve, looks[curve.freedom])
         _legend(plot)
@@ -64,8 +64,10 @@ def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
         known = [(i, each) for i, each in enumerate(curves) if np.isfinite(each.values).any()]
         if not known:
             continue
-        found = Course(label, np.asarray(places, dtype=float), texts, tuple(curves), np.zeros(3), {})
-        plot = _panel(found, f"{freedom} / {unit}", _reach([each for _, each in known]), last=freedom == freedoms[-1])
+        found = CurveSet(label, np.asarray(places, dtype=float), texts, tuple(curves), np.zeros(3), {})
+        plot = _panel(
+            found, f"{freedom} / {unit}", _ordinate([each for _, each in known]), last=freedom == freedoms[-1]
+        )
         for i, curve in known:
             beside = 0.0 if joined else 0.12 * (i - (len(names) - 1) / 2)
             _draw(plot, replace(found, places=found.places + beside), curve, i)
@@ -75,9 +77,9 @@ def comparison_item(ds: xr.Dataset) -> dict[str, Any]:
 
 
 def live_item(units: Mapping[str, str]) -> dict[str, Any]:
-    """Return a figure over time without data: one panel for each unit; the browser fills the source of each name.
+    """Return a figure over time without data: one panel for each unit; the browser fills in the data of each name.
 
-    ``units`` holds the unit of each quantity by its name.
+    ``units`` states the unit of each quantity by name.
     """
     panels: list[figure] = []
     kinds = list(dict.fromkeys(units.values()))
@@ -97,7 +99,7 @@ def live_item(units: Mapping[str, str]) -> dict[str, Any]:
 
 
 def following_item() -> dict[str, Any]:
-    """Return axes for the offsets of a compensation, without data: the browser fills the sources X, Y and Z."""
+    """Return a figure of the offsets of a compensation without data; the browser fills in the data of X, Y and Z."""
     panels: list[figure] = []
     looks = (("asked", "from the prediction", 0), ("offset", "offset", 1), ("applied", "in effect", 2))
     for axis in "XYZ":
@@ -120,7 +122,7 @@ def following_item() -> dict[str, Any]:
 
 
 def _stacked(panels: Sequence[figure]) -> dict[str, Any]:
-    """Return panels one above the other, with one range of the abscissa."""
+    """Return panels above each other, with a common abscissa."""
     for panel in panels[1:]:
         panel.x_range = panels[0].x_range
     rows = [[panel] for panel in panels]
@@ -128,22 +130,22 @@ def _stacked(panels: Sequence[figure]) -> dict[str, Any]:
 
 
 def plain(text: str) -> str:
-    """Return a name that is drawn as it is: short, printable, and never taken for mathematics (``$$``)."""
-    shown = "".join(each if each.isprintable() else "?" for each in text[:LONGEST])
-    return shown.replace("$$", "$\N{ZERO WIDTH SPACE}$") + ("…" if len(text) > LONGEST else "")
+    """Return a name for drawing: shortened, printable, and without the delimiter of mathematics (``$$``)."""
+    shown = "".join(each if each.isprintable() else "?" for each in text[:MAX_NAME])
+    return shown.replace("$$", "$\N{ZERO WIDTH SPACE}$") + ("…" if len(text) > MAX_NAME else "")
 
 
-def _reach(curves: Sequence[Curve]) -> Range1d:
+def _ordinate(curves: Sequence[Curve]) -> Range1d:
     """Return the range of the ordinate: all values with their bands."""
     ends = [each.values + sign * np.nan_to_num(each.expanded) for each in curves for sign in (-1.0, 1.0)]
     known = np.concatenate(ends)[np.isfinite(np.concatenate(ends))]
     low, high = float(known.min()), float(known.max())
-    margin = max(0.06 * (high - low), SMALLEST_MARGIN)
+    margin = max(0.06 * (high - low), MIN_MARGIN)
     return Range1d(low - margin, high + margin)
 
 
-def _panel(found: Course, unit: str, reach: Range1d, *, last: bool) -> figure:
-    plot = _axes(unit, plain(found.label) if last else None, last=last, y_range=reach)
+def _panel(found: CurveSet, unit: str, ordinate: Range1d, *, last: bool) -> figure:
+    plot = _axes(unit, plain(found.label) if last else None, last=last, y_range=ordinate)
     if found.names:
         ticks = np.unique(np.linspace(0, len(found.names) - 1, min(len(found.names), 12)).astype(int))
         plot.xaxis.ticker = [int(k) for k in ticks]
@@ -179,7 +181,7 @@ def _look(number: int) -> tuple[str, tuple[float, ...]]:
 
 
 def _legend(plot: figure) -> None:
-    """Put the legend above the axes, where it hides no curve."""
+    """Place the legend above the axes, where it hides no curve."""
     legend = plot.legend[0]
     plot.center.remove(legend)
     plot.add_layout(legend, "above")
@@ -188,7 +190,7 @@ def _legend(plot: figure) -> None:
     legend.label_text_color = INK
 
 
-def _draw(plot: figure, found: Course, curve: Curve, number: int) -> None:
+def _draw(plot: figure, found: CurveSet, curve: Curve, number: int) -> None:
     colour, dash = _look(number)
     kept = thin(curve.values)
     values, expanded = curve.values[kept], curve.expanded[kept]
@@ -212,6 +214,6 @@ def _draw(plot: figure, found: Course, curve: Curve, number: int) -> None:
         drawn = plot.line(
             "x", "y", source=source, color=colour, line_width=1.8, line_dash=list(dash), legend_label=curve.name
         )
-        if len(kept) <= FEW:  # one alone makes no line
+        if len(kept) <= FEW:  # a single value has no line
             plot.scatter("x", "y", source=source, size=6, color=colour)
     plot.add_tools(HoverTool(renderers=[drawn], tooltips=tips, mode="mouse" if found.names else "vline"))

@@ -1,4 +1,4 @@
-"""The runs of one folder as the dashboard shows them, and the files of a run that may be fetched."""
+"""The runs of one folder for the dashboard, and the files of a run that can be downloaded."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from errormotion.datasets.files.runfile import FILE
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 from errormotion.record.runs.entry import Entry, read_entry
-from errormotion.record.runs.listing import DEEPEST, list_runs
-from errormotion.record.text import FIELD, LONG
+from errormotion.record.runs.listing import MAX_DEPTH, list_runs
+from errormotion.record.text import FIELD, MM_FROM
 from errormotion.report.text import DASH, rounded, signs
 
-LONGEST_KEY = 600
-"""Characters of the key of a run."""
+MAX_KEY = 600
+"""Longest key of a run, characters."""
 FILES = {"report": "report.html", "pdf": "report.pdf", "xlsx": "report.xlsx", "run": FILE, "log": "log.jsonl"}
-"""Files of a run folder that may be fetched, by the word for them; the error dataset is one more, ``errors``."""
+"""Files of a run folder that can be downloaded, by keyword; the keyword ``errors`` is the error dataset."""
 
 
 class NotFoundError(RunError):
-    """There is no such run, or it has no such file."""
+    """The run or the file does not exist."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """Runs that were selected, newest first, the values that filters may have, and what a reader should know."""
+    """Selected runs, newest first, the possible values of filters, and remarks for the user."""
 
     rows: tuple[Row, ...]
     total: int
@@ -80,15 +80,15 @@ class Lab:
         Raises
         ------
         RunError
-            A date that is none, or too many runs.
+            The date is invalid, or there are too many runs.
         """
         if not self.runs.is_dir():
-            return Table((), 0, (), (), (), (), (f"There is no folder {self.runs} yet.",))
+            return Table((), 0, (), (), (), (), (f"The folder {self.runs} does not exist yet.",))
         found = list_runs([self.runs], since=_date(choice.since))
         chosen = [(path, entry) for path, entry in found.runs if _fits(entry, choice)]
         remarks = [f"{found.undated} runs have no known date."] if found.undated else []
         if found.waiting:
-            remarks.append(f"The figures of {found.waiting} runs are not read yet; load the page again.")
+            remarks.append(f"{found.waiting} runs: figures of merit not read yet; reload the page.")
         root = self.runs.resolve()
         return Table(
             tuple(_row(path.relative_to(root).as_posix(), entry) for path, entry in chosen),
@@ -106,33 +106,33 @@ class Lab:
         Raises
         ------
         NotFoundError
-            The key names no run in the folder of runs.
+            The key is not that of a run in the folder of runs.
         """
         parts = key.split("/")
-        if len(key) <= LONGEST_KEY and key.isprintable() and "\\" not in key and 0 < len(parts) <= DEEPEST + 1:
+        if len(key) <= MAX_KEY and key.isprintable() and "\\" not in key and 0 < len(parts) <= MAX_DEPTH + 1:
             root = self.runs.resolve()
             path = root.joinpath(*parts)
             if not any(part in ("", ".", "..") for part in parts) and _inside(path / FILE, root):
                 return path
-        raise NotFoundError(f"There is no run {key[:LONGEST_KEY]!r} in {self.runs}.")
+        raise NotFoundError(f"No run {key[:MAX_KEY]!r} in {self.runs}.")
 
     def entry(self, key: str) -> Entry:
-        """Return what a run states.
+        """Return the entry of a run.
 
         Raises
         ------
         RunError
-            There is no such run, or its ``run.json`` cannot be read.
+            The run does not exist, or its ``run.json`` cannot be read.
         """
         return read_entry(self.folder(key))
 
     def file(self, key: str, word: str) -> Path:
-        """Return a file of a run by its word: one of FILES, or ``errors``.
+        """Return a file of a run by its keyword: a key of `FILES`, or ``errors``.
 
         Raises
         ------
         RunError
-            There is no such run or file, or a link leads out of the folder.
+            The run or the file does not exist, or a link leads out of the folder.
         """
         folder = self.folder(key)
         name = read_entry(folder).errors if word == "errors" else FILES.get(word, "")
@@ -141,7 +141,7 @@ class Lab:
         raise NotFoundError(f"Run {key!r} has no file '{word[:20]}'.")
 
     def files(self, key: str) -> tuple[str, ...]:
-        """Return the words of the files that a run has."""
+        """Return the keywords of the files of a run."""
         found = []
         for word in (*FILES, "errors"):
             try:
@@ -153,9 +153,9 @@ class Lab:
 
 
 def figure_text(figure: FigureOfMerit) -> tuple[str, str, str]:
-    """Return value, expanded uncertainty (k = 2) and unit of a figure of merit in the field's unit."""
+    """Return value, expanded uncertainty (k = 2) and printed unit of a figure of merit."""
     factor, unit = FIELD.get(figure.unit, (1.0, figure.unit))
-    if figure.unit == "m" and abs(figure.value) >= LONG:
+    if figure.unit == "m" and abs(figure.value) >= MM_FROM:
         factor, unit = 1e3, "mm"
     value, expanded = rounded(factor * figure.value, factor * figure.expanded_uncertainty)
     return value, expanded, signs(unit)

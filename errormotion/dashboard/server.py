@@ -1,4 +1,4 @@
-"""The server: handlers, access, connection; it runs until it is interrupted."""
+"""The server: routes, access, connection."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from errormotion.errors import RunError
 
 HERE = Path(__file__).parent
 PAGES = (("/measure", "Measure"), ("/results", "Results"), ("/compare", "Compare"), ("/compensate", "Compensate"))
-"""Paths and titles of the pages that every dashboard has."""
+"""Paths and titles of the pages in the menu."""
 BOKEH = ("bokeh.min.js",)
-"""Scripts of the package bokeh that pages load."""
+"""Scripts of bokeh that pages load."""
 WORKERS = 4
-"""Threads that read and compute."""
+"""Number of threads for fast functions."""
 SLOW_WORKERS = 2
-"""Threads for work that may take long."""
-LARGEST_REQUEST = 1 << 20
-"""Bytes of a request."""
-LARGEST_HEAD = 1 << 15
-"""Bytes of the head of a request."""
-IDLE = 60.0
-"""Time after which a silent connection is closed, s."""
+"""Number of threads for slow functions."""
+MAX_REQUEST = 1 << 20
+"""Largest size of a request, bytes."""
+MAX_HEADER = 1 << 15
+"""Largest size of the header of a request, bytes."""
+IDLE_TIMEOUT = 60.0
+"""Time after which an idle connection is closed, s."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How the dashboard is served."""
+    """Options of the server."""
 
     runs: Path
     host: str = LOOPBACK
@@ -61,18 +61,18 @@ class Start(Guarded):
     """The address without a path."""
 
     def get(self) -> None:
-        """Lead to the instruments, or without a bench to the results."""
+        """Redirect to the page Now, or without a bench to Results."""
         self.redirect("/results" if self.context.watch is None else "/now")
 
 
 class Missing(Guarded):
-    """Any address that there is not."""
+    """Any unknown address."""
 
     def prepare(self) -> None:
-        """Refuse, after the rules of access."""
+        """Refuse the request, after the check of access."""
         super().prepare()
         if not self._finished:
-            raise HTTPError(404, reason="There is no such page")
+            raise HTTPError(404, reason="No such page")
 
 
 class Static(Guarded, StaticFileHandler):
@@ -81,17 +81,17 @@ class Static(Guarded, StaticFileHandler):
     public = True
 
     def initialize(self, context: Context, path: str) -> None:  # type: ignore[override]
-        """Take what the server knows, and the folder."""
+        """Set the context of the server and the folder."""
         Guarded.initialize(self, context)
         StaticFileHandler.initialize(self, path)
 
     def set_extra_headers(self, path: str) -> None:  # noqa: ARG002 - as tornado calls it
-        """Let browsers keep the file, and ask whether it has changed."""
+        """Allow browsers to cache the file if they check for changes."""
         self.set_header("Cache-Control", "no-cache")
 
 
 def application(context: Context) -> Application:
-    """Return the handlers of a server."""
+    """Return the application of a server: routes and handlers."""
     one = {"context": context}
     scripts = "|".join(name.replace(".", r"\.") for name in BOKEH)
     return Application(
@@ -126,21 +126,21 @@ def application(context: Context) -> Application:
 
 
 async def serve(options: Options, started: Callable[[str, Access], None], end: asyncio.Event | None = None) -> None:
-    """Serve until cancelled, or until an event.
+    """Serve until it is cancelled, or until an event.
 
     Parameters
     ----------
     options : Options
     started : callable
-        Called with address and access once the server listens: the only place where the token is given away.
+        Called with address and access when the server listens; only this function receives the token.
     end : asyncio.Event, optional
 
     Raises
     ------
     RunError
-        The address cannot be listened on, or certificate and key cannot be used.
+        The server cannot listen on the address, or certificate and key cannot be used.
     BenchError
-        The bench file has mistakes, or nothing that a monitor reads.
+        The bench file is invalid, or has no instruments for a monitor.
     """
     context_of_tls = _encryption(options)
     watch = Watch(load_bench(options.bench), options.runs, options.interval) if options.bench is not None else None
@@ -152,7 +152,9 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
         try:
             sockets = bind_sockets(options.port, options.host)
         except OSError as error:
-            raise RunError(f"{options.host}, port {options.port}: cannot be listened on: {error.strerror}") from error
+            raise RunError(
+                f"{options.host}, port {options.port}: the server cannot listen: {error.strerror}"
+            ) from error
         port = int(sockets[0].getsockname()[1])
         pages = (*((("/now", "Now"),) if watch is not None else ()), *PAGES)
         context = Context(
@@ -161,11 +163,11 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
         server = HTTPServer(
             application(context),
             ssl_options=context_of_tls,
-            idle_connection_timeout=IDLE,
-            body_timeout=IDLE,
-            max_body_size=LARGEST_REQUEST,
-            max_buffer_size=LARGEST_REQUEST,
-            max_header_size=LARGEST_HEAD,
+            idle_connection_timeout=IDLE_TIMEOUT,
+            body_timeout=IDLE_TIMEOUT,
+            max_body_size=MAX_REQUEST,
+            max_buffer_size=MAX_REQUEST,
+            max_header_size=MAX_HEADER,
         )
         server.add_sockets(sockets)
         if watch is not None:

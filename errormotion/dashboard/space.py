@@ -14,18 +14,18 @@ from errormotion.report.drawings.turntable import Dots, Lines, Scene, draw, enla
 
 LINEAR = ("EX", "EY", "EZ")
 PLACES = ("x", "y", "z")
-MOST = 2000
-"""Targets that are drawn."""
+MAX_TARGETS = 2000
+"""Number of targets that are drawn."""
 ARROW = 0.16
-"""Length of the longest arrow, as a share of the diagonal of the targets."""
+"""Length of the longest arrow, as a fraction of the diagonal of the targets."""
 SHADES = ("#7fb0dc", "#2a5599", "#D55E00")
-"""Thirds of the longest, shortest first."""
+"""Colours by thirds of the longest vector, shortest first."""
 FAINT = "#9aa5ad"
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A drawing in space as HTML, its name for who does not see it, and what is to be read below it."""
+    """A drawing in space as HTML, its accessible name, and its caption."""
 
     markup: Markup
     label: str
@@ -33,7 +33,7 @@ class Drawing:
 
 
 def has_volume(ds: xr.Dataset) -> bool:
-    """Return whether a dataset has translations at targets with places."""
+    """Return whether a dataset has displacements at targets with positions."""
     return "target" in ds.em.dims and all(name in ds for name in LINEAR) and all(axis in ds.coords for axis in PLACES)
 
 
@@ -52,7 +52,7 @@ def drawing(ds: xr.Dataset, point: Sequence[float] | None = None, select: Mappin
     Raises
     ------
     DatasetError
-        No volume, an index beyond its dimension, or nothing that can be drawn.
+        The dataset is no volume, an index is beyond its dimension, or no target can be drawn.
     """
     if not has_volume(ds):
         raise DatasetError("a drawing in space needs EX, EY and EZ at targets with x, y and z")
@@ -67,8 +67,8 @@ def drawing(ds: xr.Dataset, point: Sequence[float] | None = None, select: Mappin
     expanded = moved.em.expanded(k=2).sel(dof=list(LINEAR)).transpose("target", "dof").values
     known = np.flatnonzero(np.isfinite(places).all(axis=-1) & np.isfinite(vectors).all(axis=-1))
     if not known.size:
-        raise DatasetError("no target has a known place and known errors")
-    picked = known[np.unique(np.linspace(0, known.size - 1, min(known.size, MOST)).astype(int))]
+        raise DatasetError("no target has a known position and known errors")
+    picked = known[np.unique(np.linspace(0, known.size - 1, min(known.size, MAX_TARGETS)).astype(int))]
     lengths = np.linalg.norm(vectors[picked], axis=-1)
     longest = float(lengths.max())
     diagonal = float(np.linalg.norm(np.ptp(places[picked], axis=0)))
@@ -88,16 +88,16 @@ def drawing(ds: xr.Dataset, point: Sequence[float] | None = None, select: Mappin
     fewer = f" {picked.size} of {known.size} targets are drawn." if picked.size < known.size else ""
     unknown = f" {len(places) - known.size} targets are unknown." if known.size < len(places) else ""
     caption = (
-        f"Error vectors, {factor} times enlarged; the longest is {1e6 * longest:.2f} µm. Pale: up to a third of it, "
-        f"dark: up to two thirds, red: above.{fewer}{unknown} Drag or use the arrow keys to turn, Ctrl and the wheel "
-        "to zoom; point at a target for its errors with U (k = 2)."
+        f"Error vectors, enlarged {factor} times; the longest is {1e6 * longest:.2f} µm. Pale: up to a third of it, "
+        f"dark: up to two thirds, red: above.{fewer}{unknown} Drag or use the arrow keys to rotate, Ctrl and the wheel "
+        "to zoom; move the pointer to a target for its errors with U (k = 2)."
     )
     label = f"Error vectors of {picked.size} targets in space; the longest is {1e6 * longest:.2f} µm"
     return Drawing(Markup(draw(Scene(list(parts)), "space")), label, caption)
 
 
 def _box(places: np.ndarray) -> Lines:
-    """Return the edges of the box around places."""
+    """Return the edges of the box around positions."""
     ends = places.min(axis=0), places.max(axis=0)
     corners = np.array([[ends[i >> k & 1][k] for k in range(3)] for i in range(8)])
     edges = [(corners[i], corners[i | 1 << k]) for i in range(8) for k in range(3) if not i >> k & 1]

@@ -1,6 +1,6 @@
-"""The instruments of a bench, read by a monitor in a thread: what they say now, and the last hours in memory.
+"""The instruments of a bench, read by a monitor in a thread: present readings, and those of the last hours.
 
-While another program has claimed the instruments, they are closed here, and what that program records is shown.
+While another program has claimed the instruments, they are closed, and the record of that program is shown.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.campaign.background.recorded import Recorded, Value, recorded
+from errormotion.campaign.claims import Claim, holder, watching
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.sources import Source
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.campaign.storage.journal import cause_of
-from errormotion.campaign.turns import Claim, holder, watching
-from errormotion.dashboard.course import thin
+from errormotion.dashboard.curves import thin
 from errormotion.errors import ErrormotionError
 
 SPAN = 8 * 3600.0
-"""Time that is kept in memory, s; the log of the monitor holds everything."""
-MOST_ROWS = 100_000
-"""Rows that are kept, whatever the interval."""
+"""Time span in memory, s; the log of the monitor is complete."""
+MAX_ROWS = 100_000
+"""Largest number of rows in memory."""
 PARAMETERS = (
     ("X", "mm", 1e3),
     ("Y", "mm", 1e3),
@@ -41,35 +41,34 @@ PARAMETERS = (
     ("spindle load", "%", 100.0),
     ("feed", "mm/min", 60e3),
 )
-"""Working parameters: name, unit on the page, and number of these in one SI unit."""
+"""Working parameters: name, unit on the page, and factor from the SI unit to it."""
 _STATES = ("spindle_speed", "spindle_load", "feed")
 _OF_A_LOG = ("gap", "temperature_flag")
-"""Variables of a monitor's log that are no readings."""
-LONGEST_TEXT = 200
-"""Characters of a text from a device."""
+"""Variables of the log of a monitor that are not readings."""
+MAX_TEXT = 200
+"""Longest text from a device, characters."""
 RATE_SPAN = 10.0
-"""Time over which the rate of readings is counted, s."""
-TURN_INTERVAL = 0.2
-"""Of the look whether another program wants the instruments, s."""
+"""Period over which the rate of readings is determined, s."""
+CLAIM_INTERVAL = 0.2
+"""Interval between checks for claims of other programs, s."""
 RECORD_INTERVAL = 1.0
-"""Shortest time from one look into the record of another program to the next, s."""
+"""Shortest interval between readings of the record of another program, s."""
 EMERGENCY_STOP = "emergency stop"
-"""The alarm; controllers with alarms of their own may state it too."""
+"""Text of the alarm; a controller may also report it among its alarms."""
 OLDEST_SAMPLE = 5.0
-"""Time without a new sample after which the last one is no present value, s."""
+"""Age from which the last sample of a record is outdated, s."""
 _FIELD = {"m": ("mm", 1e3), "rad": ("arcsec", 3600 * 180 / math.pi), "degC": ("°C", 1.0), "1": ("", 1.0)}
-"""Unit on the page, and number of these in one unit of a record."""
+"""Unit on the page, and factor from the unit of a record to it."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """One instrument: ``state`` is ``answers``, ``waiting``, ``silent`` or ``lent``; since when, and why.
+    """One instrument: ``state`` with its start ``since`` and its cause ``why``.
 
-    Another program has one that is lent.
-
-    ``rate`` is the number of readings per second lately, ``missed`` that of rows of the log without a reading.
+    ``state`` is ``answers``, ``waiting``, ``silent``, or ``lent`` (in use by another program). ``rate`` is the present
+    number of readings per second, ``missed`` the number of rows of the log without a reading.
     """
 
     name: str
@@ -84,7 +83,7 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One value now, NaN if unknown, with its extremes and its change since the monitor started.
+    """One present value, NaN if unknown, with its extremes and its change since the start of the monitor.
 
     ``place`` is the position of a sensor on the machine, m; None if unknown.
     """
@@ -101,11 +100,11 @@ class Quantity:
 
 @dataclass(frozen=True, eq=False)
 class Present:
-    """Everything that a bench says now; the same object until something has changed.
+    """Present readings of a bench; the same object until a change.
 
-    ``running`` is False once the monitor has stopped, for the reason ``error``; ``rows`` counts those of its log.
-    ``lent`` says which program has the instruments, if any: the values are those of its record in ``run`` then, with
-    ``rows`` samples, and ``recorded`` holds those that are neither a temperature nor a parameter of this bench.
+    ``running`` is False after the monitor has stopped, with the cause ``error``; ``rows`` is the length of its log.
+    ``lent`` states the other program that uses the instruments, if any: the values are then those of its record in
+    ``run``, with ``rows`` samples, and ``recorded`` contains those that are no temperature or parameter of this bench.
     """
 
     time: datetime
@@ -146,20 +145,20 @@ class _History:
         """Return times and values of a column over the last seconds, in order."""
         n = min(self.count, self.size)
         order = (np.arange(self.count - n, self.count)) % self.size
-        begin = int(np.searchsorted(self.times[order], self.times[order[-1]] - seconds)) if n else 0
-        return self.times[order[begin:]], self.rows[order[begin:], column]
+        start = int(np.searchsorted(self.times[order], self.times[order[-1]] - seconds)) if n else 0
+        return self.times[order[start:]], self.rows[order[start:], column]
 
 
 class Watch:
-    """Reads a bench from `start` to `stop`.
+    """Reader of a bench, from `start` to `stop`.
 
     Parameters
     ----------
     plan : BenchPlan
     runs : Path
-        Folder of the monitor's run folder.
+        Folder for the run folder of the monitor.
     interval : float
-        Of the rows, s.
+        Interval of the rows, s.
 
     Raises
     ------
@@ -170,20 +169,22 @@ class Watch:
     def __init__(self, plan: BenchPlan, runs: Path, interval: float = 1.0) -> None:
         self.plan, self.runs, self.interval = plan, runs, interval
         self._lock, self._end = threading.Lock(), threading.Event()
-        self._clock = _Turn(self._given_up)
+        self._clock = _InterruptibleClock(self._must_release)
         self._monitor = Monitor(plan, runs, interval, self._clock)
         sensors = self._monitor.sensors
         parameters = PARAMETERS if self._monitor.controller is not None else ()
         self.units = {**dict.fromkeys(sensors, "°C"), **{name: unit for name, unit, _ in parameters}}
         self._places = dict(zip(sensors, self._monitor.places, strict=True))
-        self._history = _History(tuple(self.units), min(MOST_ROWS, max(2, math.ceil(SPAN / interval))))
+        self._history = _History(tuple(self.units), min(MAX_ROWS, max(2, math.ceil(SPAN / interval))))
         self._extremes = np.full((3, len(self.units)), np.nan)  # first, lowest, highest
         self._last: Snapshot | None = None
-        self._shift = 0.0  # from the time of the present monitor to that of the history, s
+        self._shift = 0.0  # time of the history minus time of the present monitor, s
         self._used = False
         self._lent: Claim | None = None
         self._record: Recorded | None = None
-        self._record_time = self._looked = -math.inf  # of the history: of the last sample, and of the last look
+        self._record_time = (
+            self._looked
+        ) = -math.inf  # times of the history: of the last sample, and of its last reading
         self._known: tuple[tuple[Any, ...], Present] | None = None
         self._since: dict[str, tuple[str, datetime]] = {}
         most = 1 + max(2, math.ceil(RATE_SPAN / interval))
@@ -204,7 +205,7 @@ class Watch:
         self._thread.join()
 
     def present(self) -> Present:
-        """Return what the bench says now."""
+        """Return the present readings of the bench."""
         errors = tuple(source.error for source in self._monitor.sources)
         with self._lock:
             revision = (self._running, self._error, self._revision, *errors)
@@ -244,13 +245,13 @@ class Watch:
         row, others = self._split(found.values if age <= OLDEST_SAMPLE else ())
         temperatures, parameters = self._quantities(row, {})
         title = f" ({_text(found.title)})" if found.title else ""
-        words = f"{_text(claim.what)}{title} has the instruments. "
+        words = f"{_text(claim.what)}{title} uses the instruments. "
         if not found.samples:
-            words += "It has recorded nothing yet."
+            words += "It has recorded no samples yet."
         elif age > OLDEST_SAMPLE:
             words += f"Its last sample is {age:.0f} s old."
         else:
-            words += "The values are those that it records."
+            words += "The values are taken from its record."
         return Present(
             _now(),
             self._running,
@@ -277,7 +278,7 @@ class Watch:
         return tuple(e for e in found if e.name in self._places), tuple(e for e in found if e.name not in self._places)
 
     def _split(self, values: Sequence[Value]) -> tuple[list[float], tuple[Quantity, ...]]:
-        """Return a row of the history from a record, and what has no column there."""
+        """Return a row of the history from a record, and the values without a column in the history."""
         row, others = dict.fromkeys(self.units, math.nan), []
         factors = {name: factor for name, _, factor in PARAMETERS}
         for each in values:
@@ -298,7 +299,7 @@ class Watch:
     def history(self, names: Sequence[str], seconds: float) -> Mapping[str, tuple[Array, Array]]:
         """Return times (s since 1970, UTC) and values of the last seconds, reduced; unknown values are NaN.
 
-        Names that are not known are left out.
+        Unknown names are left out.
         """
         found = {}
         began, columns = self._start_time().timestamp(), {name: k for k, name in enumerate(self.units)}
@@ -318,7 +319,7 @@ class Watch:
                         self._read()
                 while not self._end.is_set() and (claim := holder(self.plan.machine)) is not None:
                     self._look(claim)
-                    self._end.wait(TURN_INTERVAL)
+                    self._end.wait(CLAIM_INTERVAL)
                 with self._lock:
                     self._lent, self._record = None, None
                     self._revision += 1
@@ -329,8 +330,8 @@ class Watch:
             self._running = False
 
     def _read(self) -> None:
-        """Read the instruments until this watch ends or another program has claimed them."""
-        if self._used:  # a monitor works once
+        """Read the instruments until the end, or until another program claims them."""
+        if self._used:  # a monitor can be used once only
             self._monitor = Monitor(self.plan, self.runs, self.interval, self._clock)
         self._used = True
         with self._lock:
@@ -340,14 +341,14 @@ class Watch:
         with self._monitor as monitor:
             for snapshot in monitor.watch():
                 self._take(snapshot)
-                if self._given_up():
+                if self._must_release():
                     break
 
-    def _given_up(self) -> bool:
+    def _must_release(self) -> bool:
         return self._end.is_set() or holder(self.plan.machine) is not None
 
     def _start_time(self) -> datetime:
-        """Return the zero of the history."""
+        """Return time 0 of the history."""
         if self._began is None:
             self._began = _now()
         return self._began
@@ -368,7 +369,7 @@ class Watch:
             self._put(self._shift + snapshot.time, row)
 
     def _look(self, claim: Claim) -> None:
-        """Take what another program has recorded."""
+        """Take the last sample of the record of another program."""
         now = self._elapsed()
         if self._lent == claim and now < self._looked + RECORD_INTERVAL:
             return
@@ -385,7 +386,7 @@ class Watch:
                 self._record_time = now
             self._lent, self._record = claim, found
             self._revision += 1
-            if new or now - self._record_time > OLDEST_SAMPLE:  # between two samples is no gap
+            if new or now - self._record_time > OLDEST_SAMPLE:  # the time between two samples is no gap
                 row, _ = self._split(found.values if found is not None and new else ())
                 self._put(now, np.array(row))
 
@@ -397,7 +398,7 @@ class Watch:
         self._extremes = np.stack([np.where(np.isnan(first), row, first), np.fmin(low, row), np.fmax(high, row)])
 
     def _instrument(self, source: Source) -> Instrument:
-        """Return the state of a source, and note a change; a failed reading counts before the last one is too old."""
+        """Return the state of a source, and store a change; a failed reading counts at once."""
         silent = self._last.silent.get(source.name, "") if self._last is not None else ""
         why = source.error or silent
         state = "answers" if not why else "silent" if source.answer or self._last is not None else "waiting"
@@ -423,27 +424,27 @@ class Watch:
         return folder.path.name if folder is not None else ""
 
 
-class _Turn(Clock):
-    """The clock of a computer, on which the thread of a watch ends its waits once the instruments are given up."""
+class _InterruptibleClock(Clock):
+    """The clock of the computer; waits of the owning thread end when the instruments must be released."""
 
-    def __init__(self, given_up: Callable[[], bool]) -> None:
-        self._given_up = given_up
+    def __init__(self, must_release: Callable[[], bool]) -> None:
+        self._must_release = must_release
         self.owner: threading.Thread | None = None
 
     def sleep(self, seconds: float) -> None:
         """Wait, in short steps."""
         end = self.now() + seconds
-        while (left := end - self.now()) > 0 and not self._given_up():
-            super().sleep(min(left, TURN_INTERVAL))
+        while (left := end - self.now()) > 0 and not self._must_release():
+            super().sleep(min(left, CLAIM_INTERVAL))
 
     def wait(self, event: threading.Event, seconds: float) -> None:
-        """Wait for an event, in short steps; threads that read instruments are not woken."""
+        """Wait for an event, in short steps; waits of other threads are not interrupted."""
         if threading.current_thread() is not self.owner:
             super().wait(event, seconds)
             return
         end = self.now() + seconds
-        while not event.is_set() and (left := end - self.now()) > 0 and not self._given_up():
-            event.wait(min(left, TURN_INTERVAL))
+        while not event.is_set() and (left := end - self.now()) > 0 and not self._must_release():
+            event.wait(min(left, CLAIM_INTERVAL))
 
 
 def _rate(counts: Sequence[tuple[float, int]]) -> float:
@@ -465,8 +466,8 @@ def _row(snapshot: Snapshot, names: Mapping[str, str]) -> list[float]:
 
 
 def _text(value: Any) -> str:
-    """Return a printable text of a device, bounded."""
-    text = "" if value is None else str(value)[:LONGEST_TEXT]
+    """Return a text of a device, printable and of limited length."""
+    text = "" if value is None else str(value)[:MAX_TEXT]
     return "".join(each if each.isprintable() else "?" for each in text)
 
 

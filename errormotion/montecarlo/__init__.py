@@ -1,4 +1,4 @@
-"""Propagation of distributions by the Monte Carlo method, JCGM 101: of any model, and through a method's identify."""
+"""Propagation of distributions by the Monte Carlo method (JCGM 101), for models and for methods."""
 
 from errormotion.montecarlo.adaptive import Summary, numerical_tolerance, propagate
 from errormotion.montecarlo.evaluation import evaluate

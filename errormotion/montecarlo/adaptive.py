@@ -1,7 +1,7 @@
-"""Propagation of distributions with as many trials as its results need: JCGM 101, clauses 7.2 to 7.9.
+"""Propagation of distributions with an adaptive number of trials: JCGM 101, clauses 7.2 to 7.9.
 
-The trials come in blocks from any function ``block(sequence, size)``: a model of a textbook, or the identification of a
-method. A block has a seed of its own, so that it is the same whenever and wherever it is computed.
+Trials are computed in blocks by a function ``block(sequence, size)``, such as a textbook model or the identification of
+a method. Each block has its own seed, so that its trials do not depend on when and where they are computed.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
 from errormotion.arrays import Array
-from errormotion.montecarlo.intervals import confidence, fewest, shortest, standard_errors, symmetric
+from errormotion.montecarlo.intervals import confidence, min_samples, shortest, standard_errors, symmetric
 
 Block = Callable[[SeedSequence, int], Array]
-"""``block(sequence, size)``: ``size`` samples of k quantities (size, k), NaN where a trial gave no value."""
+"""``block(sequence, size)``: ``size`` samples of k quantities (size, k), NaN for a trial without a value."""
 
-MOST_TRIALS = 1_000_000
-"""Trials after which the adaptive procedure stops in any case."""
+MAX_TRIALS = 1_000_000
+"""Number of trials after which the adaptive procedure stops in any case."""
 STABLE = float(ndtr(2.0))
-"""Quantile that belongs to the factor of two standard deviations."""
+"""Probability of the quantile of the normal distribution at two standard deviations."""
 FALSE_ALARM = 0.05
-"""Probability that the finite number of trials puts the end of any interval outside of its bounds."""
-COLUMNS = 4_000_000
-"""Samples that are sorted at a time, which bounds the memory."""
+"""Probability that the end of any interval is outside its bounds because of the finite number of trials."""
+MAX_SORTED = 4_000_000
+"""Number of samples that are sorted at a time, which limits the memory."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What the trials say of k quantities.
+    """Results of the trials for k quantities.
 
     Attributes
     ----------
@@ -48,15 +48,15 @@ class Summary:
     symmetric, shortest : ndarray (2, k)
         Ends of the intervals, 7.7.
     standard_error : ndarray (2, k)
-        Of both ends of the symmetric interval, from the finite number of trials.
+        Standard errors of both ends of the symmetric interval, from the finite number of trials.
     low_bounds, high_bounds : ndarray (2, k)
-        Bounds of both ends that hold for all quantities together with a probability of 95 % (Bonferroni).
+        Bounds of both ends, valid for all quantities simultaneously with a probability of 95 % (Bonferroni).
     tolerance : ndarray (k,)
         Numerical tolerance of the standard uncertainty, 7.9.2.
     missing : ndarray (k,)
         Number of trials without a value.
     stable : ndarray (k,)
-        Whether the adaptive procedure found all results stable, 7.9.4; without it, false.
+        Whether the adaptive procedure found all results stable, 7.9.4; false without the adaptive procedure.
     """
 
     trials: int
@@ -90,8 +90,8 @@ def numerical_tolerance(uncertainty: Array | float, digits: int) -> Array:
 def block_size(probability: float, cheap: bool = True) -> int:
     """Return the size of a block: JCGM 101, 7.9.4 b).
 
-    J = 100 / (1 - p) leaves about a hundred trials of a block outside the interval. The clause takes 10 000 where J is
-    less; for a model that takes milliseconds or seconds a trial, J alone.
+    With J = 100 / (1 - p), about a hundred trials of a block are outside the interval. The clause requires at least
+    10 000 trials; for a model that takes milliseconds or seconds per trial, J is used.
     """
     J = math.ceil(round(100.0 / (1.0 - probability), 9))
     return max(J, 10_000) if cheap else J
@@ -110,7 +110,7 @@ def propagate(
     digits: int = 2,
     seed: int = 0,
     size: int | None = None,
-    most: int = MOST_TRIALS,
+    most: int = MAX_TRIALS,
     floor: float = 0.0,
     enough: Callable[[list[Array]], bool] | None = None,
 ) -> Summary:
@@ -127,15 +127,15 @@ def propagate(
     digits : int
         Meaningful digits of the standard uncertainties.
     seed : int
-        One seed gives one result.
+        Seed of the random numbers.
     size : int, optional
         Size of a block; default :func:`block_size`.
     most : int
         Largest number of trials of the adaptive procedure.
     floor : float
-        Tolerance where the standard uncertainty is 0: what is rounding.
+        Smallest tolerance of the standard uncertainty, which allows for rounding errors.
     enough : function, optional
-        A further condition for the adaptive procedure to stop, of all samples so far.
+        A further condition for the adaptive procedure to stop, a function of all samples so far.
 
     Returns
     -------
@@ -162,11 +162,11 @@ def _counts(trials: int | None, size: int, most: int) -> Iterator[int]:
 
 
 class Stability:
-    """Whether the results of equal blocks are stable: JCGM 101, 7.9.4 g) to k).
+    """Test whether the results of equal blocks are stable: JCGM 101, 7.9.4 g) to k).
 
-    The clause takes a result as stable where twice the standard deviation of its mean over the blocks is within the
-    tolerance. With two or three blocks that deviation is itself hardly known, and the procedure would often stop by
-    chance; Student's factor for h - 1 degrees of freedom, which becomes 2 with many blocks, keeps its probability.
+    By the clause, a result is stable if twice the standard deviation of its mean over the blocks is within the
+    tolerance. With two or three blocks this standard deviation is very uncertain, and the procedure would often stop by
+    chance. Student's factor for h - 1 degrees of freedom, which is 2 for many blocks, maintains the probability.
     """
 
     def __init__(self, probability: float, digits: int, floor: float = 0.0) -> None:
@@ -175,7 +175,7 @@ class Stability:
         self._sums: tuple[Array, Array, Array] | None = None
 
     def add(self, samples: Array) -> None:
-        """Take a block of samples (n, k)."""
+        """Add a block of samples (n, k)."""
         ordered = np.sort(samples, axis=0)  # unknown values come last
         known = np.isfinite(samples)
         n = known.sum(axis=0)
@@ -194,7 +194,7 @@ class Stability:
                 self._sums = (total, level + shift * n / total, spread + square + shift**2 * before * n / total)
 
     def stable(self) -> NDArray[np.bool_]:
-        """Return which quantities (k,) have stable results; a quantity without values in some trial is left out."""
+        """Return which quantities (k,) have stable results; quantities with missing values count as stable."""
         if self._sums is None:
             return np.zeros(0, dtype=bool)
         results, count = np.stack(self._results), len(self._results)
@@ -216,12 +216,12 @@ class Stability:
 def summarise(
     blocks: Sequence[Array], probability: float, digits: int, stable: NDArray[np.bool_] | None = None
 ) -> Summary:
-    """Return what the samples of all blocks, each (n, k), say; a part of the quantities is sorted at a time."""
+    """Return the results of the samples of all blocks, each (n, k); only some quantities are sorted at a time."""
     trials, k = sum(len(block) for block in blocks), blocks[0].shape[1]
     mean, u, tolerance = (np.full(k, np.nan) for _ in range(3))
     central, short, error, low_bounds, high_bounds = (np.full((2, k), np.nan) for _ in range(5))
     missing = np.zeros(k, dtype=np.int64)
-    step = max(1, COLUMNS // max(trials, 1))
+    step = max(1, MAX_SORTED // max(trials, 1))
     for first in range(0, k, step):
         part = slice(first, min(first + step, k))
         ordered = np.concatenate([np.asarray(block[:, part], dtype=float) for block in blocks])
@@ -229,7 +229,7 @@ def summarise(
         missing[part] = np.isnan(ordered).sum(axis=0)
         for lost in np.unique(missing[part]):
             columns = np.flatnonzero(missing[part] == lost)
-            if trials - lost < fewest(probability):
+            if trials - lost < min_samples(probability):
                 continue
             values, at = ordered[: trials - lost, columns], first + columns
             mean[at], u[at] = values.mean(axis=0), values.std(axis=0, ddof=1)

@@ -1,4 +1,4 @@
-"""Monte Carlo evaluation of a method's result: trials in parallel, kept on disk as they come, resumed after a stop."""
+"""Monte Carlo evaluation of the result of a method: parallel trials, stored on disk and resumed after a stop."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from errormotion.arrays import Array
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import MethodError, RunError
 from errormotion.montecarlo.adaptive import block_size, propagate, summarise
-from errormotion.montecarlo.intervals import fewest
+from errormotion.montecarlo.intervals import min_samples
 from errormotion.montecarlo.places import chosen_places
 from errormotion.montecarlo.result import build
 from errormotion.montecarlo.store import Store
@@ -34,16 +34,16 @@ from errormotion.plugins import Redrawing
 
 PROBABILITY = 0.95
 CHUNK = 20
-"""Trials of one task; a process that is killed loses at most those in work."""
-MOST = 100_000
-"""Trials after which the adaptive procedure stops."""
-FEWEST = fewest(PROBABILITY)
-"""Smallest number of trials that is accepted: the interval needs samples beyond both of its ends."""
+"""Number of trials of one task; a killed process loses at most the trials of its task."""
+MAX_TRIALS = 100_000
+"""Number of trials after which the adaptive procedure stops."""
+MIN_TRIALS = min_samples(PROBABILITY)
+"""Smallest number of trials: samples are needed outside both ends of the interval."""
 FLOOR = 1e-13
-"""Differences below are rounding, m or rad."""
+"""Largest difference that is regarded as a rounding error, m or rad."""
 
-_turn = threading.Lock()
-_preparing = threading.Lock()
+_identify_lock = threading.Lock()
+_prepare_lock = threading.Lock()
 
 
 class Progress(Protocol):
@@ -89,7 +89,7 @@ class _Run:
     reasons: dict[str, int] = field(default_factory=dict)
 
     def block(self, sequence: SeedSequence, size: int) -> Array:
-        """Return the trials (size, places times freedoms) of a block; those on disk are not repeated."""
+        """Return the trials (size, places times freedoms) of a block; trials on disk are not repeated."""
         number = int(sequence.spawn_key[-1])
         complete = self.store.block(number, size)
         if complete is None:
@@ -133,10 +133,10 @@ def evaluate(
     scheduler: str = "threads",
     workers: int | None = None,
     progress: Progress | None = None,
-    most: int = MOST,
+    most: int = MAX_TRIALS,
     keep: bool = False,
 ) -> xr.Dataset:
-    """Evaluate a result by the Monte Carlo method, JCGM 101, and compare its linear intervals.
+    """Evaluate a result by the Monte Carlo method (JCGM 101), and compare its linear intervals.
 
     Parameters
     ----------
@@ -145,17 +145,17 @@ def evaluate(
     method_id : str
         The method.
     settings : PluginSettings
-        With which it was identified.
+        Settings of the identification.
     errors : Dataset
-        What the method made of the raw dataset with these settings.
+        Result of the method for the raw dataset with these settings.
     folder : path
-        Folder for the trials while the evaluation is in work; an interrupted one is continued from it.
+        Folder for the trials during the evaluation; an interrupted evaluation is continued from it.
     trials : int, optional
         Number of trials; default: adaptive, 7.9.4, until all results are stable and every verdict is clear.
     digits : int
         Meaningful digits of the standard uncertainties, 1 or 2.
     seed : int
-        One seed gives one result, whatever the scheduler and the number of workers.
+        Seed of the random numbers; the result does not depend on the scheduler and the number of workers.
     scheduler : str
         ``threads``, ``processes``, ``sync``, or the address of a Dask scheduler.
     workers : int, optional
@@ -165,7 +165,7 @@ def evaluate(
     most : int
         Largest number of trials of the adaptive procedure.
     keep : bool
-        Whether the trials are kept at the end, until the result is stored: see `Store.remove`.
+        Whether the trials are kept at the end, for example until the result is saved; see `Store.remove`.
 
     Returns
     -------
@@ -175,12 +175,12 @@ def evaluate(
     Raises
     ------
     MethodError
-        The method does not state how its sources are drawn anew; too few trials; no trial gave a result.
+        The method has no redrawing, the number of trials is too small, or no trial had a result.
     RunError
-        The folder holds trials of another evaluation; the scheduler does not work.
+        The folder contains trials of another evaluation, or the scheduler does not work.
     """
-    if trials is not None and trials < FEWEST:
-        raise MethodError(f"--monte-carlo: expected 'auto' or a number of trials from {FEWEST} on; found {trials}")
+    if trials is not None and trials < MIN_TRIALS:
+        raise MethodError(f"--monte-carlo: expected 'auto' or at least {MIN_TRIALS} trials; found {trials}")
     if digits not in (1, 2):
         raise MethodError(f"--digits: expected 1 or 2 meaningful digits of an uncertainty; found {digits}")
     if seed < 0:
@@ -210,7 +210,7 @@ def evaluate(
         )
     if (summary.missing[np.isfinite(linear.ravel())] == summary.trials).any():
         reason = max(run.reasons, key=run.reasons.__getitem__, default="unknown")
-        raise MethodError(f"No trial of {summary.trials} gave a value everywhere that the result has one: {reason}")
+        raise MethodError(f"None of {summary.trials} trials had a value at all positions of the result: {reason}")
     verdict = validate_linear(linear.ravel(), u.ravel(), summary, floor=FLOOR)
     found = build(errors, where, linear, u, summary, verdict, seed, list(redrawing.sources), run.reasons)
     if not keep:
@@ -220,18 +220,18 @@ def evaluate(
 
 @dataclass
 class _Enough:
-    """Whether every verdict is clear; looked at only now and then, since all samples are sorted for it."""
+    """Condition that every verdict is clear; tested at growing intervals, since it sorts all samples."""
 
     linear: Array
     u: Array
     digits: int
     progress: Progress | None
-    looked: int = 0
+    tested: int = 0
 
     def __call__(self, blocks: list[Array]) -> bool:
-        if len(blocks) < 1.25 * self.looked:
+        if len(blocks) < 1.25 * self.tested:
             return False
-        self.looked = len(blocks)
+        self.tested = len(blocks)
         found = validate_linear(self.linear, self.u, summarise(blocks, PROBABILITY, self.digits), floor=FLOOR)
         open_ = int((found.verdict[np.isfinite(self.linear)] == UNDECIDED).sum())
         if self.progress is not None:
@@ -240,7 +240,7 @@ class _Enough:
 
 
 def compute(*task: Any) -> tuple[Array, dict[str, int]]:
-    """Execute one task: return values (trial, places times freedoms) and the reasons of refused trials by count."""
+    """Execute one task: return values (trial, places times freedoms), and the number of failed trials by reason."""
     given = Task(*task)
     for what, wanted, found in (
         ("errormotion", given.version, __version__),
@@ -251,14 +251,14 @@ def compute(*task: Any) -> tuple[Array, dict[str, int]]:
     with _quiet():
         method, redrawing, shape = _prepared(given.raw, given.method_id, given.method_version, given.settings)
         sequence = SeedSequence(given.seed, spawn_key=(given.block,))
-        with _turn if one_thread_at_a_time() else nullcontext():
+        with _identify_lock if one_thread_at_a_time() else nullcontext():
             values, reasons = sample(method, redrawing, sequence, range(given.first, given.stop), shape)
     return values[:, list(given.rows)].reshape(len(values), -1), reasons
 
 
 def _prepared(raw: str, method_id: str, method_version: str, settings: str) -> tuple[Any, Redrawing, tuple[int, int]]:
-    """Return method, redrawing and (places, freedoms); made once in each process."""
-    with _preparing:
+    """Return method, redrawing and (places, freedoms), computed once in each process."""
+    with _prepare_lock:
         return _prepare(raw, method_id, method_version, settings)
 
 
@@ -273,18 +273,18 @@ def _prepare(raw: str, method_id: str, _method_version: str, settings: str) -> t
 
 
 def _missing(ready: list[range], size: int) -> Iterator[range]:
-    """Yield the trials that are still to be made, in chunks."""
-    there: NDArray[np.bool_] = np.zeros(size, dtype=bool)
+    """Yield the missing trials, in chunks."""
+    present: NDArray[np.bool_] = np.zeros(size, dtype=bool)
     for part in ready:
-        there[part.start : part.stop] = True
+        present[part.start : part.stop] = True
     for first in range(0, size, CHUNK):
         stop = min(first + CHUNK, size)
-        if not there[first:stop].all():
+        if not present[first:stop].all():
             yield range(first, stop)
 
 
 def _key(errors: xr.Dataset, common: tuple[str, ...], seed: int) -> dict[str, Any]:
-    """Return what identifies an evaluation: the same trials belong to it."""
+    """Return the data that identify an evaluation; evaluations with equal data have the same trials."""
     digest = sha256(values_of(errors).tobytes() + linear_uncertainty(errors).tobytes()).hexdigest()
     return {"result": digest, "method": common[1], "method_version": common[2], "settings": json.loads(common[3]),
             "errormotion": common[4], "seed": seed}  # fmt: skip
@@ -292,7 +292,7 @@ def _key(errors: xr.Dataset, common: tuple[str, ...], seed: int) -> dict[str, An
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what every trial would log as a warning again out of the log."""
+    """Suppress warnings, which every trial would log again."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

@@ -24,13 +24,13 @@ def shortest(ordered: Array, probability: float) -> tuple[Array, Array]:
 def standard_errors(ordered: Array, probability: float) -> tuple[Array, Array]:
     """Return the standard errors of both ends of the symmetric interval of ordered samples (M, k).
 
-    The number of samples below a quantile is binomial: the samples one standard deviation of it to either side
-    enclose twice the standard error, whatever the distribution.
+    The number of samples below a quantile has a binomial distribution. The samples at one standard deviation of this
+    number on both sides enclose twice the standard error, for any distribution of the samples.
     """
     count = len(ordered)
     low, q = _ranks(count, probability)
-    share = (1.0 - probability) / 2.0
-    step = max(1, round(float(np.sqrt(count * share * (1.0 - share)))))
+    tail = (1.0 - probability) / 2.0
+    step = max(1, round(float(np.sqrt(count * tail * (1.0 - tail)))))
     found = []
     for rank in (low, low + q):
         below, above = max(rank - step, 0), min(rank + step, count - 1)
@@ -39,30 +39,30 @@ def standard_errors(ordered: Array, probability: float) -> tuple[Array, Array]:
 
 
 def confidence(ordered: Array, probability: float, alarm: float) -> tuple[Array, Array]:
-    """Return bounds (2, k) of the low and of the high end of the symmetric interval, from ordered samples (M, k).
+    """Return bounds (2, k) of the low and the high end of the symmetric interval, from ordered samples (M, k).
 
-    Each end is outside of its bounds with at most the probability ``alarm``, whatever the distribution: the number of
-    samples below a quantile is binomial. Infinite where the samples are too few.
+    Each end is outside its bounds with a probability of at most ``alarm``, for any distribution of the samples, since
+    the number of samples below a quantile has a binomial distribution. With too few samples bounds are infinite.
     """
     from scipy.stats import binom
 
-    count, share = len(ordered), (1.0 - probability) / 2.0
+    count, tail = len(ordered), (1.0 - probability) / 2.0
     beyond = np.full((1, ordered.shape[1]), np.inf)
     padded = np.concatenate([-beyond, ordered, beyond])  # sample number r, counted from 1, is row r
     found = []
-    for q in (share, 1.0 - share):
+    for q in (tail, 1.0 - tail):
         low, high = (int(binom.ppf(p, count, q)) for p in (alarm / 2, 1.0 - alarm / 2))
         found.append(np.stack([padded[low], padded[min(high + 1, count + 1)]]))
     return found[0], found[1]
 
 
-def fewest(probability: float) -> int:
-    """Return the fewest samples that have an interval with samples on both sides of it."""
+def min_samples(probability: float) -> int:
+    """Return the smallest number of samples with which samples are outside both ends of the interval."""
     return int(np.ceil(round(2.0 / (1.0 - probability), 9)))
 
 
 def _ranks(count: int, probability: float) -> tuple[int, int]:
-    """Return the index of the low end, and how many samples further the high end is."""
+    """Return the index of the low end, and the number of samples from there to the high end."""
     inside = probability * count
     q = min(int(np.floor(inside + 0.5)), count - 1)
     rank = (count - q) / 2.0

@@ -1,4 +1,4 @@
-"""Places at which the trials are kept: the memory of an evaluation does not grow with the length of a record."""
+"""Choice of the places at which trials are stored, so that the memory does not grow with the length of a record."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 PLACES = 200
-"""Places of a result that are kept; of longer ones evenly spread ones, the ends among them."""
+"""Largest number of places; of a longer result, evenly spaced places including the ends are used."""
 
 
 def chosen_places(errors: xr.Dataset) -> tuple[NDArray[np.intp], dict[str, NDArray[np.intp]]]:
-    """Return the rows of the stacked places that are kept, and their indices along each dimension.
+    """Return the rows of the chosen places among the stacked places, and their indices along each dimension.
 
-    The longest dimensions are thinned first, so that the places stay a grid.
+    The longest dimensions are reduced first; the chosen places form a grid.
     """
     dims = [str(dim) for dim in errors.em.dims]
     count = {dim: errors.sizes[dim] for dim in dims}

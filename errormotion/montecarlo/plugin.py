@@ -12,7 +12,7 @@ class MonteCarloDataset:
 
     info: ClassVar[DatasetInfo] = DatasetInfo(
         id="monte_carlo_evaluation",
-        summary="Monte Carlo evaluation of a result: intervals, and whether the linear ones are validated",
+        summary="Monte Carlo evaluation of a result: intervals, and validation of the linear ones",
         schemas=("errormotion.monte_carlo/1",),
     )
     violations = lazy("errormotion.montecarlo.result:violations")

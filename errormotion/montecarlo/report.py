@@ -31,16 +31,16 @@ def chapters(source: Source) -> list[Part]:
     p = 100 * float(ds.attrs["probability"])
     verdicts, intervals = [_row(line) for line in found], [_intervals(line) for line in found]
     how = Text(
-        f"{int(ds.attrs['trials'])} trials with the seed {int(ds.attrs['seed'])}, each through the identification of "
-        f"{ds.attrs['method']} {ds.attrs['method_version']} with all sources drawn anew (JCGM 101): "
+        f"{int(ds.attrs['trials'])} trials with seed {int(ds.attrs['seed'])}; each trial repeats the identification by "
+        f"{ds.attrs['method']} {ds.attrs['method_version']} with new random draws of all sources (JCGM 101): "
         f"{', '.join(map(str, np.atleast_1d(ds.attrs['sources'])))}. The tolerance follows from "
         f"{int(ds.attrs['digits'])} meaningful digit{'s' if int(ds.attrs['digits']) > 1 else ''} of the standard "
         "uncertainty."
     )
     notes = [Text(str(note), "note") for note in np.atleast_1d(ds.attrs["notes"]) if str(note)]
-    at = "at the place where both intervals differ most against the tolerance"
+    at = "at the place where both intervals differ most relative to the tolerance"
     tables = [
-        Table(f"Standard uncertainties, and difference of the intervals, {at} (JCGM 101, clause 8).", HEAD, verdicts),
+        Table(f"Standard uncertainties and difference of the intervals, {at} (JCGM 101, clause 8).", HEAD, verdicts),
         Table(f"Intervals of {p:g} %, {at}.", ["", "unit", "linear", "Monte Carlo", "place"], intervals),
     ]
     return [

@@ -68,9 +68,9 @@ def build(
     validation : Validation
     seed : int
     sources : sequence of str
-        What was drawn.
+        Names of the drawn sources.
     reasons : mapping of str to int
-        Why trials gave no result, by count.
+        Number of trials without a result, by reason.
 
     Raises
     ------
@@ -109,10 +109,10 @@ def build(
     places = errors[names].isel({dim: where[dim] for dim in dims})
     own = {name: places[name].variable for name in places.coords if set(map(str, places[name].dims)) <= set(dims)}
     refused = int(found.missing[known].max(initial=0))
-    notes = [f"{count} trials were refused: {reason}" for reason, count in sorted(reasons.items())]
+    notes = [f"{count} trials failed: {reason}" for reason, count in sorted(reasons.items())]
     if refused and not notes:
-        notes = [f"{refused} trials gave no value at some place."]
-    thinned = [f"{len(where[dim])} of {errors.sizes[dim]} places along {dim} are kept."
+        notes = [f"{refused} trials had no value at some places."]
+    thinned = [f"{len(where[dim])} of {errors.sizes[dim]} places along {dim} were evaluated."
                for dim in dims if len(where[dim]) < errors.sizes[dim]]  # fmt: skip
     attrs = {name: errors.attrs[name] for name in ATTRIBUTES if name in errors.attrs}
     attrs |= {
@@ -164,23 +164,23 @@ def violations(ds: xr.Dataset) -> list[str]:
 
 @dataclass(frozen=True)
 class Line:
-    """What is said of one freedom.
+    """Results of one freedom.
 
     Attributes
     ----------
     name : str
     verdict : int
-        That of the worst place.
+        Verdict of the worst place.
     linear_uncertainty, uncertainty, tolerance : float
-        At the place where the intervals differ most against the tolerance; m or rad.
+        Values at the place where the intervals differ most relative to the tolerance; m or rad.
     distance : float
-        Larger one of both ends there.
+        Larger distance of the two ends at this place.
     linear, interval : tuple of float
-        Ends of both intervals there.
+        Ends of both intervals at this place.
     place : str
-        Where that is; empty for one place.
+        Name of this place; empty if there is only one.
     open_places, places : int
-        Places that are not validated or undecided, and all.
+        Number of places that are not validated or undecided, and number of all places.
     """
 
     name: str
@@ -197,7 +197,7 @@ class Line:
 
     @property
     def word(self) -> str:
-        """The verdict in words."""
+        """Verdict as text."""
         return WORDS[self.verdict]
 
 
@@ -233,7 +233,7 @@ def lines(ds: xr.Dataset) -> list[Line]:
 
 
 def _place(ds: xr.Dataset, dims: list[str], number: int) -> str:
-    """Return a place in words."""
+    """Return a place as text."""
     index = np.unravel_index(number, [ds.sizes[dim] for dim in dims]) if dims else ()
     parts = []
     for dim, i in zip(dims, index, strict=True):

@@ -1,4 +1,4 @@
-"""Trials on disk while an evaluation is in work: written beside and renamed, so that what is there is whole."""
+"""Trials on disk during an evaluation; each file is written under a temporary name and renamed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -19,8 +18,8 @@ from errormotion.errors import RunError
 KEY = "evaluation.json"
 _CHUNK = re.compile(r"block-(\d{4,})-(\d+)-(\d+)\.npy")
 
-LARGEST_KEY = 2**20
-"""Bytes of the file of the key; more is none of ours."""
+MAX_KEY = 2**20
+"""Largest size of the file of the key, bytes; a larger file is not one of this program."""
 
 
 class Store:
@@ -29,14 +28,14 @@ class Store:
     Parameters
     ----------
     folder : path
-        It is created where it is missing.
+        Folder of the trials; it is created if missing.
     key : mapping
-        What the trials belong to.
+        Data that identify the evaluation.
 
     Raises
     ------
     RunError
-        The folder holds the trials of another evaluation, other files, or cannot be written.
+        The folder contains trials of another evaluation or other files, or cannot be written.
     """
 
     def __init__(self, folder: str | Path, key: dict[str, Any]) -> None:
@@ -54,28 +53,30 @@ class Store:
                         k for k in sorted(keys) if not isinstance(found, dict) or found.get(k) != self._key.get(k)
                     ]
                     raise RunError(
-                        f"{self.folder}: holds trials of another evaluation ({', '.join(differ)} differ). Remove the "
-                        "folder, or give another name to --out"
+                        f"{self.folder}: contains trials of another evaluation ({', '.join(differ)} differ). Remove "
+                        "the folder, or give another name to --out"
                     )
-            elif any(each != _part(file) for each in self.folder.iterdir()):  # of a process that ended while it began
-                raise RunError(f"{self.folder}: expected an empty folder or trials of this evaluation; found others")
+            elif any(
+                each != _part(file) for each in self.folder.iterdir()
+            ):  # left by a process that ended during its start
+                raise RunError(
+                    f"{self.folder}: expected an empty folder or trials of this evaluation; found other files"
+                )
             else:
                 self._write(file, json.dumps(self._key, indent=1).encode())
         except (OSError, ValueError, RecursionError) as error:
-            raise RunError(f"{self.folder}: expected a folder for the trials that can be written; {error}") from error
+            raise RunError(f"{self.folder}: expected a writable folder for the trials; {error}") from error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Leave the trials: an interrupted evaluation is continued from them."""
+    def __exit__(self, *_: object) -> None:
+        """Keep the trials, from which an interrupted evaluation is continued."""
 
     def block(self, number: int, size: int) -> Array | None:
-        """Return a complete block (size, k), mapped from its file; None where there is none."""
+        """Return a complete block (size, k), memory-mapped; None if it does not exist."""
         return self._read(self._block_file(number), size)
 
     def chunks(self, number: int, size: int) -> list[range]:
-        """Return the trials of a block that are there."""
+        """Return the stored trials of a block."""
         found = []
         for file in sorted(self.folder.glob(f"block-{number:04d}-*.npy")):
             match = _CHUNK.fullmatch(file.name)
@@ -91,7 +92,7 @@ class Store:
         self._save(self.folder / f"block-{number:04d}-{trials.start}-{trials.stop}.npy", values)
 
     def join(self, number: int, size: int) -> Array:
-        """Join the trials of a block to one file and return them, mapped from it."""
+        """Join the trials of a block into one file, and return them, memory-mapped."""
         parts = self.chunks(number, size)
         files = [self.folder / f"block-{number:04d}-{part.start}-{part.stop}.npy" for part in parts]
         whole: Array | None = None
@@ -115,7 +116,7 @@ class Store:
         return self.folder / f"block-{number:04d}.npy"
 
     def _read(self, file: Path, size: int) -> Array | None:
-        """Return the values of a file, None where it is not one of ours."""
+        """Return the values of a file; None if it is not one of this program."""
         try:
             values = np.load(file, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError, EOFError):
@@ -138,12 +139,12 @@ class Store:
 
 
 def _part(file: Path) -> Path:
-    """Return where a file is written before it is renamed."""
+    """Return the temporary name of a file before it is renamed."""
     return file.with_name(f".{file.name}.part")
 
 
 def _small(file: Path) -> str:
-    """Return the text of a file; ValueError for one that is too large."""
-    if file.stat().st_size > LARGEST_KEY:
-        raise ValueError(f"{file.name} is larger than {LARGEST_KEY} bytes")
+    """Return the text of a file; ValueError if it is too large."""
+    if file.stat().st_size > MAX_KEY:
+        raise ValueError(f"{file.name} is larger than {MAX_KEY} bytes")
     return file.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""One trial of a method: every source drawn anew, then the method's own identification."""
+"""One trial of a method: new random draws of all sources, then the identification."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from errormotion.arrays import Array
 from errormotion.errors import ErrormotionError, MethodError
 from errormotion.plugins import Redrawing
 
-SAME = 1e-2
-"""Largest difference of the reduced data's result from the measured data's, in standard uncertainties."""
+MAX_DIFFERENCE = 1e-2
+"""Largest difference between the results of reduced and measured data, in standard uncertainties."""
 ROUNDING = 1e-12
-"""The same where there is no uncertainty, m or rad."""
+"""Largest difference between these results for values without uncertainty, m or rad."""
 
 
 def redrawing_of(method: Any, raw: xr.Dataset, settings: Any, errors: xr.Dataset) -> Redrawing:
-    """Return how a method draws its sources anew.
+    """Return the redrawing of a method: data, settings, and how the sources are drawn.
 
     Raises
     ------
     MethodError
-        The method does not bring it, or its reduced data do not give the result of the measured ones.
+        The method has no redrawing, or the result of its reduced data is not that of the measured data.
     """
     if not hasattr(method, "redrawing"):
         raise MethodError(
-            f"The method {method.info.id} {method.info.version} cannot be evaluated by the Monte Carlo method: it does "
-            "not state how its sources are drawn anew (redrawing). Its linear uncertainty is unaffected."
+            f"The method {method.info.id} {method.info.version} cannot be evaluated by the Monte Carlo method: it has "
+            "no 'redrawing'. Its linear uncertainty is not affected."
         )
     found: Redrawing = method.redrawing(raw, settings, errors)
     check_centre(method.identify(found.raw, found.settings), errors)
@@ -38,20 +38,20 @@ def redrawing_of(method: Any, raw: xr.Dataset, settings: Any, errors: xr.Dataset
 
 
 def check_centre(centre: xr.Dataset, errors: xr.Dataset) -> None:
-    """Raise MethodError unless the reduced data give the values of the measured data."""
+    """Raise MethodError unless the result of the reduced data is that of the measured data."""
     one, other = values_of(centre), values_of(errors)
     if one.shape != other.shape:
         raise MethodError(
-            f"The data to be drawn anew give {one.shape[0]} places, the measured data {other.shape[0]}; "
-            "expected the same. This is a defect of the method's redrawing."
+            f"The result has {one.shape[0]} places from the reduced data and {other.shape[0]} from the measured data; "
+            "expected the same number. This is a defect of the redrawing of the method."
         )
     u = linear_uncertainty(errors)
     known = np.isfinite(other)
-    off = np.abs(one - other) > np.maximum(SAME * np.nan_to_num(u), ROUNDING)
+    off = np.abs(one - other) > np.maximum(MAX_DIFFERENCE * np.nan_to_num(u), ROUNDING)
     if wrong := int((known & (off | ~np.isfinite(one))).sum()):
         raise MethodError(
-            f"The data to be drawn anew give other values than the measured data at {wrong} of {int(known.sum())} "
-            "places and freedoms. This is a defect of the method's redrawing."
+            f"The results from the reduced data and from the measured data differ at {wrong} of {int(known.sum())} "
+            "places and freedoms. This is a defect of the redrawing of the method."
         )
 
 
@@ -75,15 +75,15 @@ def linear_uncertainty(errors: xr.Dataset) -> Array:
 def trial(method: Any, redrawing: Redrawing, sequence: SeedSequence, only: Iterable[str] | None = None) -> xr.Dataset:
     """Return the error dataset of one trial.
 
-    Every source has a generator of its own, by its number: leaving one out (``only`` names those that act) leaves
-    the draws of the others as they are.
+    Every source has its own generator, so that the draws of a source do not depend on which other sources are active
+    (``only`` states the active ones).
     """
-    acting = set(redrawing.sources if only is None else only)
+    active = set(redrawing.sources if only is None else only)
     raw, settings = redrawing.raw, redrawing.settings
     generators = {
         name: np.random.default_rng(SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, number)))
         for number, name in enumerate(redrawing.sources)
-        if name in acting
+        if name in active
     }
     for name, generator in generators.items():
         if (draw := redrawing.sources[name].draw) is not None:
@@ -103,20 +103,20 @@ def sample(
     shape: tuple[int, int],
     only: Iterable[str] | None = None,
 ) -> tuple[Array, dict[str, int]]:
-    """Return the values (trial, place, freedom) of some trials, NaN where one was refused, and the reasons by count.
+    """Return the values (trial, place, freedom) of trials, NaN for failed ones, and the number of failures by reason.
 
     Parameters
     ----------
     method : Method
     redrawing : Redrawing
     sequence : SeedSequence
-        Of the block; each trial has one of its own by its number.
+        Seed of the block; the seed of a trial follows from its number.
     trials : range
         Numbers of the trials.
     shape : (int, int)
         Places and freedoms.
     only : iterable of str, optional
-        Sources that act; default all.
+        Active sources; default: all.
     """
     found, reasons = np.full((len(trials), *shape), np.nan), dict[str, int]()
     for row, number in enumerate(trials):
@@ -129,6 +129,6 @@ def sample(
             if values.shape == shape:
                 found[row] = values
                 continue
-            reason = f"a trial gave {values.shape[0]} places instead of {shape[0]}"
+            reason = f"a trial has {values.shape[0]} places instead of {shape[0]}"
         reasons[reason] = reasons.get(reason, 0) + 1
     return found, reasons

@@ -1,4 +1,4 @@
-"""Whether the linear propagation of uncertainty is validated by the Monte Carlo method: JCGM 101, clause 8."""
+"""Validation of the linear propagation of uncertainty by the Monte Carlo method: JCGM 101, clause 8."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from errormotion.montecarlo.adaptive import Summary
 
 VALIDATED, NOT_VALIDATED, UNDECIDED = 1, 0, -1
 WORDS = {VALIDATED: "validated", NOT_VALIDATED: "not validated", UNDECIDED: "undecided"}
-MOST_MISSING = 0.01
-"""Share of trials without a value above which a quantity is undecided."""
+MAX_MISSING = 0.01
+"""Fraction of trials without a value above which a quantity is undecided."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Validation:
     low, high : ndarray (k,)
         Distances of the ends, d_low and d_high, 8.1.
     verdict : ndarray (k,)
-        ``VALIDATED`` where both are within the tolerance, ``NOT_VALIDATED`` where one is not, ``UNDECIDED`` where the
-        number of trials does not tell, or trials gave no value.
+        ``VALIDATED`` if both are within the tolerance, ``NOT_VALIDATED`` if one is not, ``UNDECIDED`` if the number of
+        trials is not sufficient or too many trials have no value.
     """
 
     low: Array
@@ -51,18 +51,19 @@ def validate_linear(
     value, uncertainty : ndarray (k,)
         Estimate and standard uncertainty by linear propagation.
     found : Summary
-        Of the trials.
+        Results of the trials.
     factor : float, optional
         Coverage factor; default that of the normal distribution.
     floor : float
-        Difference that is rounding, whatever the tolerance.
+        Largest difference that is regarded as a rounding error.
     short : bool
         Compare with the shortest interval instead of the symmetric one.
 
     Notes
     -----
-    The ends of the trials' interval are known within bounds, which hold for all quantities together with a probability
-    of 95 %. A quantity is decided where all that lies within the bounds is inside the tolerance, or all outside.
+    The ends of the interval of the trials are known within bounds, which are valid for all quantities simultaneously
+    with a probability of 95 %. A quantity is decided if all values within the bounds are inside the tolerance, or all
+    outside.
     """
     k = float(ndtri(0.5 + found.probability / 2)) if factor is None else factor
     ends = np.stack([value - k * uncertainty, value + k * uncertainty])
@@ -76,5 +77,5 @@ def validate_linear(
         inside = np.all(np.abs(off) <= limit, axis=(0, 1)) | np.all(distance <= floor, axis=0)
         outside = np.any((off[0] > limit) | (off[1] < -limit), axis=0)
     verdict = np.where(inside, VALIDATED, np.where(outside, NOT_VALIDATED, UNDECIDED))
-    verdict[~known | (found.missing > MOST_MISSING * found.trials)] = UNDECIDED
+    verdict[~known | (found.missing > MAX_MISSING * found.trials)] = UNDECIDED
     return Validation(distance[0], distance[1], verdict.astype(np.int8))

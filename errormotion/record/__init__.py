@@ -1,7 +1,6 @@
-"""A machine's record: every run of one or more folders with its figures of merit.
+"""The record of a machine: all runs of one or more folders with their figures of merit.
 
-``runs`` reads what run folders state, keeps it for the next call, and selects; ``history`` follows one figure over
-time.
+``runs`` reads, indexes and selects runs; ``history`` evaluates one figure over time.
 """
 
 from errormotion.record.tree import open_run

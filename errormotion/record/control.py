@@ -1,10 +1,10 @@
 """Control chart of individual values with their own uncertainties (Shewhart; ISO 7870-2 for equal ones).
 
-Between two steps the centre is the generalised mean of the values that do not depart alone, with weights w for the
-covariance ``V = V0 + tau^2``: V0 is what the runs state, and tau the reproducibility of the machine and its set-up from
-the moving ranges. The limits are three standard deviations of a value from this centre,
-``Var(y_k - w'y) = V_kk - 2 (V w)_k + w'V w``: each value has limits of its own, and a source that all runs share
-cancels. The limit of a moving range is its expectation plus three of its standard deviations, for normal values
+Between two steps the centre is the generalised mean of the values without outliers, with weights w for the covariance
+``V = V0 + tau^2``: V0 is the covariance that the runs state, and tau the reproducibility of machine and set-up from the
+moving ranges. The limits are three standard deviations of the difference from this centre,
+``Var(y_k - w'y) = V_kk - 2 (V w)_k + w'V w``: each value has its own limits, and a source that all runs share cancels.
+The limit of a moving range is its expectation plus three standard deviations, for normal values
 ``(sqrt(2 / pi) + 3 sqrt(1 - 2 / pi)) sd = 2.606 sd``, where sd is that of the difference.
 """
 
@@ -22,7 +22,7 @@ from errormotion.record.series import Series
 from errormotion.record.steps import Model
 
 WIDTH = 3.0
-"""Standard deviations between centre and limit."""
+"""Distance of the limits from the centre, standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Chart:
     tau: float
 
     def outside(self, value: Array) -> NDArray[np.bool_]:
-        """Return which values are outside of their limits, bool (n,)."""
+        """Return which values are outside their limits, bool (n,)."""
         found: NDArray[np.bool_] = (value < self.lower) | (value > self.upper)
         return found
 

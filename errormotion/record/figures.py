@@ -1,9 +1,9 @@
 """One figure of many runs as a series: a figure of merit, or an error at a place.
 
-The effect of a source that several runs share, by its identity in their error datasets, comes from ``influence``: of an
-error directly, of a figure of merit as the method states it, else as its change when the errors change by one standard
-uncertainty of the source. A figure from other variables whose influence is not stated does not respond; its runs then
-count as independent.
+A source that several runs share is recognised by its identity in their error datasets. Its effect on an error is its
+``influence``. Its effect on a figure of merit is that stated by the method, otherwise the change of the figure when the
+errors change by one standard uncertainty of the source. For a figure from other variables without a stated influence
+this change is zero, and its runs are treated as independent.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from errormotion.tolerances.conformity import matches
 if TYPE_CHECKING:
     import xarray as xr
 
-LONGEST = 1000
-"""Values of a series; of more runs, the newest count."""
-MOST_LISTED = 30
-"""Names of figures in a message."""
-NEAR = 1e-3
-"""Largest distance of a target from the place that is asked for, m."""
+MAX_VALUES = 1000
+"""Largest number of values of a series; of more runs the newest are used."""
+MAX_LISTED = 30
+"""Number of names of figures in a message."""
+MAX_DISTANCE = 1e-3
+"""Largest distance of a target from the requested place, m."""
 FREEDOM = re.compile(r"(E[XYZABC]|deviation)(?: after (\d{1,6}(?:\.\d+)?) min)?")
 
 
 @dataclass(frozen=True)
 class Reading:
-    """The figure of one run, SI, k = 1, with the signed effect of each source that has an identity."""
+    """Figure of one run, SI, k = 1, with the signed effect of each source that has an identity."""
 
     run: str
     name: str
@@ -50,8 +50,8 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Followed:
-    """A figure over time, what was left out of it, and what a reader should know."""
+class FigureOverTime:
+    """A figure over time, with the runs that are left out and notes for the user."""
 
     series: Series
     figure: str
@@ -59,29 +59,31 @@ class Followed:
     notes: tuple[str, ...]
 
 
-def follow(runs: Sequence[tuple[Path, Entry]], figure: str, at: Sequence[float] | None = None) -> Followed:
+def figure_over_time(
+    runs: Sequence[tuple[Path, Entry]], figure: str, at: Sequence[float] | None = None
+) -> FigureOverTime:
     """Return a figure of runs over time.
 
     Parameters
     ----------
     runs : sequence of (path, entry)
     figure : str
-        Name of a figure of merit; ``*`` stands for any characters, and a short form for the name that holds its parts
-        in their order: ``d(Z)60``. Or a freedom of the error datasets, ``EZ`` for its last known value over time, or
-        ``EZ after 60 min``.
+        Name of a figure of merit, in which ``*`` stands for any characters, or a short form such as ``d(Z)60``, which
+        contains parts of the name in their order. Or a freedom of the error datasets: ``EZ`` for its last known value
+        over time, or ``EZ after 60 min``.
     at : sequence of float, optional
-        Place of the freedom, m: the functional point of errors over time, else the commanded position.
+        Place of the freedom, m: functional point of errors over time, otherwise commanded position.
 
     Raises
     ------
     RunError
-        No run states the figure, or one states several; what there is.
+        No run states the figure, or a run states several; the message lists the known figures.
     """
     dated = sorted(((path, each) for path, each in runs if each.time is not None), key=lambda run: _time(run[1]))
     left_out = [f"{each.folder}: its time is unknown" for _, each in runs if each.time is None]
-    if len(dated) > LONGEST:
-        left_out.append(f"{len(dated) - LONGEST} older runs: only the {LONGEST} newest are used")
-        dated = dated[-LONGEST:]
+    if len(dated) > MAX_VALUES:
+        left_out.append(f"{len(dated) - MAX_VALUES} older runs: only the {MAX_VALUES} newest are used")
+        dated = dated[-MAX_VALUES:]
     freedom = FREEDOM.fullmatch(figure.strip())
     if at is not None and freedom is None:
         raise RunError(f"--at: expected --figure with a freedom, such as EZ; found '{figure}'")
@@ -89,7 +91,7 @@ def follow(runs: Sequence[tuple[Path, Entry]], figure: str, at: Sequence[float] 
     found = list[Reading]()
     for path, entry in dated:
         if not freedom and path not in names:
-            left_out.append(f"{entry.folder}: does not state it")
+            left_out.append(f"{entry.folder}: does not state the figure")
             continue
         try:
             found.append(_of_freedom(path, entry, freedom, at) if freedom else _of_merit(path, entry, names[path]))
@@ -99,8 +101,8 @@ def follow(runs: Sequence[tuple[Path, Entry]], figure: str, at: Sequence[float] 
             left_out.append(f"{entry.folder}: {type(error).__name__}: {error}")
     if not found:
         reasons = "".join(f"\n  - {reason}" for reason in left_out[:5])
-        raise RunError(f"No value of '{figure}' in {len(runs)} runs. There are: {_available(dated)}{reasons}")
-    return Followed(_series(found), figure, tuple(left_out), tuple(_remarks(found, at)))
+        raise RunError(f"No value of '{figure}' in {len(runs)} runs. Known figures: {_available(dated)}{reasons}")
+    return FigureOverTime(_series(found), figure, tuple(left_out), tuple(_remarks(found, at)))
 
 
 def _time(entry: Entry) -> float:
@@ -108,32 +110,32 @@ def _time(entry: Entry) -> float:
 
 
 def _available(runs: Sequence[tuple[Path, Entry]]) -> str:
-    """Return the names of the figures of runs, the most frequent first, and how freedoms are asked for."""
+    """Return the names of the figures of runs, the most frequent first, and how freedoms are stated."""
     counts = Counter(each.name for _, entry in runs for each in entry.figures or ())
-    listed = [f"'{name}'" for name, _ in counts.most_common(MOST_LISTED)]
-    more = f", and {len(counts) - MOST_LISTED} more" if len(counts) > MOST_LISTED else ""
+    listed = [f"'{name}'" for name, _ in counts.most_common(MAX_LISTED)]
+    more = f", and {len(counts) - MAX_LISTED} more" if len(counts) > MAX_LISTED else ""
     freedoms = "a freedom of the error datasets, EX to EC, at a place with --at"
     return "; ".join([", ".join(listed) + more, freedoms] if listed else [freedoms])
 
 
 def _names(runs: Sequence[tuple[Path, Entry]], figure: str) -> dict[Path, FigureOfMerit]:
-    """Return the figure of each run that states it, by the strictest reading of its name that any run has."""
+    """Return the figure of each run that states it, by the strictest match of the name in any run."""
     for agrees in (str.__eq__, lambda wanted, name: "*" in wanted and matches(wanted, name), _short):
         found = {}
         for path, entry in runs:
             own = [each for each in entry.figures or () if agrees(figure, each.name)]
             if len(own) > 1:
-                several = ", ".join(f"'{each.name}'" for each in own[:MOST_LISTED])
-                raise RunError(f"'{figure}' stands for several figures of {entry.folder}: {several}. Give one of them")
+                several = ", ".join(f"'{each.name}'" for each in own[:MAX_LISTED])
+                raise RunError(f"'{figure}' matches several figures of {entry.folder}: {several}. State one of them")
             if own:
                 found[path] = own[0]
         if found:
             return found
-    raise RunError(f"No value of '{figure}' in {len(runs)} runs. There are: {_available(runs)}")
+    raise RunError(f"No value of '{figure}' in {len(runs)} runs. Known figures: {_available(runs)}")
 
 
 def _short(wanted: str, name: str) -> bool:
-    """Return whether a name begins with the first part of a short form and holds the others in their order."""
+    """Return whether a name starts with the first part of a short form and contains the others in their order."""
     parts, words = _parts(wanted[:100]), _parts(name)
     if not parts or not words or words[0] != parts[0]:
         return False
@@ -148,7 +150,7 @@ def _parts(text: str) -> list[str | float]:
 
 
 def _of_merit(path: Path, entry: Entry, stated: FigureOfMerit) -> Reading:
-    """Return a figure of merit with the effects of the shared sources, as far as the error dataset states them."""
+    """Return a figure of merit with the effects of shared sources, as far as the error dataset states them."""
     u = _checked(stated.value, stated.expanded_uncertainty / 2)
     effects = dict[str, float]()
     origin: tuple[str, ...] = (entry.method,)
@@ -167,14 +169,14 @@ def _of_merit(path: Path, entry: Entry, stated: FigureOfMerit) -> Reading:
 
 
 def _influence(errors: xr.Dataset, name: str) -> Mapping[str, float] | None:
-    """Return the effects of the sources on a figure as its method states them, by name."""
+    """Return the effects of the sources on a figure by name, as stated by the method."""
     from errormotion.datasets.results.merit import figures_of
 
     return next((each.influence for each in figures_of(errors) if each.name == name), None)
 
 
 def _change(errors: xr.Dataset, row: int, name: str) -> float:
-    """Return the change of a figure with one standard uncertainty of a source in the errors."""
+    """Return the change of a figure for one standard uncertainty of a source in the errors."""
     high, low = (_figure(_moved(errors, row, sign), name) for sign in (1.0, -1.0))
     return 0.5 * (high - low)
 
@@ -186,7 +188,7 @@ def _figure(errors: xr.Dataset, name: str) -> float:
 
 
 def _moved(errors: xr.Dataset, row: int, sign: float) -> xr.Dataset:
-    """Return errors that one standard uncertainty of a source has changed."""
+    """Return errors changed by one standard uncertainty of a source."""
     names = errors.em.names
     influence = "influence" if len(names) > 1 else "deviation_influence"
     changed = {}
@@ -198,7 +200,7 @@ def _moved(errors: xr.Dataset, row: int, sign: float) -> xr.Dataset:
 
 
 def _identified(errors: xr.Dataset) -> list[tuple[int, str]]:
-    """Return row and identity of the sources that have one."""
+    """Return row and identity of the sources that have an identity."""
     influence = "influence" if len(errors.em.names) > 1 else "deviation_influence"
     if "source_id" not in errors.variables or influence not in errors.variables:
         return []
@@ -210,16 +212,16 @@ def _of_freedom(path: Path, entry: Entry, freedom: re.Match[str], at: Sequence[f
     from errormotion import datasets
 
     if not entry.errors:
-        raise RunError("has no errors yet")
+        raise RunError("the run has no errors yet")
     errors = datasets.load(path / entry.errors)
     name, minutes = freedom[1], freedom[2]
     origin = _origin(errors)
     if name not in errors.em.names:
-        raise DatasetError(f"has no {name}; its errors are {', '.join(errors.em.names)}")
+        raise DatasetError(f"has no {name}; its freedoms are {', '.join(errors.em.names)}")
     errors, place = _at_place(errors, at)
     if minutes is not None:
         if errors.em.dims != ("time",):
-            raise DatasetError("has no errors over time, so that 'after' is not defined")
+            raise DatasetError("has no errors over time, as 'after' requires")
         errors = errors.em.to_times([60.0 * float(minutes)])
         place = 0
     k = errors.em.names.index(name)
@@ -227,7 +229,9 @@ def _of_freedom(path: Path, entry: Entry, freedom: re.Match[str], at: Sequence[f
     if place is None:
         known = np.flatnonzero(np.isfinite(values))
         if not known.size:
-            raise DatasetError(f"{name} is unknown{'' if at is None else ' there: a rotation is not known'}")
+            raise DatasetError(
+                f"{name} is unknown{'' if at is None else ' at this point, because a rotation is unknown'}"
+            )
         place = int(known[-1])
     u = errors.em.expanded(1.0).values.reshape(-1, len(errors.em.names))[place, k]
     effects = dict[str, float]()
@@ -242,23 +246,23 @@ def _of_freedom(path: Path, entry: Entry, freedom: re.Match[str], at: Sequence[f
 
 
 def _at_place(errors: xr.Dataset, at: Sequence[float] | None) -> tuple[xr.Dataset, int | None]:
-    """Return errors that hold a place, and its index; without one, the last known value over time."""
+    """Return errors that contain a place, and the index of the place; None for the last known value over time."""
     dims = errors.em.dims
     if dims in ((), ("time",)):
         return (errors if at is None else errors.em.at(at)), (0 if dims == () else None)
     if at is None:
-        raise DatasetError(f"states errors over {', '.join(dims)}; give the place with --at")
+        raise DatasetError(f"states errors over {', '.join(dims)}; state the place by --at")
     own = [axis for axis in "xyz" if axis in errors.variables]
     if dims == ("position",):
         moving = [axis for axis in own if errors[axis].dims == dims]
         if len(moving) == 1:
             return errors.em.to_positions([at["xyz".index(moving[0])]], moving[0]), 0
     if len(dims) != 1 or len(own) < 3:
-        raise DatasetError(f"states errors over {', '.join(dims)} without x, y and z; the place is not defined")
+        raise DatasetError(f"states errors over {', '.join(dims)} without x, y and z, so that no place can be found")
     away = np.sqrt(sum((errors[axis].values - at["xyz".index(axis)]) ** 2 for axis in own))
     nearest = int(np.nanargmin(away))
-    if not away[nearest] <= NEAR:
-        raise DatasetError(f"its nearest position is {1e3 * away[nearest]:.1f} mm away from the place")
+    if not away[nearest] <= MAX_DISTANCE:
+        raise DatasetError(f"its nearest position is {1e3 * away[nearest]:.1f} mm away from the requested place")
     return errors, nearest
 
 
@@ -271,17 +275,17 @@ def _checked(value: float, u: float) -> float:
 
 
 def _origin(errors: xr.Dataset) -> tuple[str, ...]:
-    """Return what has to be the same for values to be comparable: component, frame, method and functional point."""
+    """Return what comparable values must have in common: method, component, frame and functional point."""
     point = ", ".join(f"{1e3 * each:g}" for each in np.asarray(errors.attrs["functional_point"], dtype=float))
     names = ("method", "component", "frame")
     return (*(str(errors.attrs.get(name, "")) for name in names), point)
 
 
 def _series(found: list[Reading]) -> Series:
-    """Return readings as a series; a source of one run only is part of its own uncertainty."""
+    """Return readings as a series; sources of a single run are part of its uncertainty."""
     units = {each.unit for each in found}
     if len(units) > 1:
-        raise RunError(f"The figure has several units: {', '.join(sorted(units))}. Give a name that matches one figure")
+        raise RunError(f"The figure has several units: {', '.join(sorted(units))}. State a name of one figure only")
     counts = Counter(identity for each in found for identity, effect in each.influence.items() if effect)
     shared = sorted(identity for identity, count in counts.items() if count > 1)
     F = np.array([[each.influence.get(identity, 0.0) for each in found] for identity in shared])
@@ -299,15 +303,21 @@ def _series(found: list[Reading]) -> Series:
 
 
 def _remarks(found: list[Reading], at: Any) -> list[str]:
-    """Return what makes values of several runs hard to compare."""
+    """Return notes on differences between the runs that affect the comparison."""
     known = [each.origin for each in found if len(each.origin) == 4]
     notes = []
     for k, what in ((0, "methods"), (1, "components"), (2, "frames"), (3, "functional points (mm)")):
         values = sorted({origin[k] for origin in known})
         if len(values) > 1 and not (k == 3 and at is not None):
-            advice = " Give --method." if k == 0 else " Give --at." if k == 3 else " Give --method or --test."
+            advice = (
+                " Choose one by --method."
+                if k == 0
+                else " Choose one by --at."
+                if k == 3
+                else " Choose one by --method or --test."
+            )
             notes.append(f"The runs state several {what}: {'; '.join(values[:5])}.{advice}")
     lacking = len(found) - len(known)
     if lacking and known:
-        notes.append(f"{lacking} of {len(found)} runs have no error dataset; their sources count as independent.")
+        notes.append(f"{lacking} of {len(found)} runs have no error dataset; their sources are treated as independent.")
     return notes

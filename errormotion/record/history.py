@@ -1,7 +1,7 @@
-"""One figure of one machine over months as a dataset, schema ``errormotion.history/1``.
+"""One figure of one machine over time as a dataset, schema ``errormotion.history/1``.
 
-``series`` holds the values with their stated covariance, ``steps`` the trend and what breaks it, ``control`` the limits
-of single values.
+``series`` contains the values with their stated covariance, ``steps`` trend, steps and outliers, ``control`` the
+control limits.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import xarray as xr
 from errormotion.datasets.files.events import instant
 from errormotion.errors import DatasetError, RunError
 from errormotion.record.control import chart
-from errormotion.record.figures import follow
+from errormotion.record.figures import figure_over_time
 from errormotion.record.regression import COVERAGE
 from errormotion.record.runs.listing import Listing, Note
 from errormotion.record.series import Series
 from errormotion.record.steps import FALSE_DEPARTURES, FALSE_STEPS, Model, Step, model_of
 
 SCHEMA = "errormotion.history/1"
-TOO_QUIET = 0.01
-"""Probability of a scatter as small as the one found, below which the stated uncertainties count as too large."""
+SMALL_SCATTER_P = 0.01
+"""Probability of a scatter at most as small as the present one, below which the history states a note."""
 
 #: Variable to its dimensions, its unit (``figure``: that of the figure), and its meaning.
 TABLE: dict[str, tuple[tuple[str, ...], str, str]] = {
@@ -71,9 +71,9 @@ def history(runs: Listing, machine: str, figure: str, at: Sequence[float] | None
     Parameters
     ----------
     runs : Listing
-        Of this machine.
+        Runs of this machine.
     machine, figure : str
-        See `errormotion.record.figures.follow`.
+        See `errormotion.record.figures.figure_over_time`.
     at : sequence of float, optional
         Place of a freedom, m.
 
@@ -85,9 +85,9 @@ def history(runs: Listing, machine: str, figure: str, at: Sequence[float] | None
     Raises
     ------
     RunError
-        No run states the figure; what there is.
+        No run states the figure; the message lists the known figures.
     """
-    followed = follow(runs.runs, figure, at)
+    followed = figure_over_time(runs.runs, figure, at)
     series = followed.series
     if series.unit not in UNITS:
         raise RunError(f"'{figure}': expected a unit of {', '.join(UNITS)}; found '{series.unit}'")
@@ -150,7 +150,7 @@ def history(runs: Listing, machine: str, figure: str, at: Sequence[float] | None
 
 
 def _common_name(series: Series, figure: str) -> str:
-    """Return the name of the figure where all runs give it the same, else as it was asked for."""
+    """Return the name of the figure if it is the same in all runs, otherwise the requested name."""
     names = set(series.names)
     return names.pop() if len(names) == 1 else figure
 
@@ -183,9 +183,9 @@ def _steps(series: Series, steps: Sequence[Step], notes: Sequence[Note]) -> dict
 
 
 def _remarks(model: Model) -> list[str]:
-    if model.fit is not None and model.fit.p < TOO_QUIET:
+    if model.fit is not None and model.fit.p < SMALL_SCATTER_P:
         return [
-            f"The values scatter less than their uncertainties state (chi-square {model.fit.chi2:.1f} with "
+            f"The values scatter less than their uncertainties allow (chi-square {model.fit.chi2:.1f} with "
             f"{model.fit.degrees} degrees of freedom, p = {model.fit.p:.2g}): the runs share sources without an "
             "identity, or U is too large. The intervals of trend and steps are then too wide."
         ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -23,13 +23,13 @@ from errormotion.report.page.language import texts_of
 from errormotion.report.write import PLAIN, Form, write_page
 
 HEIGHTS = {"values": 3.1, "chart": 2.5, "ranges": 1.9}
-"""Of the figures, inches."""
-MOST_ROWS = 200
-"""Rows of the table of values; of more, the newest."""
+"""Heights of the figures, inches."""
+MAX_ROWS = 200
+"""Largest number of rows of the table of values; of more values the newest are listed."""
 
 
 def write(history: xr.Dataset, out: Path, form: Form = PLAIN) -> Path:
-    """Write the page of a history; an older one is replaced in one step."""
+    """Write the page of a history; an existing page is replaced."""
     source = Source(history, None, {"test": str(history.attrs["figure"])}, {})
     return write_page([source], lambda: [part(history, source.key)], out, form=form)
 
@@ -50,11 +50,11 @@ def part(ds: xr.Dataset, key: str) -> Part:
     notes: list[Block] = [Text(note, "note") for note in ds.attrs["notes"] if note]
     left_out = [str(each) for each in ds.attrs["left_out"] if each]
     if left_out:
-        rows = [[each] for each in left_out[:MOST_ROWS]]
-        notes.append(Table(f"{len(left_out)} runs are left out", ["run and reason"], rows, numeric=False))
+        rows = [[each] for each in left_out[:MAX_ROWS]]
+        notes.append(Table(f"{len(left_out)} runs left out", ["run and reason"], rows, numeric=False))
     tables: list[Block] = [*_steps(ds), *_events(ds)]
     blocks: list[Section] = [
-        Section("course", "Course", [_values_figure(ds, key), *tables]),
+        Section("course", "Values over time", [_values_figure(ds, key), *tables]),
         Section("control", "Control chart", [_chart_figure(ds, key), _ranges_figure(ds, key)]),
         Section("values", "Values", [_values(ds), *notes]),
     ]
@@ -72,12 +72,12 @@ def _key_figures(ds: xr.Dataset) -> list[KeyFigure]:
         KeyFigure("Last value", last, unit, date(ds, float(ds["time"][-1]))),
         KeyFigure("Trend", Cell(slope.text, reason=slope.reason), per_year, coverage),
         KeyFigure("Steps", Cell(str(ds.sizes["step"])), "", f"of {ds.sizes['run']} runs"),
-        KeyFigure("Outside of the limits", Cell(f"{ds['outside'].values.sum():.0f}"), "", "3 standard deviations"),
+        KeyFigure("Outside the limits", Cell(f"{ds['outside'].values.sum():.0f}"), "", "3 standard deviations"),
     ]
 
 
 def _days(ds: xr.Dataset, seconds: Array) -> Array:
-    """Return times of a history in days since 1970, as axes of dates hold them."""
+    """Return times of a history in days since 1970, the unit of date axes."""
     start = instant(str(ds.attrs["start"])) or datetime.fromtimestamp(0, UTC)
     days: Array = (start.timestamp() + seconds) / 86400.0
     return days
@@ -118,49 +118,54 @@ def _marks(axes: Axes, ds: xr.Dataset) -> None:
         )
 
 
-def _legend(axes: Axes) -> None:
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.045), ncols=5, borderaxespad=0.0, handlelength=1.6)
+def _pieces(ds: xr.Dataset) -> list[slice]:
+    """Return the values between two steps."""
+    bounds = [0, *np.searchsorted(ds["time"].values, ds["step_time"].values), ds.sizes["run"]]
+    return [slice(int(first), int(last)) for first, last in pairwise(bounds)]
 
 
-def _label(ds: xr.Dataset) -> str:
-    unit = field_of(ds)[1]
-    return f"value / {unit}" if unit else "value"
+def _figure(ds: xr.Dataset, key: str, name: str, curves: Callable[[Axes], None], *texts: str) -> Figure:
+    """Return a figure over time with curves, notes, steps and legend; ``texts`` are its caption and description."""
+    unit, quantity = field_of(ds)[1], "range" if name == "ranges" else "value"
+
+    def paint(drawing: Drawing) -> None:
+        axes = _axes(drawing, ds, f"{quantity} / {unit}" if unit else quantity)
+        _marks(axes, ds)
+        curves(axes)
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.045), ncols=5, borderaxespad=0.0, handlelength=1.6)
+
+    return Figure(draw(paint, f"{key}-{name}", HEIGHTS[name], WIDTH), *texts)
 
 
 def _values_figure(ds: xr.Dataset, key: str) -> Figure:
     factor, _ = field_of(ds)
     when, y = _days(ds, ds["time"].values), factor * ds["value"].values
     U, fitted, half = (factor * ds[name].values for name in ("expanded_uncertainty", "fitted", "fitted_half_width"))
-    alone = ds["departing"].values > 0
-    bounds = [0, *np.searchsorted(ds["time"].values, ds["step_time"].values), len(y)]
+    outlier = ds["departing"].values > 0
 
-    def paint(drawing: Drawing) -> None:
-        axes = _axes(drawing, ds, _label(ds))
-        _marks(axes, ds)
-        for first, last in pairwise(bounds):
-            piece = slice(int(first), int(last))
-            # A run that departs alone has a parameter of its own: the line goes on across it.
-            kept = [k for k in range(len(y))[piece] if not alone[k]]
+    def curves(axes: Axes) -> None:
+        for piece in _pieces(ds):
+            # An outlier has its own parameter in the model; the line continues across it.
+            kept = [k for k in range(len(y))[piece] if not outlier[k]]
             axes.fill_between(
                 when[kept], (fitted - half)[kept], (fitted + half)[kept], color=GREEN, alpha=0.2, linewidth=0
             )
-            axes.plot(when[kept], fitted[kept], color=GREEN, label="trend and steps" if first == 0 else None)
+            axes.plot(when[kept], fitted[kept], color=GREEN, label=None if piece.start else "trend and steps")
         axes.errorbar(when, y, yerr=U, fmt="o", ms=3, lw=0.8, color=BLUE, label="value with U (k = 2)")
-        if alone.any():
-            axes.plot(when[alone], y[alone], "D", ms=6, mfc="none", color=VERMILLION, label="departs alone")
+        if outlier.any():
+            axes.plot(when[outlier], y[outlier], "D", ms=6, mfc="none", color=VERMILLION, label="outlier")
         if ds.sizes["step"]:
             axes.fill_between([], [], color=VERMILLION, alpha=0.18, label="time of a step")
         if ds.sizes["event"]:
             axes.plot([], [], color=PURPLE, linestyle=(0, (1.5, 1.5)), label="note")
-        _legend(axes)
 
-    coverage = f"{100 * float(ds.attrs['coverage']):.0f} %"
-    return Figure(
-        draw(paint, f"{key}-values", HEIGHTS["values"], WIDTH),
-        f"Values with their expanded uncertainty (k = 2), and trend with steps with its {coverage} interval. Red: "
-        "the interval of the time of each step. The numbers are those of the notes below.",
-        f"{ds.sizes['run']} values over time, trend {trend_text(ds)}, {ds.sizes['step']} steps",
+    caption = (
+        "Values with expanded uncertainty (k = 2); trend with steps and its "
+        f"{100 * float(ds.attrs['coverage']):.0f} % interval. Red: interval of the time of each step. Numbers refer to "
+        "the notes below."
     )
+    words = f"{ds.sizes['run']} values over time, trend {trend_text(ds)}, {ds.sizes['step']} steps"
+    return _figure(ds, key, "values", curves, caption, words)
 
 
 def _chart_figure(ds: xr.Dataset, key: str) -> Figure:
@@ -168,51 +173,42 @@ def _chart_figure(ds: xr.Dataset, key: str) -> Figure:
     when, y = _days(ds, ds["time"].values), factor * ds["value"].values
     centre, low, high = (factor * ds[name].values for name in ("centre", "lower_limit", "upper_limit"))
     out = ds["outside"].values > 0
-    bounds = [0, *np.searchsorted(ds["time"].values, ds["step_time"].values), len(y)]
 
-    def paint(drawing: Drawing) -> None:
-        axes = _axes(drawing, ds, _label(ds))
-        _marks(axes, ds)
-        for first, last in pairwise(bounds):
-            piece = slice(int(first), int(last))
-            shown = first == 0
-            axes.plot(when[piece], centre[piece], color=GREEN, lw=0.9, label="centre" if shown else None)
-            for limit, label in ((low, "limits"), (high, None)):
-                axes.plot(
-                    when[piece], limit[piece], color=BLACK, lw=0.8, ls=(0, (5, 2)), label=label if shown else None
-                )
+    def curves(axes: Axes) -> None:
+        for piece in _pieces(ds):
+            named = piece.start == 0
+            axes.plot(when[piece], centre[piece], color=GREEN, lw=0.9, label="centre" if named else None)
+            for limit, label in ((low, "limits" if named else None), (high, None)):
+                axes.plot(when[piece], limit[piece], color=BLACK, lw=0.8, ls=(0, (5, 2)), label=label)
         axes.plot(when, y, "o-", ms=3, lw=0.6, color=BLUE, label="value")
         if out.any():
             axes.plot(when[out], y[out], "o", ms=6.5, mfc="none", color=VERMILLION, label="outside")
-        _legend(axes)
 
-    return Figure(
-        draw(paint, f"{key}-chart", HEIGHTS["chart"], WIDTH),
-        "Individual values with control limits: three standard deviations from the centre, of the reproducibility from "
-        "the moving ranges and the stated uncertainty of each run. Centre and limits begin anew after a step.",
-        f"Control chart of {ds.sizes['run']} values, {out.sum():.0f} outside",
+    caption = (
+        "Individual values with control limits at three standard deviations from the centre, which result from the "
+        "reproducibility (moving ranges) and the stated uncertainty of each run. Centre and limits are determined "
+        "again after each step."
     )
+    words = f"Control chart of {ds.sizes['run']} values, {out.sum():.0f} outside"
+    return _figure(ds, key, "chart", curves, caption, words)
 
 
 def _ranges_figure(ds: xr.Dataset, key: str) -> Figure:
-    factor, unit = field_of(ds)
+    factor, _ = field_of(ds)
     when = _days(ds, ds["time"].values)
     ranges, limit = (factor * ds[name].values for name in ("moving_range", "range_limit"))
 
-    def paint(drawing: Drawing) -> None:
-        axes = _axes(drawing, ds, f"range / {unit}" if unit else "range")
-        _marks(axes, ds)
+    def curves(axes: Axes) -> None:
         axes.plot(when, limit, color=BLACK, lw=0.8, ls=(0, (5, 2)), label="limit")
         axes.plot(when, ranges, "o-", ms=3, lw=0.6, color=BLUE, label="moving range")
         axes.set_ylim(bottom=0)
-        _legend(axes)
 
-    return Figure(
-        draw(paint, f"{key}-ranges", HEIGHTS["ranges"], WIDTH),
-        "Moving ranges: difference of each value from the one before, with its upper limit. A range across a step is "
-        "left out.",
-        f"Moving ranges of {ds.sizes['run']} values",
+    caption = (
+        "Moving ranges: absolute difference of each value from the previous one, with its upper limit. Ranges across a "
+        "step are omitted."
     )
+    words = f"Moving ranges of {ds.sizes['run']} values"
+    return _figure(ds, key, "ranges", curves, caption, words)
 
 
 def _steps(ds: xr.Dataset) -> list[Table]:
@@ -220,13 +216,12 @@ def _steps(ds: xr.Dataset) -> list[Table]:
     for k in range(ds.sizes["step"]):
         size = sized(ds, float(ds["step_size"][k]), float(ds["step_half_width"][k]))
         times = [date(ds, float(ds[f"step_{name}"][k])) for name in ("time", "low", "high")]
-        rows.append([times[0], f"{times[1]} to {times[2]}", size, f"{float(ds['step_p'][k]):.2g}", _event(ds, k)])
+        event = str(ds["step_event"].values[k]) or "no note"
+        rows.append([times[0], f"{times[1]} to {times[2]}", size, f"{float(ds['step_p'][k]):.2g}", event])
     head = ["about", "between (UTC)", "size, 95 %", "p", "noted"]
-    return [Table("Steps, with the notes within the interval of their time", head, rows, numeric=False)] if rows else []
-
-
-def _event(ds: xr.Dataset, k: int) -> str:
-    return str(ds["step_event"].values[k]) or "nothing"
+    return (
+        [Table("Steps, with the notes within the time interval of the step", head, rows, numeric=False)] if rows else []
+    )
 
 
 def _events(ds: xr.Dataset) -> list[Table]:
@@ -241,20 +236,13 @@ def _events(ds: xr.Dataset) -> list[Table]:
 def _values(ds: xr.Dataset) -> Table:
     factor, unit = field_of(ds)
     rows: list[Sequence[Cell | str]] = []
-    first = max(0, ds.sizes["run"] - MOST_ROWS)
+    first = max(0, ds.sizes["run"] - MAX_ROWS)
     for k in range(first, ds.sizes["run"]):
         value = estimate(factor * float(ds["value"][k]), factor * float(ds["expanded_uncertainty"][k]))
-        remarks = [word for name, word in (("outside", "outside"), ("departing", "departs alone")) if ds[name][k]]
-        rows.append(
-            [
-                date(ds, float(ds["time"][k])),
-                str(ds["run"].values[k]),
-                value.text,
-                value.uncertainty,
-                ", ".join(remarks),
-            ]
-        )
+        remarks = [word for name, word in (("outside", "outside"), ("departing", "outlier")) if ds[name][k]]
+        started, run = date(ds, float(ds["time"][k])), str(ds["run"].values[k])
+        rows.append([started, run, value.text, value.uncertainty, ", ".join(remarks)])
     caption = f"Values in {unit}" if unit else "Values"
     if first:
-        caption += f", the newest {MOST_ROWS} of {ds.sizes['run']}"
+        caption += f", the newest {MAX_ROWS} of {ds.sizes['run']}"
     return Table(caption, ["started (UTC)", "run", "value", "U (k = 2)", "remark"], rows, numeric=False)

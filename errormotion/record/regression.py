@@ -1,15 +1,15 @@
-"""Generalised least squares with a variance between runs, and its two estimates.
+"""Generalised least squares with a variance between runs, and two estimates of this variance.
 
-The values are ``y = X b + m + e``: e has the stated covariance V0, m is what the machine and its set-up change from run
-to run, independent with the standard deviation tau, the reproducibility. Two estimates of tau:
+The model of the values is ``y = X b + m + e``: e has the stated covariance V0, m is the variation of machine and set-up
+from run to run, independent with the standard deviation tau, the reproducibility. Two estimates of tau:
 
-* Paule and Mandel (J. Res. NBS 87 (1982) 377): tau such that the weighted sum of squared residuals is its expectation,
-  ``r' (V0 + tau^2)^-1 r = n - p``; here with a full covariance and p parameters.
+* Paule and Mandel (J. Res. NBS 87 (1982) 377): tau such that the weighted sum of squared residuals equals its
+  expectation, ``r' (V0 + tau^2)^-1 r = n - p``; here with a full covariance and p parameters.
 * Moving ranges, as in a chart of individual values (ISO 7870-2): ``E|y_k - y_(k-1)| = sqrt(2 / pi) sd`` for normal
-  values, where ``sd^2 = 2 tau^2 + v_k`` and v_k follows from V0; tau such that the sum of the ranges is its
-  expectation. A step enters one range only, a trend hardly any.
+  values, where ``sd^2 = 2 tau^2 + v_k`` and v_k follows from V0; tau such that the sum of the ranges equals its
+  expectation. A step affects one range only, and a trend has little effect.
 
-Both are 0 where the stated uncertainties alone explain the scatter.
+Both are 0 if the stated uncertainties alone explain the scatter.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from scipy.stats import t as student
 from errormotion.arrays import Array
 
 COVERAGE = 0.95
-"""Of the intervals of a trend and of a step."""
+"""Coverage probability of the intervals of trend and steps."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class Fit:
     Attributes
     ----------
     parameters, half_width : ndarray, (p,)
-        With their intervals (``COVERAGE``).
+        Parameters, and half widths of their intervals (``COVERAGE``).
     covariance : ndarray, (p, p)
     tau : float
         Reproducibility by Paule and Mandel.
     chi2, p : float
-        Of the residuals for the stated uncertainties alone, tau = 0, and the probability of a smaller one.
+        Chi-square of the residuals for the stated uncertainties only (tau = 0), and probability of a smaller value.
     degrees : int
     fitted, fitted_half_width : ndarray, (n,)
     """
@@ -57,9 +57,9 @@ class Fit:
 
 
 def fit(X: Array, y: Array, V0: Array) -> Fit | None:
-    """Return the fit of ``y = X b`` (n, p); None without a degree of freedom, or for dependent columns.
+    """Return the fit of ``y = X b`` (n, p); None without degrees of freedom, or for dependent columns.
 
-    The quantile is that of Student's distribution with n - p degrees of freedom, since tau is estimated from as many.
+    The quantile is that of Student's distribution with n - p degrees of freedom, with which tau is estimated.
     """
     n, p = X.shape
     if n <= p or np.linalg.matrix_rank(X) < p:
@@ -79,7 +79,7 @@ def fit(X: Array, y: Array, V0: Array) -> Fit | None:
 
 
 def by_moving_ranges(residual: Array, V0: Array, used: Array | None = None) -> float:
-    """Return tau from the moving ranges of residuals (n,); ``used`` (n - 1,) leaves out ranges, across a step say."""
+    """Return tau from the moving ranges of residuals (n,); ``used`` (n - 1,) selects ranges, such as all but steps."""
     d = np.abs(np.diff(residual))
     v = difference_variance(V0)
     if used is not None:
@@ -95,14 +95,14 @@ def by_moving_ranges(residual: Array, V0: Array, used: Array | None = None) -> f
 
 
 def difference_variance(V: Array) -> Array:
-    """Return the variance of the differences of neighbours, (n - 1,); a shared source cancels where it acts alike."""
+    """Return the variance of the differences of neighbours, (n - 1,); equal effects of a shared source cancel."""
     diagonal = np.diag(V)
     found: Array = np.maximum(diagonal[1:] + diagonal[:-1] - 2 * np.diag(V, 1), 0.0)
     return found
 
 
 def _paule_mandel(X: Array, y: Array, V0: Array) -> float:
-    """Return tau; the sum of squares falls with tau, so that there is one root at most."""
+    """Return tau; the sum of squares decreases with tau, so that there is at most one root."""
     degrees = int(X.shape[0] - X.shape[1])
 
     def excess(tau: float) -> float:
@@ -111,7 +111,7 @@ def _paule_mandel(X: Array, y: Array, V0: Array) -> float:
     if excess(0.0) <= 0:
         return 0.0
     rest = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
-    high = float(np.sqrt(rest @ rest / degrees))  # with tau alone the sum is at most n - p here
+    high = float(np.sqrt(rest @ rest / degrees))  # with tau only, the sum is at most n - p at this value
     return float(brentq(excess, 0.0, high, xtol=1e-6 * high)) if excess(high) < 0 else high
 
 

@@ -1,4 +1,4 @@
-"""The values of one figure over time, with the covariance that their runs state."""
+"""The values of one figure over time, with their stated covariance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from errormotion.arrays import Array
 
 YEAR = 365.25 * 86400.0
-"""Seconds."""
+"""Duration of a year, s."""
 
 
 @dataclass(frozen=True)
@@ -21,15 +21,15 @@ class Series:
     Attributes
     ----------
     time : ndarray, (n,)
-        s since 1970 (UTC).
+        Times since 1970 (UTC), s.
     value, u : ndarray, (n,)
-        SI; u is the standard uncertainty that the run states, all sources included.
+        Values and stated standard uncertainties with all sources, SI.
     influence : ndarray, (s, n)
-        Signed effect of one standard uncertainty of each source that several runs share; part of u.
+        Signed effect of one standard uncertainty of each source that several runs share; included in u.
     identities : sequence of str
         Identity of each of these sources.
     runs, names : sequence of str
-        Run folder, and name of the figure there.
+        Name of the run folder, and name of the figure in this run.
     unit : str
         SI unit.
     """
@@ -56,7 +56,7 @@ class Series:
 
     @cached_property
     def covariance(self) -> Array:
-        """Stated covariance of the values, (n, n): a shared source is one draw in all runs."""
+        """Stated covariance of the values, (n, n); a shared source is fully correlated between runs."""
         F = self.influence if len(self.identities) else np.zeros((0, self.size))
         own = np.maximum(self.u**2 - (F**2).sum(axis=0), (1e-6 * self.u) ** 2)
         V: Array = np.diag(own) + F.T @ F

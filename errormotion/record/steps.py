@@ -1,19 +1,19 @@
-"""Steps in a series beside its trend, and single runs that depart from it, with a stated rate of false alarms.
+"""Detection of steps and outliers in a series with a trend, with a stated rate of false alarms.
 
-Candidates are a step between any two neighbouring times with ``LEAST_SIDE`` values on either side, and a departure of
-any single run. The statistic of a candidate is its share g of the weighted sum of squares, in the metric of the
-covariance and orthogonal to what the model already holds, over the scale: ``g (1 / r + 1 / s) / 2``. Here s is the
-mean square of the rest, and r the square that follows from the moving ranges without those that the candidate itself
-changes; steps that are not yet found inflate s, but hardly r. The largest statistic of each kind is compared with its
-own distribution where there is nothing to find, from simulated normal series with the same times and the same
-covariance: the probability of a false alarm anywhere is ``FALSE_STEPS + FALSE_DEPARTURES``. What is found joins the
-model, the positions found before are sought again, and the search is repeated with the distribution for this model
-until nothing more is significant.
+Candidates are a step between any two neighbouring times with ``MIN_SIDE`` values on either side, and an outlier at any
+single run. The statistic of a candidate is its contribution g to the weighted sum of squares, in the metric of the
+covariance and orthogonal to the present model, divided by the scale: ``g (1 / r + 1 / s) / 2``. Here s is the mean
+square of the residuals, and r the mean square that follows from the moving ranges, without those that the candidate
+itself changes; undetected steps increase s, but hardly r. The largest statistic of each kind is compared with its
+distribution without steps and outliers, from simulated normal series with the same times and the same covariance: the
+probability of any false alarm is ``FALSE_STEPS + FALSE_DEPARTURES``. A significant candidate is added to the model, the
+positions of the earlier ones are optimised again, and the search is repeated with the distribution for the new model
+until no candidate is significant.
 
-A step that is hardly significant may be chance, and would then take its size from the trend. The interval of the trend
-therefore covers the intervals with and without the steps and departures whose p is above ``CERTAIN``.
+A weakly significant step may be a chance result, which would falsify the trend. The interval of the trend therefore
+covers the intervals with and without the steps and outliers whose p is above ``CERTAIN``.
 
-The interval of the time of a step holds all positions whose log likelihood is within 7.35 / 2 of the best: the 95 %
+The interval of the time of a step contains all positions whose log likelihood is within 7.35 / 2 of the best: the 95 %
 quantile of the larger of two independent exponential variables (Eo and Morley, Quantitative Economics 6 (2015) 463).
 """
 
@@ -29,40 +29,40 @@ from errormotion.record.regression import Fit, by_moving_ranges, difference_vari
 from errormotion.record.series import Series
 
 FALSE_STEPS = 0.035
-"""Probability that a step is found in a series where there is none."""
+"""Probability that a step is detected in a series without steps."""
 FALSE_DEPARTURES = 0.01
-"""Probability that a departing run is found in a series where there is none."""
-LEAST_SIDE = 3
-"""Values on either side of a step."""
+"""Probability that an outlier is detected in a series without outliers."""
+MIN_SIDE = 3
+"""Smallest number of values on either side of a step."""
 CERTAIN = 0.001
-"""Probability of chance up to which a step is taken for certain in the interval of the trend."""
-MOST = 20
-"""Steps and departures that are sought."""
+"""Largest p at which a step is regarded as certain for the interval of the trend."""
+MAX_FOUND = 20
+"""Largest number of steps and outliers."""
 SIMULATIONS = 1999
 LIKELIHOOD_DROP = 7.35
-"""Twice the drop of the log likelihood within the 95 % interval of a step's position."""
+"""Twice the decrease of the log likelihood at the ends of the 95 % interval of the position of a step."""
 TINY = np.finfo(float).tiny
-LEAST_SHARE = 1e-6
-"""Of a candidate, the share of its square that is orthogonal to the model."""
+MIN_ORTHOGONAL = 1e-6
+"""Smallest fraction of the square of a candidate that is orthogonal to the model."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A change at value number ``index``: a step before it, or a departure of this value alone."""
+    """A change at value number ``index``: a step before it, or an outlier."""
 
     index: int
     single: bool = False
     p: float = np.nan
 
     def column(self, n: int) -> Array:
-        """Return its column of the model, (n,)."""
+        """Return the column of the design matrix, (n,)."""
         k = np.arange(n)
         return (k == self.index).astype(float) if self.single else (k >= self.index).astype(float)
 
 
 @dataclass(frozen=True)
 class Step:
-    """A step: between the values ``index - 1`` and ``index``, surely after value ``first`` and up to value ``last``."""
+    """A step between the values ``index - 1`` and ``index``; its interval is after ``first`` and up to ``last``."""
 
     index: int
     first: int
@@ -74,16 +74,16 @@ class Step:
 
 @dataclass(frozen=True)
 class Model:
-    """Trend, steps and departures of a series.
+    """Trend, steps and outliers of a series.
 
     Attributes
     ----------
     fit : Fit or None
         The first two parameters are the value at the first run and the trend per year; None for too few values.
     steps : tuple of Step
-        In the order of time.
+        Steps in chronological order.
     departing : tuple of int
-        Values that depart alone.
+        Indices of outliers.
     trend : tuple of float
         Change per year, with the limits of its interval.
     """
@@ -95,7 +95,7 @@ class Model:
 
 
 def model_of(series: Series) -> Model:
-    """Return trend, steps and departures of a series."""
+    """Return trend, steps and outliers of a series."""
     base = _base(series)
     if base.shape[1] < 2:
         return Model(None)
@@ -119,7 +119,7 @@ def model_of(series: Series) -> Model:
 
 
 def _trend(series: Series, base: Array, found: list[Candidate], result: Fit) -> tuple[float, float, float]:
-    """Return the trend with its interval, which covers the one without what may be chance."""
+    """Return the trend with its interval, which covers that of the model without uncertain candidates."""
     fits = [result]
     certain = [each for each in found if each.p <= CERTAIN]
     if len(certain) < len(found) and (without := fit(_design(base, certain), series.value, series.covariance)):
@@ -130,7 +130,7 @@ def _trend(series: Series, base: Array, found: list[Candidate], result: Fit) -> 
 
 
 def _base(series: Series) -> Array:
-    """Return the columns of a constant and a trend; the constant alone where there are fewer than three times."""
+    """Return the columns of a constant and a trend; with fewer than three times, of the constant only."""
     t = series.years
     if np.unique(t).size < 3:
         return np.ones((series.size, 1))
@@ -144,7 +144,7 @@ def _design(base: Array, found: list[Candidate]) -> Array:
 def _search(series: Series, base: Array) -> list[Candidate]:
     found: list[Candidate] = []
     noise = np.random.default_rng(20260301).normal(size=(SIMULATIONS, series.size))
-    while len(found) < MOST:
+    while len(found) < MAX_FOUND:
         X = _design(base, found)
         candidates = _candidates(series, found)
         if not candidates or series.size - X.shape[1] < 2:
@@ -152,12 +152,12 @@ def _search(series: Series, base: Array) -> list[Candidate]:
         best = _Trial(series, X, candidates).significant(noise)
         if best is None:
             break
-        found = _placed_anew(series, base, [*found, best])
+        found = _repositioned(series, base, [*found, best])
     return found
 
 
 def _candidates(series: Series, found: list[Candidate], single: bool | None = None) -> list[Candidate]:
-    """Return what may be added to a model; ``single`` restricts them to steps, or to departures."""
+    """Return the candidates for a model; ``single`` restricts them to outliers (True) or steps (False)."""
     n, t = series.size, series.time
     steps = [each.index for each in found if not each.single]
     taken = {each.index for each in found if each.single}
@@ -165,16 +165,16 @@ def _candidates(series: Series, found: list[Candidate], single: bool | None = No
     if single is not True:
         made += [
             Candidate(k)
-            for k in range(LEAST_SIDE, n - LEAST_SIDE + 1)
-            if t[k] > t[k - 1] and all(abs(k - other) >= LEAST_SIDE for other in steps)
+            for k in range(MIN_SIDE, n - MIN_SIDE + 1)
+            if t[k] > t[k - 1] and all(abs(k - other) >= MIN_SIDE for other in steps)
         ]
     if single is not False:
         made += [Candidate(k, single=True) for k in range(n) if k not in taken]
     return made
 
 
-def _placed_anew(series: Series, base: Array, found: list[Candidate]) -> list[Candidate]:
-    """Return candidates at their best positions, each sought anew beside the others, at most five times around."""
+def _repositioned(series: Series, base: Array, found: list[Candidate]) -> list[Candidate]:
+    """Return candidates at their best positions, each optimised with the others fixed, in at most five passes."""
     for _ in range(5):
         before = list(found)
         for number, each in enumerate(found):
@@ -189,7 +189,7 @@ def _placed_anew(series: Series, base: Array, found: list[Candidate]) -> list[Ca
 
 
 class _Trial:
-    """Candidates beside a model: their directions in whitened coordinates, and their statistics."""
+    """Candidates for a model: their directions in whitened coordinates, and their statistics."""
 
     def __init__(self, series: Series, X: Array, candidates: list[Candidate], V: Array | None = None) -> None:
         y, V0 = series.value, series.covariance
@@ -202,7 +202,7 @@ class _Trial:
         size = (Z**2).sum(axis=0)
         Z = Z - self._Q @ (self._Q.T @ Z)
         rest = (Z**2).sum(axis=0)
-        kept = rest > LEAST_SHARE * size
+        kept = rest > MIN_ORTHOGONAL * size
         self.candidates = [c for c, keep in zip(candidates, kept, strict=True) if keep]
         self._G = Z[:, kept] / np.sqrt(rest[kept])
         self._v = difference_variance(V)
@@ -211,16 +211,16 @@ class _Trial:
         self._white = solve_triangular(self._L, y, lower=True)
 
     def squares(self) -> Array:
-        """Return twice the gain of the log likelihood by each candidate, (candidates,)."""
+        """Return twice the increase of the log likelihood by each candidate, (candidates,)."""
         found: Array = (self._white @ self._G) ** 2
         return found
 
     def best(self) -> Candidate:
-        """Return the candidate with the largest gain."""
+        """Return the candidate with the largest increase."""
         return self.candidates[int(np.argmax(self.squares()))]
 
     def significant(self, noise: Array) -> Candidate | None:
-        """Return the significant candidate with the largest gain; None where none is significant."""
+        """Return the significant candidate with the largest increase, or None."""
         gain, own, null = self.squares(), self._statistics(self._white[None])[0], self._statistics(noise)
         best, largest = None, 0.0
         for single, rate in ((False, FALSE_STEPS), (True, FALSE_DEPARTURES)):
@@ -237,7 +237,7 @@ class _Trial:
         """Return the statistics of the candidates for each row of whitened values (m, n)."""
         rest = white - (white @ self._Q) @ self._Q.T
         d = np.abs(np.diff(rest @ self._L.T, axis=1)) / np.sqrt(np.maximum(self._v, TINY))
-        # The ranges that a candidate itself changes: the one before its value, and of a single value the one behind.
+        # Ranges that a candidate changes: the one before its value, and of an outlier also the one after it.
         around = np.pad(d, ((0, 0), (1, 1)))
         own = around[:, self._index] + np.where(self._single, around[:, self._index + 1], 0.0)
         ends = (self._index == 0) | (self._index == d.shape[1])
@@ -251,7 +251,7 @@ class _Trial:
 
 
 def _interval(series: Series, base: Array, found: list[Candidate], number: int, V: Array) -> tuple[int, int]:
-    """Return the last value surely before a step, and the first one surely after it."""
+    """Return the last value before the interval of a step, and the last value within it."""
     others = found[:number] + found[number + 1 :]
     trial = _Trial(series, _design(base, others), _candidates(series, others, single=False), V)
     if not trial.candidates:

@@ -1,4 +1,4 @@
-"""A history in words, in the field's units."""
+"""A history as text, in um, arcsec and degC."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from errormotion.datasets.files.events import instant
 from errormotion.report.text import rounded
 
 FIELD = {"m": (1e6, "um"), "rad": (648000 / math.pi, "arcsec"), "1": (1.0, ""), "degC": (1.0, "degC")}
-"""Factor and name of the unit in which a figure is printed, by its SI unit."""
-LONG = 1e-3
-"""Lengths from here on are printed in mm, m."""
+"""Factor and name of the printed unit, by SI unit."""
+MM_FROM = 1e-3
+"""Smallest length that is printed in mm, m."""
 
 
 def field_of(ds: xr.Dataset) -> tuple[float, str]:
-    """Return factor and name of the unit in which the figure of a history is shown."""
+    """Return factor and name of the printed unit of the figure of a history."""
     unit = str(ds.attrs["unit"])
-    if unit == "m" and np.median(np.abs(ds["value"].values)) >= LONG:
+    if unit == "m" and np.median(np.abs(ds["value"].values)) >= MM_FROM:
         return 1e3, "mm"
     return FIELD[unit]
 
@@ -32,7 +32,7 @@ def date(ds: xr.Dataset, seconds: float) -> str:
 
 
 def sized(ds: xr.Dataset, value: float, half_width: float) -> str:
-    """Return a value with half of its interval and the unit; ``unknown`` for NaN."""
+    """Return a value with the half width of its interval and the unit; ``unknown`` for NaN."""
     if not math.isfinite(value):
         return "unknown"
     factor, unit = field_of(ds)
@@ -43,7 +43,7 @@ def sized(ds: xr.Dataset, value: float, half_width: float) -> str:
 def trend_text(ds: xr.Dataset) -> str:
     """Return the trend with its interval."""
     if not np.isfinite(ds["trend"]):
-        return "unknown: it needs values at three times or more"
+        return "unknown, because values at three or more times are needed"
     factor, unit = field_of(ds)
     low, high = float(ds["trend_low"]), float(ds["trend_high"])
     ends = [rounded(factor * each, factor * (high - low) / 2)[0] for each in (float(ds["trend"]), low, high)]
@@ -53,7 +53,7 @@ def trend_text(ds: xr.Dataset) -> str:
 
 
 def sentences(ds: xr.Dataset) -> list[str]:
-    """Return the result of a history, the most important first."""
+    """Return the results of a history as sentences, the most important first."""
     factor, unit = field_of(ds)
     found = []
     for k in range(ds.sizes["step"]):
@@ -65,7 +65,7 @@ def sentences(ds: xr.Dataset) -> list[str]:
         found.append(f"Step of {size} about {likely} (between {low} and {high}, p = {p:.2g}){named}.")
     if not found:
         found.append(
-            "No step: none is clearer than chance makes it, with a probability of a false alarm of "
+            "No significant step, with a probability of a false alarm of "
             f"{100 * float(ds.attrs['false_alarms']):.2g} %."
         )
     sure = float(ds["trend_low"]) > 0 or float(ds["trend_high"]) < 0
@@ -73,19 +73,19 @@ def sentences(ds: xr.Dataset) -> list[str]:
     names = ds["run"].values
     departing = [str(name) for name, each in zip(names, ds["departing"].values, strict=True) if each]
     if departing:
-        found.append(f"Depart alone, and are left out of the centre of the chart: {', '.join(departing)}.")
+        found.append(f"Outliers, which are left out of the centre of the chart: {', '.join(departing)}.")
     outside = [str(name) for name, each in zip(names, ds["outside"].values, strict=True) if each]
     shown = ", ".join(outside[:5]) + (f" and {len(outside) - 5} more" if len(outside) > 5 else "")
-    found.append(f"Outside of the control limits: {shown}." if outside else "All values are within the control limits.")
+    found.append(f"Outside the control limits: {shown}." if outside else "All values are within the control limits.")
     tau = float(ds["reproducibility"])
     if np.isfinite(tau):
         own = float(np.median(ds["expanded_uncertainty"].values)) / 2
         tau_text, own_text = rounded(factor * tau, factor * max(tau, own) / 10, signed=False)[0], factor * own
         found.append(
-            f"Reproducibility of machine and set-up (Paule and Mandel): {tau_text} {unit}".rstrip()
-            + f" standard deviation, beside {own_text:.2g} {unit}".rstrip()
-            + " that the runs state (median, k = 1)."
+            f"Reproducibility of machine and set-up (Paule and Mandel): standard deviation {tau_text} {unit}".rstrip()
+            + f", in addition to the stated standard uncertainty of the runs, {own_text:.2g} {unit}".rstrip()
+            + " (median)."
         )
     if count := ds.sizes["source"]:
-        found.append(f"Sources that several runs share, and that count as one draw: {count}.")
+        found.append(f"Sources that several runs share, treated as fully correlated: {count}.")
     return found

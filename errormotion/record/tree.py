@@ -1,4 +1,4 @@
-"""A whole run as one tree of datasets."""
+"""A run as one tree of datasets."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def open_run(folder: str | Path) -> xr.DataTree:
     Returns
     -------
     DataTree
-        Nodes that exist: ``raw`` (left on disk), ``errors`` (the last identification, in memory), ``errors_<name>``
-        for what belongs to it, such as ``errors_monte_carlo``. The attributes of the root state the run: id, test,
+        Nodes, as far as they exist: ``raw`` (lazy), ``errors`` (the last identification, in memory), ``errors_<name>``
+        for associated datasets, such as ``errors_monte_carlo``. The attributes of the root state the run: id, test,
         created, status, reason, machine, bench, campaign, method, and ``run`` and ``events``, the complete record and
         its notes as JSON.
 
     Raises
     ------
     RunError
-        Not a run folder, or a damaged ``run.json``.
+        The path is not a run folder, or ``run.json`` is damaged.
     DatasetError
-        A dataset that cannot be read.
+        A dataset cannot be read.
     """
     from errormotion.report.write import belonging
 

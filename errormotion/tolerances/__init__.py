@@ -1,4 +1,4 @@
-"""Tolerances: limits of figures and freedoms, and the decision on them with the measurement uncertainty.
+"""Tolerances: limits of figures and freedoms, and decisions that take the measurement uncertainty into account.
 
-``table`` is what a person writes, ``decision`` the rule, ``conformity`` the decision on an error dataset.
+``table`` reads the limits, ``decision`` contains the rules, ``conformity`` the decision on an error dataset.
 """

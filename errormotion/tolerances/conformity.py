@@ -1,6 +1,6 @@
-"""The decision on an error dataset: each limit that applies to it, and the whole.
+"""The decision on an error dataset: on each limit that applies to it, and overall.
 
-Figures of merit come from the plugin of the method, freedoms from the dataset; no method is named here.
+Figures of merit are computed by the plugin of the method, freedoms are taken from the dataset.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Row:
-    """One limit and the value that decides; SI, k = 2. Limits are infinite where there is none."""
+    """One limit and the value that determines the decision; SI, k = 2. A missing limit is infinite."""
 
     name: str
     value: float
@@ -48,13 +48,13 @@ class Conformity:
     Attributes
     ----------
     rows : tuple of Row
-        One for each figure and freedom that has limits.
+        A row for each figure and each freedom with limits.
     unused : tuple of str
         Limits that apply to no figure and no freedom of this dataset.
     tolerances : Tolerances
         Limits and rule.
     failure : str
-        Why there are no figures; empty where there are.
+        Why figures could not be computed; empty otherwise.
     """
 
     rows: tuple[Row, ...]
@@ -71,7 +71,7 @@ class Conformity:
 
     @property
     def verdict(self) -> str:
-        """Decision in words; empty if no limit applies to this dataset."""
+        """Decision as text; empty if no limit applies to this dataset."""
         return "" if self.decision is None else WORDS[self.tolerances.rule][self.decision]
 
     def plain(self) -> dict[str, Any]:
@@ -95,7 +95,7 @@ class Conformity:
         }
 
     def lines(self) -> list[str]:
-        """Return the decision as lines of text, the whole first."""
+        """Return the decision as lines of text, the overall decision first."""
         if self.decision is None:
             return []
         words = WORDS[self.tolerances.rule]
@@ -114,8 +114,8 @@ class Conformity:
 def judge(errors: xr.Dataset, tolerances: Tolerances) -> Conformity:
     """Decide on every limit that applies to an error dataset.
 
-    A name in ``figures`` may contain ``*`` for any characters. A freedom keeps its limits if all of its known
-    points do; the row states the worst point.
+    A name in ``figures`` may contain ``*`` for any characters. A freedom is within its limits if all of its
+    known points are; the row states the worst point.
     """
     failure, figures = "", list[FigureOfMerit]()
     if is_planned(errors):
@@ -123,7 +123,7 @@ def judge(errors: xr.Dataset, tolerances: Tolerances) -> Conformity:
     if tolerances.figures:
         try:
             figures = figures_of(errors)
-        except Exception as error:  # of a foreign plugin
+        except Exception as error:  # error in a foreign plugin
             log.exception("the figures of merit failed")
             failure = f"{type(error).__name__}: {error}"
     stated = judge_figures(figures, tolerances)
@@ -137,7 +137,7 @@ def judge(errors: xr.Dataset, tolerances: Tolerances) -> Conformity:
 
 
 def judge_figures(figures: Sequence[FigureOfMerit], tolerances: Tolerances) -> Conformity:
-    """Decide on figures of merit alone; limits of freedoms are not used."""
+    """Decide on figures of merit only; limits of freedoms are not used."""
     rows, unused = list[Row](), list[str]()
     for pattern, limit in tolerances.figures.items():
         found = [figure for figure in figures if matches(pattern, figure.name)]
@@ -147,7 +147,7 @@ def judge_figures(figures: Sequence[FigureOfMerit], tolerances: Tolerances) -> C
 
 
 def matches(pattern: str, name: str) -> bool:
-    """Return whether a name is that of a pattern, in which ``*`` stands for any characters."""
+    """Return whether a name matches a pattern, in which ``*`` stands for any characters."""
     first, *rest = pattern.split("*")
     if not rest:
         return name == pattern
@@ -181,7 +181,7 @@ def _of_freedom(errors: xr.Dataset, name: str, limit: Limit, tolerances: Toleran
 
 
 def _row(name: str, value: Any, U: Any, unit: str, limit: Limit, tolerances: Tolerances) -> Row:
-    """Return the decision on values that all have to keep one limit, with the worst value."""
+    """Return the decision on values with a common limit, with the worst value."""
     lower, upper = limit.interval
     if unit != limit.unit:
         remark = f"the limit is in {limit.unit}, the value in {unit or 'no unit'}"

@@ -1,12 +1,13 @@
-"""The decision whether a measured value keeps its limits.
+"""The decision whether a measured value is within its limits.
 
-* ISO 14253-1: conformity is proved inside of the limits by at least the guard band, nonconformity outside by more than
-  the guard band; between them neither is proved. The guard band is ``guard_factor * U``, with U at k = 2. At a limit
-  each of the two proofs is wrong with the probability ``Phi(-2 guard_factor)``: 2.3 % for 1, 5 % for 0.82 (the
-  conformance probability limit of 95 % of the edition of 2017).
-* Simple: the value alone decides (JCGM 106, 8.2.1). At a limit the decision is wrong in half of all cases.
-* Shared risk: the value alone decides if U is small enough, at most ``largest_ratio`` times half the tolerance, as
-  customer and supplier have agreed (JCGM 106, 8.2.2); otherwise nothing is decided.
+* ISO 14253-1: conformity is proved if the value is inside the limits by at least the guard band, nonconformity if it is
+  outside by more than the guard band; otherwise neither is proved. The guard band is ``guard_factor * U``, with U at
+  k = 2. At a limit each of the two proofs is wrong with the probability ``Phi(-2 guard_factor)``: 2.3 % for 1, 5 % for
+  0.82 (the conformance probability limit of 95 % of the edition of 2017).
+* Simple: only the value is compared with the limits (JCGM 106, 8.2.1). At a limit the decision is wrong in half of all
+  cases.
+* Shared risk: only the value is compared with the limits if U is at most ``largest_ratio`` times half the tolerance, as
+  agreed by customer and supplier (JCGM 106, 8.2.2); otherwise there is no decision.
 """
 
 from __future__ import annotations
@@ -40,16 +41,16 @@ def decide(
     Parameters
     ----------
     value, expanded_uncertainty : array
-        Of one shape and unit; k = 2.
+        Values and U (k = 2), of the same shape and unit.
     lower, upper : float
-        Limits; infinite where there is none.
+        Limits; infinite if missing.
     rule, guard_factor, largest_ratio
-        See the head of this module.
+        See the docstring of this module.
 
     Returns
     -------
     array of int
-        OPEN where the value is unknown, or the uncertainty that the rule needs.
+        OPEN if the value, or the uncertainty that the rule needs, is unknown.
     """
     value, U = np.broadcast_arrays(np.asarray(value, dtype=float), np.asarray(expanded_uncertainty, dtype=float))
     g = guard_factor * U if rule == "iso 14253-1" else np.zeros_like(U)
@@ -62,7 +63,7 @@ def decide(
 
 
 def half_tolerance(lower: float, upper: float) -> float:
-    """Return half the width between two limits; of a single limit, its size."""
+    """Return half the distance between two limits, or the absolute value of a single limit."""
     if np.isfinite(lower) and np.isfinite(upper):
         return 0.5 * (upper - lower)
     return abs(upper) if np.isfinite(upper) else abs(lower)

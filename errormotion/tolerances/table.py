@@ -1,4 +1,4 @@
-"""The table ``[tolerances]`` of a campaign file, or of a file of its own."""
+"""The table ``[tolerances]`` of a campaign file or of a separate file."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from errormotion.errors import BenchError
 from errormotion.tolerances.decision import Rule
 
 SCHEMA = "errormotion.tolerances/1"
-LONGEST_PATTERN = 200
-"""Characters of the name of a limit."""
+MAX_PATTERN = 200
+"""Longest name of a limit, characters."""
 
 
 class Bound(BaseModel):
@@ -28,12 +28,12 @@ class Bound(BaseModel):
 
 
 def _bound(value: Any) -> Any:
-    """Return the quantity of a text; of a bare number in quotes, one without a unit."""
+    """Return the quantity of a text; a number in quotes is a quantity without a unit."""
     if isinstance(value, Bound | dict):
         return value
     expected = "expected a limit with its unit in quotes, such as '10 um' or '5 arcsec'"
-    if not isinstance(value, str) or len(value) > LONGEST_PATTERN:
-        raise ValueError(f"{expected}; found {str(value)[:LONGEST_PATTERN]}")
+    if not isinstance(value, str) or len(value) > MAX_PATTERN:
+        raise ValueError(f"{expected}; found {str(value)[:MAX_PATTERN]}")
     try:
         return Bound(value=float(value), unit="1")
     except ValueError:
@@ -62,7 +62,7 @@ class Limit(BaseModel):
             )
         bound = _bound(value)
         if not bound.value > 0:
-            raise ValueError(f"expected a limit of the absolute value above 0; found '{value}'")
+            raise ValueError(f"expected a limit above 0 for the absolute value; found '{value}'")
         return {"lower": Bound(value=-bound.value, unit=bound.unit), "upper": bound}
 
     @model_validator(mode="after")
@@ -71,9 +71,11 @@ class Limit(BaseModel):
             raise ValueError("expected 'lower', 'upper' or both; found neither")
         if self.lower is not None and self.upper is not None:
             if self.lower.unit != self.upper.unit:
-                raise ValueError(f"expected one unit; found {self.lower.unit} and {self.upper.unit}")
+                raise ValueError(
+                    f"expected the same unit for 'lower' and 'upper'; found {self.lower.unit} and {self.upper.unit}"
+                )
             if self.lower.value >= self.upper.value:
-                raise ValueError("expected 'lower' below 'upper'; found it at or above")
+                raise ValueError("expected 'lower' below 'upper'; found it at or above 'upper'")
         return self
 
     @property
@@ -84,7 +86,7 @@ class Limit(BaseModel):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Lower and upper limit, SI; infinite where there is none."""
+        """Lower and upper limit, SI; infinite if missing."""
         lower = self.lower.value if self.lower is not None else -math.inf
         return lower, self.upper.value if self.upper is not None else math.inf
 
@@ -94,8 +96,10 @@ class Tolerances(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     rule: Rule = "iso 14253-1"
-    guard_factor: float = Field(default=1.0, gt=0, le=10, description="guard band over U (k = 2)")
-    largest_ratio: float = Field(default=1.0 / 3.0, gt=0, le=1, description="largest U (k = 2) over half the tolerance")
+    guard_factor: float = Field(default=1.0, gt=0, le=10, description="guard band divided by U (k = 2)")
+    largest_ratio: float = Field(
+        default=1.0 / 3.0, gt=0, le=1, description="largest U (k = 2) divided by half the tolerance"
+    )
     figures: dict[str, Limit] = {}
     freedoms: dict[str, Limit] = {}
 
@@ -103,8 +107,8 @@ class Tolerances(BaseModel):
     @classmethod
     def _short(cls, value: dict[str, Limit]) -> dict[str, Limit]:
         for name in value:
-            if not name or len(name) > LONGEST_PATTERN:
-                raise ValueError(f"expected names of 1 to {LONGEST_PATTERN} characters; found one of {len(name)}")
+            if not name or len(name) > MAX_PATTERN:
+                raise ValueError(f"expected names of 1 to {MAX_PATTERN} characters; found one of {len(name)}")
         return value
 
     @model_validator(mode="after")
@@ -114,7 +118,7 @@ class Tolerances(BaseModel):
         return self
 
     def guard_text(self) -> str:
-        """Return the rule and its guard band in words."""
+        """Return the rule and its guard band as text."""
         if self.rule == "iso 14253-1":
             return f"ISO 14253-1, guard band {self.guard_factor:g} U (k = 2)"
         if self.rule == "shared risk":
@@ -142,12 +146,12 @@ def load_tolerances(path: str | Path) -> Tolerances:
 
 
 def from_run(run: Mapping[str, Any]) -> Tolerances | None:
-    """Return the tolerances that a ``run.json`` states; None where there are none.
+    """Return the tolerances of a ``run.json``, or None.
 
     Raises
     ------
     BenchError
-        They are damaged.
+        The tolerances are damaged.
     """
     if not run.get("tolerances"):
         return None

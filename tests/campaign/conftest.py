@@ -1,4 +1,4 @@
-"""A lab with plugins of its own, and files that use them."""
+"""A laboratory with its own plugins, and files that use them."""
 
 import os
 import subprocess
@@ -43,7 +43,7 @@ def lab(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
 
 @pytest.fixture
 def write(tmp_path: Path) -> Callable[..., Path]:
-    """Write a bench and a campaign; each test is given as its TOML table."""
+    """Write a bench and a campaign; each test is a TOML table."""
 
     def files(*tests: str, bench: str = "") -> Path:
         (tmp_path / "bench.toml").write_text(BENCH + bench)
@@ -63,7 +63,7 @@ def plan(lab: None, write: Callable[..., Path]) -> Callable[..., CampaignPlan]:
 
 @pytest.fixture
 def command(tmp_path: Path) -> Callable[..., "subprocess.Popen[str]"]:
-    """Start the command line in a process of its own, with the lab's plugins."""
+    """Start the command line in a separate process, with the plugins of the laboratory."""
     started: list[subprocess.Popen[str]] = []
 
     def start(*arguments: Any) -> "subprocess.Popen[str]":

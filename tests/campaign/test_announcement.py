@@ -1,4 +1,4 @@
-"""What a test will do with the machine is stated on one line, before anything is opened."""
+"""The motions of a test are stated on one line, before any connection."""
 
 import math
 from collections.abc import Callable
@@ -21,23 +21,23 @@ STEPS = (
 LIMITED = Limits(X=("-1 m", "1 m"), feed="2 m/min", spindle_speed="8000 /min")
 
 
-def test_positions_feed_and_spindle_speed_stand_beside_their_limits() -> None:
+def test_positions_feed_and_spindle_speed_are_shown_with_their_limits() -> None:
     assert announcement("a", STEPS, LIMITED) == (
         "a: the machine will move: X -200 mm to 100 mm (limits -1000 mm and 1000 mm), Z 0 mm to 3 mm (no limits), "
-        "feed up to 1200 mm/min (limit 2000 mm/min), rapid moves: 1 (held to 2000 mm/min), "
+        "feed up to 1200 mm/min (limit 2000 mm/min), rapid moves: 1 (limited to 2000 mm/min), "
         "spindle up to 6000 /min (limit 8000 /min)."
     )
     assert announcement("a", STEPS, Limits()).count("no limit") == 4
     assert "rapid moves: 1 (not limited)" in announcement("a", STEPS, Limits())
 
 
-def test_a_test_that_moves_nothing_says_so_and_one_that_states_nothing_may_order_nothing() -> None:
+def test_a_test_without_motions_states_it_and_an_unstated_motion_is_rejected() -> None:
     assert announcement("a", STEPS[:0], LIMITED) == "a: nothing will move."
-    assert announcement("a", None, LIMITED) == "a: states no motions; no order to the machine is allowed."
+    assert announcement("a", None, LIMITED) == "a: the method states no motions; no command to the machine is allowed."
 
 
 class Record(runner.Quiet):
-    """Keeps what is reported, in order; stops before the bench is opened."""
+    """Keeps reports in order; stops before the bench is opened."""
 
     def __init__(self) -> None:
         self.reported: list[str] = []
@@ -56,11 +56,11 @@ def test_every_test_is_announced_before_the_bench_is_opened(plan: Callable[..., 
     record = Record()
     with pytest.raises(KeyboardInterrupt):
         runner.run(plan('name = "a"', 'name = "b"'), progress=record)
-    stated = "states no motions; no order to the machine is allowed."
+    stated = "the method states no motions; no command to the machine is allowed."
     assert record.reported == [f"a: {stated}", f"b: {stated}", "opening the bench"]
 
 
-def test_a_resumed_campaign_announces_what_is_left(
+def test_a_resumed_campaign_announces_the_remaining_tests(
     plan: Callable[..., CampaignPlan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     campaign = plan('name = "a"', 'name = "b"\nsettings = {asks = "turn the key"}')
@@ -73,10 +73,10 @@ def test_a_resumed_campaign_announces_what_is_left(
     assert [text.partition(":")[0] for text in record.reported] == ["b", "opening the bench"]
 
 
-def test_the_command_prints_it_where_no_terminal_is(lab: None, write: Callable[..., Path]) -> None:
+def test_the_command_prints_it_without_a_terminal(lab: None, write: Callable[..., Path]) -> None:
     result = CliRunner().invoke(app, ["run", str(write('name = "a"')), "--no-report", "--json"])
     assert result.exit_code == 0, result.output
-    assert result.stderr == "a: states no motions; no order to the machine is allowed.\n"
+    assert result.stderr == "a: the method states no motions; no command to the machine is allowed.\n"
 
 
 def test_the_probing_example_announces_its_path() -> None:

@@ -1,4 +1,4 @@
-"""Campaigns in processes of their own: what they publish, and the doors by which they are answered and stopped."""
+"""Campaigns in separate processes: their state, and the interface by which they are answered and stopped."""
 
 import json
 import math
@@ -28,7 +28,7 @@ NAME = "20260101T000000Z-00000000"
 
 
 def wait(condition: Callable[[], object]) -> None:
-    """Wait until something holds."""
+    """Wait until a condition is true."""
     end = time.monotonic() + 30.0
     while not condition():
         assert time.monotonic() < end
@@ -50,7 +50,7 @@ def living(runs: Path) -> Iterator[Path]:
         os.close(lock)
 
 
-def test_a_request_waits_for_its_own_answer(tmp_path: Path) -> None:
+def test_a_request_waits_for_its_answer(tmp_path: Path) -> None:
     with living(tmp_path) as folder, Published(folder) as published:
         published.test("ramp", tmp_path / "20260101T000000Z-ramp-x", 0, 2)
         published.stage("measuring", 60.0)
@@ -63,7 +63,7 @@ def test_a_request_waits_for_its_own_answer(tmp_path: Path) -> None:
             processes.Request(1, "Mount <b>the bar</b>."),
             60.0,
         )
-        with pytest.raises(RunError, match="does not wait"):
+        with pytest.raises(RunError, match="is not open"):
             processes.answer(tmp_path, NAME, 2)
         assert asking.is_alive()
         listed = CliRunner().invoke(app, ["background", "list", str(tmp_path)])
@@ -82,7 +82,7 @@ def test_a_request_waits_for_its_own_answer(tmp_path: Path) -> None:
         assert not again.is_alive()
 
 
-def test_the_end_is_what_the_process_said_or_that_it_said_nothing(tmp_path: Path) -> None:
+def test_the_end_states_the_message_of_the_process_or_its_absence(tmp_path: Path) -> None:
     with living(tmp_path) as folder:
         published = Published(folder)
         published.advance(math.pi)
@@ -100,15 +100,15 @@ def test_the_end_is_what_the_process_said_or_that_it_said_nothing(tmp_path: Path
 
 
 @pytest.mark.parametrize("name", ["", "..", "../..", "20260101T000000Z-0000000g", "20260101T000000Z-00000001"])
-def test_a_name_that_is_none_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(RunError, match="there is no process"):
+def test_an_invalid_name_is_an_error(tmp_path: Path, name: str) -> None:
+    with pytest.raises(RunError, match="no process"):
         processes.stop(tmp_path, name)
 
 
 @pytest.mark.parametrize(
     "text", ["", "[]", "{" * 10_000, '{"tests": 3, "request": {"number": "x"}, "done": "x"}', "\0"]
 )
-def test_a_damaged_state_is_shown_as_far_as_it_goes(tmp_path: Path, text: str) -> None:
+def test_the_valid_part_of_a_damaged_state_is_shown(tmp_path: Path, text: str) -> None:
     with living(tmp_path) as folder:
         (folder / "status.json").write_text(text)
         (found,) = processes.found(tmp_path)
@@ -118,11 +118,11 @@ def test_a_damaged_state_is_shown_as_far_as_it_goes(tmp_path: Path, text: str) -
 
 def test_one_machine_is_measured_by_one_process(tmp_path: Path, write: Callable[..., Path], lab: None) -> None:
     campaign = write('name = "a"')
-    with living(tmp_path / "runs"), pytest.raises(RunError, match="'Ramps' is measuring on lab machine"):
+    with living(tmp_path / "runs"), pytest.raises(RunError, match="'Ramps' has used lab machine"):
         processes.start(campaign, tmp_path / "runs")
 
 
-def test_only_its_user_may_enter_the_folder_of_a_process(
+def test_the_folder_of_a_process_is_accessible_to_its_user_only(
     tmp_path: Path, write: Callable[..., Path], lab: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.executable", "/bin/false")

@@ -1,4 +1,4 @@
-"""Many runs give the same errors wherever they are identified; what breaks, breaks alone."""
+"""Errors of many runs do not depend on where they are identified; a failure affects one run only."""
 
 import json
 import os
@@ -31,7 +31,7 @@ def settings(average: float = 2.0) -> PluginSettings:
 
 @pytest.fixture(scope="module")
 def raws(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Four records of a minute, and one that was cut off between them."""
+    """Four records of a minute, and an incomplete one between them."""
     folder = tmp_path_factory.mktemp("raw")
     machine = VirtualMachine("cframe", seed=1)
     machine.start([Event(0.0, 15000.0, None)])
@@ -44,7 +44,7 @@ def raws(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture
 def identify(raws: list[Path], tmp_path: Path) -> Identify:
-    """Identify the records, one after another unless stated otherwise."""
+    """Identify the records, in sequence unless stated otherwise."""
 
     def call(chosen: list[Path] | None = None, **keywords: object) -> list[Outcome]:
         options: dict[str, object] = {"scheduler": "sync"} | keywords
@@ -74,12 +74,12 @@ def cluster() -> Iterator[LocalCluster]:
 
 @pytest.fixture(scope="module")
 def reference(raws: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[Outcome]:
-    """The records identified one after another."""
+    """The records identified in sequence."""
     return identify_runs(raws, "spindle_drift", settings(), tmp_path_factory.mktemp("sync"), scheduler="sync")
 
 
 def same_as(reference: list[Outcome], outcomes: list[Outcome]) -> None:
-    """Every error dataset is the same to the last bit, and the one bad record failed, alone and in its place."""
+    """Every error dataset is identical, and only the incomplete record failed."""
     assert [outcome.raw for outcome in outcomes] == [outcome.raw for outcome in reference]
     assert [bool(outcome.reason) for outcome in outcomes] == [False, False, True, False, False]
     assert "truncated" in outcomes[2].reason
@@ -90,7 +90,7 @@ def same_as(reference: list[Outcome], outcomes: list[Outcome]) -> None:
             assert outcome.seconds > 0
 
 
-def test_batch_finds_what_the_method_finds(reference: list[Outcome], raws: list[Path]) -> None:
+def test_a_batch_returns_the_results_of_the_method(reference: list[Outcome], raws: list[Path]) -> None:
     with datasets.load(raws[0]) as raw:
         direct = plugins.get("methods", "spindle_drift")().identify(raw, settings())
     assert reference[0].errors is not None
@@ -102,11 +102,15 @@ def test_batch_finds_what_the_method_finds(reference: list[Outcome], raws: list[
 
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
-def test_threads_and_processes_give_the_same_bits(reference: list[Outcome], identify: Identify, scheduler: str) -> None:
+def test_threads_and_processes_return_identical_results(
+    reference: list[Outcome], identify: Identify, scheduler: str
+) -> None:
     same_as(reference, identify(scheduler=scheduler, workers=2))
 
 
-def test_cluster_gives_the_same_bits(reference: list[Outcome], identify: Identify, cluster: LocalCluster) -> None:
+def test_a_cluster_returns_identical_results(
+    reference: list[Outcome], identify: Identify, cluster: LocalCluster
+) -> None:
     address = str(cluster.scheduler_address)
     assert address.startswith("tcp://")
     same_as(reference, identify(scheduler=address))
@@ -122,7 +126,7 @@ def test_cluster_with_another_version_is_refused(
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_worker_that_came_later_with_another_version_refuses_its_task(
+def test_a_later_worker_with_another_version_rejects_its_task(
     identify: Identify, cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batch, "__version__", "99.0")
@@ -131,7 +135,7 @@ def test_worker_that_came_later_with_another_version_refuses_its_task(
     assert all("expected errormotion in version 99.0" in outcome.reason for outcome in outcomes)
 
 
-def test_cluster_that_is_not_there_is_reported(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_cluster_is_reported(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallel, "CLUSTER_TIMEOUT", 0.3)
     with pytest.raises(RunError, match="none answers"):
         identify(scheduler="tcp://127.0.0.1:9")
@@ -146,13 +150,13 @@ def test_cluster_without_workers_is_reported(identify: Identify, monkeypatch: py
         identify(scheduler=str(empty.scheduler_address))
 
 
-def test_goes_on_where_it_was_interrupted(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
+def test_an_interrupted_test_continues(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
     class Impatient(runner.Quiet):
         def advance(self, done: float) -> None:
             if done == 2:
                 raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match="2 of 5 runs are done; repeat the command to continue"):
+    with pytest.raises(KeyboardInterrupt, match="2 of 5 runs are done; repeat the command"):
         identify(progress=Impatient())
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
     assert sorted(path.name for path in before) == ["run0.nc", "run1.nc"]
@@ -161,7 +165,7 @@ def test_goes_on_where_it_was_interrupted(raws: list[Path], identify: Identify, 
     assert all(path.stat().st_mtime_ns == then for path, then in before.items())
 
 
-def test_result_of_an_earlier_version_is_recognised_by_the_hash_it_carries(
+def test_a_result_of_an_earlier_version_is_recognised_by_its_hash(
     raws: list[Path], identify: Identify, tmp_path: Path
 ) -> None:
     (outcome,) = identify(raws[:1])
@@ -172,7 +176,7 @@ def test_result_of_an_earlier_version_is_recognised_by_the_hash_it_carries(
     assert [each.stepped_over for each in identify(raws[:1])] == [True]
 
 
-def test_result_of_anything_else_is_never_overwritten(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
+def test_another_result_is_never_overwritten(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
     (first,) = identify(raws[:1])
     assert first.errors is not None
     before = first.errors.read_bytes()
@@ -186,7 +190,7 @@ def test_result_of_anything_else_is_never_overwritten(raws: list[Path], identify
     assert first.errors.read_bytes() == before
 
 
-def test_plugin_that_breaks_on_one_run_harms_no_other(
+def test_a_plugin_error_in_one_run_does_not_affect_others(
     raws: list[Path], identify: Identify, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     method = plugins.get("methods", "spindle_drift")
@@ -205,13 +209,15 @@ def test_plugin_that_breaks_on_one_run_harms_no_other(
     assert "Traceback" in outcomes[1].traceback
 
 
-def test_process_that_dies_is_reported(raws: list[Path], identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_ends_unexpectedly_is_reported(
+    raws: list[Path], identify: Identify, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(batch, "_identify", lambda *_: os._exit(1))
     (outcome,) = identify(raws[:1], scheduler="processes", workers=1)
     assert "the process ended unexpectedly" in outcome.reason
 
 
-def test_names_tell_runs_apart(tmp_path: Path) -> None:
+def test_names_distinguish_runs(tmp_path: Path) -> None:
     for folder in ("a/x", "b/x", "c"):
         (tmp_path / folder).mkdir(parents=True)
     raws = [tmp_path / "a/x/raw.nc", tmp_path / "b/x/raw.nc", tmp_path / "c/raw.nc", tmp_path / "c/other.nc"]
@@ -220,11 +226,11 @@ def test_names_tell_runs_apart(tmp_path: Path) -> None:
         batch._names([tmp_path / "c/raw.nc", tmp_path / "c/raw.zarr"])
 
 
-def test_run_that_is_named_twice_is_identified_once(raws: list[Path], identify: Identify) -> None:
+def test_a_run_stated_twice_is_identified_once(raws: list[Path], identify: Identify) -> None:
     assert len(identify([raws[0], raws[0], raws[0].parent / ".." / raws[0].parent.name / raws[0].name])) == 1
 
 
-def test_folder_of_runs_means_those_of_the_method(plan: Callable[..., CampaignPlan], tmp_path: Path) -> None:
+def test_a_folder_of_runs_selects_those_of_the_method(plan: Callable[..., CampaignPlan], tmp_path: Path) -> None:
     first, second = runner.run(plan('name = "a"\nsettings = {count = 500}', 'name = "b"\nsettings = {count = 500}'))
     ramp = plugins.get("methods", "ramp").Settings()
     runs = first.path.parent
@@ -244,7 +250,7 @@ def test_folder_of_runs_means_those_of_the_method(plan: Callable[..., CampaignPl
         identify_runs([runs], "spindle_drift", settings(), tmp_path / "none", scheduler="sync")
 
 
-def test_mistakes_are_reported_before_anything_is_done(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
+def test_errors_are_reported_before_any_action(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="found 'thread'"):
         identify(scheduler="thread")
     with pytest.raises(RunError, match="--workers: expected 1 or more"):
@@ -269,7 +275,7 @@ def test_without_dask_it_says_what_to_install(
         identify(scheduler=scheduler)
 
 
-def test_one_after_another_needs_no_dask() -> None:
+def test_serial_execution_requires_no_dask() -> None:
     script = (
         "import sys, errormotion.campaign.batch as b; print([n for n in ('dask', 'distributed') if n in sys.modules])"
     )

@@ -1,4 +1,4 @@
-"""The example of a beam calibration, from the wires to a beam with the truth in its uncertainty, with either sensor."""
+"""The example of a beam calibration with either sensor: the true beam is within its uncertainty."""
 
 import shutil
 from pathlib import Path
@@ -60,7 +60,7 @@ def measured(request, tmp_path_factory):
     return run, truth
 
 
-def test_the_example_can_be_read_where_it_lies():
+def test_the_example_can_be_read_in_its_folder():
     plan = load_campaign(EXAMPLE / "campaign.toml")
     assert [(test.name, test.method) for test in plan.tests] == [("beam", BeamDirection)]
 
@@ -79,7 +79,7 @@ def test_truth_lies_within_the_stated_uncertainty(measured):
     assert ds.sizes["plane"] == 3
 
 
-def test_without_the_compensation_the_same_readings_miss_the_truth_by_far(measured):
+def test_without_the_compensation_the_same_readings_deviate_from_the_truth(measured):
     run, truth = measured
     ds = datasets.load(run.errors)
     true = truth["beam_direction"].values[0]
@@ -87,7 +87,7 @@ def test_without_the_compensation_the_same_readings_miss_the_truth_by_far(measur
     assert np.linalg.norm(ds["uncompensated_direction"].values[0] - true) > 10 * compensated
 
 
-def test_raw_data_say_how_they_came_about(measured):
+def test_raw_data_state_their_provenance(measured):
     run, _ = measured
     raw = datasets.load(run.raw)
     datasets.validate(raw)
@@ -99,7 +99,7 @@ def test_raw_data_say_how_they_came_about(measured):
     assert low < readings.min() < raw["mid_range"] < readings.max() < high
 
 
-def test_a_calibration_that_goes_after_the_campaign_was_read_stops_the_test_before_it_measures(tmp_path):
+def test_a_calibration_that_is_deleted_after_reading_of_the_campaign_ends_the_test_before_it_measures(tmp_path):
     there = shutil.copytree(EXAMPLE / "calibrations", tmp_path / "lab" / "calibrations")
     gone = shutil.copy(there / "lk-h050.nc", there / "lk-h080.nc")
     plan = write(tmp_path / "lab", campaign=[('compensation = "lk-h050"', 'compensation = "lk-h080"')])
@@ -110,7 +110,7 @@ def test_a_calibration_that_goes_after_the_campaign_was_read_stops_the_test_befo
     assert not (folder / "raw.zarr").exists()
 
 
-def test_an_interrupted_campaign_goes_on_with_the_faces_that_are_left(tmp_path, monkeypatch):
+def test_an_interrupted_campaign_continues_with_the_remaining_faces(tmp_path, monkeypatch):
     plan = write(tmp_path / "lab")
     acquire = BeamDirection.acquire
 
@@ -136,5 +136,5 @@ def test_a_bench_without_a_control_is_refused_before_anything_is_measured(tmp_pa
     control = (
         '[instruments.control]\ndriver = "virtual_controller"\narm = true\naddress = "sim://cframe/controller?seed=3"'
     )
-    with pytest.raises(BenchError, match=r"needs controller; the bench .* offers point_lds"):
+    with pytest.raises(BenchError, match=r"needs controller; the bench .* has point_lds"):
         write(tmp_path, [(control, "")])

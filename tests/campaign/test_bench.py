@@ -1,4 +1,4 @@
-"""A bench opens all its instruments or none, and reports the failures with their causes."""
+"""A bench opens all instruments or none, and reports failures with their causes."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +21,7 @@ def bench(lab: None, write: Callable[..., Path]) -> Callable[[str], BenchPlan]:
     return read
 
 
-def test_offers_its_instruments_by_kind_and_closes_them(bench: Callable[..., BenchPlan]) -> None:
+def test_a_bench_returns_its_instruments_by_kind_and_closes_them(bench: Callable[..., BenchPlan]) -> None:
     opened = plugins.get("instruments", "counter").opened
     with OpenBench(bench()) as table:
         assert table.machine == "lab machine"
@@ -46,9 +46,9 @@ def test_failed_connections_are_reported_as_a_tree_and_nothing_stays_open(bench:
     assert plugins.get("instruments", "counter").opened == []
 
 
-def test_kind_that_is_missing_or_there_twice_is_refused(bench: Callable[..., BenchPlan]) -> None:
+def test_a_missing_or_ambiguous_kind_is_an_error(bench: Callable[..., BenchPlan]) -> None:
     with OpenBench(bench(SECOND)) as table:
-        with pytest.raises(BenchError, match="expected a thermometer; it offers counter"):
+        with pytest.raises(BenchError, match="expected a thermometer; found counter"):
             table.of_kind("thermometer")
         with pytest.raises(BenchError, match="expected one counter; found counter, other"):
             table.of_kind("counter")
@@ -68,7 +68,7 @@ def test_of_several_instruments_of_a_kind_one_is_chosen_by_name(bench: Callable[
     assert plugins.get("instruments", "counter").opened == []
 
 
-def test_operator_is_asked_only_where_something_is_real(bench: Callable[..., BenchPlan]) -> None:
+def test_the_operator_is_prompted_for_real_instruments_only(bench: Callable[..., BenchPlan]) -> None:
     asked: list[str] = []
     with OpenBench(bench(), asked.append) as table:
         table.ask("Mount the bar.")

@@ -1,4 +1,4 @@
-"""Every kind of fault, one after the other: the offset at the machine never leaves its limits."""
+"""Every kind of fault in sequence: the offset at the machine never exceeds its limits."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ def own_lock(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
 
-def test_no_fault_takes_the_offset_beyond_its_limits(tmp_path: Path) -> None:
+def test_no_fault_moves_the_offset_beyond_its_limits(tmp_path: Path) -> None:
     found = follow(tmp_path, (len(FAULTS) + 1) * INTERVAL / 3600, INTERVAL, seed=2)
     assert limits_kept(found) == []
     assert set(found.faults) == set(FAULTS)

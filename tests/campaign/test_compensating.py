@@ -1,4 +1,4 @@
-"""A compensation follows the temperatures of a machine, writes only when it may, and says why it does not."""
+"""A compensation follows the temperatures of a machine, writes only if allowed, and states the reason otherwise."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Thermometer:
 
 
 class Machine:
-    """Takes offsets as a machine with a slew limit of its own would; its watchdog is tested with each compensator."""
+    """Accepts offsets like a machine with a slew limit; its watchdog is tested with each compensator."""
 
     info = InstrumentInfo("fake_compensator", "compensator", "for tests", "simulated_only")
     Settings = PluginSettings
@@ -263,14 +263,14 @@ def test_a_stop_of_the_machine_ends_it(plan: BenchPlan, model: xr.Dataset, tmp_p
     assert len(Machine.written) == 8
 
 
-def test_an_offset_that_somebody_else_wrote_ends_it(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
+def test_an_offset_written_by_another_client_ends_it(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     script = {2: set_to(Thermometer, "value", STEADY + 2), 8: set_to(Machine, "offset", (15e-6, 0.0, 0.0))}
     moments = run(Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()), script, 20)
     assert states(moments) == ["following", "fault"]
-    assert "another offset than the one written" in moments[8].step.cause
+    assert "is not the written one" in moments[8].step.cause
 
 
-def test_after_a_lost_connection_it_goes_on_from_the_offset_of_the_machine(
+def test_after_a_lost_connection_it_continues_from_the_offset_of_the_machine(
     plan: BenchPlan, model: xr.Dataset, tmp_path: Path
 ) -> None:
     def ramped() -> None:  # what the watchdog of the machine did in the meantime
@@ -325,7 +325,7 @@ def test_a_plc_follows_and_ramps_to_zero_when_the_program_ends(
         assert plc.machine.offset == (0.0, 0.0, 0.0)
 
 
-def test_an_offset_that_is_not_taken_is_a_fault(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
+def test_a_rejected_offset_is_a_fault(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     script = {2: set_to(Thermometer, "value", STEADY + 2), 8: set_to(Machine, "deaf", True)}
     moments = run(Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()), script, 10)
     assert states(moments) == ["following", "fault"]
@@ -344,7 +344,7 @@ def test_a_restart_does_not_jump(plan: BenchPlan, model: xr.Dataset, tmp_path: P
 
 
 def earlier_by(log: xr.Dataset, seconds: float, **changes: Any) -> xr.Dataset:
-    """Return a log that a wall clock would have made that was behind by these seconds."""
+    """Return the log of a wall clock that was behind by these seconds."""
     start = datetime.fromisoformat(log.attrs["start"]) - timedelta(seconds=seconds)
     clock = json.loads(log.attrs["clock"])
     clock |= {name: clock[name] - seconds for name in ("wall", "began")} | changes
@@ -383,18 +383,16 @@ def test_one_machine_has_one_compensation(plan: BenchPlan, model: xr.Dataset, tm
             pass
 
 
-def test_what_does_not_fit_is_refused_before_anything_is_opened(
-    plan: BenchPlan, model: xr.Dataset, tmp_path: Path
-) -> None:
+def test_contradictions_are_reported_before_any_connection(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     def made(plan: BenchPlan = plan, **attrs: Any) -> Compensation:
         ds = model.assign_attrs({key: value for key, value in attrs.items() if key != "arm"})
         return Compensation(plan, ds, tmp_path, arm=attrs.get("arm"))
 
-    with pytest.raises(CompensationError, match=r"--arm Mill 6: the machine of bench\.toml is called 'Mill 5'"):
+    with pytest.raises(CompensationError, match=r"--arm Mill 6: the machine of bench\.toml is 'Mill 5'"):
         made(arm="Mill 6")
     with pytest.raises(CompensationError, match=r"expected a table \[compensator\]"):
         made(replace(plan, compensator=None), arm=MACHINE)
-    with pytest.raises(CompensationError, match="The model is of the machine 'Mill 6'"):
+    with pytest.raises(CompensationError, match="The model is for the machine 'Mill 6'"):
         made(machine="Mill 6")
     with pytest.raises(CompensationError, match="offsets need 'machine'"):
         made(frame="tool")
@@ -404,7 +402,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_opened(
     assert not list(tmp_path.glob("*monitor*"))
 
 
-def test_a_bench_names_its_compensator(tmp_path: Path) -> None:
+def test_a_bench_states_its_compensator(tmp_path: Path) -> None:
     head = f'schema = "errormotion.bench/1"\nname = "Shop"\nmachine = "{MACHINE}"\n[compensator]\n'
     text = f'driver = "offset_file"\naddress = "{tmp_path}/offset.json"\nvalid = "3 s"\n'
     found = parse_bench(f'{head}{text}[compensator.limits]\nlimit = "30 um"\n', Path("b.toml")).compensator

@@ -1,4 +1,4 @@
-"""Damaged bench and campaign files: every mutant is read, or refused with an error of the project, in bounded time."""
+"""Damaged bench and campaign files: every mutant is read, or an error of the project is raised, in bounded time."""
 
 import json
 from pathlib import Path
@@ -44,7 +44,7 @@ def test_a_run_json_that_is_nested_too_deep_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "event", [{"time": [1]}, {"time": "1"}, {"time": -1}, {}, {"time": 1, "speed": 1}, {"time": 1, "spindle_speed": []}]
 )
-def test_a_schedule_that_is_none_is_named(tmp_path: Path, event: dict[str, object]) -> None:
+def test_an_invalid_schedule_is_named(tmp_path: Path, event: dict[str, object]) -> None:
     content = {"schema": "errormotion.run/1", "clock": {"start": "", "time": 0, "schedule": [event]}}
     (tmp_path / "run.json").write_text(json.dumps(content))
     with pytest.raises(RunError, match=r"run\.json: [\s\S]*clock\.schedule"):

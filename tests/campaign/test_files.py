@@ -20,7 +20,7 @@ def complaints(path: Path, load: Callable[[Path], object]) -> list[str]:
     return mistakes
 
 
-def test_good_files_carry_settings_in_si_and_defaults(write: Callable[..., Path]) -> None:
+def test_valid_files_have_settings_in_si_and_defaults(write: Callable[..., Path]) -> None:
     path = write(
         'name = "a"\nsettings = {level = "25 mm"}', 'name = "b"\ninputs = {zero = "a"}', bench='rate = "20 kHz"'
     )
@@ -61,7 +61,7 @@ def test_all_mistakes_of_a_campaign_file_are_reported_at_once(write: Callable[..
     assert earlier == "test[1].inputs.zero: expected the name of an earlier test; found 'first'; Known here: a"
 
 
-def test_name_that_makes_no_folder_name_is_refused_together_with_wrong_settings(write: Callable[..., Path]) -> None:
+def test_an_invalid_folder_name_is_reported_together_with_wrong_settings(write: Callable[..., Path]) -> None:
     name, level = complaints(write('name = "../a"\nsettings = {level = 25}'), load_campaign)
     assert name.startswith("test[0].name: expected ")
     assert name.endswith('; found "../a"')
@@ -78,8 +78,7 @@ def test_bench_without_the_instruments_of_a_method_is_refused_before_anything_is
     monkeypatch.setattr(method, "needs", plugins.Needs(("counter", "thermometer"), "errormotion.raw.ramp/1"))
     (mistake,) = complaints(path, load_campaign)
     assert (
-        mistake
-        == f"test[0]: the method 'ramp' needs thermometer; the bench {path.parent / 'bench.toml'} offers counter"
+        mistake == f"test[0]: the method 'ramp' needs thermometer; the bench {path.parent / 'bench.toml'} has counter"
     )
 
 
@@ -122,7 +121,7 @@ def test_several_instruments_of_a_needed_kind_without_a_choice_are_refused(write
     path = write('name = "a"', bench=SECOND)
     (mistake,) = complaints(path, load_campaign)
     assert mistake == (
-        f"test[0]: the method 'ramp' needs one counter; the bench {path.parent / 'bench.toml'} offers counter, other. "
+        f"test[0]: the method 'ramp' needs one counter; the bench {path.parent / 'bench.toml'} has counter, other. "
         'Choose one: instruments = { counter = "counter" }'
     )
 
@@ -145,7 +144,7 @@ def test_broken_toml_is_reported_with_its_line(write: Callable[..., Path]) -> No
         load_campaign(path)
 
 
-def test_a_calibration_that_is_not_there_is_reported_when_the_campaign_is_read(tmp_path: Path) -> None:
+def test_a_missing_calibration_is_reported_when_the_campaign_is_read(tmp_path: Path) -> None:
     source = Path(__file__).parents[2] / "examples" / "virtual_beam"
     shutil.copy(source / "bench.toml", tmp_path)
     shutil.copy(source / "campaign.toml", tmp_path)
@@ -155,10 +154,10 @@ def test_a_calibration_that_is_not_there_is_reported_when_the_campaign_is_read(t
     assert load_campaign(tmp_path / "campaign.toml").tests[0].name == "beam"
 
 
-def test_a_file_of_another_kind_is_named_as_that(tmp_path: Path) -> None:
+def test_a_file_of_another_kind_is_reported_as_such(tmp_path: Path) -> None:
     (tmp_path / "bench.toml").write_text('schema = "errormotion.bench/1"\nname = "b"\nmachine = "M"\n')
     (tmp_path / "campaign.toml").write_text('schema = "errormotion.campaign/1"\nname = "c"\nbench = "bench.toml"\n')
-    with pytest.raises(BenchError, match=r"expected a campaign file; found a file of kind 'bench'. .* the campaign"):
+    with pytest.raises(BenchError, match=r"expected a campaign file; found a file of kind 'bench'. .* a campaign"):
         load_campaign(tmp_path / "bench.toml")
     with pytest.raises(BenchError, match="expected a bench file; found a file of kind 'campaign'"):
         load_bench(tmp_path / "campaign.toml")

@@ -1,4 +1,4 @@
-"""A run folder that is moved or deleted while data are written to it: the message says that it is gone."""
+"""A run folder that is moved or deleted while data are written to it: the message states that it is missing."""
 
 import shutil
 import time
@@ -16,7 +16,7 @@ from errormotion.campaign.storage.recorder import Recorder
 from errormotion.campaign.storage.store import RawStore
 from errormotion.errors import RunError
 
-GONE = "is gone: it was moved or deleted while data were written to it"
+GONE = "is missing: it was moved or deleted while data were written"
 THERMOMETER = """\
 schema = "errormotion.bench/1"
 name = "Shop"
@@ -47,7 +47,7 @@ def chunk(first: int) -> xr.Dataset:
     return xr.Dataset({"a": ("time", np.arange(first, first + 10.0))}, attrs={"sample_rate": 10.0})
 
 
-def test_a_store_writes_nothing_where_its_folder_was(tmp_path: Path, loss: Callable[[Path], None]) -> None:
+def test_a_store_writes_nothing_at_the_former_place_of_its_folder(tmp_path: Path, loss: Callable[[Path], None]) -> None:
     path = tmp_path / "run" / "raw.zarr"
     path.parent.mkdir()
     store = RawStore.create(path, chunk(0), "time")
@@ -61,7 +61,7 @@ def test_a_store_writes_nothing_where_its_folder_was(tmp_path: Path, loss: Calla
 
 
 @pytest.mark.parametrize("inside", [False, True])
-def test_the_recorder_says_so(tmp_path: Path, loss: Callable[[Path], None], inside: bool) -> None:
+def test_the_recorder_reports_it(tmp_path: Path, loss: Callable[[Path], None], inside: bool) -> None:
     """The folder around the store, or the store itself."""
     path = tmp_path / "run" / "raw.zarr"
     path.parent.mkdir()
@@ -78,7 +78,7 @@ def test_the_recorder_says_so(tmp_path: Path, loss: Callable[[Path], None], insi
         record()
 
 
-def test_a_campaign_ends_with_the_reason_and_goes_on_where_the_folder_is(
+def test_a_campaign_ends_with_the_reason_and_continues_in_the_moved_folder(
     plan: Callable[..., CampaignPlan], tmp_path: Path
 ) -> None:
     class Mover(runner.Quiet):

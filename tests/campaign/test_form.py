@@ -1,4 +1,4 @@
-"""A campaign as a form: the fields are those of the settings, of foreign methods as well."""
+"""A campaign as a form: the fields are those of the settings, also of foreign methods."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -38,7 +38,7 @@ def test_every_method_has_a_form_of_all_its_settings(tmp_path: Path) -> None:
         assert keys == set(each.cls.Settings.model_fields)
 
 
-def test_mistakes_of_the_bench_stand_beside_those_of_the_fields(tmp_path: Path) -> None:
+def test_errors_of_the_bench_are_reported_with_those_of_the_fields(tmp_path: Path) -> None:
     head = 'schema = "errormotion.campaign/1"\nname = "x"\nbench = "nowhere.toml"\nruns = "s3://x"\n'
     form = form_of(f'{head}[[test]]\nname = "a b"\nmethod = "spindle_drift"\nextra = 1\n', tmp_path / "campaign.toml")
     assert "expected" in _by_label(form, 1)["name"].mistakes[0]

@@ -13,9 +13,7 @@ from errormotion.datasets.files.runfile import read_run
 LOGO = b"\x89PNG\r\n\x1a\nlogo"
 
 
-def test_a_run_carries_the_head_and_the_logo_to_its_report(
-    lab: None, write: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_the_report_of_a_run_has_its_head_and_logo(lab: None, write: Callable[..., Path], tmp_path: Path) -> None:
     (tmp_path / "logo.png").write_bytes(LOGO)
     bench = '[laboratory]\nname = "Room <2>"\nlogo = "logo.png"\n[calibrated_until]\nbar = 2020-01-31\n'
     campaign = write('name = "a"\nsettings = { count = 11 }\n', bench=bench)

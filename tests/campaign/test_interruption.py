@@ -1,4 +1,4 @@
-"""A real process is killed, stopped and interrupted during an acquisition; another process continues the run."""
+"""A process is killed, stopped and interrupted during an acquisition; another process continues the run."""
 
 import json
 import os
@@ -37,7 +37,7 @@ def wait_for(tmp_path: Path, process: "subprocess.Popen[str]", samples: int) -> 
 
 @pytest.fixture
 def pace(tmp_path: Path) -> Path:
-    """While this file exists samples come in real time; the run that goes on takes what is left all at once."""
+    """While this file exists, samples arrive in real time; a continued run reads the remaining ones at once."""
     file = tmp_path / "pace"
     file.touch()
     return file
@@ -49,7 +49,7 @@ def bench(pace: Path) -> str:
 
 
 def held(folder: RunFolder) -> int:
-    """Return how many samples are on disk; all of them are what they should be."""
+    """Return the number of samples on disk, and check their values."""
     with datasets.load(folder.raw) as raw:
         count = int(raw.sizes["time"])
         np.testing.assert_array_equal(raw["distance"].values[0], np.arange(count) * 1e-6)
@@ -57,7 +57,7 @@ def held(folder: RunFolder) -> int:
 
 
 @pytest.mark.timeout(300)  # two processes start: a minute each where six others want the processors
-def test_kill_9_loses_at_most_the_last_second_and_resume_goes_on(
+def test_kill_9_loses_at_most_the_last_second_and_resume_continues(
     tmp_path: Path, write: Callable[..., Path], command: Start, lab: None, pace: Path, bench: str
 ) -> None:
     long = f'name = "long"\nsettings = {{count = {COUNT}}}'
@@ -93,7 +93,7 @@ def test_kill_9_loses_at_most_the_last_second_and_resume_goes_on(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stopping_leaves_a_run_folder_that_is_whole_and_resumes(
+def test_a_stopped_run_has_a_complete_folder_and_can_be_resumed(
     tmp_path: Path,
     write: Callable[..., Path],
     command: Start,

@@ -1,4 +1,4 @@
-"""Nothing moves that would leave the limits of its bench."""
+"""No motion leaves the limits of its bench."""
 
 from pathlib import Path
 
@@ -58,13 +58,13 @@ def test_a_test_within_the_limits_is_accepted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("limits", "message"),
     [
-        ('X = ["0 m", "3 m"]', r"test\[0\]: X would go from .* mm to 36.* mm; its limits are 0 mm and 3000 mm"),
-        ('Z = ["200 mm", "1 m"]', r"Z would go from 120 mm to .* mm; its limits are 200 mm and 1000 mm"),
+        ('X = ["0 m", "3 m"]', r"test\[0\]: X would move from .* mm to 36.* mm; its limits are 0 mm and 3000 mm"),
+        ('Z = ["200 mm", "1 m"]', r"Z would move from 120 mm to .* mm; its limits are 200 mm and 1000 mm"),
         ('feed = "1 m/min"', r"the feed would be \d+ mm/min; its limit is 1000 mm/min"),
         ('spindle_speed = "8000 /min"', r"the spindle would turn at 9000 /min; its limit is 8000 /min"),
     ],
 )
-def test_a_test_that_would_leave_them_is_refused_when_it_is_read(tmp_path: Path, limits: str, message: str) -> None:
+def test_a_test_beyond_the_limits_is_an_error_when_it_is_read(tmp_path: Path, limits: str, message: str) -> None:
     with pytest.raises(BenchError, match=message):
         load_campaign(campaign(tmp_path, limits))
 
@@ -77,12 +77,12 @@ def test_a_test_that_would_leave_them_is_refused_when_it_is_read(tmp_path: Path,
         ('W = ["0 m", "4 m"]', r"limits\.W: unknown key"),
     ],
 )
-def test_limits_without_sense_are_reported(tmp_path: Path, limits: str, message: str) -> None:
+def test_invalid_limits_are_reported(tmp_path: Path, limits: str, message: str) -> None:
     with pytest.raises(BenchError, match=message):
         load_campaign(campaign(tmp_path, limits))
 
 
-def test_the_extent_is_what_the_steps_say() -> None:
+def test_the_extent_follows_from_the_steps() -> None:
     steps = [
         Step("move", (0.0, 0.0, 0.0), 0.1, 0.0),
         Step("touch", (0.3, 0.4, 0.0), 0.01, 50.0, 0.0),
@@ -118,9 +118,7 @@ def test_the_extent_is_what_the_steps_say() -> None:
     ],
     ids=["two balls", "no cycle", "no time to warm up"],
 )
-def test_a_campaign_that_cannot_be_made_is_refused_when_it_is_read(
-    tmp_path: Path, old: str, new: str, message: str
-) -> None:
+def test_an_impossible_campaign_is_an_error_when_it_is_read(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = campaign(tmp_path, "")
     assert old in CAMPAIGN
     path.write_text(CAMPAIGN.replace(old, new))

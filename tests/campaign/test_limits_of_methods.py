@@ -1,4 +1,4 @@
-"""A bench whose limits allow nothing, against every method: nothing is accepted when it is read, and nothing moves."""
+"""A bench whose limits allow no motion, with every method: the campaign is an error when read, and nothing moves."""
 
 import re
 import sys
@@ -36,7 +36,7 @@ spindle_speed = "1 /min"
 
 
 def limited(bench: str) -> str:
-    """Return the text of a bench whose limits allow nothing."""
+    """Return the text of a bench whose limits allow no motion."""
     tables, kept = bench.split("\n["), []
     for table in tables:
         if not table.startswith("limits]"):
@@ -46,7 +46,7 @@ def limited(bench: str) -> str:
 
 @pytest.fixture(params=[*EXAMPLES, probing.CAMPAIGN], ids=lambda path: f"{path.parent.name}-{path.stem}")
 def campaign(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a campaign with one of the project's methods, on a bench whose limits allow nothing."""
+    """Return a campaign with a method of the project, on a bench whose limits allow no motion."""
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "campaign.toml"
     path.write_text(request.param.read_text())
@@ -142,7 +142,7 @@ Write = Callable[..., Path]
 
 @pytest.fixture
 def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Write]:
-    """Return what installs foreign plugins, and writes a campaign with them."""
+    """Return a function that installs foreign plugins, and writes a campaign with them."""
 
     def written(method: str = METHOD, bench: str = BENCH) -> Path:
         info = tmp_path / "foreign-1.2.dist-info"
@@ -166,14 +166,14 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Write]:
     plugins.refresh()
 
 
-def test_a_method_that_states_its_motions_runs_to_them(write: Write, tmp_path: Path) -> None:
+def test_a_method_moves_to_its_stated_motions(write: Write, tmp_path: Path) -> None:
     with plugins.get("instruments", "virtual_controller")("sim://cframe/c?seed=77") as watching:
         with pytest.raises(RunError, match=r"yielded no data|dimension|time"):
             runner.run(load_campaign(write(METHOD + HONEST)), runs=tmp_path / "runs")
         assert watching.state()["position"] == pytest.approx([0.1, 0.1, 0.1])
 
 
-def test_a_method_that_states_none_moves_nothing(write: Write, tmp_path: Path) -> None:
+def test_a_method_without_stated_motions_moves_nothing(write: Write, tmp_path: Path) -> None:
     path = write()
     with plugins.get("instruments", "virtual_controller")("sim://cframe/c?seed=77") as watching:
         before = watching.state()["position"]
@@ -193,11 +193,11 @@ def test_a_method_that_writes_programs_and_states_no_motions_is_refused_when_it_
 
 
 def test_a_method_that_states_motions_beyond_the_limits_is_refused_when_it_is_read(write: Write) -> None:
-    with pytest.raises(BenchError, match="X would go from 100 mm to 100 mm"):
+    with pytest.raises(BenchError, match="X would move from 100 mm to 100 mm"):
         load_campaign(write(METHOD + HONEST, limited(BENCH)))
 
 
-def test_a_method_that_states_other_motions_than_it_makes_is_stopped_at_the_door(write: Write, tmp_path: Path) -> None:
+def test_a_motion_that_the_method_did_not_state_is_prevented(write: Write, tmp_path: Path) -> None:
     path = write(METHOD + WRONG, limited(BENCH))
     with plugins.get("instruments", "virtual_controller")("sim://cframe/c?seed=77") as watching:
         before = watching.state()["position"]
@@ -217,25 +217,25 @@ def test_a_method_that_states_other_motions_than_it_makes_is_stopped_at_the_door
         "[(0.0, 0.0, 0.0)]",
     ],
 )
-def test_steps_that_are_none_are_refused(write: Write, steps: str) -> None:
+def test_invalid_steps_are_an_error(write: Write, steps: str) -> None:
     stated = f"    def motions(self, settings, instruments): return {steps}\n"
     with pytest.raises(BenchError, match="motions of 'wanderer': expected steps with finite positions"):
         load_campaign(write(METHOD + stated))
 
 
-def test_a_bench_that_is_not_armed_moves_nothing(write: Write, tmp_path: Path) -> None:
+def test_a_bench_without_arm_causes_no_motion(write: Write, tmp_path: Path) -> None:
     path = write(METHOD + HONEST, BENCH.replace("arm = true\n", ""))
     with pytest.raises(RunError, match=r"virtual_controller at .* only reads.*arm = true for the instrument in the be"):
         runner.run(load_campaign(path), runs=tmp_path / "runs")
 
 
-def test_a_driver_that_moves_and_holds_no_limits_is_not_opened(write: Write, tmp_path: Path) -> None:
+def test_a_driver_that_moves_without_limits_is_not_opened(write: Write, tmp_path: Path) -> None:
     bench = BENCH.replace("virtual_controller", "mill").replace("arm = true\n", "")
-    with pytest.raises(BenchError, match="'mill' can move or change a machine and holds no limits"):
+    with pytest.raises(BenchError, match="'mill' can move or change a machine and does not check limits"):
         runner.run(load_campaign(write(METHOD + HONEST, bench)), runs=tmp_path / "runs")
 
 
-def test_the_kit_refuses_that_driver_and_that_method(write: Write) -> None:
+def test_the_conformance_kit_rejects_this_driver_and_this_method(write: Write) -> None:
     write()
     mill = plugins.get("instruments", "mill")("tcp://127.0.0.1:9")
     found = kind_registry.deviations(mill, kind_registry.kind("controller"))
@@ -248,7 +248,7 @@ def test_the_kit_refuses_that_driver_and_that_method(write: Write) -> None:
     assert "'wanderer' uses a controller and does not state its motions" in result.message
 
 
-def test_what_a_driver_refuses_is_an_error_of_the_instrument() -> None:
+def test_an_error_of_a_driver_is_an_error_of_the_instrument() -> None:
     driver = plugins.get("instruments", "virtual_controller")
     with driver("sim://cframe/c?seed=77", driver.Settings(arm=True)) as control:
         control.bound(plugins.MachineLimits(forbidden="a test says so"))

@@ -1,4 +1,4 @@
-"""A disturbed link between `errormotion compensate run` and the real LinuxCNC, by the record of its servo thread."""
+"""A disturbed link between `errormotion compensate run` and LinuxCNC, by the record of its servo thread."""
 
 import threading
 from collections.abc import Iterator
@@ -61,7 +61,7 @@ def machine(started: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 class Following:
-    """A compensation that runs beside the test, and what it stated."""
+    """A compensation that runs in parallel to the test, and its states."""
 
     def __init__(self, machine: Machine, link: Path, runs: Path) -> None:
         head = f'schema = "errormotion.bench/1"\nname = "Shop"\nmachine = "{MACHINE}"\n'
@@ -109,7 +109,7 @@ def following(machine: Machine, link: Link, tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("kind", HARMLESS)
-def test_pieces_and_delays_change_nothing(machine: Machine, link: Link, following: Following, kind: str) -> None:
+def test_split_and_delayed_data_have_no_effect(machine: Machine, link: Link, following: Following, kind: str) -> None:
     machine.watch()
     before = len(following.moments)
     link.kind = kind

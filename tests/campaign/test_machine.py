@@ -51,7 +51,7 @@ def test_the_table_is_read_in_si(tmp_path: Path) -> None:
     assert OpenBench(plan).description is machine
 
 
-def test_the_name_alone_is_enough(tmp_path: Path) -> None:
+def test_the_name_alone_suffices(tmp_path: Path) -> None:
     plan = load_bench(bench(tmp_path, 'machine = "Mill"\n'))
     assert plan.machine == "Mill"
     assert plan.description is None
@@ -90,7 +90,7 @@ def test_the_name_alone_is_enough(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_machine_without_sense_is_refused_with_file_and_key(tmp_path: Path, old: str, new: str, text: str) -> None:
+def test_an_invalid_machine_is_reported_with_file_and_key(tmp_path: Path, old: str, new: str, text: str) -> None:
     assert old in MACHINE
     found = mistakes(bench(tmp_path, MACHINE.replace(old, new, 1)))
     assert any(each.startswith(text) for each in found), found
@@ -102,13 +102,13 @@ def test_mistakes_of_the_machine_are_reported_with_those_of_the_rest(tmp_path: P
     assert keys == ["machine.chain", "limits.feed", "instruments.other.driver"]
 
 
-def test_limits_are_the_travel_where_none_are_given(tmp_path: Path) -> None:
+def test_limits_default_to_the_travel(tmp_path: Path) -> None:
     limits = load_bench(bench(tmp_path, MACHINE + '[limits]\nX = ["-100 mm", "300 mm"]\n')).limits
     assert (limits.X, limits.Y, limits.Z) == ((-0.1, 0.3), (-0.25, 0.25), (0.0, 0.46))
     assert limits.feed is None
 
 
-def test_limits_outside_of_the_travel_are_refused(tmp_path: Path) -> None:
+def test_limits_outside_the_travel_are_an_error(tmp_path: Path) -> None:
     (found,) = mistakes(bench(tmp_path, MACHINE + '[limits]\nX = ["-301 mm", "300 mm"]\n'))
     assert found == (
         "limits.X: expected limits within the travel (machine.travel.X), -300 mm to 300 mm; found -301 mm to 300 mm"
@@ -198,6 +198,6 @@ def test_the_simulated_control_moves_the_machine_of_the_bench(tmp_path: Path) ->
         ),
     ],
 )
-def test_a_machine_that_cannot_be_simulated_over_the_wire_is_refused(tmp_path: Path, machine: str, text: str) -> None:
+def test_a_machine_without_simulated_instruments_is_an_error(tmp_path: Path, machine: str, text: str) -> None:
     with pytest.raises(BenchError, match=text), OpenBench(load_bench(bench(tmp_path, machine + CONTROL))):
         pass

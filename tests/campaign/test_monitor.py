@@ -82,7 +82,7 @@ class Server(socketserver.ThreadingTCPServer):
 
 @contextmanager
 def module(port: int = 0) -> Iterator[Server]:
-    """A module that can be unplugged: at the end its connections break."""
+    """A module that can be disconnected."""
     with Server(port) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
@@ -128,7 +128,7 @@ def test_temperatures_and_parameters_are_logged_on_one_clock(tmp_path: Path) -> 
         assert [each["identity"]["simulated"] for each in json.loads(log.attrs["instruments"])] == [True, True]
 
 
-def test_a_thermometer_that_is_unplugged_and_comes_back_leaves_a_marked_gap(tmp_path: Path) -> None:
+def test_a_thermometer_that_is_disconnected_and_reconnected_leaves_a_marked_gap(tmp_path: Path) -> None:
     with module() as server:
         port = server.server_address[1]
         plan = bench(dcon("far", f"tcp://127.0.0.1:{port}"), CONTROL)
@@ -157,7 +157,7 @@ def test_a_thermometer_that_is_unplugged_and_comes_back_leaves_a_marked_gap(tmp_
     assert monitor.folder.data["samples"]["invalid"] == {"no answer of far": int(gap.sum())}
 
 
-def test_a_silent_instrument_keeps_nobody_waiting(tmp_path: Path) -> None:
+def test_a_silent_instrument_does_not_delay_the_others(tmp_path: Path) -> None:
     quiet = dcon("quiet", "sim://cframe/a?seed=11&fault=silence&fault_at=3", more="")
     good = dcon("good", "sim://cframe/b?seed=11", '["front", "rear"]')
     with Monitor(bench(quiet, good), tmp_path, TICK) as monitor:
@@ -204,7 +204,7 @@ def test_sensors_of_the_same_name_keep_the_names_of_their_instruments(tmp_path: 
     assert monitor.sensors == ("spindle", "a.column", "b.column", "bed")
 
 
-def test_a_bench_that_measures_nothing_is_refused(tmp_path: Path) -> None:
+def test_a_bench_without_instruments_is_an_error(tmp_path: Path) -> None:
     sensor = '[instruments.x1]\ndriver = "optoncdt"\naddress = "sim://cframe/X1"\n'
     with pytest.raises(BenchError, match=r"bench\.toml: expected thermometers, a controller, or both; found point_lds"):
         Monitor(bench(sensor), tmp_path)
@@ -219,8 +219,8 @@ def test_the_log_of_a_monitor_is_no_campaign_to_resume(tmp_path: Path) -> None:
         runner.resume(runs=tmp_path)
 
 
-def test_the_memory_of_a_long_log_stays_where_it_is(tmp_path: Path) -> None:
-    """Twelve hundred rows against three hundred: what grows with the rows would be four times as much."""
+def test_the_memory_of_a_long_log_is_constant(tmp_path: Path) -> None:
+    """Twelve hundred rows instead of three hundred: memory that grows with the rows would be four times as large."""
     with Monitor(bench(CONTROL), tmp_path, 1e-3) as monitor:
         watched = monitor.watch()
         tracemalloc.start()

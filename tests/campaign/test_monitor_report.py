@@ -121,13 +121,13 @@ def test_working_parameters_are_those_of_the_log(html):
     assert found["Position X"][1] == "−200.0"
 
 
-def test_log_without_a_controller_says_so(tmp_path):
+def test_a_log_without_a_controller_states_it(tmp_path):
     text = words(write_report(log(controller=False), tmp_path / "r.html").read_text(encoding="utf-8"))
     assert "The bench had no controller" in text
     assert "Spindle speed" not in text
 
 
-def test_rows_that_were_never_written_are_a_gap_too(tmp_path):
+def test_rows_that_were_not_written_are_a_gap(tmp_path):
     whole = log()
     part = whole.isel(time=np.r_[0:100, 150:200])
     text = words(write_report(part, tmp_path / "r.html").read_text(encoding="utf-8"))
@@ -136,7 +136,7 @@ def test_rows_that_were_never_written_are_a_gap_too(tmp_path):
 
 
 @pytest.mark.parametrize("block", [1000, 7, 10**6])
-def test_long_log_is_read_in_blocks_and_gives_the_same_numbers(monkeypatch, block):
+def test_a_long_log_is_read_in_blocks_with_equal_results(monkeypatch, block):
     long = log(5000, 60.0)
     monkeypatch.setattr(monitor_log, "BLOCK", block)
     found = monitor_log.read_log(long)
@@ -156,7 +156,7 @@ def test_long_log_is_read_in_blocks_and_gives_the_same_numbers(monkeypatch, bloc
     assert not found.silent["control"].any()
 
 
-def test_short_gap_in_a_long_log_is_still_seen():
+def test_a_short_gap_in_a_long_log_is_visible():
     found = monitor_log.read_log(log(5000, 60.0))
     at = np.flatnonzero(found.silent["thermo"])
     assert (np.abs(found.time[at] - 3501 * 60.0) < 600.0).any()
@@ -176,7 +176,7 @@ def test_log_of_one_row_and_of_none_have_a_page(tmp_path):
     assert monitor_log.read_log(log().isel(time=[])).rows == 0
 
 
-def test_run_folder_of_a_monitor_gets_its_page(tmp_path):
+def test_the_page_of_the_run_folder_of_a_monitor_is_written(tmp_path):
     folder = tmp_path / "20260302T081500Z-monitor-ab12"
     folder.mkdir()
     save(log(), folder / "raw.zarr")

@@ -1,4 +1,4 @@
-"""A monitor for some simulated minutes with a fault a minute; ``make endurance`` does the same for 24 hours."""
+"""A monitor for some simulated minutes with one fault per minute; ``make endurance`` runs 24 hours."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from errormotion.campaign.monitor import sources
 MINUTES = 8
 
 
-def test_every_gap_is_marked_and_nothing_comes_twice(tmp_path: Path) -> None:
+def test_every_gap_is_marked_and_no_sample_is_repeated(tmp_path: Path) -> None:
     folder, day = watch(tmp_path, MINUTES / 60, 30.0, seed=2)
     assert not day.errors
     assert sum(day.faults.values()) >= MINUTES - 2  # a suspension may take the rest
@@ -26,7 +26,7 @@ def test_every_gap_is_marked_and_nothing_comes_twice(tmp_path: Path) -> None:
         assert np.diff(log.time).max() < 100 * INTERVAL
 
 
-def test_the_examination_finds_readings_that_are_kept_too_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_examination_detects_readings_that_are_too_old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sources.Source, "fresh", lambda source, oldest: source._reading)
     _, day = watch(tmp_path, MINUTES / 60, 30.0, 3)
     assert any("is not marked" in text for text in day.errors)

@@ -1,4 +1,4 @@
-"""Short warm-ups of virtual machines: control, probe and thermometer on their wires, recorder and identification."""
+"""Short warm-ups of virtual machines: simulated control, probe and thermometer, recorder and identification."""
 
 import json
 import time
@@ -103,7 +103,7 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
 
 
 def without_control(plan: CampaignPlan) -> CampaignPlan:
-    """Take the control off the bench."""
+    """Remove the control from the bench."""
     bench = plan.folder / "bench.toml"
     before, _, rest = bench.read_text().partition("[instruments.control]")
     bench.write_text(before + "[instruments.probe]" + rest.partition("[instruments.probe]")[2])
@@ -111,7 +111,7 @@ def without_control(plan: CampaignPlan) -> CampaignPlan:
 
 
 def here(kind: str = "gantry") -> VirtualWorld:
-    """Return the world of the next run; what it knows can be asked afterwards."""
+    """Return the simulated world of the next run, with its true values."""
     return world(kind, SEED)
 
 
@@ -127,7 +127,7 @@ def raw_of(run: RunFolder) -> xr.Dataset:
 
 
 def off(errors: xr.Dataset, machine: VirtualMachine) -> np.ndarray:
-    """Return how far errors are off the truth, in their standard uncertainties; (cycle, 6), without the cold cycle."""
+    """Return the deviations of errors from the truth, in standard uncertainties; (cycle, 6), without the cold cycle."""
     truth = machine.truth_probing(errors["time"].values, errors.attrs["functional_point"])
     values, true = (np.stack([ds[name].values for name in DOF], axis=-1) for ds in (errors, truth))
     u = np.sqrt(np.diagonal(errors["covariance"].values, axis1=1, axis2=2))
@@ -135,7 +135,7 @@ def off(errors: xr.Dataset, machine: VirtualMachine) -> np.ndarray:
 
 
 def breaks_at(monkeypatch: pytest.MonkeyPatch, name: str, number: int, what: Callable[[], Any]) -> None:
-    """Have something happen before the so-many-th call of an operation of the controller."""
+    """Run a function before the n-th call of an operation of the controller."""
     usual, calls = getattr(VirtualController, name), []
 
     def call(self: VirtualController, *arguments: Any, **keywords: Any) -> Any:
@@ -155,7 +155,7 @@ IN_SECOND_CYCLE = 5 * TOUCHES + 20
 
 
 @pytest.mark.parametrize(("kind", "unseen"), [("gantry", ""), ("cframe", "EC")])
-def test_a_campaign_finds_the_truth(lab: Lab, kind: str, unseen: str) -> None:
+def test_a_campaign_determines_the_true_errors(lab: Lab, kind: str, unseen: str) -> None:
     machine = here(kind).machine
     plan, runs = lab(kind)
     (run,) = runner.run(plan, runs=runs)
@@ -173,7 +173,7 @@ def test_a_campaign_finds_the_truth(lab: Lab, kind: str, unseen: str) -> None:
     assert float(abs(errors["EZ"][-1])) > 3e-6
 
 
-def test_a_ball_that_was_pushed_is_named(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_displaced_ball_is_named(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     virtual = here()
     plan, runs = lab(minutes=60, balls=4)
 
@@ -195,7 +195,7 @@ def test_a_ball_that_was_pushed_is_named(lab: Lab, monkeypatch: pytest.MonkeyPat
     ("trouble", "message"),
     [("alarm", "in alarm: servo alarm"), ("estop", "emergency stop")],
 )
-def test_trouble_in_a_cycle_stops_everything_and_the_next_cycle_follows_when_it_is_over(
+def test_an_error_in_a_cycle_stops_the_machine_and_the_next_cycle_follows_after_recovery(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, trouble: str, message: str
 ) -> None:
     plan, runs = lab()
@@ -229,7 +229,7 @@ def test_trouble_in_a_cycle_stops_everything_and_the_next_cycle_follows_when_it_
         assert np.nanmax(np.abs(off(datasets.load(run.errors), virtual.machine))) < 3
 
 
-def test_an_alarm_while_it_warms_up_stops_the_spindle(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_alarm_during_the_warm_up_stops_the_spindle(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     plan, runs = lab()
     with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as operator:
         breaks_at(monkeypatch, "elapse", 20, lambda: here().raise_alarm("oil is hot"))
@@ -248,7 +248,7 @@ def test_an_alarm_while_it_warms_up_stops_the_spindle(lab: Lab, monkeypatch: pyt
         ("tripped", "the probe is tripped before it moves, and remains so"),
     ],
 )
-def test_a_broken_probe_ends_the_cold_cycle_with_nothing_kept(lab: Lab, fault: str, message: str) -> None:
+def test_a_broken_probe_ends_the_cold_cycle_without_data(lab: Lab, fault: str, message: str) -> None:
     plan, runs = lab(probe=f"&fault={fault}")
     with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as operator:
         with pytest.raises(RunError, match=message):
@@ -259,7 +259,7 @@ def test_a_broken_probe_ends_the_cold_cycle_with_nothing_kept(lab: Lab, fault: s
     assert not one_run(runs).raw.exists()
 
 
-def test_a_ball_that_is_not_there_ends_the_cold_cycle(lab: Lab) -> None:
+def test_a_missing_ball_ends_the_cold_cycle(lab: Lab) -> None:
     plan, runs = lab()
     virtual = here()
     virtual.balls = virtual.balls.moved(1, (0.0, 0.3, 0.0))
@@ -267,7 +267,7 @@ def test_a_ball_that_is_not_there_ends_the_cold_cycle(lab: Lab) -> None:
         runner.run(plan, runs=runs)
 
 
-def test_a_connection_lost_in_a_cycle_keeps_its_touches_and_stops(lab: Lab) -> None:
+def test_touches_before_a_lost_connection_are_kept_and_the_test_stops(lab: Lab) -> None:
     plan, runs = lab(probe="&fault=disconnect&fault_at=150")
     with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as operator:
         with pytest.raises(RunError, match=r"Touch \d+ of 12"):
@@ -278,7 +278,7 @@ def test_a_connection_lost_in_a_cycle_keeps_its_touches_and_stops(lab: Lab) -> N
     assert 0 < (raw["touch_flag"].values[1] == 0).sum() < TOUCHES
 
 
-def test_a_connection_lost_while_the_spindle_turns_is_opened_again_to_stop_it(lab: Lab) -> None:
+def test_a_connection_lost_while_the_spindle_rotates_is_reopened_to_stop_it(lab: Lab) -> None:
     plan, runs = lab(control="&fault=disconnect&fault_at=60")
     with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as operator:
         with pytest.raises(RunError, match="connection"):
@@ -288,7 +288,7 @@ def test_a_connection_lost_while_the_spindle_turns_is_opened_again_to_stop_it(la
     assert raw_of(one_run(runs)).sizes["time"] == 1
 
 
-def test_a_thermometer_that_is_away_for_a_cycle_leaves_a_gap(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thermometer_without_answer_for_a_cycle_leaves_a_gap(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     usual, calls = ModbusTemperature.read, []
 
     def read(self: ModbusTemperature) -> dict[str, float]:
@@ -335,7 +335,7 @@ def test_an_interrupted_run_has_the_data_of_an_uninterrupted_one(
         np.testing.assert_array_equal(raw[name].values, whole_values.values, err_msg=str(name))
 
 
-def test_a_killed_process_costs_the_cycle_that_it_was_in(lab: Lab, command: Callable[..., Any]) -> None:
+def test_a_killed_process_loses_only_its_present_cycle(lab: Lab, command: Callable[..., Any]) -> None:
     plan, runs = lab(minutes=100)
     process = command("run", plan.folder / "campaign.toml", "--runs", runs, "--no-report")
     cycles = 0
@@ -371,7 +371,7 @@ def test_a_program_that_prints_measures_the_same(lab: Lab) -> None:
         np.testing.assert_allclose(errors[name], truth[name] - truth[name][0], atol=1e-6)
 
 
-def test_an_alarm_while_a_program_runs_ends_the_run_with_nothing_false(
+def test_an_alarm_while_a_program_runs_ends_the_run_without_false_data(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan, runs = lab(driver="dprnt")
@@ -398,7 +398,7 @@ def test_an_alarm_while_a_program_runs_ends_the_run_with_nothing_false(
     assert (np.diff(raw["touch_time"].values[raw["touch_flag"].values == 0]) > 0).all()  # no line is taken twice
 
 
-def test_a_printer_that_goes_silent_keeps_what_it_has_printed(lab: Lab) -> None:
+def test_printed_lines_are_kept_when_the_device_stops_printing(lab: Lab) -> None:
     plan, runs = lab(driver="dprnt", probe="&fault=silence&fault_at=17")
     with pytest.raises(RunError, match=r"Touch 6 of 12 \(item 1\): no line for 1 s"):
         runner.run(plan, runs=runs)
@@ -406,7 +406,7 @@ def test_a_printer_that_goes_silent_keeps_what_it_has_printed(lab: Lab) -> None:
     assert (flags.reshape(2, TOUCHES) == 0).sum(axis=1).tolist() == [12, 5]
 
 
-def test_a_lost_line_costs_its_touch(lab: Lab) -> None:
+def test_a_lost_line_loses_only_its_touch(lab: Lab) -> None:
     plan, runs = lab(driver="dprnt", probe="&fault=drop&fault_at=14&fault_every=1000")
     (run,) = runner.run(plan, runs=runs)
     flags = raw_of(run)["touch_flag"].values
@@ -414,7 +414,7 @@ def test_a_lost_line_costs_its_touch(lab: Lab) -> None:
     assert run.data["status"] == "finished"
 
 
-def test_a_machine_without_a_control_on_the_bench_warms_up_by_the_program_that_its_operator_starts(
+def test_without_a_control_on_the_bench_the_operator_starts_the_warm_up_program(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan, runs = lab(driver="dprnt")
@@ -442,14 +442,14 @@ def test_a_machine_without_a_control_on_the_bench_warms_up_by_the_program_that_i
     assert float(abs(errors["EZ"][-1])) > 3e-6
 
 
-def test_a_probe_that_has_the_machine_moved_is_refused_without_a_control(lab: Lab) -> None:
+def test_a_probe_that_moves_the_machine_requires_a_control(lab: Lab) -> None:
     plan, runs = lab()
     plan = without_control(plan)
     with pytest.raises(RunError, match=r"'controller_probe' moves the machine.*the bench has none"):
         runner.run(plan, runs=runs)
 
 
-def test_a_plan_takes_the_noise_of_a_touch_from_the_probe_of_the_bench(lab: Any) -> None:
+def test_a_plan_uses_the_noise_of_the_probe_of_the_bench(lab: Any) -> None:
     def u(**stated: str) -> tuple[float, str]:
         plan, _ = lab(**stated)
         bench = plan.folder / "bench.toml"

@@ -1,4 +1,4 @@
-"""The runner stores everything before it uses it, and continues a run where it ended."""
+"""The runner stores data before it uses them, and continues a run where it ended."""
 
 import errno
 import fcntl
@@ -18,7 +18,7 @@ import pytest
 from errormotion import datasets, plugins
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
-from errormotion.campaign.folder import LOOK_DURATION, RunFolder, list_runs
+from errormotion.campaign.folder import CHECK_DURATION, RunFolder, list_runs
 from errormotion.campaign.storage.journal import journal
 from errormotion.campaign.storage.store import RawStore
 from errormotion.errors import BenchError, RunError
@@ -29,12 +29,12 @@ Plan = Callable[..., CampaignPlan]
 
 
 def whole(folder: RunFolder, count: int) -> None:
-    """Sample i is i micrometres: nothing is lost, doubled or out of place."""
+    """Sample i is i micrometres: no sample is lost, repeated or in the wrong order."""
     with datasets.load(folder.raw) as raw:
         np.testing.assert_array_equal(raw["distance"].values[0], np.arange(count) * STEP)
 
 
-def test_run_folder_holds_all_that_the_result_rests_on(plan: Plan) -> None:
+def test_a_run_folder_contains_all_data_of_the_result(plan: Plan) -> None:
     (folder,) = runner.run(plan('name = "a"\nsettings = {level = "25 mm"}'))
     data = json.loads((folder.path / "run.json").read_text())
     assert folder.path.name.split("-")[1:] == ["a", data["id"]]
@@ -70,9 +70,7 @@ def test_run_folder_can_be_moved(plan: Plan, tmp_path: Path) -> None:
     assert (moved[1].path / moved[1].data["inputs"]["zero"]).resolve() == moved[0].errors.resolve()  # type: ignore[union-attr]
 
 
-def test_folder_that_is_moved_during_the_run_is_missed_and_the_run_continued_where_it_is(
-    plan: Plan, tmp_path: Path
-) -> None:
+def test_a_folder_moved_during_the_run_is_reported_and_the_run_continued_there(plan: Plan, tmp_path: Path) -> None:
     runs, elsewhere = tmp_path / "runs", tmp_path / "elsewhere"
 
     class Mover(runner.Quiet):
@@ -87,19 +85,19 @@ def test_folder_that_is_moved_during_the_run_is_missed_and_the_run_continued_whe
     whole(folder, 1000)
 
 
-def test_log_that_cannot_be_opened_harms_nothing(tmp_path: Path) -> None:
+def test_a_log_that_cannot_be_opened_is_ignored(tmp_path: Path) -> None:
     with journal(tmp_path / "full" / "log.jsonl"):
         logging.getLogger("errormotion.test").warning("no space for this")
     assert not (tmp_path / "full").exists()
 
 
-def test_result_of_an_earlier_test_reaches_the_later_one(plan: Plan) -> None:
+def test_the_result_of_an_earlier_test_is_passed_to_a_later_one(plan: Plan) -> None:
     folders = runner.run(plan('name = "a"', 'name = "b"\ninputs = {zero = "a"}'))
     with datasets.load(folders[1].raw) as raw, datasets.load(folders[0].errors or "") as errors:
         assert raw.attrs["offset"] == float(errors["EX"][0])
 
 
-def test_settings_are_on_disk_even_if_the_first_sample_never_came(plan: Plan, tmp_path: Path) -> None:
+def test_settings_are_on_disk_without_any_sample(plan: Plan, tmp_path: Path) -> None:
     (tmp_path / "broken").touch()
     with pytest.raises(RunError, match="1000 samples are stored"):
         runner.run(plan('name = "a"\nsettings = {count = 5000}', bench=f'breaks = "{tmp_path / "broken"}"'))
@@ -108,7 +106,7 @@ def test_settings_are_on_disk_even_if_the_first_sample_never_came(plan: Plan, tm
     assert folder.data["settings"]["count"] == 5000
 
 
-def test_breakdown_keeps_what_was_measured_and_resume_goes_on_behind_it(plan: Plan, tmp_path: Path) -> None:
+def test_a_failure_keeps_the_measured_data_and_resume_continues_after_it(plan: Plan, tmp_path: Path) -> None:
     (tmp_path / "broken").touch()
     broken = plan('name = "a"\nsettings = {count = 5000}', bench=f'breaks = "{tmp_path / "broken"}"')
     with pytest.raises(RunError, match="Test 'a' failed: the counter fell off the table") as caught:
@@ -141,7 +139,7 @@ def test_failed_identification_keeps_the_raw_data_and_is_redone_without_the_benc
     whole(folder, 1000)
 
 
-def test_resume_steps_over_finished_tests(plan: Plan, tmp_path: Path) -> None:
+def test_resume_skips_finished_tests(plan: Plan, tmp_path: Path) -> None:
     made = plan('name = "a"', f'name = "b"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}', 'name = "c"')
     with pytest.raises(RunError, match="Test 'b' failed"):
         runner.run(made)
@@ -153,7 +151,7 @@ def test_resume_steps_over_finished_tests(plan: Plan, tmp_path: Path) -> None:
     assert {folder.data["id"] for folder in folders} == {before["a"].data["id"]}
 
 
-def test_full_disk_says_how_much_is_safe_and_can_be_resumed(
+def test_a_full_disk_is_reported_with_the_stored_amount_and_the_run_can_be_resumed(
     plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = plan('name = "a"\nsettings = {count = 4000}', bench='rate = "1 kHz"')
@@ -178,7 +176,7 @@ def test_full_disk_says_how_much_is_safe_and_can_be_resumed(
     whole(folder, 4000)
 
 
-def test_a_disk_that_becomes_read_only_says_how_much_is_safe(
+def test_a_read_only_disk_is_reported_with_the_stored_amount(
     plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     append = RawStore.append
@@ -199,7 +197,7 @@ def test_a_disk_that_becomes_read_only_says_how_much_is_safe(
     assert "1000 samples are stored in" in str(caught.value)
 
 
-def test_changed_files_are_not_resumed_by_mistake(plan: Plan, tmp_path: Path) -> None:
+def test_changed_files_are_not_resumed(plan: Plan, tmp_path: Path) -> None:
     setting = f'settings = {{needs_file = "{tmp_path / "needed"}"}}'
     with pytest.raises(RunError, match="failed"):
         runner.run(plan(f'name = "a"\n{setting}'))
@@ -211,7 +209,7 @@ def test_changed_files_are_not_resumed_by_mistake(plan: Plan, tmp_path: Path) ->
     assert folder.finished
 
 
-def test_nothing_to_resume_is_said(plan: Plan) -> None:
+def test_a_finished_campaign_is_reported_by_resume(plan: Plan) -> None:
     made = plan('name = "a"')
     with pytest.raises(RunError, match=r"Nothing to resume in .*runs: found 0 campaigns"):
         runner.resume(made)
@@ -224,15 +222,15 @@ def test_two_processes_cannot_work_on_one_run(plan: Plan, tmp_path: Path) -> Non
     with pytest.raises(RunError, match="failed"):
         runner.run(plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}'))
     (folder,) = list_runs(tmp_path / "runs")
-    with folder.locked(), pytest.raises(RunError, match="another process is working on this run"):
+    with folder.locked(), pytest.raises(RunError, match="another process is using this run"):
         runner.resume(runs=tmp_path / "runs")
 
 
-def test_whoever_only_looks_at_a_lock_does_not_hold_it_against_a_run(plan: Plan, tmp_path: Path) -> None:
+def test_inspecting_a_lock_does_not_block_a_run(plan: Plan, tmp_path: Path) -> None:
     (folder,) = runner.run(plan('name = "a"'))
     looking = os.open(folder.path, os.O_RDONLY)
     fcntl.flock(looking, fcntl.LOCK_SH)
-    timer = threading.Timer(LOOK_DURATION / 2, os.close, [looking])
+    timer = threading.Timer(CHECK_DURATION / 2, os.close, [looking])
     timer.start()
     with RunFolder.open(folder.path).locked():
         timer.join()
@@ -284,7 +282,7 @@ class Nobody(runner.Quiet):
         self.announced: list[str] = []
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
-        with pytest.raises(RunError, match="another process is working on this run"):
+        with pytest.raises(RunError, match="another process is using this run"):
             runner.resume(runs=self.runs)
         self.refused.append(name)
 
@@ -292,7 +290,7 @@ class Nobody(runner.Quiet):
         self.announced.append(text)
 
 
-def test_nobody_continues_a_campaign_between_two_tests(plan: Plan, tmp_path: Path) -> None:
+def test_no_other_process_continues_a_campaign_between_two_tests(plan: Plan, tmp_path: Path) -> None:
     made = plan('name = "a"', f'name = "b"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}', 'name = "c"')
     other = Nobody(tmp_path / "runs")
     with pytest.raises(RunError, match="Test 'b' failed"):
@@ -303,7 +301,7 @@ def test_nobody_continues_a_campaign_between_two_tests(plan: Plan, tmp_path: Pat
     assert [folder.data["test"] for folder in list_runs(tmp_path / "runs")] == ["a", "b", "c"]
 
 
-def test_a_campaign_that_another_process_has_finished_meanwhile_is_left_as_it_is(
+def test_a_campaign_finished_by_another_process_is_not_changed(
     plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(RunError, match="Test 'a' failed"):
@@ -350,7 +348,7 @@ def test_a_test_is_not_measured_again_because_its_record_is_damaged(
     first = list_runs(tmp_path / "runs")[0].path
     stated = (first / "run.json").read_text()
     damage(first / "run.json")
-    with pytest.raises(RunError, match=rf"not clear which of its tests were measured(.|\n)*{first.name}"):
+    with pytest.raises(RunError, match=rf"unclear which tests were measured(.|\n)*{first.name}"):
         runner.resume(runs=tmp_path / "runs")
     assert len(list(tmp_path.glob("runs/2*"))) == 2
     shutil.rmtree(tmp_path / "runs" / f"copy-{first.name}", ignore_errors=True)
@@ -358,9 +356,7 @@ def test_a_test_is_not_measured_again_because_its_record_is_damaged(
     assert first.name in [folder.path.name for folder in runner.resume(runs=tmp_path / "runs")]
 
 
-def test_a_record_that_cannot_be_read_is_named_before_an_older_campaign_is_continued(
-    plan: Plan, tmp_path: Path
-) -> None:
+def test_an_unreadable_record_is_named_before_an_older_campaign_is_continued(plan: Plan, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="Test 'a' failed"):
         runner.run(plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}'))
     (tmp_path / "needed").touch()
@@ -372,13 +368,13 @@ def test_a_record_that_cannot_be_read_is_named_before_an_older_campaign_is_conti
     assert any(newest.name in text for text in other.announced)
 
 
-def test_bench_that_does_not_come_up_leaves_no_run_folder(plan: Plan, tmp_path: Path) -> None:
+def test_a_bench_that_cannot_be_opened_leaves_no_run_folder(plan: Plan, tmp_path: Path) -> None:
     with pytest.raises(BenchError, match="could not be opened"):
         runner.run(plan('name = "a"', bench="refuses = true"))
     assert list_runs(tmp_path / "runs") == []
 
 
-def test_report_that_fails_harms_no_measurement(plan: Plan) -> None:
+def test_a_failed_report_does_not_affect_the_measurement(plan: Plan) -> None:
     def report(folder: Path) -> Path:
         raise OSError("no ink")
 
@@ -397,7 +393,7 @@ def test_a_test_may_evaluate_its_result_by_trials(plan: Plan) -> None:
     assert "Monte Carlo evaluation" in (folder.path / "report.html").read_text(encoding="utf-8")
 
 
-def test_an_evaluation_that_fails_harms_no_measurement(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_evaluation_does_not_affect_the_measurement(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     campaign = plan('name = "a"\nmonte_carlo = 60')
     monkeypatch.delattr(plugins.get("methods", "ramp"), "redrawing")
     (folder,) = runner.run(campaign)
@@ -407,9 +403,14 @@ def test_an_evaluation_that_fails_harms_no_measurement(plan: Plan, monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    ("key", "message"), [("3", "from 40 on; found 3"), ("'often'", "monte_carlo"), ("60", "does not state how")]
+    ("key", "message"),
+    [
+        ("3", "at least 40 trials; found 3"),
+        ("'often'", "monte_carlo"),
+        ("60", "does not support the Monte Carlo evaluation"),
+    ],
 )
-def test_an_evaluation_that_cannot_be_is_refused(
+def test_an_impossible_evaluation_is_an_error(
     plan: Plan, monkeypatch: pytest.MonkeyPatch, key: str, message: str
 ) -> None:
     if key == "60":
@@ -434,7 +435,7 @@ def test_broken_run_json_is_reported_and_affects_no_other_run(
     assert load_campaign(write('name = "a"')).name == "Ramps"
 
 
-def test_each_test_measures_with_the_instrument_that_it_chooses_and_records_it_alone(plan: Plan) -> None:
+def test_each_test_measures_with_its_chosen_instrument_and_records_only_this_one(plan: Plan) -> None:
     second = '[instruments.other]\ndriver = "counter"\naddress = "sim://other"\nrate = "2 kHz"\n'
     folders = runner.run(
         plan(
@@ -469,7 +470,7 @@ def test_the_operator_of_a_campaign_is_in_the_raw_data(lab: None, write: Callabl
         assert "certificates" not in raw.attrs
 
 
-def test_a_certificate_of_nothing_known_is_refused(lab: None, write: Callable[..., Path]) -> None:
+def test_a_certificate_of_an_unknown_item_is_an_error(lab: None, write: Callable[..., Path]) -> None:
     file = write('name = "a"', bench='[certificates]\nbear = "K-1"\n')
     with pytest.raises(BenchError, match=r"certificates.*bear: expected the number or hash of a certificate"):
         load_campaign(file)
@@ -486,7 +487,7 @@ def test_a_certificate_of_nothing_known_is_refused(lab: None, write: Callable[..
         '{"schema": "errormotion.run/1", "id": "x", "created": "9", "campaign": {"tests": []}, "status": "running"}',
     ],
 )
-def test_a_damaged_run_beside_another_does_not_stop_its_resumption(plan: Plan, tmp_path: Path, text: str) -> None:
+def test_a_damaged_run_does_not_prevent_the_resumption_of_another(plan: Plan, tmp_path: Path, text: str) -> None:
     (tmp_path / "missing.txt").unlink(missing_ok=True)
     with pytest.raises(RunError, match=r"missing\.txt"):
         runner.run(plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "missing.txt"}"}}'))

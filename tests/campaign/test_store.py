@@ -1,4 +1,4 @@
-"""The raw store holds what was appended, whatever write was the last."""
+"""The raw store contains the appended data, whichever write was the last."""
 
 import json
 import warnings
@@ -17,7 +17,7 @@ RATE = 1000.0
 LSB = 3.1e-8  # m; a step of a 16 bit sensor of 2 mm range
 
 
-def test_a_new_store_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_store_is_synchronised_before_it_is_renamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: set[str] = set()
     monkeypatch.setattr(store_module, "_sync", lambda path: synced.add(str(path)))
     RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 1.0)
@@ -70,7 +70,7 @@ def same(path: Path, wanted: xr.Dataset) -> None:
 
 @pytest.mark.parametrize("lengths", [[64], [1, 2, 3, 250], [100] * 7, [300, 1]])
 @pytest.mark.parametrize("packed", [True, False])
-def test_reads_back_bit_by_bit_what_was_appended(tmp_path: Path, lengths: list[int], packed: bool) -> None:
+def test_appended_data_are_read_back_exactly(tmp_path: Path, lengths: list[int], packed: bool) -> None:
     wanted = fill(tmp_path / "raw.zarr", lengths, expected=64, packed=packed)
     same(tmp_path / "raw.zarr", wanted)
 
@@ -94,7 +94,7 @@ def test_texts_have_a_type_with_a_specification(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "raw.zarr" / "sensor" / "zarr.json").read_text())["data_type"] == "string"
 
 
-def test_packing_that_would_lose_something_is_left_out(tmp_path: Path) -> None:
+def test_lossy_packing_is_omitted(tmp_path: Path) -> None:
     part = chunk(0, 100)
     part["distance"].values[0, 50] += LSB / 10
     store = RawStore.create(tmp_path / "raw.zarr", part, "time", 0.1)
@@ -103,7 +103,7 @@ def test_packing_that_would_lose_something_is_left_out(tmp_path: Path) -> None:
     same(tmp_path / "raw.zarr", part)
 
 
-def test_broken_promise_of_packing_is_refused(tmp_path: Path) -> None:
+def test_inexact_packing_is_an_error(tmp_path: Path) -> None:
     store = RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 0.1)
     part = chunk(0, 10)
     part["distance"].values[0, 0] += LSB / 10
@@ -111,14 +111,14 @@ def test_broken_promise_of_packing_is_refused(tmp_path: Path) -> None:
         store.append(part)
 
 
-def test_counts_of_lost_samples_add_up(tmp_path: Path) -> None:
+def test_counts_of_lost_samples_are_summed(tmp_path: Path) -> None:
     fill(tmp_path / "raw.zarr", [10, 10, 10], expected=30)
     with datasets.load(tmp_path / "raw.zarr") as raw:
         assert raw.attrs["dropped"] == 3
         assert raw.attrs["invalid"] == '{"dark": 9}'
 
 
-def test_goes_on_in_the_middle_of_a_block(tmp_path: Path) -> None:
+def test_a_test_continues_in_the_middle_of_a_block(tmp_path: Path) -> None:
     path = tmp_path / "raw.zarr"
     fill(path, [50, 27], expected=64)
     store = RawStore(path, "time")
@@ -132,10 +132,10 @@ class PowerCutError(Exception):
     """The process ends here."""
 
 
-def test_whatever_write_is_the_last_readers_see_whole_samples_and_it_goes_on(
+def test_after_any_last_write_readers_see_complete_samples_and_writing_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The process is cut off before each of its writes in turn (an array's length, a chunk, the root's new text)."""
+    """The process ends before each of its writes in turn (length of an array, a chunk, the new text of the root)."""
     from zarr.storage import _local
 
     put, replace = _local._put, store_module.replace_text
@@ -208,7 +208,7 @@ def test_gap_is_refused_with_the_time_that_was_expected(tmp_path: Path) -> None:
         (lambda raw: raw.isel(time=0), "expected data along 'time'"),
     ],
 )
-def test_dataset_that_does_not_fit_is_refused(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_an_incompatible_dataset_is_an_error(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
     store = RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 0.1)
     store.append(chunk(0, 10))
     with pytest.raises(RunError, match=message):
@@ -216,7 +216,7 @@ def test_dataset_that_does_not_fit_is_refused(tmp_path: Path, change, message: s
 
 
 def test_joins_along_named_channels(tmp_path: Path) -> None:
-    """Beam detection grows channel by channel, and the names of the channels with it."""
+    """Data of a beam detection are appended by channel, together with the names of the channels."""
     parts = [
         xr.Dataset({"distance": (("channel", "step"), np.full((1, 4), k))}, coords={"channel": [name]})
         for k, name in enumerate(["X1", "X2", "a long name"])
@@ -229,7 +229,7 @@ def test_joins_along_named_channels(tmp_path: Path) -> None:
 
 
 def test_damaged_metadata_are_an_error_and_never_an_empty_store(tmp_path):
-    """A store without samples is removed and measured again: what is unknown must not look like one."""
+    """A store without samples is removed and measured again: an unknown state must not look like one."""
     path = tmp_path / "raw.zarr"
     store = RawStore.create(path, chunk(0, 50), "time")
     store.append(chunk(0, 50))

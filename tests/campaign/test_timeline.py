@@ -79,7 +79,7 @@ def run(campaign: Path) -> list[RunFolder]:
     return runner.run(load_campaign(campaign), runs=campaign.parent / "runs")
 
 
-def test_tests_at_one_time_meet_one_machine_and_others_follow_each_other(write: Write) -> None:
+def test_simultaneous_tests_share_one_machine_and_others_are_sequential(write: Write) -> None:
     folders = run(write(drift("first", "10 min", FROM_REST), drift("again", "10 min", FROM_REST), drift("next")))
     first, again, after = (datasets.load(folder.raw) for folder in folders)
     assert first.attrs["start"] == again.attrs["start"] == "2026-03-02T06:10:00+00:00"
@@ -110,17 +110,20 @@ def test_a_schedule_that_contradicts_the_timeline_is_refused(write: Write) -> No
 
 def test_a_run_without_timeline_states_no_truth(write: Write) -> None:
     (folder,) = run(write(drift("drift"), timeline=""))
-    with pytest.raises(RunError, match=r"expected a run of a campaign with a table \[timeline\]"):
+    with pytest.raises(RunError, match=r"expected a run of a campaign on a virtual machine with a table \[timeline\]"):
         truth_of(folder)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"timeline": ""}, r"test\[0\].at: expected a table \[timeline\]; found none"),
+        ({"timeline": ""}, r"test\[0\].at: needs a table \[timeline\]; found none"),
         ({"control": ""}, r"\[timeline\]: expected a controller of a virtual machine"),
         ({"timeline": TIMELINE.replace("+01:00", "")}, "expected an instant such as"),
-        ({"timeline": TIMELINE.replace("[{", '[{ at = "20 min", spindle_speed = "0 /min" }, {')}, "times that rise"),
+        (
+            {"timeline": TIMELINE.replace("[{", '[{ at = "20 min", spindle_speed = "0 /min" }, {')},
+            "times in ascending order",
+        ),
     ],
 )
 def test_mistakes_of_a_timeline_are_found_when_the_campaign_is_read(
@@ -138,7 +141,7 @@ class Interrupting(runner.Quiet):
         raise KeyboardInterrupt
 
 
-def test_an_interrupted_test_goes_on_at_its_time(write: Write) -> None:
+def test_an_interrupted_test_continues_at_its_time(write: Write) -> None:
     longer = drift("drift", "10 min", FROM_REST).replace('"20 s"', '"4 min"')
     plan = load_campaign(write(longer))
     runs = plan.source.parent / "runs"

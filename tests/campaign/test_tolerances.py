@@ -56,7 +56,7 @@ def test_a_file_of_limits_replaces_those_of_the_campaign(lab: None, write: Calla
     call("run", "--resume", "--tolerances", strict, code=2)
 
 
-def test_a_limit_that_applies_to_nothing_is_reported(lab: None, write: Callable[..., Path]) -> None:
+def test_an_unused_limit_is_reported(lab: None, write: Callable[..., Path]) -> None:
     campaign = write('name = "a"\n[tolerances]\nfigures = { "d(Z)*" = "1 um" }\nfreedoms = { EX = "1 m" }\n')
     found = call("run", campaign, "--no-report", code=5).stdout
     assert "the limit 'd(Z)*' applies to no figure and no freedom" in found
@@ -102,7 +102,7 @@ CASES = [
 ]
 
 
-def test_identify_and_runs_decide_with_a_file_of_limits(lab: None, write: Callable[..., Path], tmp_path: Path) -> None:
+def test_identify_and_runs_apply_a_file_of_limits(lab: None, write: Callable[..., Path], tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     call("run", write('name = "a"\nsettings = { count = 11 }\n'), "--no-report")
     (path,) = runs.glob("2*")
@@ -129,7 +129,7 @@ def test_each_of_many_results_is_decided(lab: None, write: Callable[..., Path], 
         assert f"Tolerances: {verdict}" in call(*several_with, code=code).stdout
 
 
-def test_runs_that_cannot_be_decided_are_reported(lab: None, write: Callable[..., Path], tmp_path: Path) -> None:
+def test_runs_without_decision_are_reported(lab: None, write: Callable[..., Path], tmp_path: Path) -> None:
     call("run", write('name = "a"\nsettings = { count = 11 }\n'), "--no-report")
     (path,) = (tmp_path / "runs").glob("2*")
     next(path.glob("errors/*/errors.nc")).write_bytes(b"damaged")

@@ -1,4 +1,4 @@
-"""A tracker in turn at four stations of the virtual machine: operator, wires, recorder and identification together."""
+"""A tracker at four stations of the virtual machine: operator, simulators, recorder and identification."""
 
 import re
 
@@ -57,7 +57,7 @@ stations = [
 
 
 class Operator:
-    """Carries the tracker to where it is asked for, to some millimetres."""
+    """Moves the tracker to the requested station, with a deviation of some millimetres."""
 
     def __init__(self):
         self.messages = []
@@ -71,7 +71,7 @@ class Operator:
 
 @pytest.fixture
 def lab(tmp_path, monkeypatch):
-    """Return a function that writes the lab; its tracker is carried by an operator."""
+    """Return a function that writes bench and campaign; an operator moves the tracker."""
     monkeypatch.setattr(OpenBench, "virtual", property(lambda self: False))
     monkeypatch.delattr(VirtualController, "set_station")
 
@@ -88,7 +88,7 @@ def lab(tmp_path, monkeypatch):
 
 
 def miss(run):
-    """Return by how many standard uncertainties each error of the volume misses the truth, and the errors."""
+    """Return the deviations of the errors of the volume from the truth, in standard uncertainties, and the errors."""
     ds = datasets.load(run.errors)
     position = np.stack([ds[name].values for name in "xyz"], axis=-1)
     truth = simulation.true_errors(VirtualMachine("cframe", seed=3), position, (0.02, -0.01, -0.08))
@@ -98,7 +98,7 @@ def miss(run):
     return (found - true) / sigma, true
 
 
-def test_errors_of_the_volume_are_found_within_their_uncertainty(lab):
+def test_errors_of_the_volume_are_determined_within_their_uncertainty(lab):
     plan, runs = lab()
     operator = Operator()
     (run,) = runner.run(plan, runs=runs, ask=operator)
@@ -115,7 +115,7 @@ def test_errors_of_the_volume_are_found_within_their_uncertainty(lab):
     assert np.abs(true).max() > 3e-6
 
 
-def test_a_beam_that_breaks_costs_nothing_but_time(lab):
+def test_an_interrupted_beam_loses_no_data(lab):
     plan, runs = lab("&fault=beam_broken&fault_at=20&fault_for=3")
     (run,) = runner.run(plan, runs=runs, ask=Operator())
     raw = datasets.load(run.raw)
@@ -126,7 +126,7 @@ def test_a_beam_that_breaks_costs_nothing_but_time(lab):
     assert np.abs(miss(run)[0]).max() < 4
 
 
-def test_a_tracker_that_nobody_moves_is_reported_and_not_measured(lab):
+def test_a_tracker_at_an_unchanged_station_is_reported_and_not_measured(lab):
     plan, runs = lab()
     operator = Operator()
 
@@ -138,7 +138,7 @@ def test_a_tracker_that_nobody_moves_is_reported_and_not_measured(lab):
         runner.run(plan, runs=runs, ask=lazy)
 
 
-def test_an_interrupted_campaign_goes_on_with_the_stations_that_are_left(lab, monkeypatch):
+def test_an_interrupted_campaign_continues_with_the_remaining_stations(lab, monkeypatch):
     plan, runs = lab()
     acquire = Multilateration.acquire
 

@@ -20,7 +20,7 @@ Run = Callable[..., Result]
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Run a command in an empty folder; ``code`` is the exit code that it must have."""
+    """Run a command in an empty folder; ``code`` is the required exit code."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
@@ -34,7 +34,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
 @pytest.fixture
 def answer(run: Run) -> Callable[..., Any]:
-    """Run a command with --json and return what it says."""
+    """Run a command with --json and return its output."""
     return lambda *arguments, code=0: json.loads(run(*arguments, "--json", code=code).stdout)
 
 

@@ -39,7 +39,7 @@ def test_readings_become_a_calibration_that_is_found_by_its_name(run, data, tmp_
     assert "valid" in run("validate", "calibrations/left.nc").stdout
 
 
-def test_a_program_gets_the_figures(answer, data):
+def test_figures_are_in_the_json_output(answer, data):
     said = answer("calibrate", data, "--out", "left.nc")
     low, high = said["remaining_error_um_interval"]
     # 0.1 um of noise over depths of +-10 mm
@@ -50,7 +50,7 @@ def test_a_program_gets_the_figures(answer, data):
     assert abs(said["mid_range_found_mm"]) < 5 * said["mid_range_uncertainty_mm"]
 
 
-def test_a_table_of_text_does_as_well(answer, data, readings, tmp_path):
+def test_a_table_of_text_is_accepted(answer, data, readings, tmp_path):
     columns = (np.degrees(readings.inclination), np.degrees(readings.rotation), 1e3 * readings.reading)
     rows = zip(*columns, 1e3 * readings.reference, strict=True)
     lines = "".join(",".join(f"{float(cell):.6f}" for cell in row) + "\n" for row in rows)
@@ -83,14 +83,14 @@ def test_other_data_are_refused(run, record, tmp_path):
     assert not (tmp_path / "a.nc").exists()
 
 
-def test_readings_that_cannot_be_meant_leave_no_file(run, readings, tmp_path):
+def test_implausible_readings_leave_no_file(run, readings, tmp_path):
     datasets.save(readings.assign(reference=-readings["reference"]), tmp_path / "data.nc")
     found = run("calibrate", "data.nc", "-o", "a.nc", code=1)
     assert "Change the sign of the reference" in found.stderr
     assert not (tmp_path / "a.nc").exists()
 
 
-def test_identify_says_where_such_readings_belong(run, data):
+def test_identify_states_the_command_for_such_readings(run, data):
     found = run("identify", data, "--out", "errors.nc", code=1)
     assert "errormotion calibrate" in found.stderr
     assert "Traceback" not in found.stderr

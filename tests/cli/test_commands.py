@@ -1,4 +1,4 @@
-"""Every command answers a person in words, a program in JSON, and ends with the exit code that the reference states."""
+"""Every command prints text or JSON, and returns the exit code of the reference."""
 
 import json
 import re
@@ -44,13 +44,13 @@ def test_module_is_the_command() -> None:
         assert f"\n  {name} " in result.stdout
 
 
-def test_unknown_commands_and_options_are_mistakes_of_usage(run: Run) -> None:
+def test_unknown_commands_and_options_are_usage_errors(run: Run) -> None:
     run("frobnicate", code=2)
     run("plugins", "list", "--frobnicate", code=2)
     assert "--resume" in run("run", code=2).stderr
 
 
-def test_plugins_are_listed_with_what_they_are(run: Run, answer: Answer) -> None:
+def test_plugins_are_listed_with_their_kind(run: Run, answer: Answer) -> None:
     found = {plugin["id"]: plugin for plugin in answer("plugins", "list")["plugins"]}
     assert found["spindle_drift"]["group"] == "methods"
     assert found["optoncdt"]["kind"] == "point_lds"
@@ -78,7 +78,7 @@ def test_plugin_shows_its_settings(run: Run, answer: Answer) -> None:
     assert answer("plugins", "show", "spindle_drift")["settings"]["properties"]["average"]["default"] == 0.5
 
 
-def test_unknown_plugin_names_the_nearest(run: Run) -> None:
+def test_an_unknown_plugin_is_reported_with_the_nearest_name(run: Run) -> None:
     assert "did you mean 'optoncdt'?" in run("plugins", "show", "optoncd", code=1).stderr
 
 
@@ -123,9 +123,7 @@ def test_identify_states_an_interruption_of_unknown_duration(
     assert len(errors.em.notes) > 1
 
 
-def test_identify_takes_many_runs_and_tells_those_that_fail(
-    run: Run, answer: Answer, raw: Path, tmp_path: Path
-) -> None:
+def test_identify_accepts_many_runs_and_reports_failures(run: Run, answer: Answer, raw: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.nc").write_bytes(raw.read_bytes()[:5000])
     command = ("identify", "raw.nc", "cut.nc", "--method", "spindle_drift", "--out", "results", "--scheduler", "sync")
     text = run(*command, code=1).stdout
@@ -143,7 +141,7 @@ def test_identify_takes_many_runs_and_tells_those_that_fail(
     assert "raw.nc: expected a folder" in wrong.stderr
 
 
-def test_mistake_of_ours_in_one_of_many_runs_names_the_log(
+def test_an_internal_error_in_one_of_many_runs_names_the_log(
     run: Run, raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*arguments: object) -> None:
@@ -165,7 +163,7 @@ def test_settings_come_from_a_file_and_single_ones_over_it(run: Run, raw: Path, 
     assert (settings["average"], settings["noise"], settings["layout"]["rate"]) == (2.0, "stated", 1500.0)
 
 
-def test_wrong_settings_are_all_told_at_once(run: Run, raw: Path, tmp_path: Path) -> None:
+def test_all_wrong_settings_are_reported_at_once(run: Run, raw: Path, tmp_path: Path) -> None:
     options = ("--set", "average=2", "--set", "avrage=2 s", "--set", "bar_radius_uncertainty=1 s")
     text = run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc", *options, code=1).stderr
     assert "--set: 3 mistakes" in text
@@ -177,7 +175,7 @@ def test_wrong_settings_are_all_told_at_once(run: Run, raw: Path, tmp_path: Path
     assert "expected key=value" in wrong.stderr
 
 
-def test_error_is_one_message_and_the_traceback_is_in_the_log(run: Run, answer: Answer, tmp_path: Path) -> None:
+def test_an_error_is_one_message_with_the_traceback_in_the_log(run: Run, answer: Answer, tmp_path: Path) -> None:
     result = run("identify", "nothing.nc", "--method", "spindle_drift", "--out", "errors.nc", code=1)
     assert "nothing.nc: cannot be read: there is no such file" in result.stderr
     assert "Traceback" not in result.stderr
@@ -187,7 +185,7 @@ def test_error_is_one_message_and_the_traceback_is_in_the_log(run: Run, answer: 
     assert error["exit_code"] == 1
 
 
-def test_mistake_of_ours_has_its_own_exit_code_and_names_the_log(
+def test_an_internal_error_has_a_specific_exit_code_and_names_the_log(
     run: Run, raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*arguments: object) -> None:
@@ -200,7 +198,7 @@ def test_mistake_of_ours_has_its_own_exit_code_and_names_the_log(
     assert "Traceback" not in result.stderr
 
 
-def test_validate_tells_every_violation(run: Run, answer: Answer, raw: Path, tmp_path: Path) -> None:
+def test_validate_reports_every_violation(run: Run, answer: Answer, raw: Path, tmp_path: Path) -> None:
     assert answer("validate", raw)["ok"] is True
     assert "raw.nc: valid" in run("validate", raw).stdout
     with datasets.load(raw) as good:
@@ -220,7 +218,7 @@ def test_report_of_a_file_of_errors(run: Run, answer: Answer, raw: Path, tmp_pat
     assert "run folder" in run("report", tmp_path, code=1).stderr
 
 
-def test_import_says_what_it_made(run: Run, answer: Answer, tmp_path: Path) -> None:
+def test_import_reports_its_result(run: Run, answer: Answer, tmp_path: Path) -> None:
     names = ("X1", "X2", "Y1", "Y2", "Z")
     lines = ["t," + ",".join(names), *(f"{k / 2},1.1,1.2,1.3,1.4,1.{k}" for k in range(9))]
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
@@ -239,14 +237,14 @@ def test_import_says_what_it_made(run: Run, answer: Answer, tmp_path: Path) -> N
     run("import", "log.csv", "--map", "map.toml", "--out", "other.nc", code=1)
 
 
-def test_doctor_finds_this_machine_well_and_says_what_is_not(
+def test_doctor_reports_valid_and_faulty_installations(
     run: Run, answer: Answer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from errormotion.cli.commands import doctor as examination
 
-    monkeypatch.setattr(examination, "LEAST_DISK", 0)
+    monkeypatch.setattr(examination, "MIN_FREE_DISK", 0)
     assert answer("doctor")["ok"] is True
-    monkeypatch.setattr(examination, "LEAST_DISK", 2**60)
+    monkeypatch.setattr(examination, "MIN_FREE_DISK", 2**60)
     assert "BAD  disk here" in run("doctor", code=1).stdout
 
 
@@ -286,7 +284,7 @@ def test_bench_probe_reads_a_profiler_that_waits_for_its_encoder(run: Run) -> No
     assert control.count("alarms none") == 1
 
 
-def test_log_falls_back_where_the_state_folder_cannot_be_made(
+def test_the_log_has_a_fallback_for_a_read_only_state_folder(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
@@ -333,7 +331,7 @@ def test_validate_does_not_take_another_file_for_a_bench(answer: Answer, tmp_pat
     assert "found 'errormotion.map/1'" in found
 
 
-def test_every_command_has_h_o_and_words_of_the_field(run: Run) -> None:
+def test_every_command_has_h_o_and_terms_of_the_field(run: Run) -> None:
     import typer
 
     from errormotion.cli.app import app
@@ -356,7 +354,7 @@ def test_settings_are_shown_with_their_units(run: Run) -> None:
     assert re.search(r"^reference_time +- \(a time\)", text, re.MULTILINE)
 
 
-def test_doctor_says_how_to_install_what_is_missing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_states_how_to_install_missing_parts(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     from importlib.metadata import PackageNotFoundError
 
     from errormotion.cli.commands import doctor

@@ -61,7 +61,7 @@ def test_json_has_files_and_figures(run, folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("y.nc", "--for", "fagor", "--axis", "Y"), "No format of tables 'fagor'; there are: fanuc, generic"),
+        (("y.nc", "--for", "fagor", "--axis", "Y"), "Unknown table format 'fagor'; available: fanuc, generic"),
         (("y.nc", "--for", "siemen", "--axis", "Y"), "Did you mean 'siemens'"),
         (("y.nc", "--for", "generic", "--axis", "Q"), "axis: expected X, Y or Z; found 'Q'"),
         (("y.nc", "--for", "generic", "--axis", "X"), "y.nc: The errors have no positions of X"),
@@ -75,7 +75,7 @@ def test_json_has_files_and_figures(run, folder: Path) -> None:
         (("missing.nc", "--for", "generic", "--axis", "Y"), "missing.nc"),
     ],
 )
-def test_what_makes_no_table_is_refused_and_nothing_is_written(
+def test_errors_without_table_are_reported_and_nothing_is_written(
     run, folder: Path, tmp_path: Path, arguments: tuple[str, ...], message: str
 ) -> None:
     reported = run(folder / arguments[0], *arguments[1:], "--out", "tables")
@@ -84,7 +84,7 @@ def test_what_makes_no_table_is_refused_and_nothing_is_written(
     assert not Path("tables").exists()
 
 
-def test_places_that_are_none_are_a_mistake_of_use(run, folder: Path) -> None:
+def test_invalid_positions_are_usage_errors(run, folder: Path) -> None:
     reported = run(folder / "y.nc", "--for", "generic", "--axis", "Y", "--at", "1,2")
     assert reported.exit_code == 2
     assert "--at 1,2: expected three numbers in mm" in reported.stderr

@@ -64,7 +64,7 @@ def test_writes_a_program_and_a_page(part: Path, volume: Path) -> None:
     assert shown.count("<svg") == 2
 
 
-def test_says_what_was_done(part: Path, volume: Path) -> None:
+def test_the_result_is_printed(part: Path, volume: Path) -> None:
     code, text = run(part, "--with", volume, "--offset", "G54=0,0,100")
     assert code == 0, text
     for words in ("largest correction", "k = 2", "not corrected: 1 rapid moves", "in line 3"):
@@ -75,7 +75,7 @@ def test_says_what_was_done(part: Path, volume: Path) -> None:
     ("options", "why"),
     [
         ((), "part.ngc: "),
-        ((), "G54 is not known"),
+        ((), "G54 is unknown"),
         (("--offset", "G60=0,0,0"), "G60"),
         (("--offset", "G54=0,0,0", "--tolerance", "1"), "--tolerance"),
         (("--offset", "G54=0,0,0", "--unit", "km"), "--unit km"),
@@ -84,7 +84,7 @@ def test_says_what_was_done(part: Path, volume: Path) -> None:
         (("--offset", "G54=0,0,0", "--block-delete", "maybe"), "--block-delete maybe"),
     ],
 )
-def test_refuses_what_it_cannot_do_and_writes_nothing(
+def test_an_impossible_request_is_an_error_and_nothing_is_written(
     part: Path, volume: Path, options: tuple[str, ...], why: str
 ) -> None:
     code, text = run(part, "--with", volume, *options)
@@ -93,14 +93,14 @@ def test_refuses_what_it_cannot_do_and_writes_nothing(
     assert [path.name for path in part.parent.iterdir()] == ["part.ngc"]
 
 
-def test_never_replaces_a_program(part: Path, volume: Path) -> None:
+def test_an_existing_program_is_not_replaced(part: Path, volume: Path) -> None:
     code, text = run(part, "--with", volume, "--offset", "G54=0,0,0", "--out", part)
     assert code == 1
     assert "exists already" in text
     assert part.read_text() == PROGRAM
 
 
-def test_a_thermal_model_needs_temperatures_and_takes_the_last(part: Path, tmp_path: Path) -> None:
+def test_a_thermal_model_requires_temperatures_and_uses_the_last(part: Path, tmp_path: Path) -> None:
     machine = VirtualMachine("cframe", 3)
     off = {"X": False, "Y": False, "Z": False}
     days = []

@@ -39,7 +39,7 @@ slew = "20 um/s"
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a bench and a model that asks for 6 um at each temperature."""
+    """A folder with a bench and a model that predicts 6 um at each temperature."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     Path("bench.toml").write_text(BENCH, encoding="utf-8")
@@ -88,7 +88,7 @@ def test_armed_it_writes_and_ends_with_zero(place: Path) -> None:
 def test_the_name_of_the_machine_must_be_right(place: Path) -> None:
     result = CliRunner().invoke(app, command("--arm", "Mill 6"))
     assert result.exit_code == 1
-    assert "is called 'Mill 5'. Nothing was written." in result.output
+    assert "the machine of bench.toml is 'Mill 5'. Nothing was written." in result.output
 
 
 @pytest.mark.parametrize("signals", [1, 2], ids=["once", "twice"])
@@ -118,7 +118,7 @@ def test_ctrl_c_ramps_to_zero_a_second_one_ends_at_once(place: Path, signals: in
         process.stderr.close()
 
 
-def test_another_command_sees_it_and_has_it_ramp_to_zero(place: Path) -> None:
+def test_another_command_shows_it_and_ramps_it_to_zero(place: Path) -> None:
     def call(*arguments: str, code: int = 0) -> str:
         result = CliRunner().invoke(app, ["compensate", *arguments])
         assert result.exit_code == code, result.output

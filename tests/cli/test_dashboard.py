@@ -17,7 +17,7 @@ from errormotion.cli.commands import dashboard
         (["--bench", "nowhere.toml"], "nowhere.toml"),
     ],
 )
-def test_options_without_sense_are_named(run: Any, arguments: list[str], message: str) -> None:
+def test_invalid_options_are_named(run: Any, arguments: list[str], message: str) -> None:
     pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
     assert message in run("dashboard", *arguments, code=1).output
 

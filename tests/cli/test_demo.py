@@ -1,4 +1,4 @@
-"""The demo in small: beams and two minutes of drift through the wire, beside the truth."""
+"""A short demonstration: beams and two minutes of drift, compared with the truth."""
 
 import json
 from collections.abc import Callable
@@ -27,7 +27,7 @@ def short_campaign(measured: tuple[Path, list[RunFolder]], monkeypatch: pytest.M
 
 
 @pytest.mark.usefixtures("short_campaign")
-def test_demo_prints_numbers_beside_the_truth(run: Callable[..., Result], tmp_path: Path) -> None:
+def test_the_demo_prints_results_and_true_values(run: Callable[..., Result], tmp_path: Path) -> None:
     found = json.loads(run("demo", "--json").stdout)
     assert [test["status"] for test in found["tests"]] == ["finished", "finished", "finished"]
     for test in found["tests"]:
@@ -47,7 +47,7 @@ def test_demo_prints_numbers_beside_the_truth(run: Callable[..., Result], tmp_pa
 
 
 @pytest.mark.usefixtures("short_campaign")
-def test_demo_says_where_the_report_is(run: Callable[..., Result]) -> None:
+def test_the_demo_prints_the_path_of_the_report(run: Callable[..., Result]) -> None:
     text = run("demo").stdout
     assert ["measured", "U", "(k=2)", "truth"] in [line.split() for line in text.splitlines()]
     assert "Do the five sensors and the probing of four balls agree?" in text

@@ -1,4 +1,4 @@
-"""The closed loop in small: one warm-up, a model of two sensors, and one compensated warm-up, beside the truth."""
+"""A short closed loop: one warm-up, a model of two sensors, and one compensated warm-up, compared with the truth."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def loop() -> Loop:
     return close(VirtualMachine("cframe", seed=5), compensated.TRAINING, compensated.FURTHER[:1], SHORT)
 
 
-def test_the_compensation_takes_off_four_fifths_of_what_it_was_not_fitted_to(loop: Loop) -> None:
-    """Other speeds than those of the fit; 20 % is what a compensation may leave."""
+def test_the_compensation_reduces_errors_outside_its_fit_by_four_fifths(loop: Loop) -> None:
+    """Other speeds than those of the fit; at most 20 % of the errors may remain."""
     (warm_up,) = loop.warm_ups
     assert np.sqrt((warm_up.true_before**2).sum(axis=1).mean()) > 10e-6
     assert warm_up.remaining < 0.2
@@ -38,7 +38,7 @@ def test_the_compensation_takes_off_four_fifths_of_what_it_was_not_fitted_to(loo
     assert reduction.value == pytest.approx(1 - warm_up.remaining, abs=0.03)  # other instants, and the probe's noise
 
 
-def test_the_offset_rests_while_the_machine_probes_and_keeps_its_slew_limit(loop: Loop) -> None:
+def test_the_offset_is_constant_during_probing_and_observes_its_slew_limit(loop: Loop) -> None:
     (warm_up,) = loop.warm_ups
     offsets, limits = warm_up.offsets, SHORT.limits
     changes = np.abs(np.diff(offsets.offset, axis=0)).max(axis=1)
@@ -61,7 +61,7 @@ def test_the_demo_prints_the_effect_and_keeps_the_results(
     assert "expected one of virtual" in run("demo", "--compensate", "--controller", "none", code=2).stderr
 
 
-def test_a_sensor_that_shows_noise_makes_no_feature(loop: Loop) -> None:
+def test_a_sensor_with_noise_only_is_no_feature(loop: Loop) -> None:
     errors = loop.warm_ups[0].before
     kept = closed_loop.with_warm_sensors(errors)["sensor"].values.tolist()
     assert "motor" in kept

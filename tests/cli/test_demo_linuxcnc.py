@@ -1,4 +1,4 @@
-"""The demo on the real LinuxCNC, in small: a cold cycle and a warm one, three balls, beside the truth."""
+"""A short demonstration on LinuxCNC: a cold cycle and a warm one, three balls, compared with the truth."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""A dry run tells and draws what would move, and opens nothing."""
+"""A dry run states and draws the motions, and opens no instrument."""
 
 import json
 import shutil
@@ -35,14 +35,14 @@ def test_path_duration_and_limits_are_reported_and_drawn(folder: Path) -> None:
     assert "exists already" in again.stderr
 
 
-def test_a_program_reads_the_same(folder: Path) -> None:
+def test_the_json_output_has_the_same_content(folder: Path) -> None:
     result = CliRunner().invoke(app, ["run", "virtual_probing/monday.toml", "--dry-run", "--json"])
     motions = json.loads(result.stdout)["tests"][0]["motions"]
     assert motions["touches"] == 380
     assert motions["spindle_speed"] == 12000.0
 
 
-def test_moves_without_a_stated_feed_and_duration_are_counted(folder: Path) -> None:
+def test_moves_without_feed_and_duration_are_counted(folder: Path) -> None:
     result = CliRunner().invoke(app, ["run", "virtual_beam/campaign.toml", "--dry-run", "--out", "pictures"])
     assert result.exit_code == 0, result.output
     assert "rapid in 366 moves" in result.stdout
@@ -61,7 +61,7 @@ def test_moves_without_a_stated_feed_and_duration_are_counted(folder: Path) -> N
         ["virtual_beam/campaign.toml", "--out", "x"],
     ],
 )
-def test_options_that_do_not_go_together_are_refused(folder: Path, arguments: list[str]) -> None:
+def test_contradictory_options_are_an_error(folder: Path, arguments: list[str]) -> None:
     result = CliRunner().invoke(app, ["run", *arguments])
     assert result.exit_code == 2
     assert not (folder / "runs").exists()

@@ -1,4 +1,4 @@
-"""``errormotion identify`` takes readings as text, and the method from the schema."""
+"""``errormotion identify`` reads text, and selects the method by the schema."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,7 @@ Run = Callable[..., Any]
 
 
 def drift_as_text(record: xr.Dataset) -> str:
-    """Write a record of the five-sensor frame in field units, one line an instant."""
+    """Write a record of the five-sensor frame in customary units, one line per time."""
     head = [
         "# schema = errormotion.raw.spindle_drift/1",
         f"# bar_radius = {1e3 * float(record['bar_radius'])!r} mm",
@@ -32,9 +32,7 @@ def drift_as_text(record: xr.Dataset) -> str:
     return "\n".join([*head, *lines, "", *beams]) + "\n"
 
 
-def test_text_gives_the_errors_that_the_same_numbers_give_as_netcdf(
-    run: Run, record: xr.Dataset, tmp_path: Path
-) -> None:
+def test_text_and_netcdf_with_equal_numbers_have_equal_errors(run: Run, record: xr.Dataset, tmp_path: Path) -> None:
     names = ["distance", "beam_origin", "beam_direction", "bar_radius", "distance_noise", "level"]
     same = record[names].drop_vars(["spindle_speed", "temperature", "sensor"], errors="ignore")
     datasets.save(same, tmp_path / "drift.nc")
@@ -48,7 +46,7 @@ def test_text_gives_the_errors_that_the_same_numbers_give_as_netcdf(
     assert b.attrs["method"] == "spindle_drift"
 
 
-def test_mistake_in_the_text_is_reported_with_its_place(run: Run, tmp_path: Path) -> None:
+def test_an_error_in_the_text_is_reported_with_its_position(run: Run, tmp_path: Path) -> None:
     text = "# schema = errormotion.raw.inclination/1\nreading [mm],reference [mm],inclination,rotation [deg]\n1,1,0,0\n"
     (tmp_path / "readings.csv").write_text(text)
     reported = run("identify", "readings.csv", "--method", "spindle_drift", "--out", "errors.nc", code=1).stderr
@@ -56,7 +54,7 @@ def test_mistake_in_the_text_is_reported_with_its_place(run: Run, tmp_path: Path
     assert not (tmp_path / "errors.nc").exists()
 
 
-def test_errors_name_no_method_to_identify_them(run: Run, raw: Path) -> None:
+def test_errors_do_not_state_a_method_for_identification(run: Run, raw: Path) -> None:
     run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc")
     reported = run("identify", "errors.nc", "--out", "again.nc", code=1).stderr
     assert "expected a raw dataset of a method; found schema errormotion.errors/1" in reported
@@ -73,7 +71,7 @@ def test_method_of_a_folder_of_runs_has_to_be_named(run: Run, tmp_path: Path) ->
     ("name", "radius", "left_out"),
     [("scheme1", 25.0009, 0), ("scheme2_0deg_compensated", 24.9608, 1), ("scheme3", 25.0018, 0)],
 )
-def test_check_bar_alone_is_fitted_and_tells_no_beam(run: Run, name: str, radius: float, left_out: int) -> None:
+def test_a_check_bar_alone_is_fitted_without_beams(run: Run, name: str, radius: float, left_out: int) -> None:
     published = Path(__file__).parents[2] / "examples" / "check_bar" / f"{name}.csv"
     run("validate", published)
     reported = run("identify", published, "--out", "errors.nc").stdout

@@ -17,7 +17,7 @@ TRAVEL = ("--chain", CHAIN, "--travel", "X=-300mm,300mm", "--travel", "Y=-200 mm
 FRAME = ("--instrument", "frame=five_sensor_frame@sim://cframe?seed=3")
 
 
-def test_options_alone_write_a_bench_and_a_campaign(run: Run, tmp_path: Path) -> None:
+def test_a_bench_and_a_campaign_are_written_by_options_alone(run: Run, tmp_path: Path) -> None:
     options = (
         "--machine",
         'VM "1"',
@@ -45,12 +45,12 @@ def test_mistakes_are_those_of_the_files_and_nothing_is_written(run: Run, tmp_pa
     assert said.rstrip().endswith("Nothing was written.")
     assert "Did you mean 'spindle_drift'" in run("init", *FRAME, "--test", "a=spindle_drft", code=1).stderr
     assert "name of an instrument or a test (frame)" in run("init", *FRAME, "--set", "b.c=1", code=1).stderr
-    assert "no terminal to ask" in run("init", "new", code=2).stderr
+    assert "no terminal for questions" in run("init", "new", code=2).stderr
     assert not list(tmp_path.glob("*.toml"))
     assert not (tmp_path / "new").exists()
 
 
-def test_questions_lead_to_the_same_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_interactive_questions_write_the_same_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     given = iter([
         "VM 1", "X-X", CHAIN, "300 mm, -300 mm", "-300 mm, 300 mm", "-200 mm, 200 mm", "0 mm, 400 mm",
         "five_sensor_frme", "five_sensor_frame", "no name", "frame", "sim://cframe?seed=3", "",

@@ -17,7 +17,7 @@ SPEEDS = ((6000.0, 12000.0), (15000.0, 4000.0), (10000.0, 14000.0))
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three warm-ups of a machine, as exact as the twin knows them."""
+    """Three warm-ups of a machine, with the exact errors of the virtual machine."""
     path = tmp_path_factory.mktemp("warm")
     machine = VirtualMachine("cframe", 5)
     for number, (early, late) in enumerate(SPEEDS):
@@ -57,7 +57,7 @@ def test_a_model_is_made_used_and_checked(run, folder: Path) -> None:
         (("check", "{0}/0.nc", "{0}/1.nc"), "expected schema errormotion.model.thermal/1"),
     ],
 )
-def test_what_cannot_be_done_is_reported(run, folder: Path, arguments: tuple[str, ...], message: str) -> None:
+def test_impossible_requests_are_reported(run, folder: Path, arguments: tuple[str, ...], message: str) -> None:
     result = run(*(text.format(folder) for text in arguments))
     assert result.exit_code == 1
     assert message in result.stderr

@@ -35,7 +35,7 @@ def run(*arguments: str):
     return CliRunner().invoke(app, list(arguments))
 
 
-def test_a_check_writes_its_page_and_says_where(folder: Path) -> None:
+def test_a_check_writes_its_page_and_prints_the_path(folder: Path) -> None:
     reported = run("model", "check", "m.nc", "third.nc", "--report", "page.html")
     assert reported.exit_code == 0, reported.output
     assert reported.stdout.splitlines()[-1] == "page.html"
@@ -45,7 +45,7 @@ def test_a_check_writes_its_page_and_says_where(folder: Path) -> None:
     assert answer["removed"]["EZ"] > 0
 
 
-def test_a_page_is_not_written_over_something_else(folder: Path) -> None:
+def test_a_page_does_not_overwrite_another_file(folder: Path) -> None:
     reported = run("model", "check", "m.nc", "third.nc", "--report", "third.nc")
     assert reported.exit_code == 1
     assert "third.nc: expected a name that ends in .html" in reported.output
@@ -56,7 +56,7 @@ def test_without_the_option_there_is_no_page(folder: Path) -> None:
     assert not list(folder.glob("*.html"))
 
 
-def test_a_monitor_gets_its_page_where_it_is_wanted(folder: Path) -> None:
+def test_a_page_of_a_monitor_is_written_on_request(folder: Path) -> None:
     address = "sim://cframe/t?seed=21&sensors=spindle_front,column"
     bench = f"""\
 schema = "errormotion.bench/1"

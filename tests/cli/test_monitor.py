@@ -1,4 +1,4 @@
-"""`errormotion monitor`: what a person sees, and what a program reads."""
+"""`errormotion monitor`: output on a terminal and as JSON."""
 
 import errno
 import io
@@ -16,7 +16,7 @@ from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.campaign.storage.store import RawStore
 from errormotion.cli.app import app
-from errormotion.cli.commands.instruments.monitor import LEAST_SPAN, Screen, clock
+from errormotion.cli.commands.instruments.monitor import MIN_SPAN, Screen, clock
 from errormotion.cli.curves import bars
 
 BENCH = """\
@@ -50,12 +50,12 @@ def test_each_row_is_a_line_of_json_for_a_program(bench: Path) -> None:
     assert "column" in rows[-1]["flags"]
 
 
-def test_the_end_says_where_the_log_is(bench: Path) -> None:
+def test_the_end_states_the_path_of_the_log(bench: Path) -> None:
     result = CliRunner().invoke(app, ["monitor", str(bench), "--interval", "50 ms", "--duration", "100 ms"])
     assert re.match(r"[123] rows over 00:00:00 in runs/\S+-monitor-\S+\.", result.stdout)
 
 
-def test_a_monitor_that_is_stopped_before_its_log_has_begun_ends_as_such(
+def test_a_monitor_stopped_before_the_start_of_its_log_ends_as_stopped(
     bench: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stop(self: Monitor) -> Monitor:
@@ -70,7 +70,7 @@ def test_a_monitor_that_is_stopped_before_its_log_has_begun_ends_as_such(
 @pytest.mark.parametrize(
     ("error", "status"), [(OSError(errno.ENOSPC, "full"), "failed"), (KeyboardInterrupt(), "interrupted")]
 )
-def test_a_monitor_that_cannot_begin_states_it_in_its_run(
+def test_a_monitor_that_cannot_start_states_it_in_its_run(
     bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, status: str
 ) -> None:
     def fail(*_: object) -> None:
@@ -85,10 +85,10 @@ def test_a_monitor_that_cannot_begin_states_it_in_its_run(
 
 
 @pytest.mark.parametrize("stopped", [False, True])
-def test_a_monitor_on_a_full_disk_says_how_much_is_stored(
+def test_a_monitor_on_a_full_disk_reports_the_stored_amount(
     bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stopped: bool
 ) -> None:
-    """It says so where run.json cannot be written either, and where the last rows of a stopped monitor are lost."""
+    """It is also reported if run.json cannot be written, and if the last rows of a stopped monitor are lost."""
 
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -118,7 +118,7 @@ def test_a_monitor_on_a_full_disk_says_how_much_is_stored(
         (["--duration", "0 s"], "--duration: expected more than 0 s; found '0 s'"),
     ],
 )
-def test_a_time_without_sense_is_reported(bench: Path, arguments: list[str], message: str) -> None:
+def test_an_invalid_time_is_reported(bench: Path, arguments: list[str], message: str) -> None:
     result = CliRunner().invoke(app, ["monitor", str(bench), *arguments])
     assert result.exit_code == 1
     assert message in result.stderr
@@ -135,7 +135,7 @@ def page(*snapshots: Snapshot) -> str:
     return captured.get()
 
 
-def test_the_page_shows_temperatures_parameters_alarms_and_who_is_silent() -> None:
+def test_the_page_shows_temperatures_parameters_alarms_and_silent_instruments() -> None:
     state = {
         "position": [0.1, 0.0, -0.05],
         "spindle_speed": 12000.0,
@@ -161,9 +161,9 @@ def test_the_page_shows_temperatures_parameters_alarms_and_who_is_silent() -> No
     assert "rows without an answer: far 7" in text
 
 
-def test_bars_leave_a_blank_for_what_is_not_known() -> None:
+def test_bars_leave_a_blank_for_unknown_values() -> None:
     assert bars([20.0, math.nan, 28.0]) == "▁ █"
-    assert bars([20.0, 20.001], LEAST_SPAN) == "▁▁"  # a thousandth of a kelvin is no mountain
+    assert bars([20.0, 20.001], MIN_SPAN) == "▁▁"  # a thousandth of a kelvin is no mountain
     assert bars([math.nan]) == ""
 
 

@@ -1,4 +1,4 @@
-"""Tables that keep to the width of a terminal."""
+"""Tables that fit the width of a terminal."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ def width(monkeypatch: pytest.MonkeyPatch):
     return use
 
 
-def test_a_table_keeps_to_the_width_and_loses_no_word(width) -> None:
+def test_a_table_fits_the_width_and_is_complete(width) -> None:
     width(35)
     text = table(HEAD, ROWS)
     assert max(map(len, text.splitlines())) <= 35
@@ -44,7 +44,7 @@ def test_numbers_and_a_pipe_are_not_wrapped(width) -> None:
     assert table(HEAD, ROWS).splitlines()[3] == "second      3  short"
 
 
-def test_what_takes_long_is_stated_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_long_operations_are_announced_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     def work(seconds: float) -> str:
         with output.working("Writing the report"):
             time.sleep(seconds)

@@ -9,7 +9,7 @@ BEAM = ROOT / "examples" / "virtual_beam" / "campaign.toml"
 GANTRY = ROOT / "examples" / "virtual_gantry" / "campaign.toml"
 
 
-def test_a_plan_says_what_to_expect_and_how_much_better_it_could_be(run, tmp_path):
+def test_a_plan_states_expected_uncertainties_and_possible_improvements(run, tmp_path):
     shown = run("plan", BEAM, "--out", tmp_path / "plan.nc").stdout
     assert "beam (beam_direction):" in shown
     assert "U (k=2)" in shown
@@ -28,6 +28,6 @@ def test_every_test_of_a_campaign_is_planned_for_a_program_too(answer):
     assert 0.01 < rows["EA"]["expanded_uncertainty"] < 20
 
 
-def test_wrong_calls_say_what_was_expected(run, tmp_path):
+def test_wrong_calls_report_the_expected_arguments(run, tmp_path):
     assert "expected one of the tests beam; found 'bean'" in run("plan", BEAM, "--test", "bean", code=1).stderr
-    assert "name it with --test" in run("plan", GANTRY, "--out", tmp_path / "plan.nc", code=1).stderr
+    assert "choose it with --test" in run("plan", GANTRY, "--out", tmp_path / "plan.nc", code=1).stderr

@@ -24,7 +24,7 @@ def test_programs_of_every_test_are_written_each_in_its_folder(run, answer, tmp_
     assert text.startswith(b"%\r\n(pass.nc: measuring pass over 4 artefacts)\r\n")
 
 
-def test_one_test_goes_straight_into_the_folder(run, tmp_path):
+def test_a_single_test_is_written_into_the_folder_itself(run, tmp_path):
     shown = run("program", GANTRY, "--test", "pose", "--out", tmp_path)
     assert "spindle 182 mm above where it was cut" in shown.stdout
     assert shown.stderr.startswith("pose: the machine will move: ")
@@ -45,7 +45,7 @@ def test_methods_without_programs_are_refused(run, tmp_path):
     assert "spindle_drift has no NC programs" in found.stderr
 
 
-def test_an_unknown_test_names_those_there_are(run, tmp_path):
+def test_an_unknown_test_is_reported_with_the_available_ones(run, tmp_path):
     assert (
         "expected one of the tests pose, scan; found 'scans'"
         in run("program", GANTRY, "--test", "scans", "--out", tmp_path, code=1).stderr

@@ -1,4 +1,4 @@
-"""Bars with the remaining time on a terminal, silence elsewhere."""
+"""Progress bars with the remaining time on a terminal, no output elsewhere."""
 
 import io
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from errormotion.cli.curves import MOST_CURVES, MOST_POINTS, Curves
+from errormotion.cli.curves import MAX_CURVES, MAX_POINTS, Curves
 from errormotion.cli.progress import Bars
 
 
@@ -19,7 +19,7 @@ class Terminal(io.StringIO):
 
 @pytest.fixture
 def terminal(monkeypatch: pytest.MonkeyPatch) -> Callable[[], Terminal]:
-    """Make stderr a terminal; to be called in the test, because pytest sets stderr anew when a test begins."""
+    """Make stderr a terminal; to be called in the test, because pytest replaces stderr at the start of each test."""
 
     def make() -> Terminal:
         monkeypatch.setenv("TERM", "xterm")
@@ -41,7 +41,7 @@ def work(quiet: bool = False) -> None:
         bars.stage("identifying")
 
 
-def test_terminal_sees_test_part_share_and_remaining_time(terminal: Callable[[], Terminal]) -> None:
+def test_the_terminal_shows_test_part_fraction_and_remaining_time(terminal: Callable[[], Terminal]) -> None:
     stderr = terminal()
     work()
     text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", stderr.getvalue())
@@ -50,7 +50,7 @@ def test_terminal_sees_test_part_share_and_remaining_time(terminal: Callable[[],
     assert "2/2 drift: identifying" in text
 
 
-def test_nothing_is_shown_where_a_program_reads(
+def test_progress_is_not_shown_without_a_terminal(
     terminal: Callable[[], Terminal], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stderr = terminal()
@@ -62,7 +62,9 @@ def test_nothing_is_shown_where_a_program_reads(
     assert pipe.getvalue() == ""
 
 
-def test_operator_is_asked_between_the_bars(terminal: Callable[[], Terminal], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_operator_is_prompted_between_the_bars(
+    terminal: Callable[[], Terminal], monkeypatch: pytest.MonkeyPatch
+) -> None:
     stderr = terminal()
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))
     with Bars() as bars:
@@ -84,17 +86,17 @@ def test_values_of_notes_become_curves_on_a_terminal_only(terminal: Callable[[],
     assert "+4 arcsec  (+0 to +4)" in text
 
 
-def test_a_long_curve_keeps_its_course_in_bounded_memory() -> None:
+def test_a_long_curve_keeps_its_shape_in_bounded_memory() -> None:
     curves = Curves()
     for k in range(100_000):
-        curves.take(f"EX {k:+} um")
+        curves.add(f"EX {k:+} um")
     (line,) = curves.lines(80)
     assert len(line.plain) <= 80
     assert re.search(r"▁▁?▂.*▇▇*█", line.plain)
-    assert len(curves._courses["EX"].points) < MOST_POINTS
+    assert len(curves._courses["EX"].points) < MAX_POINTS
     for k in range(100):
-        curves.take(f"name{k} +1 um")
-    assert len(list(curves.lines(80))) == MOST_CURVES
+        curves.add(f"name{k} +1 um")
+    assert len(list(curves.lines(80))) == MAX_CURVES
     plain = Curves()
-    plain.take("12 of 300 values undecided, v1.2.3")
+    plain.add("12 of 300 values undecided, v1.2.3")
     assert not plain.shown

@@ -1,4 +1,4 @@
-"""``errormotion record`` and ``replay``: what crossed the wire, with the identity, and the driver on it again."""
+"""``errormotion record`` and ``replay``: recorded communication, with the identity, replayed to the driver."""
 
 import json
 from pathlib import Path
@@ -86,7 +86,7 @@ def test_a_recorded_session_is_reproduced_frame_by_frame(folder: Path, name: str
     assert recorded["note"]["plugin_version"]
 
 
-def test_an_instrument_without_a_stream_is_read_until_the_time_is_over(folder: Path) -> None:
+def test_an_instrument_without_a_stream_is_read_for_the_whole_duration(folder: Path) -> None:
     recorded = run("record", "bench.toml", "air", "--for", "1 s", "--out", "a.rec")
     assert 4 <= recorded["note"]["session"]["readings"]["count"] <= 3 + 1.0 / 0.2
     result = CliRunner().invoke(app, ["replay", "a.rec"])
@@ -94,14 +94,14 @@ def test_an_instrument_without_a_stream_is_read_until_the_time_is_over(folder: P
     assert "DCON 7018 unit 01 A2.0" in result.stdout
 
 
-def test_a_session_that_ends_with_an_error_is_a_recording_too(folder: Path) -> None:
+def test_a_session_that_ends_with_an_error_is_recorded(folder: Path) -> None:
     recorded = run("record", "bench.toml", "dead", "--for", "0.3 s", "--out", "a.rec", code=1)
     assert recorded["note"]["session"]["error"] == "InstrumentTimeoutError"
     assert recorded["note"]["session"]["step"] == "stream"
     assert run("replay", "a.rec")["reproduced"]
 
 
-def test_an_instrument_that_is_not_there_leaves_no_recording(folder: Path) -> None:
+def test_a_missing_instrument_leaves_no_recording(folder: Path) -> None:
     run("record", "bench.toml", "nobody", "--out", "a.rec", code=1)
     assert not Path("a.rec").exists()
 
@@ -118,7 +118,9 @@ def test_a_changed_driver_does_not_reproduce_the_session(folder: Path, monkeypat
 
 
 @pytest.mark.parametrize(("name", "serial"), [("gauge", "00003186"), ("tracker", "390000")])
-def test_a_masked_recording_replays_and_does_not_hold_the_serial_number(folder: Path, name: str, serial: str) -> None:
+def test_a_masked_recording_replays_and_does_not_contain_the_serial_number(
+    folder: Path, name: str, serial: str
+) -> None:
     run("record", "bench.toml", name, "--for", "0.1 s", "--out", "open.rec")
     run("record", "bench.toml", name, "--for", "0.1 s", "--out", "masked.rec", "--mask-serial")
     shown = int(serial).to_bytes(4, "little") if name == "tracker" else serial.encode()
@@ -132,7 +134,7 @@ def test_a_masked_recording_replays_and_does_not_hold_the_serial_number(folder: 
     assert again["identity"]["serial_number"] == "1" * len(serial)
 
 
-def test_what_cannot_be_masked_is_removed(folder: Path) -> None:
+def test_values_that_cannot_be_masked_are_removed(folder: Path) -> None:
     found = run("record", "bench.toml", "air", "--for", "0.1 s", "--out", "a.rec", "--mask-serial", code=1)
     assert "cannot be masked" in found["error"]["message"]
     assert list(folder.iterdir()) == [folder / "bench.toml"]
@@ -147,7 +149,7 @@ def test_a_serial_number_is_masked_across_frames(folder: Path) -> None:
     assert read_recording(path)[1][:2] == [("R", b"xxSN-11"), ("R", b"11yy")]
 
 
-def test_recordings_without_a_note_load_and_are_refused_by_replay_in_a_sentence(folder: Path) -> None:
+def test_recordings_without_a_note_load_and_are_rejected_by_replay(folder: Path) -> None:
     with DconTemperature("sim://cframe/air?seed=3", record=Path("old.rec")) as thermometer:
         reading = thermometer.read()
     with DconTemperature("replay://old.rec") as thermometer:
@@ -156,7 +158,7 @@ def test_recordings_without_a_note_load_and_are_refused_by_replay_in_a_sentence(
     assert Path("old.rec").read_text().startswith("errormotion-session/1 ")
 
 
-def test_a_note_that_is_not_json_is_an_error_of_its_own(folder: Path) -> None:
+def test_a_note_that_is_not_json_has_a_specific_error(folder: Path) -> None:
     Path("a.rec").write_text("errormotion-session/2 t a\nNOTE {\nEND 0 00000000\n")
     with pytest.raises(ReplayError, match="note"):
         read_note(Path("a.rec"))
@@ -165,7 +167,7 @@ def test_a_note_that_is_not_json_is_an_error_of_its_own(folder: Path) -> None:
         parts_of(Path("b.rec"))
 
 
-def test_a_file_that_is_no_recording_is_refused_as_that(folder: Path) -> None:
+def test_a_file_that_is_no_recording_is_reported_as_such(folder: Path) -> None:
     (folder / "errors.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(64))
     with pytest.raises(ReplayError, match=r"errors\.nc is not a recording"):
         read_note(folder / "errors.nc")
@@ -182,7 +184,7 @@ def test_a_note_replaces_an_earlier_one(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["record", "bench.toml", "sensor"], "there are: air, dead"),
+        (["record", "bench.toml", "sensor"], "expected one of the instruments air, dead"),
         (["record", "bench.toml", "air", "--for", "2 h"], "at most 3600 s"),
         (["record", "bench.toml", "air", "--for", "soon"], "--for"),
         (["record", "bench.toml", "air", "--out", "bench.toml"], "exists already"),

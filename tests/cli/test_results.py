@@ -60,7 +60,7 @@ def test_open_shows_the_newest_report_and_prints_its_path(run: Run, tmp_path: Pa
     assert "has no report.html. Write it with 'errormotion report runs/c'" in run("open", "runs/c", code=1).stderr
 
 
-def test_open_says_that_there_is_no_browser_and_follows_no_link_out(
+def test_open_reports_a_missing_browser_and_follows_no_link_out_of_the_folder(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = make_run(tmp_path / "runs" / "a", "2026-01-01T08:00:00+00:00")
@@ -87,7 +87,7 @@ def test_export_writes_a_table_in_field_units(run: Run, tmp_path: Path) -> None:
     xr.testing.assert_identical(datasets.load(tmp_path / "out.nc"), errors())
 
 
-def test_what_holds_no_errors_is_named_and_nothing_is_written(run: Run, tmp_path: Path) -> None:
+def test_a_dataset_without_errors_is_named_and_nothing_is_written(run: Run, tmp_path: Path) -> None:
     comparison = datasets.load(Path(__file__).parents[1] / "data" / "datasets" / "comparison.nc")
     datasets.save(comparison, tmp_path / "other.nc")
     for out in ("out.csv", "out.nc"):
@@ -96,7 +96,7 @@ def test_what_holds_no_errors_is_named_and_nothing_is_written(run: Run, tmp_path
         assert not (tmp_path / out).exists()
 
 
-def test_texts_of_strangers_are_no_formulas(run: Run, tmp_path: Path) -> None:
+def test_foreign_texts_are_no_formulas(run: Run, tmp_path: Path) -> None:
     datasets.save(errors(("=1+1", "<b>&")), tmp_path / "errors.nc")
     run("export", "errors.nc", "-o", "out.csv")
     assert "\n'=1+1," in (tmp_path / "out.csv").read_text()

@@ -1,4 +1,4 @@
-"""``errormotion simulate``: a simulated device by itself, for drivers and for other people's clients."""
+"""``errormotion simulate``: a separate simulated device, for drivers and other clients."""
 
 import json
 import signal
@@ -30,7 +30,7 @@ WAIT = 60  # s
 
 @contextmanager
 def device(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
-    """Start the command in a process of its own; return what it prints."""
+    """Start the command in a separate process; return its output."""
     command = [sys.executable, "-m", "errormotion", "simulate", *arguments, "--json"]
     # A shell that starts the tests in the background has SIGINT ignored, and so would its children.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -56,7 +56,7 @@ def free_port() -> int:
         return int(server.getsockname()[1])
 
 
-def test_a_device_answers_one_client_after_another_and_outlives_them() -> None:
+def test_a_simulated_device_serves_several_clients_in_turn() -> None:
     port = free_port()
     with device("dcon_temperature", "--port", str(port), "--set", "noise=0") as (process, printed):
         assert printed["url"] == f"tcp://127.0.0.1:{port}"
@@ -136,7 +136,7 @@ def test_a_bench_file_states_machine_and_device(monkeypatch: pytest.MonkeyPatch,
     assert {name: address.params[name] for name in ("seed", "unit", "pace")} == {"seed": "6", "unit": "7", "pace": "1"}
 
 
-def test_a_machine_that_takes_offsets_states_the_settings_of_a_bench_file(
+def test_a_machine_that_accepts_offsets_states_the_settings_of_a_bench_file(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     shown = run(monkeypatch, "modbus_registers", "--set", "type=i16").stdout.splitlines()
@@ -161,7 +161,7 @@ def test_a_machine_that_takes_offsets_states_the_settings_of_a_bench_file(
         (["can_temperature"], "bus=udp_multicast"),
     ],
 )
-def test_what_cannot_be_simulated_is_refused_in_a_sentence(
+def test_instruments_without_simulator_are_an_error(
     monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
 ) -> None:
     result = run(monkeypatch, *arguments)
@@ -170,7 +170,7 @@ def test_what_cannot_be_simulated_is_refused_in_a_sentence(
     assert "Traceback" not in result.output
 
 
-def test_a_port_that_is_taken_is_refused() -> None:
+def test_a_port_in_use_is_an_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         address = parse_address(f"sim://cframe/thermometer?port={port}")
@@ -178,7 +178,7 @@ def test_a_port_that_is_taken_is_refused() -> None:
             load_simulator(get("instruments", "dcon_temperature").info.simulator, address.url)(address)
 
 
-def test_a_device_that_stands_alone_outlives_a_request_that_it_cannot_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_separate_device_continues_after_a_request_it_cannot_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     name = get("instruments", "dcon_temperature").info.simulator
     module, _, cls = name.partition(":")
     monkeypatch.setattr(f"{module}.{cls}.answer", lambda self, request: 1 / 0)

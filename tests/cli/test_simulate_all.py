@@ -1,4 +1,4 @@
-"""Every simulated device by itself, on a stated port, in a process of its own: its driver connects to it and reads."""
+"""Every simulated device in a separate process on a stated port: its driver connects and reads."""
 
 import contextlib
 import json
@@ -39,14 +39,14 @@ def first_reading(instrument: Any) -> None:
 
 
 def no_line_without_a_program(instrument: Any) -> None:
-    """A printer port is silent while no program prints."""
+    """A printer port sends nothing while no program prints."""
     with pytest.raises(InstrumentTimeoutError):
         next(instrument.measure([Touch((0.0, 0.0, 0.0), (1e-3, 0.0, 0.0))]))
 
 
 @dataclass(frozen=True)
 class Case:
-    """How a driver reaches a device that another process simulates."""
+    """Address of a device that another process simulates."""
 
     arguments: tuple[str, ...] = ()
     settings: str = ""
@@ -80,7 +80,7 @@ CASES = {
 
 
 def free_port() -> int:
-    """Return a port that is free, and the next ones too; not one that the system gives to somebody who asks for any."""
+    """Return the first of several free ports outside the range of ephemeral ports."""
     while True:
         port = random.randrange(10_000, 32_000)
         with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
@@ -97,7 +97,7 @@ def commands() -> Iterator[Commands]:
 
 @contextmanager
 def simulated(commands: Commands, plugin_id: str, *arguments: str) -> Iterator[tuple[dict[str, Any], int]]:
-    """Start a device; yield what was printed and its port. It must end at SIGTERM and leave nothing."""
+    """Start a device; yield its output and its port. It must end at SIGTERM and leave no process."""
     port = free_port()
     process = commands.start("simulate", plugin_id, "--port", port, *arguments, "--json")
     with contextlib.closing(process):
@@ -132,14 +132,14 @@ def nobody_left_of(session: int) -> bool:
 
 
 def session_of(pid: int) -> int:
-    """Return the session of a process; 0 where it has ended."""
+    """Return the session of a process; 0 if it has ended."""
     try:
         return os.getsid(pid)
     except OSError:
         return 0
 
 
-def test_every_simulated_instrument_is_here() -> None:
+def test_every_simulated_instrument_is_listed() -> None:
     ours = [each for each in plugins.available("instruments") if each.distribution.startswith("errormotion ")]
     simulated = {each.id for each in ours if plugins.get("instruments", each.id).info.simulator}
     assert simulated == set(CASES)

@@ -1,4 +1,4 @@
-"""The figures and notes that a person sees first of a result."""
+"""The figures and notes of a result that are shown first."""
 
 import math
 from typing import Any

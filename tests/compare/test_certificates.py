@@ -1,4 +1,4 @@
-"""One certificate, one draw: two measurements with one bar and one thermometer, and with two of each."""
+"""Common certificates are fully correlated: measurements with one bar and thermometer, and with two of each."""
 
 import json
 
@@ -44,13 +44,13 @@ def drift(raw):
     return identified("spindle_drift", raw, average=40.0, functional_point=point, bar_radius_uncertainty=U_RADIUS)
 
 
-def test_one_bar_in_two_runs_is_one_draw(record):
+def test_one_bar_in_two_runs_is_fully_correlated(record):
     first, same, other = (drift(record(seed, bar)) for seed, bar in ((1, "K-7"), (2, "K-7"), (2, "K-8")))
     shared = compare({"first": first, "second": same}, causes=False)
     apart = compare({"first": first, "second": other}, causes=False)
     assert json.loads(shared.attrs["shared_sources"]) == ["certificate K-7: bar, radius"]
     assert json.loads(apart.attrs["shared_sources"]) == []
-    assert "Taken as one draw in several datasets: certificate K-7: bar, radius." in verdict(shared)
+    assert "Treated as fully correlated between datasets: certificate K-7: bar, radius." in verdict(shared)
     assert not any("one draw" in line for line in verdict(apart))
     one, both = (np.diagonal(each["difference_covariance"].values[0, -1]) for each in (shared, apart))
     assert (both > one).any()
@@ -59,7 +59,7 @@ def test_one_bar_in_two_runs_is_one_draw(record):
     np.testing.assert_allclose(both - one, 2 * effect**2, rtol=1e-2, atol=1e-4 * both.max())
 
 
-def test_one_thermometer_in_two_volumes_is_one_draw():
+def test_one_thermometer_in_two_volumes_is_fully_correlated():
     machine = VirtualMachine("cframe", seed=3)
     position = tracking.target_grid(machine, (3, 3, 2))
 
@@ -80,7 +80,7 @@ def test_one_thermometer_in_two_volumes_is_one_draw():
 
 
 @pytest.mark.parametrize("text", ["[", "[]", '{"bear": "K-7"}', '{"bar": ""}', '{"bar": 7}', "[" * 5000, 7])
-def test_certificates_that_are_none_are_refused(text):
+def test_invalid_certificates_are_an_error(text):
     with pytest.raises(DatasetError, match="attribute 'certificates': expected a JSON object"):
         certificates.certified({"certificates": text}, {"bar radius": ("bar", "radius")})
 

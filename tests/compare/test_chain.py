@@ -1,4 +1,4 @@
-"""An axis against the volume: the prediction through the chain, its uncertainty, and what is refused."""
+"""An axis compared with the volume: prediction by the chain, its uncertainty, and errors."""
 
 import numpy as np
 import pytest
@@ -127,7 +127,7 @@ def test_a_wrong_scale_of_the_axis_is_found():
     assert min(p for name, p in freedoms.items() if name != "EY") > 1e-3
 
 
-def test_a_warm_axis_is_compared_with_the_change_of_the_volume_at_its_instant():
+def test_a_warm_axis_is_compared_with_the_change_of_the_volume_at_its_time():
     rng = np.random.default_rng(4)
     cold, warm = motions(rng), motions(rng)
     before = volume(cold, GANTRY, rng, start="2026-03-02T07:00:00+00:00")
@@ -153,7 +153,7 @@ def test_a_warm_axis_is_compared_with_the_change_of_the_volume_at_its_instant():
         compare({"scans": silent, "volume": after.em.change_from(before)})
 
 
-def test_one_interferometer_in_both_volumes_is_one_draw():
+def test_one_interferometer_in_both_volumes_is_fully_correlated():
     rng = np.random.default_rng(5)
     c = motions(rng)
     one, other = (volume(c, GANTRY, rng, source_ids={"refraction": "cert 7"}) for _ in range(2))
@@ -171,12 +171,12 @@ def test_one_interferometer_in_both_volumes_is_one_draw():
         (lambda a, v: (a, v.assign_attrs(chain="workpiece-bed-X-Z-tool")), "has no axis Y"),
         (lambda a, v: (a, v.assign_attrs(chain="workpiece-C-X-Y-bed-Z-tool")), "no commanded position of C"),
         (lambda a, v: (a, v.drop_vars("x")), "no commanded position of X"),
-        (lambda a, v: (a.assign_coords(y=a["y"] + 3.0), v), "nothing is extrapolated"),
+        (lambda a, v: (a.assign_coords(y=a["y"] + 3.0), v), "errors are not extrapolated"),
         (lambda a, v: (a, v.isel(target=slice(0, 27, 4))), "measure more targets"),
-        (lambda a, v: (a.drop_vars("y"), v), "no coordinate y along position"),
+        (lambda a, v: (a.drop_vars("y"), v), "no coordinate y along the dimension position"),
     ],
 )  # fmt: skip
-def test_what_is_missing_is_named(change, message):
+def test_missing_parts_are_named(change, message):
     rng = np.random.default_rng(6)
     c = motions(rng)
     a, v = change(axis(c, rng), volume(c, CFRAME, rng, levels=(3, 3, 3)))

@@ -1,4 +1,4 @@
-"""``errormotion compare``: files, run folders, folders of runs, names, and what it refuses."""
+"""``errormotion compare``: files, run folders, folders of runs, names, and error messages."""
 
 import json
 from pathlib import Path
@@ -38,7 +38,7 @@ def files(tmp_path, results):
 
 
 def stored(folder: Path, ds, test, created=""):
-    """Store a result in a run folder as a campaign leaves it."""
+    """Store a result in a run folder like a campaign."""
     made = RunFolder.create(folder.parent, "test", "1", {"test": test})
     made.path.rename(folder)
     run = RunFolder.open(folder)
@@ -48,7 +48,7 @@ def stored(folder: Path, ds, test, created=""):
 
 
 def without(ds, *names):
-    """Return a result that does not see some freedoms."""
+    """Return a result with unknown freedoms."""
     k = [["EX", "EY", "EZ", "EA", "EB", "EC"].index(name) for name in names]
     ds = ds.assign({name: ds[name] * np.nan for name in names}).copy(deep=True)
     ds["covariance"].values[:, k] = np.nan
@@ -58,7 +58,7 @@ def without(ds, *names):
 
 
 def both_ways(ds):
-    """Return the result of a foreign method, over a dimension of its own and time."""
+    """Return the result of a foreign method, over an additional dimension and time."""
     twice = np.stack([ds.em.twist().values] * 2)
     return datasets.build_errors(
         twice, np.stack([ds["covariance"].values] * 2), dims=("way", "time"),
@@ -68,7 +68,7 @@ def both_ways(ds):
     )  # fmt: skip
 
 
-def test_a_freedom_that_one_does_not_see_is_left_out(run, files, results):
+def test_a_freedom_unknown_to_one_dataset_is_omitted(run, files, results):
     datasets.save(without(results["probing"], "EX", "EA", "EB"), "blind.nc")
     run("compare", "drift.nc", "blind.nc", "--out", "c.nc")
     assert datasets.load("c.nc")["dof"].values.tolist() == ["EY", "EZ"]
@@ -76,7 +76,7 @@ def test_a_freedom_that_one_does_not_see_is_left_out(run, files, results):
 
 @pytest.mark.parametrize("rank", [0, 1])
 def test_a_singular_covariance_is_compared_unless_it_is_zero(run, results, rank):
-    """Values without any uncertainty are refused; freedoms may be one draw."""
+    """Values without any uncertainty are an error; freedoms may be fully correlated."""
     for name, ds in results.items():
         u = np.where(np.isfinite(ds.em.twist().values), 1e-6 * rank, np.nan)
         one = ds.drop_dims("source").assign(covariance=(ds["covariance"].dims, u[:, :, None] * u[:, None, :]))
@@ -96,7 +96,7 @@ def test_files_are_compared_and_the_result_is_written(run, files):
     assert "drift - probing" in Path("again.html").read_text()
 
 
-def test_the_page_is_in_the_language_and_a_pdf_beside_it(run, files, monkeypatch):
+def test_the_page_is_in_the_language_and_has_a_pdf(run, files, monkeypatch):
     from errormotion.report.exports import pdf
 
     monkeypatch.setattr(pdf, "write", lambda page, out: out.write_bytes(page.read_bytes()))
@@ -109,7 +109,7 @@ def test_the_page_is_in_the_language_and_a_pdf_beside_it(run, files, monkeypatch
     Path("d.pdf").write_text("mine")
     again = run("compare", "drift.nc", "probing.nc", *FEW, "--report", "d.html", "--pdf", code=1)
     assert "d.pdf: exists already" in again.stderr
-    assert "no page is asked for" in run("compare", "drift.nc", "probing.nc", *FEW, "--pdf", code=1).stderr
+    assert "--pdf: allowed with a page only" in run("compare", "drift.nc", "probing.nc", *FEW, "--pdf", code=1).stderr
 
 
 def test_a_result_is_never_overwritten(run, files):
@@ -195,10 +195,10 @@ ALTERED = {
         (("drift.nc", "raw.nc"), 1, "raw.nc: The dataset breaks its schema"),
         (("drift.nc", "c.nc"), 1, "'c': '.em.names' belongs to error datasets"),
         (("drift.nc", "probing.nc", "--since", "1e9"), 1, "since: expected a time from"),
-        (("drift.nc", "moment.nc"), 1, "depend on different things ('drift': time; 'moment': none)"),
+        (("drift.nc", "moment.nc"), 1, "depend on different dimensions ('drift': time; 'moment': none)"),
     ],
 )
-def test_refusals_say_what_was_expected(run, results, arguments, code, message):
+def test_errors_state_the_expected_input(run, results, arguments, code, message):
     Path("empty").mkdir()
     for name in {"drift.nc", *(each for each in arguments if each.endswith(".nc"))} & set(ALTERED):
         datasets.save(ALTERED[name](results["drift"], results["probing"]), name)
@@ -226,7 +226,8 @@ def test_results_over_two_dimensions_are_compared_over_one(tmp_path, run):
         run("compare", "a.nc", "b.nc", "--over", "time", "--select", "position=2", "--same-start", "--json").output
     )
     assert found["ok"]
-    assert "'a' has position 0 to 2" in run("compare", "a.nc", "b.nc", "--select", "position=3", code=1).output
+    text = "'a' has the elements position=0 to position=2"
+    assert text in run("compare", "a.nc", "b.nc", "--select", "position=3", code=1).output
     assert "--select 3" in run("compare", "a.nc", "b.nc", "--select", "3", code=1).output
     words = run("compare", "a.nc", "b.nc", "--over", "target", "--select", "position=0", "--same-start", code=1).output
     assert "compared over time" in words

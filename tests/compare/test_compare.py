@@ -1,4 +1,4 @@
-"""Whole comparisons: methods that agree, planted mistakes and their causes, bad input, the dataset of the result."""
+"""Complete comparisons: methods that agree, simulated errors and their causes, invalid input, the result."""
 
 import re
 import tracemalloc
@@ -25,7 +25,7 @@ def drift(t):
 
 
 def made(t, rng, *, name="a", change=lambda values: values, point=(0, 0, 0), start=START, radius="", unit=1.0, **more):
-    """Return an error dataset of the warm-up with noise and one source (a radius) that is one draw.
+    """Return an error dataset of the warm-up with noise and one fully correlated source (a radius).
 
     ``unit`` is a wrong unit of the rotations, which their uncertainties have as well.
     """
@@ -107,7 +107,7 @@ def test_datasets_that_start_later_are_compared_from_a_common_state():
     assert found["p"].item() > 0.001
 
 
-def test_one_bar_in_both_datasets_is_one_draw():
+def test_one_bar_in_both_datasets_is_fully_correlated():
     rng = np.random.default_rng(4)
     shared = {"a": made(T1, rng, radius="bar 7"), "b": made(T2, rng, name="b", radius="bar 7")}
     apart = {"a": made(T1, rng), "b": made(T2, rng, name="b")}
@@ -155,7 +155,7 @@ def turn(angle):
 
 
 @pytest.mark.parametrize("name", PLANTED)
-def test_a_planted_mistake_is_found_and_named(name):
+def test_a_simulated_error_is_detected_and_named(name):
     rng = np.random.default_rng(5)
     first = 0
     for _ in range(5):
@@ -179,7 +179,7 @@ def test_the_size_of_a_mistake_is_estimated_with_its_uncertainty():
     assert inside >= 25
 
 
-def test_a_difference_that_no_cause_explains_says_so():
+def test_a_difference_without_known_cause_is_reported():
     rng = np.random.default_rng(7)
 
     def noisy(values):
@@ -201,7 +201,7 @@ def test_a_difference_that_no_cause_explains_says_so():
         ({"change": lambda v: v * np.nan}, "do not overlap in time|no freedom in common"),
     ],
 )
-def test_what_cannot_be_compared_is_refused_in_words(changed, message):
+def test_incomparable_datasets_are_reported(changed, message):
     if changed.get("component") == "X":
         rng = np.random.default_rng(8)
         pair = {"drift": made(T1, rng), "probing": made(T2, rng, component="X")}
@@ -219,7 +219,7 @@ def test_one_dataset_twice_one_alone_and_other_dims_are_refused():
     with pytest.raises(DatasetError, match="at least two"):
         compare({"a": ds})
     single = ds.em.mean("time")
-    with pytest.raises(DatasetError, match="depend on different things"):
+    with pytest.raises(DatasetError, match="depend on different dimensions"):
         compare({"a": ds, "b": single})
     assert compare({"a": ds, "b": made(T2, rng, start="", name="b")}, same_start=True)["p"].item() > 1e-4
 
@@ -240,7 +240,7 @@ def test_a_dataset_without_any_uncertainty_is_refused():
         compare({"a": made(T1, rng), "b": exact})
 
 
-def test_three_datasets_have_a_consensus_and_the_wrong_one_is_named():
+def test_three_datasets_have_a_consensus_and_the_deviating_one_is_named():
     rng = np.random.default_rng(10)
     found = compare({"a": made(T1, rng), "b": made(T2, rng), "c": made(T2 + 30.0, rng, change=lambda v: v * 1.2)})
     assert found["misfit_p"].idxmin().item() == "c"
@@ -249,7 +249,7 @@ def test_three_datasets_have_a_consensus_and_the_wrong_one_is_named():
     assert found.sizes["pair"] == 3
 
 
-def test_memory_grows_with_the_instants_and_not_with_their_square():
+def test_memory_grows_linearly_with_the_times():
     peaks, rng = [], np.random.default_rng(11)
     for size in (2_000, 8_000):
         t = np.linspace(0, 7200, size)
@@ -274,15 +274,15 @@ def test_many_datasets_are_compared_with_one_of_them():
         compare(few, against="m9")
 
 
-def test_no_two_interpolated_values_share_a_measured_one(monkeypatch):
-    """With shared neighbours the values are correlated, which no covariance of the result would hold."""
+def test_no_two_interpolated_values_depend_on_the_same_measured_one(monkeypatch):
+    """With common neighbours the values would be correlated, which the covariance of the result does not include."""
     monkeypatch.setitem(globals(), "NOISE", 10 * NOISE)  # far more than what interpolation adds
     rng, p, between = np.random.default_rng(14), [], T2[:-1] + 120.0
     for _ in range(60):
         found = compare({"a": made(T2, rng), "b": made(between, rng, name="b")}, causes=False)
         p.append(found["p"].item())
     assert found.sizes["time"] == 15
-    assert "14 of 29 instants are left out" in found.attrs["notes"][0]
+    assert "14 of 29 times are left out" in found.attrs["notes"][0]
     assert kstest(p, "uniform").pvalue > 0.01
 
 
@@ -293,7 +293,7 @@ class Exact:
         return np.zeros(size) if size is not None else 0.0
 
 
-def test_a_mistake_is_detected_as_often_as_its_non_centrality_predicts():
+def test_an_error_is_detected_as_often_as_its_non_centrality_predicts():
     rng, changed = np.random.default_rng(15), {"functional_point": (0.0, 0.0, 0.010)}
     exact = compare(two(Exact(), **changed), causes=False)
     degrees, squares = int(exact["degrees"].item()), exact["chi2"].item()
@@ -310,7 +310,7 @@ def test_causes_with_scores_that_are_close_are_named_together():
     assert units <= {first["cause"].item(), *first["alike"].item().split("; ")}
 
 
-def test_a_wrong_functional_point_is_named_where_only_displacements_are_compared():
+def test_a_wrong_functional_point_is_named_if_only_displacements_are_compared():
     rng = np.random.default_rng(12)
     wrong = made(T2, rng, name="b").em.at((0, 0, 0.05)).assign_attrs(functional_point=np.zeros(3))
     found = compare({"drift": made(T1, rng), "probing": wrong}, freedoms=["EX", "EY", "EZ"])
@@ -348,7 +348,7 @@ def test_datasets_without_any_source_are_compared():
     assert np.mean(np.abs(en[np.isfinite(en)]) <= 1) > 0.8
 
 
-def test_a_wrong_functional_point_is_found_where_some_rotations_are_compared():
+def test_a_wrong_functional_point_is_determined_if_some_rotations_are_compared():
     t, rng = np.arange(0.0, 9000.0, 300.0), np.random.default_rng(7)
     moved = made(t, rng, name="moved").em.at([0.0, 0.0, 0.05]).assign_attrs(functional_point=[0.0, 0.0, 0.0])
     found = compare({"moved": moved, "right": made(t, rng)}, freedoms=("EX", "EY", "EZ", "EA"))

@@ -1,4 +1,4 @@
-"""Covariances with directions that have no variance of their own, against dense pseudo-inverses."""
+"""Covariances with directions without independent variance, compared with dense pseudo-inverses."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ SCALE = np.array([1e-6, 3e-6, 2e-5])
 
 
 def covariance(own, influence):
-    """Return the dense covariance and a root: what the covariance can produce."""
+    """Return the dense covariance and a root of it."""
     n, d = own.shape[:2]
     V = np.zeros((n * d, n * d))
     for i, block in enumerate(own):
@@ -28,7 +28,7 @@ def bound(rng, sources):
 
 
 def produced(rng, root, influence, count):
-    """Draw vectors of a covariance."""
+    """Return random vectors of a covariance."""
     noise = np.einsum("nij,pnj->pni", root, rng.normal(size=(count, N, D)))
     return noise + np.tensordot(rng.normal(size=(count, len(influence))), influence, axes=1)
 
@@ -47,7 +47,7 @@ def test_products_are_those_of_the_dense_pseudo_inverse(sources):
     np.testing.assert_allclose(white.product(a, b), dense, rtol=1e-7)
 
 
-def test_sources_alone_are_a_covariance():
+def test_sources_alone_form_a_covariance():
     rng = np.random.default_rng(2)
     F = rng.normal(0, 1, (4, N, D)) * SCALE
     z = rng.normal(size=4)
@@ -56,7 +56,7 @@ def test_sources_alone_are_a_covariance():
     assert white.square(np.tensordot(z, F, axes=1)) == pytest.approx(z @ z, rel=1e-9)
 
 
-def test_a_direction_with_little_variance_of_its_own_is_no_direction_without():
+def test_a_direction_with_little_independent_variance_is_not_one_without_variance():
     own = np.tile(np.diag([1.0, 1e-9, 1.0]), (N, 1, 1)) * np.outer(SCALE, SCALE)
     rng = np.random.default_rng(3)
     F = rng.normal(0, 1, (2, N, D)) * SCALE

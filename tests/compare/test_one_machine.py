@@ -1,4 +1,4 @@
-"""Two methods on one virtual machine: what their results state, that they agree, and a mistake that is named."""
+"""Two methods on one virtual machine: contents of their results, agreement, and a detected error."""
 
 from datetime import datetime
 
@@ -10,7 +10,7 @@ DISPLACEMENTS = ["EX", "EY", "EZ"]
 """Probing sees the rotation of the frame of the axes, the bar the tilt of the spindle too."""
 
 
-def test_the_results_state_what_a_comparison_needs(results):
+def test_the_results_state_the_data_of_a_comparison(results):
     drift, probing = results["drift"], results["probing"]
     raw_start = datetime.fromisoformat("2026-03-02T07:00:00+00:00")
     since = (datetime.fromisoformat(drift.attrs["start"]) - raw_start).total_seconds()
@@ -33,7 +33,7 @@ def test_records_with_the_same_beams_share_their_calibration(warm_up):
     assert not ids[0] & ids[2]
 
 
-def test_two_methods_agree_at_the_point_that_both_see(results):
+def test_two_methods_agree_at_their_common_point(results):
     found = compare(results, freedoms=DISPLACEMENTS)
     assert found["p"].item() > 0.05
     assert found.attrs["fit_p"] > 0.05

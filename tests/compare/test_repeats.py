@@ -1,4 +1,4 @@
-"""Repeats: variance components, their intervals, what the stated uncertainties let expect, and the table."""
+"""Repeats: variance components, their intervals, the expectation by the stated uncertainties, and the table."""
 
 import json
 from types import SimpleNamespace
@@ -46,7 +46,7 @@ def test_stated_uncertainty_and_shared_sources_are_respected():
     assert found.common[0] == pytest.approx(3.0)
 
 
-def test_without_repeats_in_a_group_only_the_sum_is_known_and_without_groups_only_repeatability():
+def test_without_repeats_in_a_group_only_the_sum_is_known_and_without_groups_only_the_repeatability():
     alone = repeats(estimates([1.0, 2.0, 4.0]), ["a", "b", "c"])
     assert np.isnan(alone.value[:2, 0]).all()
     assert alone.value[2, 0] == pytest.approx(np.std([1.0, 2.0, 4.0], ddof=1))
@@ -58,7 +58,7 @@ def test_without_repeats_in_a_group_only_the_sum_is_known_and_without_groups_onl
 
 
 @pytest.mark.parametrize(("points", "shared", "most"), [(1, 0.0, 0.985), (10, 0.95, 0.99), (10, 0.3, 1.0)])
-def test_the_intervals_hold_the_truth_with_their_probability(points, shared, most):
+def test_the_intervals_contain_the_truth_with_their_probability(points, shared, most):
     found = interval_coverage(4, 4, 400, 2, points=points, shared=shared)
     assert set(found) == set(KINDS)
     for share in found.values():  # 0.95 with a standard deviation of 0.011
@@ -99,7 +99,7 @@ def call(*arguments):
     return CliRunner().invoke(app, ["compare", *arguments])
 
 
-def test_operators_that_differ_show_in_the_table_and_on_the_page(three_operators, tmp_path):
+def test_different_operators_are_shown_in_the_table_and_on_the_page(three_operators, tmp_path):
     shown = call(*three_operators.files, "--by", "operator", "--same-start", "--out", "c.nc", "--report", "c.html")
     assert shown.exit_code == 0, shown.output
     found = datasets.load("c.nc")
@@ -121,7 +121,7 @@ def test_operators_that_differ_show_in_the_table_and_on_the_page(three_operators
         datasets.validate(found.drop_vars("spread_low"))
 
 
-def test_repeats_on_other_days_need_same_start(three_operators):
+def test_repeats_on_other_days_require_the_option_same_start(three_operators):
     result = call(*three_operators.files, "--by", "operator")
     assert result.exit_code == 1
     assert "do not overlap in time" in result.stderr
@@ -130,7 +130,7 @@ def test_repeats_on_other_days_need_same_start(three_operators):
 @pytest.mark.parametrize(
     ("by", "message"), [("operator", "'b': no operator is stated"), ("instrument", "no instrument")]
 )
-def test_a_dataset_that_belongs_to_no_group_is_named(by, message):
+def test_a_dataset_without_group_is_named(by, message):
     rng = np.random.default_rng(4)
     both = {"a": warm_up(rng, operator="Anna"), "b": warm_up(rng)}
     with pytest.raises(DatasetError, match=message):
@@ -138,7 +138,7 @@ def test_a_dataset_that_belongs_to_no_group_is_named(by, message):
     assert labels(both, "method") == {"a": "example", "b": "example"}
 
 
-def test_a_comparison_without_groups_holds_none():
+def test_a_comparison_without_groups_has_none():
     rng = np.random.default_rng(5)
     found: xr.Dataset = compare({"a": warm_up(rng), "b": warm_up(rng)}, causes=False)
     assert "spread" not in found.variables

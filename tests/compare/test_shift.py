@@ -1,4 +1,4 @@
-"""A shift in time: its size from a course that bends where the warm-up starts."""
+"""A shift in time, estimated from a curve that bends at the start of the warm-up."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_a_shift_is_found_without_bias(sign):
     assert np.abs(score).max() < 5
 
 
-def test_no_shift_is_found_in_a_course_that_stands_still():
+def test_no_shift_is_reported_for_constant_errors():
     t = np.arange(0.0, 3600.0, 60.0)
     course = smooth(t, np.zeros((t.size, 2)), np.full((t.size, 2), NOISE))
     white = whitener(np.tile(NOISE**2 * np.eye(2), (t.size, 1, 1)), np.zeros((0, t.size, 2)))

@@ -1,4 +1,4 @@
-"""Differences, consensus and tests against dense algebra, and their rates by Monte Carlo."""
+"""Differences, consensus and tests compared with dense algebra, and their rates by Monte Carlo."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def model(rng, name, shared=(), sources=2):
 
 
 def drawn(rng, models, truth):
-    """Draw values: each key once for all estimates."""
+    """Return random values; equal keys are fully correlated."""
     z = {key: rng.normal() for each in models for key in each.source}
     found = []
     for each in models:
@@ -85,7 +85,7 @@ def test_consensus_is_the_dense_generalised_least_squares(shared):
     assert found.fit.degrees == 2 * N * D
 
 
-def test_rates_of_all_tests_hold():
+def test_rates_of_all_tests_are_as_stated():
     rng = np.random.default_rng(4)
     models = [model(rng, name, ("bar",)) for name in "abc"]
     joint, fit, inside, en, left, held = [], [], 0, 0, [], []
@@ -108,7 +108,7 @@ def test_rates_of_all_tests_hold():
     assert np.mean(np.array(left) < 0.05) < 0.08
 
 
-def test_a_shared_source_that_is_taken_as_two_gives_wrong_rates():
+def test_a_common_source_treated_as_two_has_wrong_rates():
     rng = np.random.default_rng(5)
     models = [model(rng, name, ("bar",), sources=0) for name in "ab"]
     for each in models:
@@ -124,7 +124,7 @@ def test_a_shared_source_that_is_taken_as_two_gives_wrong_rates():
     assert np.mean(wrong) > 0.995
 
 
-def test_a_dataset_that_does_not_fit_is_named():
+def test_an_incompatible_dataset_is_named():
     rng = np.random.default_rng(6)
     models = [model(rng, name) for name in "abcd"]
     named = 0
@@ -136,7 +136,7 @@ def test_a_dataset_that_does_not_fit_is_named():
     assert named >= 38
 
 
-def test_the_robust_mean_finds_the_spread_between_datasets():
+def test_the_robust_mean_estimates_the_spread_between_datasets():
     rng = np.random.default_rng(7)
     models = [model(rng, f"m{k}", sources=0) for k in range(12)]
     tau = 20 * SCALE
@@ -150,7 +150,7 @@ def test_the_robust_mean_finds_the_spread_between_datasets():
     assert (random_effects(drawn(rng, models, np.zeros((N, D))))[2] < 2 * SCALE).all()
 
 
-def test_unknown_values_of_one_dataset_leave_those_of_the_others():
+def test_unknown_values_of_one_dataset_do_not_affect_the_others():
     rng = np.random.default_rng(8)
     values = drawn(rng, [model(rng, name) for name in "abc"], np.zeros((N, D)))
     values[0].value[2], values[0].own[2], values[0].influence[:, 2] = np.nan, np.nan, np.nan

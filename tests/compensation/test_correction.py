@@ -48,7 +48,7 @@ def noisy(ds: xr.Dataset, sigma: np.ndarray, rng: np.random.Generator) -> xr.Dat
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_corrected_commands_bring_the_tool_to_its_place_to_second_order(kind: str) -> None:
+def test_corrected_commands_move_the_tool_to_its_position_to_second_order(kind: str) -> None:
     machine = VirtualMachine(kind, 3)
     asked = grid(machine, 5)[::3]  # on the nodes nothing is interpolated
     lines = grid(machine, 21)
@@ -62,7 +62,7 @@ def test_corrected_commands_bring_the_tool_to_its_place_to_second_order(kind: st
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_axes_add_up_at_any_tool(kind: str) -> None:
+def test_errors_of_axes_are_added_for_any_tool(kind: str) -> None:
     machine = VirtualMachine(kind, 4)
     for name in machine.geometry.locations:
         machine.geometry.locations[name] = 0.0  # type: ignore[index]  # an axis by itself has no squareness
@@ -80,7 +80,7 @@ def test_axes_add_up_at_any_tool(kind: str) -> None:
     assert np.abs(correction(axes).at(asked).offset - found.offset).max() > 1e-6
 
 
-def test_the_rotation_that_remains_is_that_of_the_tool() -> None:
+def test_the_residual_rotation_is_that_of_the_tool() -> None:
     machine = VirtualMachine("gantry", 2)
     lines = grid(machine, 9)
     asked = lines[::7]
@@ -89,7 +89,7 @@ def test_the_rotation_that_remains_is_that_of_the_tool() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_frame_that_turns_with_heat_is_corrected_at_every_place(kind: str) -> None:
+def test_a_frame_that_rotates_thermally_is_corrected_at_all_positions(kind: str) -> None:
     machine = VirtualMachine(kind, 5)
     machine.start([Event(0.0, 9000.0, OFF)])
     times = np.arange(0.0, 3601.0, 20.0)
@@ -104,21 +104,21 @@ def test_a_frame_that_turns_with_heat_is_corrected_at_every_place(kind: str) -> 
 
 
 def test_errors_that_change_fast_are_inverted_by_iteration() -> None:
-    """A gradient of 0.3: the error at the place asked for is wrong by a third of it."""
+    """A gradient of 0.3: without iteration the correction would deviate by a third."""
     machine = VirtualMachine("cframe", 1)
     errors = machine.truth_axis("X", np.linspace(-0.3, 0.3, 61))
     steep = errors.assign(EX=0.3 * errors["x"], **{name: 0.0 * errors[name] for name in DOF[1:]})
     asked = np.column_stack([np.linspace(-0.2, 0.2, 41), np.zeros((41, 2))])
     found = correction(steep).at(asked)
     assert np.abs(1.3 * (asked + found.offset)[:, 0] - asked[:, 0]).max() < 1e-9
-    with pytest.raises(DatasetError, match="does not settle"):
+    with pytest.raises(DatasetError, match="does not converge"):
         correction(errors.assign(EX=-0.09 * np.sin(40 * errors["x"]), **{n: 0.0 * errors[n] for n in DOF[1:]})).at(
             asked
         )
 
 
 @pytest.mark.parametrize("scattered", [False, True], ids=["grid", "scattered"])
-def test_outside_of_what_was_measured_the_offset_is_held_and_flagged(scattered: bool) -> None:
+def test_outside_the_measured_range_the_offset_is_constant_and_flagged(scattered: bool) -> None:
     machine = VirtualMachine("cframe", 3)
     nodes = places(machine, 300) if scattered else grid(machine, 6)
     made = correction(machine.volumetric_truth(nodes))
@@ -140,7 +140,7 @@ def test_outside_of_what_was_measured_the_offset_is_held_and_flagged(scattered: 
     assert np.abs(found.offset[-1]).max() <= np.abs(machine.geometry.twist(nodes)[:, :3]).max()
 
 
-def test_before_and_after_the_measurement_the_last_correction_is_held() -> None:
+def test_before_and_after_the_measurement_the_nearest_correction_applies() -> None:
     machine = VirtualMachine("cframe", 5)
     machine.start([Event(0.0, 9000.0, OFF)])
     made = correction(machine.truth_spindle(np.arange(0.0, 1801.0, 60.0)))
@@ -160,8 +160,8 @@ def coverage(made: Correction, machine: VirtualMachine, asked: np.ndarray) -> np
     return np.einsum("ni,nij,nj->n", remaining, np.linalg.inv(found.covariance), remaining)
 
 
-def test_the_covariance_covers_what_remains() -> None:
-    """60 measurements of one machine, each with its own noise; 12 places each, on and between the nodes."""
+def test_the_covariance_covers_the_remaining_errors() -> None:
+    """60 measurements of one machine with independent noise, at 12 positions each, on and between the nodes."""
     machine = VirtualMachine("cframe", 6)
     truth = machine.volumetric_truth(grid(machine, 9))
     rng = np.random.default_rng(7)
@@ -172,8 +172,8 @@ def test_the_covariance_covers_what_remains() -> None:
     assert 0.9 < (distance < 7.81).mean() <= 1.0
 
 
-def test_a_source_of_all_axes_is_one_draw() -> None:
-    """One calibration behind two axes: its effects add up before they are squared."""
+def test_a_source_of_all_axes_is_fully_correlated() -> None:
+    """One calibration of two axes: its effects are added before they are squared."""
     machine = VirtualMachine("cframe", 6)
     axes = []
     for axis in "XY":
@@ -195,7 +195,7 @@ def test_a_source_of_all_axes_is_one_draw() -> None:
     assert other[0, 0, 0] == pytest.approx(2 * (1e-6) ** 2)
 
 
-def test_what_no_source_knows_is_refused_or_left() -> None:
+def test_unknown_freedoms_are_an_error_or_omitted() -> None:
     machine = VirtualMachine("cframe", 6)
     ds = machine.truth_axis("Y", np.linspace(*machine.travel["Y"], 9))
     alone = ds.assign({name: ds[name] * np.nan for name in DOF if name != "EY"})
@@ -220,11 +220,11 @@ def test_an_unknown_rotation_is_refused_where_it_moves_the_tool() -> None:
     ds = ds.assign(EC=ds["EC"] * np.nan)
     along_z = correction(ds, [0.0, 0.0, -0.1])  # EC has no lever there
     assert np.isnan(along_z.at(np.zeros((1, 3))).residual_rotation[0]).tolist() == [False, False, True]
-    with pytest.raises(DatasetError, match="EC is not known"):
+    with pytest.raises(DatasetError, match="EC is unknown"):
         along_z.for_tool([0.1, 0.0, -0.1])
 
 
-def test_a_thermal_model_corrects_and_flags_what_it_was_not_trained_on(
+def test_a_thermal_model_corrects_and_flags_inputs_outside_its_training(
     warm_up: Callable[..., xr.Dataset], pair: list[xr.Dataset]
 ) -> None:
     model = fit(pair, Settings(variant="lagged"))
@@ -248,11 +248,11 @@ def test_a_thermal_model_corrects_and_flags_what_it_was_not_trained_on(
         (lambda ds: ds.assign_attrs(frame="artefact"), "machine coordinates"),
         (lambda ds: ds.drop_vars("y"), "expected one coordinate"),
         (lambda ds: ds.rename(position="angle"), r"over time, position, target.*found \(angle\)"),
-        (lambda ds: ds.assign({name: ds[name] * np.nan for name in DOF}), "no error is known"),
+        (lambda ds: ds.assign({name: ds[name] * np.nan for name in DOF}), "all errors are unknown"),
         (lambda ds: ds.assign_attrs(chain="bed-X"), "expected a chain"),
     ],
 )
-def test_what_corrects_nothing_is_refused(change: Callable[[xr.Dataset], xr.Dataset], message: str) -> None:
+def test_errors_without_correction_are_reported(change: Callable[[xr.Dataset], xr.Dataset], message: str) -> None:
     machine = VirtualMachine("cframe", 6)
     with pytest.raises(DatasetError, match=message):
         correction(change(machine.truth_axis("Y", np.linspace(-0.2, 0.2, 9))))
@@ -267,26 +267,26 @@ def test_what_corrects_nothing_is_refused(change: Callable[[xr.Dataset], xr.Data
         (np.zeros((1, 3)), np.nan),
     ],
 )
-def test_points_that_are_none_are_refused(positions: np.ndarray, time: object) -> None:
+def test_invalid_points_are_an_error(positions: np.ndarray, time: object) -> None:
     machine = VirtualMachine("cframe", 6)
     made = correction(machine.truth_axis("Y", np.linspace(-0.2, 0.2, 9)))
     with pytest.raises(DatasetError, match="expected"):
         made.at(positions, time)  # type: ignore[arg-type]
 
 
-def test_places_without_errors_are_bridged_and_reported() -> None:
+def test_positions_without_errors_are_interpolated_and_reported() -> None:
     machine = VirtualMachine("cframe", 6)
     ds = machine.volumetric_truth(grid(machine, 5))
     lost = ds.assign({name: ds[name].where(ds["target_index"] % 31 != 5) for name in DOF})
     made = correction(lost)
-    assert any("4 of 125 places lack errors" in note for note in made.notes)
+    assert any("4 of 125 positions lack errors" in note for note in made.notes)
     asked = places(machine, 50) * 0.8
     assert np.isfinite(made.at(asked).offset).all()
     assert np.abs(made.at(asked).offset - correction(ds).at(asked).offset).max() < 3e-6
 
 
 def test_many_points_are_fast() -> None:
-    """200 000 points of a volume take less than a second of one processor; ten times that is allowed here."""
+    """200 000 points of a volume take less than one second of processor time; ten seconds are allowed here."""
     machine = VirtualMachine("gantry", 3)
     made = correction(machine.volumetric_truth(grid(machine, 11)))
     asked = places(machine, 200_000)

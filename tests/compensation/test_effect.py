@@ -1,4 +1,4 @@
-"""The effect of a compensation: intervals that hold the true reduction, and what the page states."""
+"""The effect of a compensation: intervals that contain the true reduction, and the page."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def warm_up(size: float, expansion: str = "", **changes: Any) -> xr.Dataset:
     )
 
 
-def test_intervals_hold_the_true_values_in_95_percent_of_all_measurements() -> None:
-    """A displacement falls to a tenth: white noise, two sources of each record, and one that both share."""
+def test_intervals_contain_the_true_values_in_95_percent_of_all_measurements() -> None:
+    """A displacement decreases to a tenth: white noise, two sources of each record, and a common one."""
     rng = np.random.default_rng(1)
     t = np.linspace(0.05, 1.0, 20)[:, None]
     b = 10 * (1 - np.exp(-3 * t)) * np.array([1.0, 0.5, -0.7])
@@ -89,7 +89,7 @@ def test_intervals_hold_the_true_values_in_95_percent_of_all_measurements() -> N
 
 
 def test_the_noise_of_a_measurement_is_no_residual() -> None:
-    """The record after is noise alone: the estimate is near 0, and 0 is in the interval."""
+    """The record after contains only noise: the estimate is near 0, and the interval contains 0."""
     rng = np.random.default_rng(2)
     own = np.broadcast_to(0.5**2 * np.eye(1), (400, 1, 1))
     none = np.zeros((0, 400, 1))
@@ -100,8 +100,8 @@ def test_the_noise_of_a_measurement_is_no_residual() -> None:
     assert found.value < 0.02 < np.sqrt(after.square / before.square)
 
 
-def test_the_reduction_on_the_virtual_machine_holds_the_true_one() -> None:
-    """The control's own compensation, off and on: EZ falls, EY grows, and the tilt stays."""
+def test_the_reduction_on_the_virtual_machine_covers_the_true_one() -> None:
+    """The compensation of the control, off and on: EZ decreases, EY increases, and the tilt is unchanged."""
     machine, method = VirtualMachine("cframe", seed=3), plugins.get("methods", "normal_vector")
     results, truth = [], []
     for on in (False, True):
@@ -124,8 +124,8 @@ def test_the_reduction_on_the_virtual_machine_holds_the_true_one() -> None:
     assert 0 < found.part("EZ").reference < found.part("EZ").floor == found.part("EZ").perfect
 
 
-def test_a_source_that_both_share_is_one_draw() -> None:
-    """An expansion that scales both records alike cannot be what changed."""
+def test_a_common_source_is_fully_correlated() -> None:
+    """An expansion that scales both records equally cannot cause a change."""
     alone = effect(warm_up(30), warm_up(15, start=LATER)).part("EZ").reduction
     shared = effect(warm_up(30, expansion="bar 7"), warm_up(15, start=LATER, expansion="bar 7")).part("EZ").reduction
     assert shared.value == pytest.approx(0.5, abs=0.01) == pytest.approx(alone.value, abs=0.01)
@@ -139,7 +139,7 @@ def test_a_result_may_state_references_without_identities() -> None:
     assert effect(warm_up(30), after).part("EZ").reference > 0
 
 
-def test_results_of_different_days_have_one_time_0() -> None:
+def test_results_of_different_days_have_a_common_time_0() -> None:
     found = effect(warm_up(30), warm_up(3, start=LATER))
     assert found.ground.estimates[1].value.shape == found.ground.estimates[0].value.shape == (13, 6)
     assert found.part(DISPLACEMENT).reduction.value == pytest.approx(0.9, abs=0.01)
@@ -153,7 +153,7 @@ def test_other_machines_and_frames_are_refused(attribute: str, value: str) -> No
 
 
 def test_the_interval_of_a_figure_is_that_of_the_ratio() -> None:
-    """With an exact figure before, the ratio is a scaled value; with unknown correlation, the widest one holds."""
+    """With an exact figure before, the ratio is a scaled value; an unknown correlation has the widest interval."""
     exact = reduction_of((10.0, 0.0), (-2.0, 0.1))
     assert exact == pytest.approx((0.8, 1 - (2 + K * 0.1) / 10, 1 - (2 - K * 0.1) / 10))
     widths = [

@@ -1,4 +1,4 @@
-"""Figures of ISO 230-2 and ISO 230-3 side by side, without and with a compensation."""
+"""Figures of ISO 230-2 and ISO 230-3, without and with a compensation."""
 
 import pytest
 
@@ -11,7 +11,7 @@ from errormotion.methods.spindle_drift import SpindleDrift
 from errormotion.methods.spindle_drift.simulation import simulate
 
 
-def test_figures_of_iso_230_2_stand_side_by_side() -> None:
+def test_figures_of_iso_230_2_are_compared() -> None:
     settings = Settings(axis="Y", freedoms=("EY",), trials=200)
     raw, _ = raw_and_truth(settings, 3, Behaviour())
     raw = raw.drop_vars(

@@ -1,4 +1,4 @@
-"""Features are the answers that physics says."""
+"""Features are the responses of physical systems."""
 
 import numpy as np
 import pytest
@@ -9,25 +9,25 @@ from errormotion.compensation.thermal_model.record import Inputs, read_inputs
 from errormotion.errors import DatasetError
 
 
-def test_a_step_that_is_held_is_answered_by_an_exponential() -> None:
+def test_the_response_to_a_step_is_exponential() -> None:
     time = np.array([0.0, 10.0, 25.0, 100.0, 1000.0])
     answer = first_order(time, np.array([0.0, 1.0, 1.0, 1.0, 1.0]), 50.0, held=True)
     np.testing.assert_allclose(answer, 1 - np.exp(-time / 50.0), rtol=1e-12)
 
 
-def test_a_ramp_is_answered_with_its_delay_whatever_the_steps() -> None:
+def test_the_response_to_a_ramp_has_its_delay_for_any_time_steps() -> None:
     time = np.array([0.0, 3.0, 40.0, 41.0, 900.0])
     answer = first_order(time, 0.2 * time, 60.0, held=False)
     np.testing.assert_allclose(answer, 0.2 * (time - 60.0 * (1 - np.exp(-time / 60.0))), rtol=1e-12)
 
 
-def test_a_lag_looks_back_and_finds_the_reference_state_before_the_start() -> None:
+def test_a_lag_before_the_start_refers_to_the_reference_state() -> None:
     inputs = Inputs(np.array([0.0, 100.0, 200.0]), {"head": np.array([0.0, 1.0, 4.0])}, {})
     found = matrix(inputs, lagged(["head"], (50.0,)))
     np.testing.assert_allclose(found, [[0.0, 0.0], [1.0, 0.5], [4.0, 2.5]])
 
 
-def test_an_unknown_value_is_unknown_now_and_bridged_in_the_past() -> None:
+def test_an_unknown_value_is_unknown_at_present_and_interpolated_in_the_past() -> None:
     inputs = Inputs(np.array([0.0, 100.0, 200.0]), {"head": np.array([0.0, np.nan, 4.0])}, {})
     found = matrix(inputs, [Feature("head"), Feature("head", lag=100.0)])
     assert np.isnan(found[1]).all()
@@ -41,7 +41,7 @@ def test_friction_grows_with_the_speed_and_its_square() -> None:
     np.testing.assert_allclose(matrix(inputs, features)[1], np.array([3.0, 9.0]) * (1 - np.exp(-1)))
 
 
-def test_an_input_that_is_missing_is_named() -> None:
+def test_a_missing_input_is_named() -> None:
     inputs = Inputs(np.zeros(1), {"bed": np.zeros(1)}, {})
     with pytest.raises(DatasetError, match="needs the temperature 'head'; the data have bed"):
         matrix(inputs, [Feature("head")])
@@ -57,7 +57,7 @@ def data(**changes: object) -> xr.Dataset:
     return ds.assign_coords(changes)
 
 
-def test_temperatures_count_from_the_first_that_is_known() -> None:
+def test_temperatures_are_relative_to_the_first_known_value() -> None:
     inputs = read_inputs(data(spindle_speed=("time", [0.0, 3000.0, np.nan]), feed=("time", [0.0, 0.05, 0.1])))
     np.testing.assert_allclose(inputs.temperature["a"], [0.0, 1.0, 3.0])
     np.testing.assert_allclose(inputs.temperature["b"], [np.nan, 0.0, 1.0])
@@ -74,6 +74,6 @@ def test_temperatures_count_from_the_first_that_is_known() -> None:
         (data().isel(time=0), "expected temperatures over time; found the dims sensor"),
     ],
 )
-def test_data_that_cannot_be_read_say_why(wrong: xr.Dataset, message: str) -> None:
+def test_unreadable_data_are_reported_with_the_reason(wrong: xr.Dataset, message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         read_inputs(wrong)

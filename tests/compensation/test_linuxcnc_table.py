@@ -1,4 +1,4 @@
-"""The table of LinuxCNC in the real LinuxCNC: what its servo thread commands the motor of an axis."""
+"""The table of LinuxCNC in LinuxCNC: the commands of its servo thread to the motor of an axis."""
 
 import json
 import time
@@ -27,7 +27,7 @@ FLOAT = 1e-7
 
 
 def measured(machine: VirtualMachine) -> xr.Dataset:
-    """Return errors of Y with a reversal, as exact as the twin knows them: 30 um where it is largest."""
+    """Return the exact errors of Y of the virtual machine with a reversal of up to 30 um."""
     y = np.linspace(-0.25, 0.25, 26)
     ds = machine.truth_axis("Y", y).load()
     reversal = np.full((1, y.size), REVERSAL)
@@ -36,7 +36,7 @@ def measured(machine: VirtualMachine) -> xr.Dataset:
 
 
 @pytest.mark.parametrize("kind", [1, 0])
-def test_the_motor_is_commanded_by_the_table_and_the_tool_is_where_it_was_commanded(kind: int) -> None:
+def test_with_the_table_the_tool_reaches_the_commanded_position(kind: int) -> None:
     machine = VirtualMachine("cframe", 3)
     errors = measured(machine)
     table = axis_table(errors, "Y", step=0.025)

@@ -1,4 +1,4 @@
-"""Pages of thermal models: a prediction with its interval, and a model against a campaign that it has not seen."""
+"""Pages of thermal models: a prediction with its interval, and a comparison with another campaign."""
 
 import json
 import re
@@ -39,7 +39,7 @@ def number(text):
 
 @pytest.fixture(scope="module")
 def warm_ups():
-    """Four warm-ups of one machine, as exact as the twin knows them; the last is hotter than all others."""
+    """Four warm-ups of one virtual machine with exact errors; the last is hotter than all others."""
     machine, found = VirtualMachine("cframe", 5), []
     for early, late in SPEEDS:
         machine.start((Event(0.0, early, OFF), Event(3600.0, late)))
@@ -62,7 +62,7 @@ def checked(model, warm_ups, tmp_path_factory):
     return found, path.read_text(encoding="utf-8")
 
 
-def test_figures_of_the_check_stand_on_the_page(checked):
+def test_figures_of_the_check_are_on_the_page(checked):
     found, html = checked
     reported = {row[0]: row[1:] for row in rows(html, "Root mean square of the measured errors")}
     for i, name in enumerate(DOF):
@@ -100,7 +100,7 @@ def test_coefficients_and_their_units_are_those_of_the_model(checked, model):
                 assert number(row[3 + column]) == pytest.approx(expected, abs=0.06 * expanded)
 
 
-def test_simulated_measurement_puts_its_banner_above(checked):
+def test_a_simulated_measurement_has_a_banner(checked):
     assert "SIMULATED DATA" in checked[1]
 
 
@@ -136,7 +136,7 @@ def test_error_that_was_not_measured_is_not_compared(model, warm_ups, tmp_path):
     assert row[2].startswith("—")
 
 
-def test_prediction_shows_its_numbers_and_that_nothing_was_measured(model, warm_ups, tmp_path):
+def test_a_prediction_is_shown_as_not_measured(model, warm_ups, tmp_path):
     predicted = model.predict(warm_ups[2])
     html = write_report(predicted, tmp_path / "r.html").read_text(encoding="utf-8")
     assert "<h1>Errors predicted by a thermal model</h1>" in html
@@ -165,7 +165,7 @@ def test_prediction_beyond_training_is_reported_and_shaded(model, warm_ups, tmp_
     assert all(note in text for note in json_notes)
 
 
-def test_instant_without_an_input_has_no_prediction(model, warm_ups, tmp_path):
+def test_a_time_without_an_input_has_no_prediction(model, warm_ups, tmp_path):
     part = warm_ups[2].copy(deep=True)
     values = part["temperature"].values.copy()
     values[4, list(part["sensor"].values).index("column")] = np.nan

@@ -1,4 +1,4 @@
-"""Compensation tables: written, read as a control reads them, applied to the twin, and measured again."""
+"""Compensation tables: written, read like a control, applied to the virtual machine, and measured again."""
 
 import re
 import sys
@@ -39,7 +39,7 @@ def machine() -> VirtualMachine:
 
 
 def measured(machine: VirtualMachine, seed: int | None = None, count: int = 33, reversal: float = 0.0) -> xr.Dataset:
-    """Return a measurement of Y, with noise where a seed is given."""
+    """Return a measurement of Y, with noise if a seed is given."""
     low, high = machine.travel["Y"]
     ds = machine.truth_axis("Y", np.linspace(low, high, count)).load()
     if seed is not None:
@@ -62,7 +62,7 @@ def texts(exported: Exported) -> Mapping[str, str]:
 def remaining(
     machine: VirtualMachine, exported: Exported, form: str, component: str = "Y", reversal: float = 0.0
 ) -> np.ndarray:
-    """Return the true error behind a control with this table, at 101 commands in both directions, (2, 101), m."""
+    """Return the true error with this table in the control, at 101 commands in both directions, (2, 101), m."""
     control = getattr(table_readers, form)(texts(exported))
     y = np.linspace(*machine.travel["Y"], 101)
     found = []
@@ -75,10 +75,10 @@ def remaining(
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_what_remains_lies_within_the_stated_uncertainty_and_the_error_of_the_table(
+def test_the_remaining_error_is_within_the_stated_uncertainty_and_the_error_of_the_table(
     machine: VirtualMachine, form: str
 ) -> None:
-    """20 measurements of one axis; the true error is measured again behind each table."""
+    """20 measurements of one axis; the true error is determined with each table."""
     step = None if form == "linuxcnc" else 0.05
     inside, worst, before = [], [], np.abs(machine.geometry.motions["Y"](np.linspace(*machine.travel["Y"], 101))[:, 1])
     for seed in range(20):
@@ -97,7 +97,9 @@ def test_what_remains_lies_within_the_stated_uncertainty_and_the_error_of_the_ta
 
 @pytest.mark.parametrize("form", ["siemens", "heidenhain"])
 @pytest.mark.parametrize("reversal", [0.0, REVERSAL])
-def test_straightness_goes_into_a_table_of_another_axis(machine: VirtualMachine, form: str, reversal: float) -> None:
+def test_straightness_is_corrected_by_a_table_of_another_axis(
+    machine: VirtualMachine, form: str, reversal: float
+) -> None:
     exported = export(
         axis_table(measured(machine, reversal=reversal, count=201), "Y", component="Z", step=0.02), get(form)
     )
@@ -107,7 +109,7 @@ def test_straightness_goes_into_a_table_of_another_axis(machine: VirtualMachine,
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_both_directions_are_corrected_where_the_control_knows_them(machine: VirtualMachine, form: str) -> None:
+def test_both_directions_are_corrected_if_the_control_distinguishes_them(machine: VirtualMachine, form: str) -> None:
     exported = export(axis_table(measured(machine, reversal=REVERSAL, count=201), "Y", step=0.02), get(form))
     left = remaining(machine, exported, form, reversal=REVERSAL)
     if form in BOTH_DIRECTIONS:
@@ -120,7 +122,7 @@ def test_both_directions_are_corrected_where_the_control_knows_them(machine: Vir
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_every_file_states_what_it_is(machine: VirtualMachine, form: str) -> None:
+def test_every_file_states_its_content(machine: VirtualMachine, form: str) -> None:
     ds = measured(machine, 1).assign_attrs(start="2026-11-22T08:00:00+01:00", reference_temperature=20.0)
     exported = export(axis_table(ds, "Y", step=0.05, run="run 7"), get(form))
     text = next(content for name, content in texts(exported).items() if not name.endswith(".cma")).lower()
@@ -145,7 +147,7 @@ def test_a_name_cannot_become_a_line_of_the_table(machine: VirtualMachine) -> No
         )
 
 
-def test_types_of_linuxcnc_say_the_same(machine: VirtualMachine) -> None:
+def test_both_file_types_of_linuxcnc_are_equivalent(machine: VirtualMachine) -> None:
     table = axis_table(measured(machine, reversal=REVERSAL), "Y")
     form = get("linuxcnc")
     y, d = np.linspace(-0.9, 0.9, 50), np.where(np.arange(50) % 2, 1.0, -1.0)
@@ -168,7 +170,7 @@ def test_siemens_table_as_a_part_program(machine: VirtualMachine) -> None:
     assert lines[2:-1] == ini.splitlines()[2:-1]
 
 
-def test_signs_from_memory_can_be_turned(machine: VirtualMachine) -> None:
+def test_signs_from_memory_can_be_reversed(machine: VirtualMachine) -> None:
     y, d = np.linspace(-0.8, 0.8, 20), np.ones(20)
     for form, component in (("siemens", "Z"), ("heidenhain", "Y"), ("fanuc", "Y")):
         table, written = axis_table(measured(machine), "Y", component=component, step=0.05), get(form)
@@ -191,12 +193,12 @@ def steep(machine: VirtualMachine) -> xr.Dataset:
 @pytest.mark.parametrize(
     ("form", "step", "settings", "component", "message"),
     [
-        ("linuxcnc", 0.005, {}, "Y", "LinuxCNC takes at most 256 points; this table has 361"),
+        ("linuxcnc", 0.005, {}, "Y", "LinuxCNC accepts at most 256 points; this table has 361"),
         ("linuxcnc", None, {}, "Z", "no table of Z over Y"),
         ("siemens", 0.005, {"most_points": 200}, "Y", "at most 200 points; this table has 361"),
         ("heidenhain", 0.005, {}, "Y", "at most 256 points"),
-        ("fanuc", 0.005, {}, "Y", "at most 128 points an axis"),
-        ("fanuc", 0.05, {"first_number": 1000}, "Y", "numbers up to 1023; this table has 36 from 1001 on"),
+        ("fanuc", 0.005, {}, "Y", "at most 128 points per axis"),
+        ("fanuc", 0.05, {"first_number": 1000}, "Y", "numbers up to 1023; this table has 36 from 1001"),
         ("fanuc", 0.05, {}, "X", "no table of X over Y"),
     ],
 )  # fmt: skip
@@ -210,16 +212,16 @@ def test_a_table_that_the_control_would_refuse_is_not_written(
         )
 
 
-def test_fanuc_refuses_what_its_values_cannot_hold(machine: VirtualMachine) -> None:
+def test_fanuc_rejects_values_out_of_range(machine: VirtualMachine) -> None:
     with pytest.raises(
-        DatasetError, match=r"changes by 1[45]\d\d\.\d um between two points; FANUC holds at most 700 um"
+        DatasetError, match=r"changes by 1[45]\d\d\.\d um between two points; FANUC accepts at most 700 um"
     ):
         export(axis_table(steep(machine), "Y", step=0.05), get("fanuc"))
     with pytest.raises(DatasetError, match="reference point at position 0, which is none of the points"):
         export(axis_table(measured(machine, count=32), "Y"), get("fanuc"))
 
 
-def test_uneven_places_need_a_step(machine: VirtualMachine) -> None:
+def test_uneven_positions_require_a_step(machine: VirtualMachine) -> None:
     ds = measured(machine).isel(position=[0, 1, 3, 7, 16, 20, 32])
     for form in ("siemens", "fanuc"):
         with pytest.raises(DatasetError, match="points at equal distances"):
@@ -239,7 +241,7 @@ def test_uneven_places_need_a_step(machine: VirtualMachine) -> None:
         ({"axis": "Y", "step": 1e-6}, "expected at most 100000"),
     ],
 )
-def test_a_choice_that_makes_no_table_is_refused(
+def test_a_choice_without_table_is_an_error(
     machine: VirtualMachine, arguments: dict[str, object], message: str
 ) -> None:
     with pytest.raises(DatasetError, match=message):
@@ -250,11 +252,11 @@ def test_a_freedom_that_was_not_measured_has_no_table(machine: VirtualMachine) -
     ds = measured(machine)
     alone = ds.assign({name: ds[name] * np.nan for name in DOF if name != "EY"})
     assert axis_table(alone, "Y").positions.size == 33
-    with pytest.raises(DatasetError, match="EZ is not known"):
+    with pytest.raises(DatasetError, match="EZ is unknown"):
         axis_table(alone, "Y", component="Z")
 
 
-def test_a_volume_gives_the_table_of_an_axis_at_a_place(machine: VirtualMachine) -> None:
+def test_the_table_of_an_axis_at_a_position_follows_from_a_volume(machine: VirtualMachine) -> None:
     x, y, z = (np.linspace(*machine.travel[axis], 9) for axis in "XYZ")
     nodes = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     table = axis_table(machine.volumetric_truth(nodes), "Y", component="X", at=[x[2], 0.0, z[5]])
@@ -278,7 +280,7 @@ def test_files_that_exist_are_kept(machine: VirtualMachine, tmp_path: Path) -> N
     assert not first[1].exists()
 
 
-def test_the_netcdf_file_holds_the_table(machine: VirtualMachine, tmp_path: Path) -> None:
+def test_the_netcdf_file_contains_the_table(machine: VirtualMachine, tmp_path: Path) -> None:
     table = axis_table(measured(machine, 2, reversal=REVERSAL), "Y")
     paths = export(table, get("generic")).save(tmp_path)
     with xr.open_dataset(next(path for path in paths if path.suffix == ".nc"), engine="h5netcdf") as found:
@@ -320,7 +322,7 @@ def test_a_format_of_another_distribution_is_used(monkeypatch: pytest.MonkeyPatc
     assert list(exported.files) == ["table.txt"]
     assert exported.rounding > 1e-6  # it states offsets of 0, and so is found out
     for name, message in (
-        ("wrong", "calls itself 'foreign'"), ("bare", "lacks id, title"), ("broken", "does not load: ModuleNotFound"),
+        ("wrong", "has the id 'foreign'"), ("bare", "lacks id, title"), ("broken", "cannot be loaded: ModuleNotFound"),
         ("twice", "Several distributions claim"), ("foreing", "Did you mean 'foreign'"),
     ):  # fmt: skip
         with pytest.raises(PluginError, match=message):

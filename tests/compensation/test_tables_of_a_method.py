@@ -1,4 +1,4 @@
-"""A measurement of an axis by ISO 230-2, the table that follows from it, and what it leaves of the true errors."""
+"""A measurement of an axis by ISO 230-2, its compensation table, and the remaining true errors."""
 
 import numpy as np
 import table_readers

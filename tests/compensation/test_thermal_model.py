@@ -1,4 +1,4 @@
-"""A thermal model predicts a warm-up that it has not seen, and says how well."""
+"""A thermal model predicts another warm-up, and states its uncertainty."""
 
 import json
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.compensation.online.settings import Limits
 from errormotion.compensation.thermal_model import Settings, ThermalModel, check, fit
-from errormotion.compensation.thermal_model.fitting import FEWEST_SAMPLES
+from errormotion.compensation.thermal_model.fitting import MIN_SAMPLES
 from errormotion.compensation.thermal_model.model import ROWS
 from errormotion.compensation.thermal_model.plugin import ThermalModelDataset
 from errormotion.datasets.schemas import DOF
@@ -30,7 +30,7 @@ def model(pair: list[xr.Dataset]) -> ThermalModel:
 def test_a_warm_up_with_another_speed_profile_is_predicted(
     settings: Settings, pair: list[xr.Dataset], warm_up: Callable[..., xr.Dataset]
 ) -> None:
-    """The largest errors by 80 % and more; what remains of the small ones is the noise of the measurement, 0.3 um."""
+    """The largest errors by at least 80 %; the rest of the small ones is measurement noise, 0.3 um."""
     third = warm_up(3, 2)
     found = check(fit(pair, settings), third)
     assert (found.removed[[1, 2, 3, 4]] > 0.8).all()
@@ -40,8 +40,8 @@ def test_a_warm_up_with_another_speed_profile_is_predicted(
     assert found.outside == 0
 
 
-def test_intervals_hold_over_machines(warm_up: Callable[..., xr.Dataset]) -> None:
-    """Eight machines, six errors, thirty times each; the misfit is one draw a machine, so one may fare badly."""
+def test_intervals_cover_the_truth_over_machines(warm_up: Callable[..., xr.Dataset]) -> None:
+    """Eight machines, six errors, thirty times each; the misfit is common to a machine, so one may deviate."""
     settings = Settings(variant="lagged", sensors=("head", "motor", "column_front"), lags=("10 min",))
     held = [check(fit([warm_up(s, 0), warm_up(s, 1)], settings), warm_up(s, 2)).held for s in range(10, 18)]
     assert np.mean(held) > 0.93
@@ -63,7 +63,7 @@ def test_the_prediction_is_an_error_dataset_with_sources(model: ThermalModel, pa
 def test_a_small_file_that_states_many_values_is_refused_before_the_fit(
     times: int, sensors: int, pair: list[xr.Dataset]
 ) -> None:
-    """Constant values compress a thousandfold; here they take no memory at all."""
+    """Constant values are compressed by a factor of a thousand; here they require no memory."""
     small = pair[0].isel(time=0, drop=True).drop_dims("sensor")
     packed = small.expand_dims(time=np.arange(float(times)))
     packed["temperature"] = (("time", "sensor"), np.broadcast_to(20.0, (times, sensors)))
@@ -81,7 +81,7 @@ def test_a_prediction_of_too_many_times_is_refused(model: ThermalModel) -> None:
         model.predict(log)
 
 
-def test_what_was_simulated_does_not_pass_for_measured(model: ThermalModel, pair: list[xr.Dataset]) -> None:
+def test_simulated_data_are_marked_as_such(model: ThermalModel, pair: list[xr.Dataset]) -> None:
     behind = json.loads(pair[0].attrs["provenance"])["instruments"]
     assert behind
     for ds in (model.dataset, model.predict(pair[0])):
@@ -100,7 +100,7 @@ def test_times_beyond_the_training_are_flagged(model: ThermalModel, pair: list[x
     assert "outside the training range" in json.loads(predicted.attrs["notes"])[0]
 
 
-def test_an_unknown_temperature_makes_an_unknown_error_and_is_counted(
+def test_an_unknown_temperature_causes_an_unknown_error_and_is_counted(
     model: ThermalModel, pair: list[xr.Dataset]
 ) -> None:
     torn = pair[0].copy(deep=True)
@@ -132,7 +132,7 @@ def test_a_saved_model_predicts_the_same(model: ThermalModel, pair: list[xr.Data
         model.save(tmp_path / "m.nc")
 
 
-def test_an_error_that_nobody_saw_stays_unseen(pair: list[xr.Dataset]) -> None:
+def test_an_unmeasured_error_remains_unknown(pair: list[xr.Dataset]) -> None:
     blind = [ds.copy(deep=True) for ds in pair]
     for ds in blind:
         ds["EC"] = ds["EC"] * np.nan
@@ -144,8 +144,8 @@ def test_an_error_that_nobody_saw_stays_unseen(pair: list[xr.Dataset]) -> None:
     assert np.isfinite(predicted["EZ"]).all()
 
 
-def test_sensors_are_chosen_where_the_heat_is(pair: list[xr.Dataset]) -> None:
-    """A sensor of noise alone is not chosen."""
+def test_sensors_near_the_heat_are_selected(pair: list[xr.Dataset]) -> None:
+    """A sensor with noise only is not selected."""
     noisy = []
     for number, ds in enumerate(pair):
         noise = 20 + np.random.default_rng(number).normal(size=(ds.sizes["time"], 1))
@@ -160,25 +160,25 @@ def test_one_campaign_alone_is_reported(pair: list[xr.Dataset]) -> None:
     assert fit(pair[:1], LAGGED).dataset.attrs["validated"] == "blocks in time of one campaign"
 
 
-def test_a_model_of_one_warm_up_can_be_followed_at_other_speeds(warm_up: Callable[..., xr.Dataset]) -> None:
-    """Left-out blocks alone would choose one with 10 features, of which U is 17 um."""
+def test_a_model_of_one_warm_up_is_usable_at_other_speeds(warm_up: Callable[..., xr.Dataset]) -> None:
+    """A validation by blocks alone would select a model with 10 features and U = 17 um."""
     model = fit([warm_up(29, 0).isel(time=slice(None, None, 2))], Settings(variant="dynamics"))
     covariance = model.predict(warm_up(29, 2))["covariance"].values[:, :3, :3]
     assert 2 * np.sqrt(np.einsum("tii->ti", covariance).max()) < Limits().uncertainty / 2
 
 
 def of_noise(ds: xr.Dataset, keep: int) -> xr.Dataset:
-    """Return errors whose temperatures are noise, but for some."""
+    """Return errors of which most temperatures are noise."""
     noise = 20 + 0.02 * np.random.default_rng(5).normal(size=ds["temperature"].shape)
     noise[:, :keep] = ds["temperature"].values[:, :keep]
     return ds.assign(temperature=(ds["temperature"].dims, noise))
 
 
 @pytest.mark.parametrize("keep", [0, 1])
-def test_a_model_of_one_warm_up_has_a_sensor_where_one_shows_the_heat(
+def test_a_model_of_one_warm_up_uses_a_sensor_that_shows_the_heat(
     warm_up: Callable[..., xr.Dataset], keep: int
 ) -> None:
-    """Left-out blocks would choose the speed alone on this machine, whatever the first sensor shows."""
+    """A validation by blocks would select only the speed on this machine, whatever the first sensor shows."""
     settings = Settings(variant="dynamics", time_constants=("30 min",))
     one = of_noise(warm_up(3, 0), keep)
     assert fit([one], settings).sensors == tuple(map(str, one["sensor"].values[:keep]))
@@ -188,7 +188,7 @@ def changed(ds: xr.Dataset, **attrs: object) -> xr.Dataset:
     return ds.assign_attrs(attrs)
 
 
-def test_campaigns_that_do_not_belong_together_are_refused(pair: list[xr.Dataset]) -> None:
+def test_incompatible_campaigns_are_an_error(pair: list[xr.Dataset]) -> None:
     first, second = pair
     with pytest.raises(DatasetError, match="at least one campaign"):
         fit([])
@@ -196,19 +196,19 @@ def test_campaigns_that_do_not_belong_together_are_refused(pair: list[xr.Dataset
         fit([first, changed(second, machine="Another")])
     with pytest.raises(DatasetError, match=r"Campaign 2: expected the functional point .* Move the errors"):
         fit([first, changed(second, functional_point=np.array([0.0, 0.0, 0.3]))])
-    with pytest.raises(DatasetError, match=f"at least {FEWEST_SAMPLES} known values"):
+    with pytest.raises(DatasetError, match=f"at least {MIN_SAMPLES} known values"):
         fit([first.isel(time=slice(0, 4))])
     with pytest.raises(DatasetError, match=r"sensors: expected sensors of all campaigns .*; found nose"):
         fit(pair, Settings(sensors=("nose",)))
 
 
-def test_the_same_campaign_twice_is_no_second_one(pair: list[xr.Dataset]) -> None:
+def test_a_repeated_campaign_is_an_error(pair: list[xr.Dataset]) -> None:
     with pytest.raises(DatasetError, match="Campaign 2 equals campaign 1"):
         fit([pair[0], pair[0].copy()])
 
 
-def test_a_sensor_that_one_campaign_never_knew_is_not_taken(pair: list[xr.Dataset]) -> None:
-    """A broken one: it is NaN from the begin to the end. Where all are, the campaign is refused."""
+def test_a_sensor_unknown_in_one_campaign_is_not_used(pair: list[xr.Dataset]) -> None:
+    """A broken sensor is NaN throughout. If all are, the campaign is an error."""
     deaf = pair[1].copy(deep=True)
     deaf["temperature"].loc[{"sensor": "head"}] = np.nan
     model = fit([pair[0], deaf], Settings(variant="lagged", most_sensors=2))
@@ -219,7 +219,7 @@ def test_a_sensor_that_one_campaign_never_knew_is_not_taken(pair: list[xr.Datase
         fit([pair[0], deaf], Settings(variant="lagged"))
 
 
-def test_a_check_needs_the_same_component(model: ThermalModel, pair: list[xr.Dataset]) -> None:
+def test_a_check_requires_the_same_component(model: ThermalModel, pair: list[xr.Dataset]) -> None:
     with pytest.raises(DatasetError, match="Expected errors of component 'spindle'; found 'tool'"):
         check(model, changed(pair[0], component="tool"))
 

@@ -1,4 +1,4 @@
-"""Reading by reading, a model predicts what it predicts for the whole record."""
+"""Predictions for single readings equal that for the whole record."""
 
 from collections.abc import Callable
 
@@ -58,7 +58,9 @@ def test_it_is_the_prediction_at_another_functional_point(
     np.testing.assert_allclose([p.uncertainty for p in found], u, rtol=1e-6)
 
 
-def test_after_a_gap_it_is_what_the_whole_record_gives(model: ThermalModel, warm_up: Callable[..., xr.Dataset]) -> None:
+def test_after_a_gap_it_equals_the_prediction_of_the_whole_record(
+    model: ThermalModel, warm_up: Callable[..., xr.Dataset]
+) -> None:
     data = warm_up(3, 2).copy(deep=True)
     data["temperature"][10:14, :] = np.nan
     whole = model.predict(data)
@@ -85,7 +87,7 @@ def test_times_must_increase(model: ThermalModel) -> None:
 def test_a_model_without_a_translation_is_refused(model: ThermalModel) -> None:
     ds = model.dataset.copy(deep=True)
     ds["coefficient"][2] = np.nan
-    with pytest.raises(CompensationError, match="an offset needs EX, EY and EZ"):
+    with pytest.raises(CompensationError, match="an offset requires EX, EY and EZ"):
         predictor(ds)
 
 

@@ -58,13 +58,13 @@ class Served:
 
 @pytest.fixture(scope="session")
 def markup() -> str:
-    """Return what stands in each name."""
+    """Return the markup in each name."""
     return MARKUP
 
 
 @pytest.fixture(scope="session")
 def pictures(pytestconfig: pytest.Config) -> Path | None:
-    """Return the folder for pictures of the documentation; None: none are made."""
+    """Return the folder for pictures of the documentation; None: no pictures."""
     folder = pytestconfig.getoption("--pictures")
     return Path(folder).resolve() if folder else None
 
@@ -84,7 +84,7 @@ def picture(pictures: Path | None) -> Callable[..., None]:
 
 
 def finished(root: Path, number: str, bias: float = 0.0, points: int = 5000) -> RunFolder:
-    """Write a finished run whose names hold markup: an hour of drift, in the end too large by ``bias`` along Z, m."""
+    """Write a finished run whose names contain markup: an hour of drift, larger by ``bias`` along Z at the end, m."""
     base = {"bench": {"machine": f"Mill {MARKUP}"}, "method": {"id": "spindle_drift"}, "steps": []}
     folder = RunFolder.create(root, "drift", number, {**base, "status": "finished", "errors": "errors.nc"})
     t = np.linspace(0.0, 3600.0, points)
@@ -112,7 +112,7 @@ def pair_of_runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[s
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a finished run, whose names and report hold markup, and a failed one."""
+    """Return a folder with a finished run, whose names and report contain markup, and a failed one."""
     root = tmp_path_factory.mktemp("runs")
     folder = finished(root, "00000001")
     (folder.path / "report.html").write_text(f"<!DOCTYPE html><p id=written>Report</p><p>{MARKUP}</p>")
@@ -203,7 +203,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser: Any) -> Iterator[Any]:
-    """Return an empty page; at the end nobody else was asked, and nothing failed in it."""
+    """Return an empty page; at the end check that it made no external requests and had no errors."""
     context = browser.new_context(viewport={"width": 1280, "height": 800}, accept_downloads=True)
     context.set_default_timeout(30_000)
     found = context.new_page()
@@ -223,7 +223,7 @@ def page(browser: Any) -> Iterator[Any]:
 
 @pytest.fixture
 def accessible(page: Any) -> Callable[[], None]:
-    """Return a function that refuses what axe-core finds wrong on the page by WCAG 2.2 AA, and what a screen cuts."""
+    """Return a function that checks a page by axe-core against WCAG 2.2 AA, and for clipped content."""
 
     def check() -> None:
         page.evaluate(AXE.read_text())

@@ -1,4 +1,4 @@
-"""Who may ask: names, token, origin."""
+"""Access control: host names, token, origin."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from errormotion.dashboard.access import Access, access_for
 NETWORK = access_for("0.0.0.0", ["Lab-PC.example"])
 
 
-def test_only_loopback_without_control_needs_no_token() -> None:
+def test_only_loopback_without_control_requires_no_token() -> None:
     assert access_for("127.0.0.1", control=True).token
     assert not any(access_for(host).token for host in ("127.0.0.1", "::1", "localhost", "127.9.9.9"))
     tokens = [access_for(host).token for host in ("0.0.0.0", "::", "192.168.1.5", "lab-pc", "0.0.0.0")]
@@ -17,12 +17,12 @@ def test_only_loopback_without_control_needs_no_token() -> None:
 
 @pytest.mark.parametrize("host", ["localhost:5006", "127.0.0.1", "[::1]:5006", "192.168.1.5:80", "LAB-pc.example:5006"])
 def test_own_names_and_addresses_are_admitted(host: str) -> None:
-    assert NETWORK.admits(host)
+    assert NETWORK.allows_host(host)
 
 
 @pytest.mark.parametrize("host", ["", "evil.example", "localhost.evil.example", "evil@", "[", "1.2.3.4.evil:80"])
 def test_a_page_under_a_foreign_name_is_refused(host: str) -> None:
-    assert not NETWORK.admits(host)
+    assert not NETWORK.allows_host(host)
 
 
 def test_origin_is_that_of_the_page_itself() -> None:
@@ -33,9 +33,9 @@ def test_origin_is_that_of_the_page_itself() -> None:
 
 
 def test_token_opens_and_session_is_another_secret() -> None:
-    assert NETWORK.opens(NETWORK.token)
-    assert not any(NETWORK.opens(text) for text in ("", NETWORK.token[:-1], NETWORK.session, "é\ud800"))
-    assert NETWORK.knows(NETWORK.session)
-    assert not any(NETWORK.knows(text) for text in (None, "", NETWORK.token))
-    assert not Access(frozenset()).opens("")
-    assert Access(frozenset()).knows(None)
+    assert NETWORK.accepts_token(NETWORK.token)
+    assert not any(NETWORK.accepts_token(text) for text in ("", NETWORK.token[:-1], NETWORK.session, "é\ud800"))
+    assert NETWORK.accepts_session(NETWORK.session)
+    assert not any(NETWORK.accepts_session(text) for text in (None, "", NETWORK.token))
+    assert not Access(frozenset()).accepts_token("")
+    assert Access(frozenset()).accepts_session(None)

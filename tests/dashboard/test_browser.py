@@ -1,4 +1,4 @@
-"""The dashboard in Chromium: what a person sees, without a request to others or an error in the console."""
+"""The dashboard in Chromium: its content, without external requests or errors in the console."""
 
 import time
 from collections.abc import Callable
@@ -60,20 +60,20 @@ def test_results_and_a_run_at_another_functional_point(
     assert page.evaluate("window.taken") is None
 
 
-def test_the_token_is_asked_for(page: Any, accessible: Callable[[], None], open_to_the_network: Any) -> None:
+def test_the_token_is_requested(page: Any, accessible: Callable[[], None], open_to_the_network: Any) -> None:
     page.expected_errors = ("403",)
     page.goto(open_to_the_network.address + "results")
     accessible()
     page.keyboard.type("wrong")
     page.keyboard.press("Enter")
-    page.wait_for_selector("text=This is not the token")
+    page.wait_for_selector("text=The token is wrong")
     page.fill("#token", open_to_the_network.access.token)
     page.keyboard.press("Enter")
     page.wait_for_selector("h1:text('Results')")
     assert open_to_the_network.access.session not in page.evaluate("document.cookie")
 
 
-def test_values_live_and_a_sensor_that_is_unplugged(
+def test_live_values_and_a_disconnected_sensor(
     page: Any,
     accessible: Callable[[], None],
     serving: Callable[..., Any],
@@ -122,7 +122,7 @@ def test_values_live_and_a_sensor_that_is_unplugged(
 
 
 def _shows_the_same(page: Any, address: str) -> None:
-    """Require that another client shows the same values for the same rows of the log, if not at the same instant."""
+    """Require that another client shows the same values for the same rows of the log."""
     shown = "() => [document.querySelector('#clock').innerText, document.querySelector('#temperatures').innerText]"
     other = page.context.new_page()
     other.goto(address)
@@ -160,7 +160,7 @@ def test_two_results_are_compared(
     assert "contradict each other" in page.inner_text("h2.bad")
     accessible()
     page.click("text=Compensate")
-    page.click("text=What a compensation took off")
+    page.click("text=Effect of a compensation")
     for name, number in (("before", 1), ("after", 2)):
         page.select_option(f"#{name}", index=number)
     page.click("button:has-text('Compare')")

@@ -1,4 +1,4 @@
-"""The page Measure in Chromium: a campaign from its form to its report, past the end of the dashboard."""
+"""The page Measure in Chromium: a campaign from its form to its report, also after the end of the dashboard."""
 
 import os
 import re
@@ -47,7 +47,7 @@ schedule = [{ at = "0 s", spindle_speed = "15000 /min" }]
 
 @pytest.fixture
 def mortal(tmp_path: Path) -> Iterator[tuple[Any, str, str]]:
-    """Return the process of a dashboard that can be killed, its address and its token; at the end nothing runs."""
+    """Return the process of a dashboard that can be killed, its address and its token; it is ended after the test."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     options = ["--campaigns", str(tmp_path), "--allow-control", "--port", str(port), "--no-browser"]
@@ -73,7 +73,7 @@ def mortal(tmp_path: Path) -> Iterator[tuple[Any, str, str]]:
 
 
 @pytest.mark.timeout(400)  # three programs start, slowly on a busy computer
-def test_a_campaign_is_corrected_planned_run_stopped_resumed_and_outlives_the_dashboard(
+def test_a_campaign_is_corrected_planned_run_stopped_resumed_and_continues_after_the_dashboard(
     page: Any,
     accessible: Callable[[], None],
     mortal: tuple[Any, str, str],

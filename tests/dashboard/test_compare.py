@@ -59,11 +59,13 @@ def test_the_report_of_a_comparison_is_in_a_sandbox(served: Any, pair_of_runs: t
     assert "<script>window" not in text
 
 
-def test_what_cannot_be_compared_is_said_beside_the_choice(served: Any, pair_of_runs: tuple[Path, list[str]]) -> None:
+def test_incomparable_results_are_reported_next_to_the_selection(
+    served: Any, pair_of_runs: tuple[Path, list[str]]
+) -> None:
     keys = pair_of_runs[1]
     for query, message in (
-        (_query(keys[:1]), "Choose one more result"),
-        (_query([*keys, "nowhere"]), "There is no run"),
+        (_query(keys[:1]), "Select at least one more result"),
+        (_query([*keys, "nowhere"]), "No run"),
         (urlencode({"history_machine": "nobody", "figure": "EZ"}), 'role="alert"'),
     ):
         status, _, text = served.ask(f"/compare?{query}")
@@ -81,7 +83,7 @@ def test_a_figure_over_time(served: Any, markup: str) -> None:
     assert "<script>window" not in text
 
 
-def test_comparisons_that_take_long_hold_nobody_else_up(
+def test_long_comparisons_do_not_delay_other_requests(
     served: Any, pair_of_runs: tuple[Path, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     release = threading.Event()

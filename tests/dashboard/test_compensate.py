@@ -1,4 +1,4 @@
-"""The page Compensate: who may start and stop, what a compensation does as a person sees it, and its end at zero."""
+"""The page Compensate: authorisation, display of a compensation, and its end at zero."""
 
 import os
 import threading
@@ -70,7 +70,7 @@ def test_without_control_nothing_starts_and_nothing_stops(shown_only: Any, place
     assert not list(compensations(place.runs))
 
 
-def test_forged_and_wrong_requests_start_nothing(
+def test_forged_and_invalid_requests_start_nothing(
     served: Any, serving: Callable[..., Any], place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("subprocess.Popen", None)
@@ -95,18 +95,18 @@ def test_forged_and_wrong_requests_start_nothing(
 
 
 @pytest.mark.slow
-def test_a_shadow_then_armed_then_zero(
+def test_shadow_operation_then_armed_then_zero(
     page: Any, accessible: Callable[[], None], served: Any, shown_only: Any, serving: Callable[..., Any], place: Place
 ) -> None:
     from playwright.sync_api import expect
 
     page.expected_errors = ("400",)
     served.enter(page, "compensate")
-    assert page.locator("#none").inner_text() == "No compensation is at work."
+    assert page.locator("#none").inner_text() == "No compensation is running."
 
     # A shadow writes nothing.
     page.click("button:has-text('Start')")
-    page.wait_for_selector(".at-work:has-text('shadow: nothing is written')")
+    page.wait_for_selector(".at-work:has-text('shadow mode: nothing is written')")
     page.wait_for_selector(".states li.here.following")
     assert page.inner_text("#inputs tr th") == SENSOR
     page.wait_for_selector("#curves[data-drawn] canvas")

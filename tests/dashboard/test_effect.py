@@ -1,4 +1,4 @@
-"""The page of the effect of a compensation over HTTP: words and figures are those of the functions."""
+"""The page of the effect of a compensation over HTTP: texts and figures are those of the functions."""
 
 from collections.abc import Callable
 from html import escape
@@ -30,4 +30,4 @@ def test_the_effect_is_that_of_the_function(serving: Callable[..., Any], pair_of
     assert headers["Content-Security-Policy"].startswith("sandbox")
     assert "<h1>Effect of " in report
     status, _, page = served.ask("/compensate/effect?" + urlencode({"before": more, "after": "nowhere"}))
-    assert (status, "There is no run" in page) == (200, True)
+    assert (status, "No run" in page) == (200, True)

@@ -40,22 +40,22 @@ def test_filters_select(lab: Lab, choice: Choice, number: int) -> None:
     assert len(lab.table(choice).rows) == number
 
 
-def test_a_date_without_sense_is_refused(lab: Lab) -> None:
+def test_an_invalid_date_is_an_error(lab: Lab) -> None:
     with pytest.raises(RunError, match="since: expected a date"):
         lab.table(Choice(since="yesterday"))
 
 
-def test_a_folder_that_is_not_there_yet_is_an_empty_table(tmp_path: Path) -> None:
+def test_a_missing_folder_is_an_empty_table(tmp_path: Path) -> None:
     assert Lab(tmp_path / "later").table(Choice()).rows == ()
 
 
 @pytest.mark.parametrize("key", ["", ".", "..", "../{name}", "/etc", "{name}/.", "{name}/../{name}", "a\0b", "a" * 700])
-def test_a_key_leads_nowhere_else(lab: Lab, runs: Path, key: str) -> None:
-    with pytest.raises(RunError, match="There is no run"):
+def test_a_key_cannot_leave_the_folder(lab: Lab, runs: Path, key: str) -> None:
+    with pytest.raises(RunError, match="No run"):
         lab.folder(key.format(name=next(path.name for path in runs.iterdir() if path.is_dir())))
 
 
-def test_only_named_files_inside_the_folder_are_given(tmp_path: Path, lab: Lab, key: str) -> None:
+def test_only_named_files_inside_the_folder_are_served(tmp_path: Path, lab: Lab, key: str) -> None:
     assert set(lab.files(key)) == {"report", "run", "log", "errors"}
     assert lab.file(key, "errors").name == "errors.nc"
     for word in ("errors.nc", "../run.json", "", "raw"):

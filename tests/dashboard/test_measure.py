@@ -1,4 +1,4 @@
-"""The page Measure over HTTP: fields, messages, plan, and what is refused without control."""
+"""The page Measure over HTTP: fields, messages, plan, and rejected requests without control."""
 
 import itertools
 import json
@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
 
 from errormotion.campaign.background import processes
+from errormotion.dashboard.cache import TimedCache
 from errormotion.dashboard.campaigns import hash_of
-from errormotion.dashboard.kept import Lately
 from errormotion.dashboard.pages import measure
 
 BENCH = """\
@@ -133,13 +133,13 @@ def test_nothing_is_started_or_stopped_without_control(reading: Any, folder: Pat
 
 
 @pytest.mark.parametrize("path", ORDERS)
-def test_orders_come_from_pages_of_this_server_only(controlling: Any, path: str) -> None:
+def test_actions_are_accepted_from_pages_of_this_server_only(controlling: Any, path: str) -> None:
     assert controlling.ask(path, "POST", "{}", Origin="http://evil.example")[0] == 403
     assert controlling.ask(path, "POST", "{}")[0] == 403
     assert controlling.ask(path)[0] == 405
 
 
-def test_every_order_needs_control() -> None:
+def test_every_action_requires_control() -> None:
     handlers = dict(measure.HANDLERS)
     assert all(handlers[path].controls for path in ORDERS)
     reads = {"/measure", r"/measure/form\.json", r"/measure/plan\.json"}
@@ -147,12 +147,12 @@ def test_every_order_needs_control() -> None:
     assert set(handlers) - set(ORDERS) == reads
 
 
-def test_a_file_is_saved_once_and_not_over_the_work_of_others(controlling: Any, folder: Path) -> None:
+def test_a_file_is_saved_once_and_changes_of_others_are_not_overwritten(controlling: Any, folder: Path) -> None:
     text = (folder / "drift.toml").read_text()
     order = {"file": "other.toml", "text": text, "before": ""}
     assert _post(controlling, "/measure/save", **order) == (200, {"file": "other.toml", "before": hash_of(text)})
     changed = {**order, "text": text.replace("1 min", "2 min")}
-    assert "was changed by others" in _post(controlling, "/measure/save", **changed)[1]["error"]
+    assert "was changed by another program" in _post(controlling, "/measure/save", **changed)[1]["error"]
     assert _post(controlling, "/measure/save", **{**changed, "before": hash_of(text)})[0] == 200
     assert (folder / "other.toml").read_text() == changed["text"]
     for name in ("../x.toml", "x.txt", ".x.toml", "a/b.toml", "bench.toml"):
@@ -165,23 +165,23 @@ def test_a_file_is_saved_once_and_not_over_the_work_of_others(controlling: Any, 
     assert processes.found(folder / "runs") == []
 
 
-def test_without_control_no_other_files_are_looked_at(reading: Any, folder: Path) -> None:
+def test_without_control_no_other_files_are_read(reading: Any, folder: Path) -> None:
     text = (folder / "drift.toml").read_text()
     asked = itertools.product(("drift.toml", "", "none.toml", "../drift.toml"), ("/etc/hostname", "../b.toml", "C:/x"))
     for name, path in asked:
         status, found = _post(reading, "/measure/form.json", file=name, text=text.replace("bench.toml", path))
-        assert (status, "looks at files of its folder only" in found["error"]) == (400, True)
+        assert (status, "reads files of its folder only" in found["error"]) == (400, True)
 
 
 @pytest.mark.parametrize("body", ["", "[]", "{}", '{"file": 1, "text": "x"}', "[" * 100_000, "\xff"])
-def test_a_request_that_is_none_is_refused(reading: Any, body: str) -> None:
+def test_an_invalid_request_is_rejected(reading: Any, body: str) -> None:
     headers = {"Origin": reading.address.rstrip("/"), "Accept": "application/json"}
     assert reading.ask("/measure/form.json", "POST", body, **headers)[0] == 400
 
 
-def test_many_clients_do_not_keep_the_server_at_work() -> None:
+def test_many_clients_do_not_increase_the_load_of_the_server() -> None:
     made: list[int] = []
-    lately: Lately[int] = Lately(1000.0, most=2)
+    lately: TimedCache[int] = TimedCache(1000.0, most=2)
 
     def make() -> int:
         made.append(len(made))
@@ -189,4 +189,4 @@ def test_many_clients_do_not_keep_the_server_at_work() -> None:
 
     assert [lately.get("a", make) for _ in range(20)] == [0] * 20
     assert [lately.get(key, make) for key in "bca"] == [1, 2, 3]
-    assert Lately(0.0).get("a", make) == 4
+    assert TimedCache(0.0).get("a", make) == 4

@@ -1,4 +1,4 @@
-"""The dashboard with the virtual machine: ``make pictures`` writes what these tests see into the documentation."""
+"""The dashboard with the virtual machine: ``make pictures`` writes its pictures into the documentation."""
 
 import json
 import re
@@ -158,7 +158,7 @@ def warming(tmp_path: Path) -> Iterator[Path]:
 
 
 def _apart(found: list[dict[str, Any]]) -> None:
-    """Require that no text lies on another, on a circle, or beyond its drawing."""
+    """Require that no text overlaps another one or a circle, or exceeds its drawing."""
     for k, one in enumerate(found):
         left, top, right, bottom = one["box"]
         if one["kind"] == "text":
@@ -171,7 +171,7 @@ def _apart(found: list[dict[str, Any]]) -> None:
                 assert wide < 1 or high < 2, (one, other)
 
 
-def test_now_shows_a_machine_that_warms_up_and_an_instrument_that_is_off(
+def test_now_shows_a_warming_machine_and_a_missing_instrument(
     page: Any,
     accessible: Callable[[], None],
     serving: Callable[..., Any],
@@ -249,7 +249,7 @@ def test_results_of_the_demonstration(
 
 @contextmanager
 def _compensating(folder: Path) -> Iterator[Path]:
-    """Compensate the virtual machine by a model of two other warm-ups; give the runs."""
+    """Compensate the virtual machine by a model of two other warm-ups; yield the runs."""
     rng = np.random.default_rng(5)
     machine, warm_ups = VirtualMachine("cframe", seed=5), []
     for speeds in ([(0, 6000), (3600, 12000), (7200, 0)], [(0, 15000), (2400, 3000), (6000, 9000)]):

@@ -1,4 +1,4 @@
-"""The server over HTTP: rules of access on every address, names as text, files in a sandbox, figures."""
+"""The server over HTTP: access control of all addresses, names as text, files in a sandbox, figures."""
 
 import gc
 import http.client
@@ -64,13 +64,13 @@ def test_nothing_is_read_without_the_token(open_to_the_network: Any, path: str) 
 
 
 @pytest.mark.parametrize("path", [*PATHS, "/login", "/static/dashboard.css"])
-def test_a_foreign_name_is_refused_everywhere(open_to_this_computer: Any, path: str) -> None:
+def test_a_foreign_host_name_is_rejected_by_all_handlers(open_to_this_computer: Any, path: str) -> None:
     status, _, text = open_to_this_computer.ask(path, Host="evil.example:5006")
     assert status == 421
     assert "Mill" not in text
 
 
-def test_the_token_opens_and_no_log_holds_it(open_to_the_network: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_token_gives_access_and_is_in_no_log(open_to_the_network: Any, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     served, token = open_to_the_network, open_to_the_network.access.token
     origin = {"Origin": served.address.rstrip("/"), "Content-Type": "application/x-www-form-urlencoded"}
@@ -81,7 +81,7 @@ def test_the_token_opens_and_no_log_holds_it(open_to_the_network: Any, caplog: p
     )
     status, headers, text = served.ask("/login", "POST", urlencode({"token": token[:-1]}), **origin)
     assert (status, "Set-Cookie" in headers) == (403, False)
-    assert "This is not the token" in text
+    assert "The token is wrong" in text
     status, headers, _ = served.ask("/login", "POST", urlencode({"token": token}), **origin)
     assert status == 302
     cookie = headers["Set-Cookie"]
@@ -153,7 +153,7 @@ def test_a_certificate_needs_its_key(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <socket")
 def test_an_address_in_use_is_named(open_to_this_computer: Any, tmp_path: Path) -> None:
     port = int(open_to_this_computer.address.rstrip("/").rpartition(":")[2])
-    with pytest.raises(RunError, match=f"port {port}: cannot be listened on"):
+    with pytest.raises(RunError, match=f"port {port}: the server cannot listen"):
         run(Options(tmp_path, port=port), lambda *_: None)
     gc.collect()  # tornado leaves the socket that it could not bind to the collector
 
@@ -181,7 +181,7 @@ def test_the_connection_is_encrypted_with_a_certificate(
     assert "Secure" in str(answer.headers["Set-Cookie"])
 
 
-def test_a_client_that_does_not_read_holds_nobody_up(open_to_this_computer: Any, key: str) -> None:
+def test_a_client_that_does_not_read_delays_no_other_client(open_to_this_computer: Any, key: str) -> None:
     port = int(open_to_this_computer.address.rstrip("/").rpartition(":")[2])
     with ExitStack() as stack:
         for _ in range(8):  # more than there are threads
@@ -193,7 +193,7 @@ def test_a_client_that_does_not_read_holds_nobody_up(open_to_this_computer: Any,
 
 
 def _certificate(folder: Path) -> tuple[Path, Path]:
-    """Write a key and a certificate of 127.0.0.1 that it signed itself; return both files."""
+    """Write a key and a self-signed certificate of 127.0.0.1; return both files."""
     x509 = pytest.importorskip("cryptography.x509")
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec

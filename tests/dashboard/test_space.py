@@ -23,7 +23,7 @@ from errormotion.errors import DatasetError
 
 @pytest.fixture(scope="module")
 def volume() -> xr.Dataset:
-    """A volume of 27 targets that is stretched along X by 10 um/m, and turned by 1 urad about Y; one is unknown."""
+    """A volume of 27 targets, scaled along X by 10 um/m and rotated by 1 urad about Y; one is unknown."""
     grid = np.stack(np.meshgrid(*[np.linspace(0.0, 0.4, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     twist = np.zeros((27, 6))
     twist[:, 0], twist[:, 4] = 10e-6 * grid[:, 0], 1e-6
@@ -46,7 +46,7 @@ def _lines(found: Any) -> Any:
 
 def test_arrows_are_the_errors_at_the_functional_point(volume: xr.Dataset) -> None:
     found = drawing(volume)
-    factor = int(re.search(r"(\d+) times enlarged", found.caption).group(1))  # type: ignore[union-attr]
+    factor = int(re.search(r"enlarged (\d+) times", found.caption).group(1))  # type: ignore[union-attr]
     ends = _lines(found)
     known = np.isfinite(volume["EX"].values)
     assert len(ends) == known.sum() == 26
@@ -59,7 +59,7 @@ def test_arrows_are_the_errors_at_the_functional_point(volume: xr.Dataset) -> No
     assert "<b>" not in str(found.markup)
 
 
-def test_what_is_no_volume_is_refused(volume: xr.Dataset) -> None:
+def test_a_dataset_without_volume_is_an_error(volume: xr.Dataset) -> None:
     assert not has_volume(volume.drop_vars("x"))
     with pytest.raises(DatasetError, match="at targets"):
         drawing(volume.drop_vars("x"))

@@ -1,4 +1,4 @@
-"""What a bench says now, and its history in memory."""
+"""Present readings of a bench, and their history in memory."""
 
 import math
 import time
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from errormotion.campaign.background.recorded import Value
+from errormotion.campaign.claims import claimed
 from errormotion.campaign.files import load_bench
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
-from errormotion.campaign.turns import claimed
 from errormotion.dashboard.watch import Present, Watch
 from errormotion.errors import BenchError
 
@@ -91,7 +91,7 @@ def test_an_emergency_stop_is_an_alarm(make: Callable[..., Watch]) -> None:
     assert watch.present().alarms == ("emergency stop",)
 
 
-def test_a_monitor_that_ends_says_why(make: Callable[..., Watch], tmp_path: Path) -> None:
+def test_a_monitor_reports_the_reason_of_its_end(make: Callable[..., Watch], tmp_path: Path) -> None:
     (tmp_path / "runs").write_text("a file, where the folder of runs should be")
     present = wait(make(), lambda now: not now.running)
     assert present.error
@@ -113,7 +113,7 @@ def test_memory_is_a_ring_and_reduction_keeps_a_peak(make: Callable[..., Watch])
     assert times[-1] - times[0] == pytest.approx(28_799)
 
 
-def test_a_bench_without_anything_to_read_is_refused(make: Callable[..., Watch]) -> None:
+def test_a_bench_without_readable_instruments_is_an_error(make: Callable[..., Watch]) -> None:
     with pytest.raises(BenchError, match="expected thermometers, a controller, or both"):
         make(
             MODULES.partition("[instruments")[0]
@@ -121,7 +121,9 @@ def test_a_bench_without_anything_to_read_is_refused(make: Callable[..., Watch])
         )
 
 
-def test_instruments_are_lent_to_who_measures_and_taken_again(make: Callable[..., Watch], tmp_path: Path) -> None:
+def test_instruments_are_released_for_a_measurement_and_opened_again(
+    make: Callable[..., Watch], tmp_path: Path
+) -> None:
     watch = make()
     wait(watch, lambda now: now.rows >= 2)
     other = Monitor(watch.plan, tmp_path / "others", 0.1)
@@ -129,14 +131,14 @@ def test_instruments_are_lent_to_who_measures_and_taken_again(make: Callable[...
         # The claim is given once the instruments are closed here: nobody else has them now.
         assert [source._driver for source in watch._monitor.sources] == [None]
         present = wait(watch, lambda now: now.lent.startswith("A run <i>"))
-        assert "recorded nothing yet" in present.lent
+        assert "recorded no samples yet" in present.lent
         assert [each.state for each in present.instruments] == ["lent"]
         with other:
             records(other.folder.path)
             for snapshot in other.watch():
                 present = watch.present()
                 value = present.temperatures[0].value
-                if "it records" in present.lent and math.isfinite(value):
+                if "its record" in present.lent and math.isfinite(value):
                     break
                 assert snapshot.time < 30
         assert (present.run, present.rows > 0) == (other.folder.path.name, True)

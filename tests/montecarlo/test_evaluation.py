@@ -1,4 +1,4 @@
-"""Monte Carlo evaluation of a method: the same trials whatever executes them, kept, resumed, and judged."""
+"""Monte Carlo evaluation of a method: trials are independent of the executor, stored, resumed, and evaluated."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ NOISE, OFFSET = 0.5e-6, 0.9e-6  # m
 
 
 class Straight:
-    """Displacement along X and Y at three times; a reading has noise, all of them share an offset of the sensor."""
+    """Displacement along X and Y at three times; readings have noise and a common offset of the sensor."""
 
     info = MethodInfo("straight", "A method that exists in this test only", "simulated_only")
     needs = Needs((), "errormotion.raw.straight/1")
@@ -78,7 +78,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture(scope="module")
 def found(measured, tmp_path_factory: pytest.TempPathFactory) -> xr.Dataset:
-    """The evaluation, one trial after another."""
+    """The evaluation, with trials in sequence."""
     return _evaluate(measured, tmp_path_factory.mktemp("sync") / "trials", scheduler="sync")
 
 
@@ -96,14 +96,14 @@ def test_the_trials_have_the_stated_uncertainty(found):
     assert found.attrs["trials"] == TRIALS
 
 
-def test_threads_give_the_same_bits_and_leave_no_trials(measured, found, tmp_path):
+def test_threads_return_identical_results_and_leave_no_trials(measured, found, tmp_path):
     again = _evaluate(measured, tmp_path / "trials", scheduler="threads", workers=3)
     assert again.identical(found)
     assert not (tmp_path / "trials").exists()
 
 
 @pytest.mark.slow
-def test_processes_and_a_cluster_give_the_same_bits(tmp_path):
+def test_processes_and_a_cluster_return_identical_results(tmp_path):
     from distributed import LocalCluster
 
     subject = plugins.get("methods", "normal_vector").conformance()[0]
@@ -117,7 +117,7 @@ def test_processes_and_a_cluster_give_the_same_bits(tmp_path):
 
 
 @pytest.mark.slow
-def test_as_many_trials_as_it_takes(measured, tmp_path, monkeypatch):
+def test_trials_continue_until_the_tolerance_is_reached(measured, tmp_path, monkeypatch):
     """u = 1.03 um and a tolerance of 0.5 um: some hundred trials decide, and the linear model is validated."""
     monkeypatch.setattr(evaluation, "block_size", lambda probability, cheap: 60)
     found = _evaluate(measured, tmp_path / "trials", trials=None, scheduler="sync", most=3000)
@@ -158,8 +158,8 @@ def test_trials_of_another_evaluation_are_not_used(measured, tmp_path):
         _evaluate(measured, tmp_path / "trials", scheduler="sync")
 
 
-def test_a_folder_in_which_an_evaluation_had_only_begun_is_used(tmp_path):
-    """Its process was killed, or its disk was full, while the key was written."""
+def test_a_folder_of_a_started_evaluation_is_used(tmp_path):
+    """Its process was killed, or the disk was full, while the key was written."""
     (tmp_path / ".evaluation.json.part").write_text('{"se')
     with Store(tmp_path, {"seed": 1}):
         pass
@@ -167,13 +167,13 @@ def test_a_folder_in_which_an_evaluation_had_only_begun_is_used(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "[" * 10**5, "3", " " * (2**20 + 1)])
-def test_a_damaged_folder_is_refused_in_words(tmp_path, text):
+def test_a_damaged_folder_is_reported(tmp_path, text):
     (tmp_path / "evaluation.json").write_text(text)
     with pytest.raises(RunError, match="trials"), Store(tmp_path, {"seed": 1}):
         pass
 
 
-def test_damaged_trials_are_made_again(tmp_path):
+def test_damaged_trials_are_repeated(tmp_path):
     with Store(tmp_path / "trials", {"seed": 1}) as store:
         store.keep(0, range(2), np.ones((2, 3)))
         store.keep(0, range(2, 4), np.ones((2, 3)))
@@ -182,9 +182,9 @@ def test_damaged_trials_are_made_again(tmp_path):
         assert store.chunks(0, 4) == [range(2)]
 
 
-@pytest.mark.parametrize(("options", "message"), [({"trials": 10}, "from 40 on"), ({"digits": 3}, "1 or 2"),
+@pytest.mark.parametrize(("options", "message"), [({"trials": 10}, "at least 40 trials"), ({"digits": 3}, "1 or 2"),
                                                   ({"scheduler": "elsewhere"}, "Dask scheduler")])  # fmt: skip
-def test_options_that_make_no_sense_are_refused(measured, tmp_path, options, message):
+def test_invalid_options_are_an_error(measured, tmp_path, options, message):
     with pytest.raises((MethodError, RunError), match=message):
         _evaluate(measured, tmp_path / "trials", **options)
 
@@ -195,11 +195,11 @@ def test_a_method_without_redrawing_is_refused(measured):
     class Plain:
         info = method.info
 
-    with pytest.raises(MethodError, match="does not state how its sources are drawn"):
+    with pytest.raises(MethodError, match="has no 'redrawing'"):
         trials.redrawing_of(Plain(), None, settings, errors)
 
 
-def test_reduced_data_that_give_other_values_are_a_defect(measured):
+def test_reduced_data_with_other_values_are_a_defect(measured):
     path, method, settings, errors = measured
     raw = datasets.load(path).load()
 
@@ -208,11 +208,11 @@ def test_reduced_data_that_give_other_values_are_a_defect(measured):
             scaled = raw.assign(reading=raw["reading"] + 1e-5)
             return Redrawing(scaled, settings, {})
 
-    with pytest.raises(MethodError, match="defect of the method's redrawing"):
+    with pytest.raises(MethodError, match="defect of the redrawing of the method"):
         trials.redrawing_of(Shifted(), raw, settings, errors)
 
 
-def test_a_source_that_is_left_out_leaves_the_draws_of_the_others():
+def test_an_omitted_source_does_not_change_the_samples_of_the_others():
     def adds(raw, settings, generator):
         return [*raw, generator.normal()], settings
 
@@ -236,7 +236,7 @@ def test_refused_trials_are_counted_and_named(measured, tmp_path, monkeypatch):
     monkeypatch.setattr(trials, "trial", refuses)
     found = _evaluate(measured, tmp_path / "trials", scheduler="sync")
     assert int(found["missing"].max()) == TRIALS // 5
-    assert any("8 trials were refused: no luck" in note for note in found.attrs["notes"])
+    assert any("8 trials failed: no luck" in note for note in found.attrs["notes"])
     assert {line.word for line in lines(found)} == {"undecided"}
 
 
@@ -283,7 +283,7 @@ def test_the_command_prints_and_stores_the_verdicts(measured, tmp_path):
     assert "exists already" in repeated.output
 
 
-def test_several_results_are_evaluated_one_after_another_and_a_second_call_adds_nothing(measured, tmp_path):
+def test_several_results_are_evaluated_in_sequence_and_a_second_call_adds_nothing(measured, tmp_path):
     raws = [shutil.copy(measured[0], tmp_path / f"{name}.nc") for name in "ab"]
     command = ["identify", *map(str, raws), "--out", str(tmp_path / "out"), "--method", "straight"]
     command += ["--monte-carlo", str(TRIALS), "--scheduler", "sync"]
@@ -296,7 +296,7 @@ def test_several_results_are_evaluated_one_after_another_and_a_second_call_adds_
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == made
 
 
-def test_a_number_of_trials_is_a_number(measured, tmp_path):
+def test_the_number_of_trials_is_validated(measured, tmp_path):
     result = CliRunner().invoke(
         app,
         ["identify", str(measured[0]), "--out", str(tmp_path / "e.nc"), "--method", "straight", "--monte-carlo", "x"],
@@ -313,7 +313,7 @@ def test_the_chapter_states_every_freedom(found):
     assert all(len(row) == len(head) for row in rows)
 
 
-def test_what_breaks_the_schema_is_named(found):
+def test_violations_of_the_schema_are_named(found):
     broken = found.drop_vars("shortest").assign(verdict=found["verdict"] + 3)
     with pytest.raises(DatasetError, match="shortest"):
         datasets.validate(broken)

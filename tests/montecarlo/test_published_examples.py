@@ -36,7 +36,7 @@ def arcsine(low, high):
 
 
 def curvilinear_trapezoid(low, high, uncertain):
-    """A rectangle whose half width is itself known to within ``uncertain``: JCGM 101, 6.4.3.4."""
+    """A rectangle whose half width is known to within ``uncertain``: JCGM 101, 6.4.3.4."""
 
     def draw(generator, size):
         first = low - uncertain + 2 * uncertain * generator.uniform(size=size)
@@ -199,7 +199,7 @@ def test_end_gauge_of_the_gum():
     assert found.mean[0] == pytest.approx(838.0, abs=0.5)
 
 
-def test_another_package_gives_the_same_gauge_block():
+def test_another_package_returns_the_same_gauge_block_result():
     """MetroloPy, linear and by Monte Carlo, on 9.5: u 32 nm and 36 nm, 99 % interval."""
     metrolopy = pytest.importorskip("metrolopy", reason="the package MetroloPy, another implementation, is missing")
     given = metrolopy.gummy
@@ -225,7 +225,7 @@ def test_another_package_gives_the_same_gauge_block():
 
 
 def test_bounds_of_an_end_hold_as_often_as_stated():
-    """Of 4000 samples of 300, both quantiles lie within their bounds but for the stated share."""
+    """Of 4000 samples of 300, both quantiles lie within their bounds except for the stated fraction."""
     samples = np.sort(np.random.default_rng(2).exponential(size=(300, 4000)), axis=0)
     alarm = 0.05
     for bounds, q in zip(intervals.confidence(samples, 0.95, alarm), (0.025, 0.975), strict=True):
@@ -235,7 +235,7 @@ def test_bounds_of_an_end_hold_as_often_as_stated():
 
 
 def test_a_linear_model_is_never_rejected_by_few_trials():
-    """Two hundred quantities by 100 trials each, as normal as they are stated: none may be 'not validated'."""
+    """Two hundred normally distributed quantities by 100 trials each: none may be 'not validated'."""
     for seed in range(20):
         found = propagate(
             lambda sequence, n: np.random.default_rng(sequence).normal(size=(n, 200)), trials=100, seed=seed

@@ -20,7 +20,7 @@ from errormotion.datasets.files import events
 from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
-from errormotion.record.figures import follow
+from errormotion.record.figures import figure_over_time
 from errormotion.record.history import history
 from errormotion.record.runs.listing import list_runs
 from errormotion.report import write_run_report
@@ -131,30 +131,30 @@ def test_the_step_is_named_by_the_note_between_its_runs(lab: Path, call: Callabl
     assert [note["text"] for note in found["notes_on_machine"]] == ["coolant off", "hit the vice"]
 
 
-def test_a_shared_source_is_one_draw_for_a_freedom_and_for_a_figure_of_merit(lab: Path) -> None:
+def test_a_common_source_is_fully_correlated_between_a_freedom_and_a_figure_of_merit(lab: Path) -> None:
     runs = list_runs([lab]).runs[:3]
     for figure in ("EZ after 60 min", "EZ after*"):
-        series = follow(runs, figure).series
+        series = figure_over_time(runs, figure).series
         assert series.identities == ["certificate 17"]
         assert series.influence == pytest.approx(BAR)
         assert series.covariance[0, 1] == pytest.approx(BAR**2)
         assert series.covariance[0, 0] == pytest.approx(0.09e-12 + BAR**2)
-    assert follow(runs, "EX after 60 min").series.identities == []
+    assert figure_over_time(runs, "EX after 60 min").series.identities == []
 
 
-def test_the_influence_that_a_method_states_for_its_figure_counts(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_influence_stated_by_a_method_for_its_figure_is_used(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
         return [replace(figure, influence={"bar": BAR / 2}) for figure in figures_of(errors)]
 
     monkeypatch.setattr("errormotion.datasets.results.merit.figures_of", figures)
-    series = follow(list_runs([lab]).runs[:3], "EZ after*").series
+    series = figure_over_time(list_runs([lab]).runs[:3], "EZ after*").series
     assert series.identities == ["certificate 17"]
     assert series.influence == pytest.approx(BAR / 2)
 
 
 def test_a_freedom_follows_the_functional_point(lab: Path) -> None:
     runs = list_runs([lab]).runs[:3]
-    here, there = (follow(runs, "EZ", at).series for at in ((0, 0, 0), (0, 0.1, 0)))
+    here, there = (figure_over_time(runs, "EZ", at).series for at in ((0, 0, 0), (0, 0.1, 0)))
     assert there.value - here.value == pytest.approx(20e-6 * 0.1)
     assert there.u**2 - here.u**2 == pytest.approx(1e-12 * 0.1**2)
 
@@ -198,7 +198,7 @@ def test_dataset_and_page(lab: Path, call: Callable[..., Any], tmp_path: Path) -
         (lambda ds: ds.assign_attrs(start="soon"), "attribute 'start'"),
     ],
 )
-def test_a_history_that_breaks_its_schema_is_refused(
+def test_a_history_that_violates_its_schema_is_an_error(
     stored_history: xr.Dataset, change: Callable[[xr.Dataset], xr.Dataset], expected: str
 ) -> None:
     (first, *_) = datasets.violations(change(stored_history))
@@ -216,11 +216,11 @@ def test_a_history_without_steps_and_notes_is_stored(tmp_path: Path, call: Calla
     assert np.isnan(found["trend"])
 
 
-def test_what_is_unknown_is_answered_with_what_there_is(lab: Path, call: Callable[..., Any]) -> None:
+def test_an_unknown_name_is_reported_with_the_available_ones(lab: Path, call: Callable[..., Any]) -> None:
     shown = call(lab, "--figure", "hysteresis", code=1)
     assert "'EZ after 60.0 min'" in shown
     assert "EX to EC" in shown
-    assert "stands for several figures of run-00" in call(lab, "--figure", "E*", code=1)
+    assert "matches several figures of run-00" in call(lab, "--figure", "E*", code=1)
     assert "has no deviation" in call(lab, "--figure", "deviation", code=1)
     assert "a freedom, such as EZ" in call(lab, "--figure", "EZ after*", "--at", "0,0,0", code=1)
     call(lab, "--figure", "EZ", "--at", "here", code=2)
@@ -237,32 +237,32 @@ def test_short_forms_name_the_figure_of_a_standard(tmp_path: Path) -> None:
     save(tmp_path, 0, errors({"EX": 0.0}, ("time",), {"time": [0.0]}), results=figures)
     runs = list_runs([tmp_path]).runs
     for short in ("d(Z)60", "d(Z) 60", "d(Z) within", "d(Z)*"):
-        assert follow(runs, short).series.names == [names[0]]
+        assert figure_over_time(runs, short).series.names == [names[0]]
     for wrong in ("d(Z)61", "60", "d(Y)60"):
-        with pytest.raises(RunError, match="There are"):
-            follow(runs, wrong)
+        with pytest.raises(RunError, match="Known figures"):
+            figure_over_time(runs, wrong)
 
 
 def test_errors_at_a_position_and_at_a_target(tmp_path: Path) -> None:
     x = np.linspace(0.0, 0.4, 5)
     axis = errors({"EX": 1e-5 * x}, ("position",), {"position": np.arange(5)}, component="X")
     save(tmp_path, 0, axis.assign_coords(x=("position", x, {"units": "m"})))
-    series = follow(list_runs([tmp_path]).runs, "EX", (0.2, 0, 0)).series
+    series = figure_over_time(list_runs([tmp_path]).runs, "EX", (0.2, 0, 0)).series
     assert series.value == pytest.approx([2e-6])
     with pytest.raises(RunError, match="is unknown"):
-        follow(list_runs([tmp_path]).runs, "EX", (0.9, 0, 0))
+        figure_over_time(list_runs([tmp_path]).runs, "EX", (0.9, 0, 0))
     volume = errors({"EY": [1e-6, 2e-6]}, ("target",), {"target": ["a", "b"]}, component="tool")
     places = {axis: ("target", [0.0, 0.3], {"units": "m"}) for axis in "xyz"}
     save(tmp_path / "volume", 0, volume.assign_coords(places))
     runs = list_runs([tmp_path / "volume"]).runs
-    assert follow(runs, "EY", (0.3, 0.3, 0.3)).series.value == pytest.approx([2e-6])
+    assert figure_over_time(runs, "EY", (0.3, 0.3, 0.3)).series.value == pytest.approx([2e-6])
     with pytest.raises(RunError, match=r"nearest position is 17\.3 mm away"):
-        follow(runs, "EY", (0.31, 0.31, 0.31))
-    with pytest.raises(RunError, match="give the place with --at"):
-        follow(runs, "EY")
+        figure_over_time(runs, "EY", (0.31, 0.31, 0.31))
+    with pytest.raises(RunError, match="state the place by --at"):
+        figure_over_time(runs, "EY")
 
 
-def test_what_cannot_be_read_is_left_out_by_name(lab: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
+def test_unreadable_runs_are_omitted_and_named(lab: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
     for k in range(4):
         save(tmp_path, k, errors({"EX": 1e-6 * k}, ("time",), {"time": [0.0, 60.0]}))
     (tmp_path / "run-01" / "errors" / "a" / "errors.nc").write_bytes(b"damaged")
@@ -273,7 +273,7 @@ def test_what_cannot_be_read_is_left_out_by_name(lab: Path, tmp_path: Path, call
     assert "run-02" in found["skipped"][0]
 
 
-def test_values_of_several_components_are_remarked(tmp_path: Path, call: Callable[..., Any]) -> None:
+def test_values_of_several_components_have_a_remark(tmp_path: Path, call: Callable[..., Any]) -> None:
     for k, component in enumerate(("spindle", "tool")):
         point = (0, 0, 0.1 * k)
         result = errors({"EX": 1e-6}, ("time",), {"time": [0.0]}, component=component, functional_point=point)

@@ -1,4 +1,4 @@
-"""``errormotion note``: appended beside the run, listed with it, bounded, and never in the way of the data."""
+"""``errormotion note``: stored next to the run, listed with it, limited in size, and independent of the data."""
 
 import json
 import os
@@ -18,7 +18,7 @@ from errormotion.record.runs import listing
 
 
 def make(path: Path, created: str = "2026-03-01T08:00:00+00:00", machine: str = "VM1") -> Path:
-    """Write a run folder that has settled."""
+    """Write a run folder older than the resolution of time stamps."""
     path.mkdir(parents=True)
     state = {"schema": "errormotion.run/1", "created": created, "bench": {"machine": machine}, "results": []}
     (path / "run.json").write_text(json.dumps(state))
@@ -72,7 +72,7 @@ def test_a_note_on_a_machine_needs_no_run(tmp_path: Path, call: Callable[..., Re
     assert listing.list_runs([runs], since=datetime(2026, 2, 2)).notes == ()
 
 
-def test_a_note_is_listed_though_the_index_is_older(tmp_path: Path, call: Callable[..., Result]) -> None:
+def test_a_note_newer_than_the_index_is_listed(tmp_path: Path, call: Callable[..., Result]) -> None:
     run = make(tmp_path / "runs" / "a")
     assert listing.list_runs([tmp_path / "runs"]).notes == ()
     call("note", run, "repair")
@@ -96,7 +96,7 @@ def test_a_note_is_listed_though_the_index_is_older(tmp_path: Path, call: Callab
         ("x", ["--at", "2999-01-01"]),
     ],
 )
-def test_a_note_that_cannot_be_kept_is_refused(
+def test_a_note_that_cannot_be_stored_is_an_error(
     tmp_path: Path, call: Callable[..., Result], text: str, options: list[str]
 ) -> None:
     run = make(tmp_path / "a")
@@ -104,7 +104,7 @@ def test_a_note_that_cannot_be_kept_is_refused(
     assert not (run / "events.jsonl").exists()
 
 
-def test_wrong_places_and_dates_are_refused(tmp_path: Path, call: Callable[..., Result]) -> None:
+def test_wrong_folders_and_dates_are_an_error(tmp_path: Path, call: Callable[..., Result]) -> None:
     assert "no such folder" in call("note", tmp_path / "no", "x", code=1).stderr
     run = make(tmp_path / "a")
     assert "expected a date" in call("note", run, "x", "--at", "yesterday", code=2).stderr
@@ -162,7 +162,7 @@ def _write(folder: Path, number: int) -> None:
         events.append(folder, events.event(f"{number} {k} " + "x" * 500))
 
 
-def test_notes_of_several_processes_do_not_mix(tmp_path: Path) -> None:
+def test_notes_of_several_processes_are_not_mixed(tmp_path: Path) -> None:
     context = get_context("fork")
     workers = [context.Process(target=_write, args=(tmp_path, number)) for number in range(3)]
     for worker in workers:

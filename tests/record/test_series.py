@@ -32,7 +32,7 @@ def series(
 
 
 def bound(rate: float, count: int) -> float:
-    """Return three standard deviations of a rate that is counted."""
+    """Return three standard deviations of a counted rate."""
     return 3 * float(np.sqrt(rate * (1 - rate) / count))
 
 
@@ -62,7 +62,7 @@ def test_a_step_of_four_standard_deviations_is_found_where_it_is_with_its_size()
     assert covered >= (0.9 - bound(0.9, hits)) * hits
 
 
-def test_several_steps_are_found_and_a_departure_is_none() -> None:
+def test_several_steps_are_detected_and_a_single_departure_is_not() -> None:
     rng = np.random.default_rng(3)
     found = []
     for _ in range(20):
@@ -83,7 +83,7 @@ def test_a_step_between_equal_times_is_not_sought() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_few_values_have_no_step(count: int) -> None:
+def test_no_step_is_reported_for_few_values(count: int) -> None:
     values = series(np.random.default_rng(4), count, 0.0)
     found = model_of(values)
     assert found.steps == ()
@@ -93,7 +93,7 @@ def test_few_values_have_no_step(count: int) -> None:
 
 @pytest.mark.parametrize("kind", ["constant", "alternating", "huge", "one time", "tiny", "mixed", "all shared"])
 @pytest.mark.parametrize("count", [3, 7, 12])
-def test_any_series_has_an_answer(count: int, kind: str) -> None:
+def test_any_series_is_evaluated(count: int, kind: str) -> None:
     rng = np.random.default_rng(2)
     t, u, y = np.sort(rng.uniform(0, YEAR, count)), np.full(count, 1e-6), 1e-6 * rng.normal(size=count)
     F, identities = np.zeros((0, count)), list[str]()
@@ -147,7 +147,7 @@ def test_both_estimates_of_the_reproducibility_are_near_the_truth(tau: float) ->
         assert abs(estimate**2 - tau**2) <= 4 * spread**2 * np.sqrt(2 * 1.65 / n)
 
 
-def test_the_trend_is_that_of_ordinary_least_squares_where_all_uncertainties_are_alike() -> None:
+def test_the_trend_is_that_of_ordinary_least_squares_for_equal_uncertainties() -> None:
     rng, n = np.random.default_rng(7), 12
     t, y = np.arange(n) * YEAR / 4, rng.normal(0, 5e-6, n)
     X = np.column_stack([np.ones(n), t / YEAR])
@@ -172,7 +172,7 @@ def test_values_in_control_are_outside_of_their_limits_as_often_as_three_sigma_s
     assert ranges / (count * (n - 1)) == pytest.approx(2 * norm.sf(2.606), abs=0.003)
 
 
-def test_limits_follow_the_uncertainty_of_each_run_and_begin_anew_after_a_step() -> None:
+def test_limits_follow_the_uncertainty_of_each_run_and_restart_after_a_step() -> None:
     rng, n = np.random.default_rng(9), 40
     u = np.where(np.arange(n) % 2, 3e-6, 0.5e-6)
     y = u * rng.normal(size=n) + 100e-6 * (np.arange(n) >= 20)

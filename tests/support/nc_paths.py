@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from errormotion.compensation.program.reading.items import LINE, Left, Move, Setting
+from errormotion.compensation.program.reading.items import LINE, Move, Setting, Unchanged
 from errormotion.compensation.program.reading.offsets import Offsets
 from errormotion.compensation.program.reading.reader import Reader
 from errormotion.compensation.program.writing.path import Path
@@ -36,7 +36,7 @@ def rewritten(lines: Sequence[str], correcting: object, **settings: float) -> li
     return list(Rewriting(Reader(ORIGINS), correcting, **settings).lines(lines))
 
 
-def moves_of(lines: Sequence[str]) -> list[Move | Left | Setting]:
+def moves_of(lines: Sequence[str]) -> list[Move | Unchanged | Setting]:
     """Return the moves of a program."""
     return [item for item in Reader(ORIGINS).items(lines) if isinstance(item, Move)]
 

@@ -28,7 +28,7 @@ def limits(tmp_path: Path, text: str) -> Tolerances:
 
 @pytest.fixture
 def errors() -> xr.Dataset:
-    """EX of 0, 3 and 5 um and EA of 10 urad, U = 1 um and 2 urad; the last EA is unknown, EY altogether."""
+    """EX of 0, 3 and 5 um and EA of 10 urad, U = 1 um and 2 urad; the last EA and all EY are unknown."""
     values = np.full((3, 6), np.nan)
     values[:, 0], values[:2, 3] = [0.0, 3e-6, 5e-6], 10e-6
     return datasets.build_errors(
@@ -66,10 +66,13 @@ def foreign(monkeypatch: pytest.MonkeyPatch) -> None:
         ("", "tolerances: expected limits in 'figures', 'freedoms' or both; found none"),
         ('freedoms = { EX = "10" , EY = 5 }', "tolerances.freedoms.EY: expected a limit with its unit in quotes"),
         ('freedoms = { EX = "10 bananas" }', "tolerances.freedoms.EX: expected a limit with its unit"),
-        ('freedoms = { EX = "-10 um" }', "above 0; found '-10 um'"),
+        ('freedoms = { EX = "-10 um" }', "above 0 for the absolute value; found '-10 um'"),
         ('freedoms = { EX = "nan" }', "tolerances.freedoms.EX"),
         ('freedoms = { EX = { lower = "5 um", upper = "1 um" } }', "expected 'lower' below 'upper'"),
-        ('freedoms = { EX = { lower = "5 um", upper = "1 rad" } }', "expected one unit; found m and rad"),
+        (
+            'freedoms = { EX = { lower = "5 um", upper = "1 rad" } }',
+            "same unit for 'lower' and 'upper'; found m and rad",
+        ),
         ("freedoms = { EX = {} }", "expected 'lower', 'upper' or both"),
         ('freedoms = { EX = { uper = "5 um" } }', "did you mean 'upper'?"),
         ('rule = "iso14253"\nfreedoms = { EX = "1 um" }', "tolerances.rule: expected 'iso 14253-1'"),
@@ -129,7 +132,7 @@ def test_unknown_points_are_counted_and_an_unknown_freedom_is_not_decided(tmp_pa
     assert (unknown.decision, unknown.remark) == (OPEN, "the value is unknown")
 
 
-def test_a_limit_in_another_unit_decides_nothing(tmp_path: Path, errors: xr.Dataset) -> None:
+def test_a_limit_in_another_unit_has_no_decision(tmp_path: Path, errors: xr.Dataset) -> None:
     found = judge(errors, limits(tmp_path, 'freedoms = { EX = "20 arcsec" }'))
     assert found.decision == OPEN
     assert "the limit is in rad, the value in m" in found.lines()[1]
@@ -141,7 +144,7 @@ def test_one_sided_limits(tmp_path: Path, errors: xr.Dataset) -> None:
     assert judge(errors, limits(tmp_path, upper)).decision == OUTSIDE
 
 
-def test_words_of_rules_without_guard_band_state_no_proof(tmp_path: Path, errors: xr.Dataset) -> None:
+def test_texts_of_rules_without_guard_band_state_no_proof(tmp_path: Path, errors: xr.Dataset) -> None:
     for rule, guard in (("simple", "simple acceptance, no guard band"), ("shared risk", "at most 0.33 of half")):
         found = judge(errors, limits(tmp_path, f'rule = "{rule}"\nfreedoms = {{ EX = "5.1 um" }}'))
         assert found.verdict == "within limits"
@@ -162,7 +165,7 @@ def test_figures_that_fail_leave_the_decision_open(
     assert "KeyError" in found.lines()[1]
 
 
-def test_without_a_limit_that_applies_there_is_no_verdict(tmp_path: Path, errors: xr.Dataset, foreign: None) -> None:
+def test_without_an_applicable_limit_there_is_no_verdict(tmp_path: Path, errors: xr.Dataset, foreign: None) -> None:
     found = judge(errors, limits(tmp_path, 'figures = { other = "1 m" }'))
     assert (found.decision, found.verdict, found.lines()) == (None, "", [])
 

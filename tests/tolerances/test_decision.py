@@ -31,7 +31,7 @@ def test_at_the_limit_each_proof_is_wrong_as_often_as_the_guard_factor_states(tr
     assert neither == pytest.approx(1 - 2 * expected, abs=8 * sigma)
 
 
-def test_guard_factor_of_the_edition_of_2017_errs_in_five_per_cent() -> None:
+def test_the_guard_factor_of_the_2017_edition_has_five_per_cent_errors() -> None:
     assert norm.cdf(-2 * 0.82) == pytest.approx(0.05, abs=0.001)
 
 
@@ -62,12 +62,12 @@ def test_shared_risk_decides_only_with_a_small_uncertainty() -> None:
     assert decide(values, sizes, -math.inf, LIMIT, "shared risk").tolist() == [INSIDE, OPEN, OPEN]
 
 
-def test_unknown_values_and_uncertainties_decide_nothing() -> None:
+def test_unknown_values_and_uncertainties_have_no_decision() -> None:
     assert decide(np.array([np.nan, 0.0]), np.array([U, np.nan]), -LIMIT, LIMIT).tolist() == [OPEN, OPEN]
     assert decide(np.array([np.nan, 0.0]), np.array([U, np.nan]), -LIMIT, LIMIT, "simple").tolist() == [OPEN, INSIDE]
 
 
-def test_a_tolerance_narrower_than_two_guard_bands_is_never_proved() -> None:
+def test_conformity_to_a_tolerance_narrower_than_two_guard_bands_is_never_proved() -> None:
     assert INSIDE not in decide(np.linspace(-5e-6, 5e-6, 101), np.full(101, 2e-6), -1e-6, 1e-6)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import chi2, kstest, ncx2
 
 from errormotion.compare import compare, explain
-from errormotion.compare.diagnosis import CLOSE
+from errormotion.compare.diagnosis import SCORE_MARGIN
 from errormotion.compare.ground import common_ground
 from errormotion.compare.low_rank import whitener
 from errormotion.compare.pairs import pair as judged
@@ -195,7 +195,7 @@ def section(seeds: int, pool: Pool) -> list[str]:
         f"level {LEVEL:g}. Sizes are those of this power on the first machine; for a mistake without size, all "
         "uncertainties are multiplied by the factor instead. `margin`: difference of the scores (twice the logarithm "
         "of the likelihood ratio, minus the penalties) of the planted cause and of the next one, without noise; "
-        f"below {CLOSE:g} the two cannot be distinguished at this size. `right first`: of the detected mistakes, the "
+        f"below {SCORE_MARGIN:g} the two cannot be distinguished at this size. `right first`: of the detected mistakes, the "
         "planted cause has the first rank; `or alike`: it has, or the first one is reported as indistinguishable "
         "from it.",
         "",

@@ -1,1 +1,1 @@
-"""Campaigns that run in a process of their own: started, followed, answered and stopped from elsewhere."""
+"""Campaigns in separate processes: started, monitored, answered and stopped by other processes."""

@@ -1,4 +1,4 @@
-"""Commands of errormotion in processes of their own, which outlive the one that started them."""
+"""Commands of errormotion in separate processes, which continue after the process that started them has ended."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-LONGEST_OUTPUT = 4000
-"""Bytes at the end of the output that are shown."""
+MAX_OUTPUT = 4000
+"""Size of the end of the output that is shown, bytes."""
 
 
 def spawn(arguments: Sequence[str], output: Path, *, inherited: Sequence[int] = ()) -> subprocess.Popen[bytes]:
-    """Start ``errormotion ARGUMENTS`` in a session of its own; it is waited for, so that no zombie stays.
+    """Start ``errormotion ARGUMENTS`` in a new session; a thread waits for it, so that it does not become a zombie.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def spawn(arguments: Sequence[str], output: Path, *, inherited: Sequence[int] = 
     Raises
     ------
     OSError
-        The process or its file cannot be made.
+        The process cannot be started, or its file cannot be created.
     """
     with output.open("wb") as file:
         process = subprocess.Popen(
@@ -43,8 +43,8 @@ def spawn(arguments: Sequence[str], output: Path, *, inherited: Sequence[int] = 
 
 
 def printed(output: Path) -> str:
-    """Return the end of what a process has printed; empty where it cannot be read."""
+    """Return the end of the output of a process; empty if it cannot be read."""
     with suppress(OSError), output.open("rb") as file:
-        file.seek(max(0, file.seek(0, 2) - LONGEST_OUTPUT))
-        return file.read(LONGEST_OUTPUT).decode("utf-8", "replace").strip()
+        file.seek(max(0, file.seek(0, 2) - MAX_OUTPUT))
+        return file.read(MAX_OUTPUT).decode("utf-8", "replace").strip()
     return ""

@@ -1,4 +1,4 @@
-"""The errors of a run that is still measuring, from the samples that are stored so far."""
+"""The errors of a run in progress, from the samples that are stored so far."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from errormotion.errors import DatasetError, RunError
 
 
 def samples(folder: RunFolder) -> int:
-    """Return the number of samples that a reader of a run sees; 0 before the first."""
+    """Return the number of stored samples of a run that are visible to readers; 0 before the first."""
     if not folder.raw.exists():
         return 0
     test = _test(folder)
@@ -25,25 +25,25 @@ def samples(folder: RunFolder) -> int:
 
 
 def preliminary(folder: RunFolder) -> xr.Dataset:
-    """Return the errors that the samples so far determine, with the settings of the run.
+    """Return the errors that the stored samples determine, with the settings of the run.
 
     Raises
     ------
     RunError
-        The run states no test of its campaign, or has no samples yet.
+        The run is not one of a campaign, or has no samples yet.
     MethodError
-        The samples so far do not determine the errors.
+        The stored samples do not determine the errors.
     DatasetError
-        The samples so far are no complete record.
+        The stored samples are not a complete record.
     """
     test = _test(folder)
     if not samples(folder):
-        raise RunError(f"{folder.path.name}: has no samples yet")
+        raise RunError(f"{folder.path.name}: the run has no samples yet")
     with looking_beside(Path(str(folder.data["campaign"].get("folder", folder.path)))):
         try:
             with datasets.load(folder.raw) as raw:
                 errors = noted(test.method().identify(raw, test.settings).load(), raw)
-        except (ArithmeticError, LookupError, ValueError) as error:  # half a record is no defect of a method
+        except (ArithmeticError, LookupError, ValueError) as error:  # an incomplete record is no defect of the method
             raise DatasetError(f"the samples so far do not determine the errors ({error})") from error
     datasets.validate(errors)
     return errors
@@ -53,4 +53,4 @@ def _test(folder: RunFolder) -> TestPlan:
     try:
         return next(test for test in stored_plan(folder).tests if test.name == folder.data["test"])
     except (StopIteration, KeyError, TypeError, AttributeError):
-        raise RunError(f"{folder.path}: expected a run of a campaign; found something else") from None
+        raise RunError(f"{folder.path}: expected the run folder of a campaign; found another folder") from None

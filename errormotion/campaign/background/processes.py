@@ -1,8 +1,9 @@
-"""The side of the operator: start a campaign in a process of its own, find it again, answer it and stop it.
+"""Campaigns in separate processes, on the side of the operator: start, list, answer requests, stop.
 
-A process lives on when the one that started it ends. It holds a lock on a file of its folder
-``RUNS/.background/TIME-NUMBER``, which ends with it however it ends: who finds the lock free knows that nothing runs.
-Only the user who started it may enter the folder, and thus answer or stop it.
+A process continues when the one that started it ends. It holds a lock on a file of its folder
+``RUNS/.background/TIME-NUMBER``. The operating system releases the lock when the process ends for any reason: a free
+lock means that the process has ended. Only the user who started the process has access to the folder, and thus can
+answer or stop it.
 """
 
 from __future__ import annotations
@@ -35,21 +36,21 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 FOLDER = ".background"
-"""In the folder of runs."""
+"""Folder of the processes, in the folder of runs."""
 OUTPUT = "output.txt"
-"""What a process has printed."""
-MOST = 50
-"""Ended processes whose state is kept."""
-LARGEST_STATE = 1 << 20
-"""Bytes of a state."""
+"""File of the output of a process."""
+MAX_PROCESSES = 50
+"""Number of processes whose state is kept."""
+MAX_STATE = 1 << 20
+"""Largest size of a state, bytes."""
 STOP_INTERVAL = 30.0
-"""Time after which a process that was asked to stop is asked again, s."""
+"""Shortest interval between two stop signals to a process, s."""
 _NAME = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}")
 
 
 @dataclass(frozen=True)
 class Request:
-    """A request to the operator that waits for an answer."""
+    """An open request to the operator."""
 
     number: int
     text: str
@@ -57,30 +58,30 @@ class Request:
 
 @dataclass(frozen=True)
 class Background:
-    """A campaign in a process of its own, as it is now.
+    """The present state of a campaign in a separate process.
 
     Attributes
     ----------
     name : str
-        Of its folder.
+        Name of its folder.
     campaign, machine, started : str
     alive : bool
-        Whether the process lives.
+        Whether the process is running.
     ended : str
-        ``finished``, ``interrupted``, ``failed``, ``killed``; empty while it lives.
+        ``finished``, ``interrupted``, ``failed``, ``killed``; empty while it is running.
     message : str
-        Why it ended, or the end of its output.
+        Cause of its end, or the end of its output.
     test, stage, note : str
-        Where it is, and its last intermediate result.
+        Present test and stage, and the last intermediate result.
     number, total : int
-        Number of the test from 0, and of all tests.
+        Number of the test, counted from 0, and the number of tests.
     done, expected : float
-        Part of the stage that is done, and its whole, in the same unit; NaN where unknown.
+        Completed and total amount of the stage, in the same unit; NaN if unknown.
     tests : dict of str to str
-        Run folders by the names of the tests.
+        Names of run folders by test.
     request : Request, optional
     stopping : bool
-        Whether it was asked to stop.
+        Whether a stop was requested.
     """
 
     name: str
@@ -104,32 +105,32 @@ class Background:
 
 
 def start(campaign: Path, runs: Path) -> str:
-    """Run a campaign in a process of its own; return its name.
+    """Start a campaign in a separate process, and return the name of the process.
 
     Raises
     ------
     BenchError
-        The campaign or its bench has mistakes.
+        The campaign or its bench file is invalid.
     RunError
-        A process measures on the same machine, or none can be started.
+        Another process measures on the same machine, or the process cannot be started.
     """
     plan = load_campaign(campaign)
     return _start(runs, plan.name, plan.bench.machine, [str(campaign.resolve())])
 
 
 def resume(folder: Path) -> str:
-    """Continue the campaign of a run folder in a process of its own; return its name.
+    """Continue the campaign of a run folder in a separate process, and return the name of the process.
 
     Raises
     ------
     RunError
-        No run folder of a campaign, a process that measures on the same machine, or none can be started.
+        The folder is not the run folder of a campaign; or as for `start`.
     """
     data = RunFolder.open(folder).data
     try:
         campaign, machine = str(data["campaign"]["name"]), str(data["bench"]["machine"])
     except (KeyError, TypeError):
-        raise RunError(f"{folder}: expected a run of a campaign; found something else") from None
+        raise RunError(f"{folder}: expected the run folder of a campaign; found another folder") from None
     return _start(folder.parent, campaign, machine, ["--resume", str(folder.resolve())])
 
 
@@ -146,31 +147,31 @@ def answer(runs: Path, name: str, number: int) -> None:
     Raises
     ------
     RunError
-        This request does not wait: it was answered, or the process has ended.
+        The request is not open: it was answered, or the process has ended.
     """
     process = _one(runs, name)
     if not process.alive or process.request is None or process.request.number != number:
-        raise RunError(f"{process.campaign}: request {number} does not wait for an answer any more")
+        raise RunError(f"{process.campaign}: request {number} is not open any more")
     replace_text(runs / FOLDER / name / ANSWER, f"{number}\n")
 
 
 def stop(runs: Path, name: str) -> None:
-    """Ask a process to stop, as Ctrl-C does in a terminal; its run folder is complete and can be resumed.
+    """Stop a process, as Ctrl-C does in a terminal; its run folder is complete and can be resumed.
 
     Raises
     ------
     RunError
-        It has ended, or belongs to another user.
+        The process has ended, or belongs to another user.
     """
     process = _one(runs, name)
     folder = runs / FOLDER / name
     pid = _state(folder / "process.json").get("pid")
     if not process.alive or not isinstance(pid, int):
-        raise RunError(f"{process.campaign}: has ended; nothing is to be stopped")
-    asked = folder / "stop"
-    if asked.exists() and time.time() - asked.stat().st_mtime < STOP_INTERVAL:
-        return  # a second request would end it while it closes its instruments
-    asked.touch()
+        raise RunError(f"{process.campaign}: the process has ended already")
+    requested = folder / "stop"
+    if requested.exists() and time.time() - requested.stat().st_mtime < STOP_INTERVAL:
+        return  # a second signal would end it while it closes its instruments
+    requested.touch()
     try:
         os.kill(pid, signal.SIGTERM)
     except OSError as error:
@@ -179,15 +180,15 @@ def stop(runs: Path, name: str) -> None:
 
 def _start(runs: Path, campaign: str, machine: str, arguments: list[str]) -> str:
     if fcntl is None:
-        raise RunError("A process of its own needs a system with file locks (Linux, macOS). Use 'errormotion run'.")
+        raise RunError("A background process needs a system with file locks (Linux, macOS). Use 'errormotion run'.")
     try:
         runs.mkdir(parents=True, exist_ok=True)
         root = runs / FOLDER
         root.mkdir(mode=0o700, exist_ok=True)
-        with _alone(root):
+        with _exclusive(root):
             for each in found(runs):
                 if each.alive and each.machine == machine:
-                    raise RunError(f"'{each.campaign}' is measuring on {machine} since {each.started}; stop it first")
+                    raise RunError(f"'{each.campaign}' has used {machine} since {each.started}; stop it first")
             _tidy(root)
             name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{uuid4().hex[:8]}"
             _spawn(root / name, runs, {"campaign": campaign, "machine": machine, "started": now()}, arguments)
@@ -205,12 +206,12 @@ def _spawn(folder: Path, runs: Path, state: dict[str, Any], arguments: list[str]
         child = spawn(command, folder / OUTPUT, inherited=[lock])
         replace_text(folder / "process.json", json.dumps({**state, "pid": child.pid}))
     finally:
-        os.close(lock)  # the process holds it from now on
+        os.close(lock)  # the process keeps the lock
 
 
 @contextmanager
-def _alone(root: Path) -> Iterator[None]:
-    """Let one start after the other, so that two never find the machine free together."""
+def _exclusive(root: Path) -> Iterator[None]:
+    """Serialize starts, so that two processes never start on the same machine."""
     lock = os.open(root / "lock", os.O_RDWR | os.O_CREAT, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -222,7 +223,7 @@ def _alone(root: Path) -> Iterator[None]:
 def _tidy(root: Path) -> None:
     """Remove the states of the oldest processes that have ended."""
     names = sorted(path.name for path in root.iterdir() if _NAME.fullmatch(path.name))
-    for name in names[:-MOST]:
+    for name in names[:-MAX_PROCESSES]:
         if not is_locked(root / name / "lock"):
             shutil.rmtree(root / name, ignore_errors=True)
 
@@ -230,12 +231,12 @@ def _tidy(root: Path) -> None:
 def _one(runs: Path, name: str) -> Background:
     process = _read(runs / FOLDER / name) if _NAME.fullmatch(name) else None
     if process is None:
-        raise RunError(f"{runs}: there is no process {name[:60]!r}")
+        raise RunError(f"{runs}: no process {name[:60]!r}")
     return process
 
 
 def _read(folder: Path) -> Background | None:
-    alive = is_locked(folder / "lock")  # before its state, which is complete if it has ended
+    alive = is_locked(folder / "lock")  # read before the state, which is complete if the process has ended
     process, state = _state(folder / "process.json"), _state(folder / STATUS)
     if not process:
         return None
@@ -244,7 +245,7 @@ def _read(folder: Path) -> Background | None:
     if ended in ("failed", "killed"):
         message = printed(folder / OUTPUT) or message
     request = state.get("request")
-    waits = alive and isinstance(request, dict) and isinstance(request.get("number"), int)
+    open_request = alive and isinstance(request, dict) and isinstance(request.get("number"), int)
     return Background(
         name=folder.name,
         campaign=str(process.get("campaign", "")),
@@ -262,15 +263,15 @@ def _read(folder: Path) -> Background | None:
         expected=_number(state.get("expected")),
         tests={str(k): str(v) for k, v in state["tests"].items()} if isinstance(state.get("tests"), dict) else {},
         announcements=tuple(map(str, state["announcements"])) if isinstance(state.get("announcements"), list) else (),
-        request=Request(request["number"], str(request.get("text", ""))) if waits and request else None,
+        request=Request(request["number"], str(request.get("text", ""))) if open_request and request else None,
         stopping=alive and (folder / "stop").exists(),
     )
 
 
 def _state(path: Path) -> dict[str, Any]:
-    """Return what a file states; empty where it cannot be read."""
+    """Return the content of a file; empty if it cannot be read."""
     with suppress(OSError, ValueError, RecursionError):
-        content = json.loads(read_bytes(path, LARGEST_STATE))
+        content = json.loads(read_bytes(path, MAX_STATE))
         if isinstance(content, dict):
             return content
     return {}

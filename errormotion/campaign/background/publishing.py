@@ -1,7 +1,7 @@
-"""The side of the process that measures: it publishes its progress, and waits for answers to its requests.
+"""Campaigns in separate processes, on the side of the process: publish the progress, wait for answers to requests.
 
-Everything is in one folder that only its user may enter (mode 0700). ``status.json`` states the progress and the
-request that waits; it is replaced by a rename. The file ``answer`` holds the number of the request that is done.
+All files are in one folder that only its user can access (mode 0700). ``status.json`` states the progress and the
+open request; it is replaced by a rename. The file ``answer`` contains the number of the request that is done.
 """
 
 from __future__ import annotations
@@ -11,25 +11,25 @@ import os
 import time
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from errormotion.datasets.files.reading import read_bytes
 
 STATUS, ANSWER = "status.json", "answer"
 INTERVAL = 0.5
-"""Shortest time between two states of the progress, s."""
+"""Shortest interval between two updates of the progress, s."""
 POLL_INTERVAL = 0.2
-"""Of the look for an answer, s."""
-LONGEST_TEXT = 2000
-"""Characters of a text in the state."""
-MOST_TESTS = 1000
-LONGEST_ANSWER = 100
-"""Bytes of an answer."""
+"""Interval between checks for an answer, s."""
+MAX_TEXT = 2000
+"""Longest text in the state, characters."""
+MAX_TESTS = 1000
+"""Number of tests that are listed in the state."""
+MAX_ANSWER = 100
+"""Largest size of an answer, bytes."""
 
 
 class Published:
-    """Progress of a campaign in a folder, as `Progress` of the runner; usable as a context.
+    """Progress of a campaign in a folder, a `Progress` of the runner; a context manager.
 
     Parameters
     ----------
@@ -46,47 +46,45 @@ class Published:
         self._write()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         stopped = isinstance(error, KeyboardInterrupt)
         self._set(
             ended="finished" if error is None else "interrupted" if stopped else "failed",
-            message="" if error is None else str(error)[:LONGEST_TEXT],
+            message="" if error is None else str(error)[:MAX_TEXT],
         )
 
     def announce(self, text: str) -> None:
-        """State what a test will do with the machine."""
-        self._set(announcements=[*self._state["announcements"], text[:LONGEST_TEXT]][:MOST_TESTS])
+        """State how a test will move the machine."""
+        self._set(announcements=[*self._state["announcements"], text[:MAX_TEXT]][:MAX_TESTS])
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
-        """State which test is measured, and where."""
-        tests = {**self._state["tests"], name: folder.name} if number < MOST_TESTS else self._state["tests"]
+        """State the present test and its run folder."""
+        tests = {**self._state["tests"], name: folder.name} if number < MAX_TESTS else self._state["tests"]
         self._set(test=name, number=number, total=total, tests=tests)
 
     def stage(self, name: str, total: float | None = None) -> None:
-        """State the stage."""
+        """State the present stage."""
         self._set(stage=name, expected=total, done=0.0, note="")
 
     def advance(self, done: float) -> None:
-        """State how much of the stage is done; not more often than twice a second."""
+        """State the completed amount of the stage; at most twice a second."""
         self._state["done"] = done
-        self._sometimes()
+        self._write_if_due()
 
     @property
     def shown(self) -> bool:
-        """Return True: notes are shown."""
+        """Return True: notes are published."""
         return True
 
     def note(self, text: str) -> None:
         """State an intermediate result."""
-        self._state["note"] = text[:LONGEST_TEXT]
-        self._sometimes()
+        self._state["note"] = text[:MAX_TEXT]
+        self._write_if_due()
 
     def ask(self, message: str) -> None:
         """Publish a request to the operator and wait until it is answered."""
         number = self._state["requests"] + 1
-        self._set(requests=number, request={"number": number, "text": message[:LONGEST_TEXT]})
+        self._set(requests=number, request={"number": number, "text": message[:MAX_TEXT]})
         try:
             while self._answered() != number:
                 time.sleep(POLL_INTERVAL)
@@ -94,21 +92,21 @@ class Published:
             self._set(request=None)
 
     def _answered(self) -> int:
-        """Return the number of the last request that was answered; 0 for none."""
+        """Return the number of the last answered request, or 0."""
         with suppress(OSError, ValueError):
-            return int(read_bytes(self._folder / ANSWER, LONGEST_ANSWER))
+            return int(read_bytes(self._folder / ANSWER, MAX_ANSWER))
         return 0
 
     def _set(self, **changes: Any) -> None:
         self._state |= changes
         self._write()
 
-    def _sometimes(self) -> None:
+    def _write_if_due(self) -> None:
         if time.monotonic() - self._written >= INTERVAL:
             self._write()
 
     def _write(self) -> None:
-        """Replace the state; a full disk does not end a measurement because of it."""
+        """Replace the state; a write error, such as a full disk, does not end the measurement."""
         self._written = time.monotonic()
         part = self._folder / f"{STATUS}.part"
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""The last values that another process has recorded: of a run, a monitor or a compensation that is at work."""
+"""The last values recorded by another process: a run, a monitor or a compensation."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.runner import stored_plan
 from errormotion.campaign.storage.store import committed_length
 
-MOST_VALUES = 200
-"""Values of one sample that are shown."""
+MAX_VALUES = 200
+"""Number of values of one sample that are returned."""
 
 
 @dataclass(frozen=True)
 class Value:
-    """One number of the last sample: of a variable, at a label of its other dimensions, in the unit of the record."""
+    """One number of the last sample: variable, label in its other dimensions, value in the unit of the record."""
 
     variable: str
     label: str
@@ -39,11 +39,11 @@ class Recorded:
     title : str
         Test and campaign, or the kind of the record.
     samples : int
-        How many there are.
+        Number of samples.
     values : tuple of Value
-        Of the last one; NaN where unknown.
+        Values of the last sample; NaN if unknown.
     estop : bool, optional
-        Emergency stop, where the record states it.
+        Emergency stop; None if the record does not state it.
     program : str
     """
 
@@ -55,12 +55,12 @@ class Recorded:
 
 
 def recorded(path: Path) -> Recorded:
-    """Return the last sample that a reader of a run folder sees.
+    """Return the last sample of a run folder that is visible to readers.
 
     Raises
     ------
     ErrormotionError
-        It is no run folder, or its record is damaged.
+        The path is not a run folder, or its record is damaged.
     """
     folder = RunFolder.open(path)
     campaign = folder.data.get("campaign")
@@ -77,7 +77,7 @@ def recorded(path: Path) -> Recorded:
     if samples:
         with datasets.load(folder.raw) as raw:
             count = min(samples, int(raw.sizes.get(dim, 0)))
-            values = tuple(islice(_last(raw, dim, count), MOST_VALUES)) if count else ()
+            values = tuple(islice(_last(raw, dim, count), MAX_VALUES)) if count else ()
     return Recorded(title, samples, values, estop, program)
 
 
@@ -97,9 +97,9 @@ def _last(raw: xr.Dataset, dim: str, count: int) -> Iterator[Value]:
         last = variable.isel({dim: count - 1})
         numbers = np.atleast_1d(np.asarray(last.values, dtype=float))
         unit = str(variable.attrs.get("units", ""))
-        for place in np.ndindex(numbers.shape):
-            labels = (_label(raw, str(d), k) for d, k in zip(last.dims, place, strict=False))
-            yield Value(str(name), " ".join(labels), float(numbers[place]), unit)
+        for index in np.ndindex(numbers.shape):
+            labels = (_label(raw, str(d), k) for d, k in zip(last.dims, index, strict=False))
+            yield Value(str(name), " ".join(labels), float(numbers[index]), unit)
 
 
 def _label(raw: xr.Dataset, dim: str, index: int) -> str:

@@ -1,1 +1,1 @@
-"""Compensation of a machine while it works, and its state as other processes see it."""
+"""Compensation of a machine in operation, and its state for other processes."""

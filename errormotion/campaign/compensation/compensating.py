@@ -1,7 +1,7 @@
-"""Compensation of a machine while it works: readings in, prediction, offset out, as long as it runs.
+"""Compensation of a machine in operation: readings, prediction, offset, repeated in each period.
 
-The bench is read and logged as by a monitor, into a run folder with an audit log of every change. Without a machine
-that was named (``arm``) the offsets are computed and logged, and nothing is written.
+The bench is read and logged as by a monitor, into a run folder with an audit log of every change. Unless the machine
+is armed (``arm``), the offsets are only computed and logged, and nothing is written.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.campaign.claims import claimed
 from errormotion.campaign.compensation.following import AUDIT, STOP, Status, is_zero, numbers, write_status
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.campaign.storage.journal import cause_of
-from errormotion.campaign.turns import claimed
 from errormotion.compensation.online.audit import AuditLog
 from errormotion.compensation.online.follower import Conditions, Follower, State, Step
 from errormotion.compensation.online.prediction import PARAMETERS, Prediction, predictor, refusal
@@ -41,17 +41,17 @@ FRAME = "machine"
 """Frame in which a model must state its errors: offsets are along the axes."""
 
 TEST = "compensation"
-LONGEST_TEXT = 500
-"""Characters of a text in the state."""
+MAX_TEXT = 500
+"""Longest text in the state, characters."""
 
-REJOIN = 3
-"""Successful readings of the offset after which a lost connection counts as regained."""
+READINGS_TO_REJOIN = 3
+"""Consecutive readings of the offset after which a lost connection counts as restored."""
 
 AGREEMENT = 3.0
-"""Greatest difference of the offset in effect from the one written, in changes of one period at the slew limit."""
+"""Largest difference between the offset in effect and the written one, in multiples of slew limit times period."""
 
 CONFIRMATIONS = 10
-"""Readings after the last offset within which the machine should report that it is at zero."""
+"""Number of readings after the last offset within which the machine should report an offset of zero."""
 
 log = logging.getLogger(__name__)
 
@@ -63,12 +63,12 @@ class Moment:
     Attributes
     ----------
     snapshot : Snapshot
-        Readings.
+        Readings of the instruments.
     prediction : Prediction
     step : Step
         State, offset and cause.
     applied : tuple of float or None
-        Offset in effect as the machine reports it, m; None where it is not read.
+        Offset in effect as the machine reports it, m; None if it is not read.
     """
 
     snapshot: Snapshot
@@ -78,25 +78,25 @@ class Moment:
 
 
 class Compensation:
-    """Follows the temperatures of a machine; a context manager.
+    """Compensates a machine by offsets that follow its temperatures; a context manager.
 
     Parameters
     ----------
     plan : BenchPlan
-        Its thermometers and its controller are read; its compensator writes.
+        Its thermometers and its controller are read; its compensator writes the offsets.
     model : Dataset
-        Of a kind that predicts errors from readings.
+        A model that predicts errors from readings.
     runs : Path
         Folder of the run folder.
     arm : str, optional
-        Name of the machine whose offsets may change; it must be that of the bench. Without it nothing is written.
+        Name of the machine, which must be that of the bench. Without it nothing is written.
     functional_point : (3,), optional
-        Where the errors are to vanish, m, in the frame of the model; default: that of the model.
+        Point at which the errors are compensated, m, in the frame of the model; default: that of the model.
     since : Dataset, optional
         Log of a monitor or of an earlier compensation, whose first row is the reference state; default: the first
-        readings are. Temperatures are taken as linear over the time between the log and now.
+        readings are the reference state. Between the log and now temperatures are interpolated linearly.
     clock : Clock, optional
-        Its time; default that of the computer.
+        Clock; default: that of the computer.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class Compensation:
     Raises
     ------
     CompensationError
-        The machine was not named, the bench has no compensator, or the model does not fit the bench.
+        ``arm`` is not the machine of the bench, the bench has no compensator, or the model does not fit the bench.
     """
 
     def __init__(
@@ -143,14 +143,18 @@ class Compensation:
         machine, frame = str(model.attrs.get("machine", "unknown")), str(model.attrs.get("frame", "unknown"))
         if arm is not None and arm != self.plan.machine:
             raise CompensationError(
-                f"--arm {arm}: the machine of {self.plan.source} is called '{self.plan.machine}'. Nothing was written."
+                f"--arm {arm}: the machine of {self.plan.source} is '{self.plan.machine}'. Nothing was written."
             )
         if arm is not None and self.plan.compensator is None:
             raise CompensationError(f"{self.plan.source}: expected a table [compensator] to write offsets; found none.")
         if machine != self.plan.machine:
-            raise CompensationError(f"The model is of the machine '{machine}'; the bench has '{self.plan.machine}'.")
+            raise CompensationError(
+                f"The model is for the machine '{machine}'; the machine of the bench is '{self.plan.machine}'."
+            )
         if frame != FRAME:
-            raise CompensationError(f"The model states errors in the frame '{frame}'; offsets need '{FRAME}'.")
+            raise CompensationError(
+                f"The model states errors in the frame '{frame}'; offsets need the frame '{FRAME}'."
+            )
 
     def _check_inputs(self) -> None:
         absent = [name for name in self._predictor.temperatures if name not in self._monitor.sensors]
@@ -161,16 +165,18 @@ class Compensation:
             raise BenchError(f"{self.plan.source}: the model needs {', '.join(needed)}; found no controller")
 
     def _replay(self, earlier: xr.Dataset) -> float:
-        """Take the readings of a log, on a clock whose zero is now; return the time since its last row, s."""
+        """Update the predictor with the readings of a log; return the time since its last row, s."""
         passed = age(earlier)
         if math.isnan(passed):
             raise CompensationError(
-                "The time since the earlier readings is unknown: the clocks of their log and of this computer "
-                "contradict each other. Start without them, on a cold machine."
+                "The time since the earlier readings is unknown, because the clocks of their log and of this computer "
+                "contradict each other. Start on a cold machine, without --since."
             )
         times = np.asarray(earlier["time"].values, dtype=float) - passed
         if not times.size or not times[-1] < 0:
-            raise CompensationError("The log of the earlier readings ends after now: its clock or this one is wrong.")
+            raise CompensationError(
+                "The log of the earlier readings ends in the future: its clock or that of this computer is wrong."
+            )
         names = [str(name) for name in earlier["sensor"].values]
         temperature = np.asarray(earlier["temperature"].transpose("time", "sensor").values, dtype=float)
         speeds = {name: np.asarray(earlier[name].values, dtype=float) for name in PARAMETERS if name in earlier}
@@ -243,18 +249,18 @@ class Compensation:
     def stop(self) -> None:
         """Ramp to zero, then end `follow`.
 
-        It ends when the machine reports an offset of zero, or after a few readings more. Without a connection it ends
-        after the time ``hold``; the watchdog of the machine ramps to zero.
+        The iteration ends when the machine reports an offset of zero, or after `CONFIRMATIONS` readings. Without a
+        connection it ends after the time ``hold``; the watchdog of the machine ramps to zero.
         """
         self._follower.stop()
 
     def follow(self, duration: float = math.inf) -> Iterator[Moment]:
-        """Read, predict and write; yield each moment.
+        """Read, predict and write in each period; yield each decision.
 
         Parameters
         ----------
         duration : float
-            s; then the offset ramps to zero, and the iteration ends.
+            Duration, s; then the offset ramps to zero, and the iteration ends.
 
         Raises
         ------
@@ -262,7 +268,7 @@ class Compensation:
             The audit log or the log of readings cannot be written. Nothing further is written to the machine, whose
             watchdog then ramps to zero.
         """
-        able = 0.0  # the last time when the machine took offsets, or no stop had been asked for
+        able = 0.0  # last time at which the machine accepted offsets, or at which no stop was requested
         readings = 0  # since the last offset was written
         for snapshot in self._monitor.watch():
             if snapshot.time >= duration or (self.folder.path / STOP).exists():
@@ -294,7 +300,7 @@ class Compensation:
         return moment
 
     def _predict(self, snapshot: Snapshot) -> tuple[Prediction, str]:
-        """Return the prediction, and why it is not to be used."""
+        """Return the prediction, and why it must not be used."""
         readings = {**snapshot.temperatures, **_parameters(snapshot.state)}
         for name, value in readings.items():
             if math.isfinite(value):
@@ -304,7 +310,7 @@ class Compensation:
         return prediction, refusal(prediction, self.limits)
 
     def _read(self) -> tuple[tuple[float, float, float] | None, str, str]:
-        """Return the offset in effect, why it may not change, and why the machine takes none."""
+        """Return the offset in effect, why it must not change, and why the machine accepts none."""
         if self._output is None:
             return None, "", ""
         try:
@@ -320,13 +326,17 @@ class Compensation:
             return offset, found.busy, ""
         allowed = AGREEMENT * self.limits.slew * self.limits.period
         if not (np.abs(self._follower.offset - offset) <= allowed).all():
-            return offset, found.busy, "the machine has another offset than the one written: another program, or a stop"
+            return (
+                offset,
+                found.busy,
+                "the offset of the machine is not the written one: another program wrote it, or the machine stopped",
+            )
         return offset, found.busy, ""
 
     def _rejoin(self, applied: tuple[float, float, float] | None) -> None:
-        """After a lost connection, go on from the offset that the machine has now; any other fault needs a person."""
+        """After a lost connection, continue from the present offset of the machine; other faults need the operator."""
         self._regained += 1
-        if self._lost and applied is not None and self._regained >= REJOIN:
+        if self._lost and applied is not None and self._regained >= READINGS_TO_REJOIN:
             with suppress(CompensationError):
                 self._follower.arm(np.asarray(applied))
                 self._lost = False
@@ -372,13 +382,13 @@ class Compensation:
         estop = state.get("estop")
         return Status(
             time=datetime.now(UTC),
-            machine=self.plan.machine[:LONGEST_TEXT],
-            bench=self.plan.source.name[:LONGEST_TEXT],
+            machine=self.plan.machine[:MAX_TEXT],
+            bench=self.plan.source.name[:MAX_TEXT],
             compensator=self.plan.compensator.driver.info.id if self.plan.compensator is not None else "",
             armed=self.armed,
             limits=self.limits,
             state=str(self.state),
-            cause=step.cause[:LONGEST_TEXT],
+            cause=step.cause[:MAX_TEXT],
             stopping=self._follower.stopping,
             elapsed=moment.snapshot.time,
             offset=numbers(step.offset),
@@ -390,12 +400,12 @@ class Compensation:
             outside=tuple(prediction.outside),
             limited=tuple("XYZ"[k] for k in step.limited),
             estop=estop if isinstance(estop, bool) else None,
-            program=str(state.get("program") or "")[:LONGEST_TEXT],
+            program=str(state.get("program") or "")[:MAX_TEXT],
         )
 
     def _show(self, status: Status) -> None:
         self._status = status
-        with suppress(OSError):  # the audit log is what must be written
+        with suppress(OSError):  # only the audit log is mandatory
             write_status(self.folder.path, status)
 
     def _close(self) -> None:
@@ -410,7 +420,7 @@ def _parameters(state: Mapping[str, Any]) -> dict[str, float]:
 
 @contextmanager
 def _only_one(machine: str) -> Iterator[None]:
-    """Refuse a second compensation of one machine on this computer; the lock ends with the process."""
+    """Prevent a second compensation of a machine on this computer; the lock ends with the process."""
     try:
         import fcntl
     except ImportError:  # Windows: no lock
@@ -427,7 +437,7 @@ def _only_one(machine: str) -> Iterator[None]:
             holder = os.read(descriptor, 100).decode("utf-8", "replace").strip()
             raise CompensationError(
                 f"The machine '{machine}' is compensated already{f' by process {holder}' if holder else ''}; stop that "
-                "first."
+                "compensation first."
             ) from None
         os.ftruncate(descriptor, 0)
         os.write(descriptor, json.dumps(os.getpid()).encode())

@@ -1,7 +1,7 @@
-"""Compensations of a folder of runs, seen from outside: what each does now, and the request to ramp to zero and end.
+"""Compensations for other processes: present state, and the request to ramp to zero and end.
 
-A compensation writes its present state into its run folder, and looks there for the request. Another program needs
-neither its process nor its terminal.
+A compensation writes its present state into its run folder, and checks there for the request. Other programs need
+access to the folder only.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ AUDIT = "audit.jsonl"
 STATUS = "status.json"
 """Present state in the run folder, replaced at each period."""
 STOP = "stop"
-"""File in the run folder that asks for a ramp to zero and the end."""
-LARGEST_STATUS = 1 << 18
-"""Bytes of a status that are read."""
-MOST = 1000
-"""Compensations of a folder that are listed, the newest."""
+"""File in the run folder that requests the compensation to ramp to zero and end."""
+MAX_STATUS = 1 << 18
+"""Largest size of a status, bytes."""
+MAX_COMPENSATIONS = 1000
+"""Number of compensations of a folder that are listed, from the newest on."""
 
 Number = Annotated[float, Field(allow_inf_nan=False)] | None
 Vector = tuple[Number, Number, Number]
@@ -37,34 +37,34 @@ Text = Annotated[str, Field(max_length=2000)]
 
 
 class Status(BaseModel):
-    """What a compensation does now; SI, unknown numbers are None.
+    """Present state of a compensation; SI, unknown numbers are None.
 
     Attributes
     ----------
     time : datetime
-        When it was written.
+        Time of the state.
     machine, bench, compensator : str
     armed : bool
         Whether offsets are written.
     limits : Limits
     state, cause : str
-        State, and why the offset does not follow the prediction.
+        State, and the reason why the offset does not follow the prediction.
     stopping, ended : bool
-        Whether it was asked to ramp to zero; whether it has ended.
+        Whether a ramp to zero was requested; whether the compensation has ended.
     elapsed : float
-        s since its start.
+        Time since the start, s.
     offset : (3,)
-        Offset that was decided, m.
+        Decided offset, m.
     applied : (3,), optional
-        Offset in effect as the machine reports it, m; None where it is not read.
+        Offset in effect as the machine reports it, m; None if it is not read.
     predicted, uncertainty : (6,)
         Predicted errors, m and rad, and their standard uncertainty.
     inputs : mapping of str to float
         Inputs of the model as used: degC, 1/min, m/s.
     missing, outside, limited : tuple of str
-        Inputs that are unknown, inputs outside the range of the training, axes whose target is beyond the limit.
+        Unknown inputs, inputs outside the range of the training data, axes whose target exceeds the limit.
     estop : bool, optional
-        Emergency stop as the controller reports it; None where it is not known.
+        Emergency stop as the controller reports it; None if unknown.
     program : str
         Program of the controller.
     """
@@ -94,23 +94,23 @@ class Status(BaseModel):
 
     @property
     def at_zero(self) -> bool | None:
-        """Whether the offset in effect is zero as the machine reports it; None where it is not known."""
+        """Whether the offset in effect is zero as the machine reports it; None if unknown."""
         if self.applied is None or any(each is None for each in self.applied):
             return None
         return is_zero(self.applied)
 
 
 ZERO = 5e-9
-"""Offset in effect that counts as zero, m: half of the coarsest resolution of a register that is usual."""
+"""Largest offset in effect that counts as zero, m: half of the coarsest usual resolution of a register."""
 
 
 def is_zero(applied: Vector) -> bool:
-    """Return whether an offset in effect is zero, by the resolution of the machine's report."""
+    """Return whether an offset in effect is zero within the resolution of its report."""
     return all(each is not None and abs(each) <= ZERO for each in applied)
 
 
 def write_status(folder: Path, status: Status) -> None:
-    """Replace the present state of a compensation by a rename; a full disk leaves the older one.
+    """Replace the present state of a compensation by a rename; on a full disk the previous one remains.
 
     Raises
     ------
@@ -123,16 +123,16 @@ def write_status(folder: Path, status: Status) -> None:
 
 
 def read_status(folder: Path) -> Status:
-    """Return the present state of a compensation, or its last one.
+    """Return the present or the last state of a compensation.
 
     Raises
     ------
     CompensationError
-        The folder has none, or it is damaged.
+        The folder has no state, or it is damaged.
     """
     path = folder / STATUS
     try:
-        return Status.model_validate_json(read_bytes(path, LARGEST_STATUS))
+        return Status.model_validate_json(read_bytes(path, MAX_STATUS))
     except OSError as error:
         raise CompensationError(f"{path}: the state of the compensation cannot be read: {error.strerror}") from None
     except ValidationError as error:
@@ -140,12 +140,12 @@ def read_status(folder: Path) -> Status:
 
 
 def is_working(folder: Path) -> bool:
-    """Return whether a process works on a compensation: it holds the lock of its run folder."""
-    if not (folder / AUDIT).is_file():  # it is made under the lock, so that the lock is never asked for before
+    """Return whether a compensation is running: its process holds the lock of its run folder."""
+    if not (folder / AUDIT).is_file():  # created under the lock; before that, the lock is not tested
         return False
     try:
         return is_locked(folder)
-    except ImportError:  # Windows: no lock; what was written lately is at work
+    except ImportError:  # Windows: no lock; a compensation with a recent state is running
         try:
             status = read_status(folder)
         except CompensationError:
@@ -157,27 +157,27 @@ def compensations(runs: Path) -> Iterator[Path]:
     """Yield the run folders of compensations in a folder of runs, the newest first."""
     if runs.is_dir():
         found = sorted((path.parent for path in runs.glob(f"*/{AUDIT}")), key=lambda path: path.name, reverse=True)
-        yield from found[:MOST]
+        yield from found[:MAX_COMPENSATIONS]
 
 
 def request_stop(folder: Path) -> None:
-    """Ask a compensation to ramp to zero and end, as Ctrl-C does; asking again changes nothing.
+    """Request a compensation to ramp to zero and end, as Ctrl-C does; a repeated request has no effect.
 
     Raises
     ------
     CompensationError
-        No process works on it, or the request cannot be written.
+        The compensation is not running, or the request cannot be written.
     """
     if not is_working(folder):
-        raise CompensationError(f"{folder}: no compensation is at work here; there is nothing to stop.")
+        raise CompensationError(f"{folder}: no compensation is running in this folder; there is nothing to stop.")
     try:
         (folder / STOP).touch()
     except OSError as error:
         raise CompensationError(
-            f"{folder / STOP}: cannot be written: {error.strerror}. End the command itself by Ctrl-C."
+            f"{folder / STOP}: cannot be written: {error.strerror}. Stop the command by Ctrl-C in its terminal."
         ) from None
 
 
 def numbers(values: Iterable[float]) -> tuple[Any, ...]:
-    """Return numbers for a status or a log; None where unknown."""
+    """Return numbers for a status or a log; None if unknown."""
     return tuple(float(each) if math.isfinite(each) else None for each in values)

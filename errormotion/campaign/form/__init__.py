@@ -1,1 +1,1 @@
-"""A campaign as a form: the fields of its tables and of the settings of its methods, with their mistakes."""
+"""A campaign as a form: the fields of its tables and of the settings of its methods, with mistakes."""

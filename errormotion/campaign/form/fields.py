@@ -1,7 +1,7 @@
 """The fields of a campaign: one for each key that its tables and the settings of its methods may have.
 
-A form is made from the text of a campaign and knows nothing but the text: a changed field changes the text, and the
-form of the new text is shown. Text and form therefore always agree.
+A form is made from the text of a campaign only: a changed field changes the text, and the form of the new text is
+shown. Text and form therefore always agree.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from errormotion.datasets.files.tomlfile import Key, dotted, options_of, parse_t
 from errormotion.datasets.files.tomltext import value, value_of, with_table, with_value, without_table
 from errormotion.errors import BenchError, DatasetError, PluginError
 
-DEEPEST = 3
-"""Levels of tables that become fields of their own."""
+MAX_DEPTH = 3
+"""Number of levels of tables whose keys become separate fields."""
 _CAMPAIGN = ("name", "bench", "operator")
 _TEST = ("name", "method", "at", "inputs", "instruments", "monte_carlo")
 
@@ -38,15 +38,15 @@ class Field:
         Keys from the top of the file.
     label, meaning : str
     unit : str
-        How a person writes a quantity, such as ``5 mm``; empty where the value has no unit.
+        Example of a quantity with its unit, such as ``5 mm``; empty if the value has no unit.
     default : str
-        Value without this key.
+        Value if the key is not stated.
     text : str
-        What the file states, as it is written in a field; empty where it does not state the key.
+        Value in the file, as text of a field; empty if the key is not stated.
     choices : tuple of str
-        The values that there are; empty where any may be written.
+        Allowed values; empty if any value is allowed.
     plain : bool
-        Whether the text is a string of TOML, and not a number, an array or a table.
+        Whether the value is a TOML string, not a number, an array or a table.
     mistakes : tuple of str
     """
 
@@ -89,7 +89,7 @@ class Form:
 
 
 def form_of(text: str, source: Path) -> Form:
-    """Return the form of a campaign's text; ``source`` is the file in which it stands or will stand."""
+    """Return the form of the text of a campaign; ``source`` is the path of its file."""
     try:
         data = parse_toml(text, source.name, error=BenchError)
     except BenchError as error:
@@ -108,30 +108,30 @@ def form_of(text: str, source: Path) -> Form:
 
 
 def with_field(text: str, place: Sequence[Key], written: str) -> str:
-    """Return the text of a campaign after a person has changed a field; an empty field removes its key.
+    """Return the text of a campaign with a changed field; an empty field removes its key.
 
     Raises
     ------
     DatasetError
-        There is no such field, or the text states it in a form that cannot be changed alone.
+        The field does not exist, or the text states it in a form that cannot be changed separately.
     """
     data = parse_toml(text, "text")
     known = {each.place: each for _, _, fields in _groups(data) for each in fields}
     found = known.get(tuple(place))
     if found is None:
-        raise DatasetError(f"{dotted(place)}: there is no such field")
+        raise DatasetError(f"{dotted(place)}: no such field")
     if written.strip() == "" and not (found.required and found.plain):
         return with_value(text, place, None)
     return with_value(text, place, written if found.plain else value_of(written.strip()))
 
 
 def with_test(text: str) -> str:
-    """Return the text of a campaign with one more test, whose method is still to be chosen.
+    """Return the text of a campaign with one more test, without a method.
 
     Raises
     ------
     DatasetError
-        The text states its tests in a form to which none can be added.
+        The text states its tests in a form to which no test can be added.
     """
     tests = parse_toml(text, "text").get("test")
     names = {test.get("name") for test in tests if isinstance(test, dict)} if isinstance(tests, list) else set()
@@ -145,17 +145,17 @@ def without_test(text: str, number: int) -> str:
     Raises
     ------
     DatasetError
-        There is no such test, or the text states it in a form that cannot be removed alone.
+        The test does not exist, or the text states it in a form that cannot be removed separately.
     """
     return without_table(text, "test", number)
 
 
 def _checked(text: str, source: Path) -> tuple[CampaignPlan | None, list[str], list[str]]:
-    """Return the plan, the mistakes that begin with a key of this file, and the others."""
+    """Return the plan, the mistakes that start with a key of this file, and the others."""
     try:
         return campaign_of(text, source), [], []
     except MistakesError as error:
-        if error.source != source:  # of the bench alone
+        if error.source != source:  # mistakes of the bench file only
             return None, [], [str(error)]
         return None, list(error.mistakes), [error.more] if error.more else []
     except BenchError as error:
@@ -163,7 +163,7 @@ def _checked(text: str, source: Path) -> tuple[CampaignPlan | None, list[str], l
 
 
 def _split(mistakes: Sequence[str], place: Sequence[Key], *, whole: bool = False) -> tuple[list[str], list[str]]:
-    """Return the mistakes at a place or below it, without its key, and the others; ``whole``: with their keys."""
+    """Return the mistakes at a key or below it, without the key, and the others; ``whole``: with their keys."""
     key = dotted(place)
     here, others = [], []
     for each in mistakes:
@@ -204,7 +204,7 @@ def _fields(
         key = field.alias or name
         stated = data.get(key)
         inner = _table(field)
-        if inner is not None and len(label.split(".")) < DEEPEST and (stated is None or isinstance(stated, dict)):
+        if inner is not None and len(label.split(".")) < MAX_DEPTH and (stated is None or isinstance(stated, dict)):
             yield from _fields(inner, (*place, key), stated or {}, label=f"{label}{key}.")
         else:
             yield _field(field, (*place, key), f"{label}{key}", stated)
@@ -219,7 +219,7 @@ def _field(field: FieldInfo, place: tuple[Key, ...], label: str, stated: Any) ->
     if place[-1] == "method":
         choices, plain = tuple(each.id for each in plugins.available("methods") if each.cls is not None), True
     written = "" if stated is None else stated if plain and isinstance(stated, str) else value(stated)
-    if written and choices and written not in choices:  # a mistake is shown as it is
+    if written and choices and written not in choices:  # an invalid value is shown as well
         choices = (*choices, written)
     return Field(
         place=place,
@@ -244,7 +244,7 @@ def _choices(options: Sequence[Any]) -> tuple[str, ...]:
 
 
 def _table(field: FieldInfo) -> type[BaseModel] | None:
-    """Return the model of a field that is always a table of its own; None for anything else."""
+    """Return the model of a field that is always a table; None for other fields."""
     options = options_of(field.annotation)
     only = options[0] if len(options) == 1 else None
     return only if isinstance(only, type) and issubclass(only, BaseModel) else None

@@ -1,4 +1,4 @@
-"""Settings as a person writes them: default, unit, quantity."""
+"""Settings as text: default, unit, quantity."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _USUAL_UNITS = {
     "s": ("s", "min", "h", "ms"),
     "Hz": ("Hz", "kHz"),
 }
-"""Units that people use, by the inside unit; of two alike the first."""
+"""Usual units by SI unit; of equally short texts the first one is used."""
 
 
 def default_of(field: FieldInfo) -> str:
-    """Return the default of a setting as a person writes it in a campaign, with its unit; else what is expected."""
+    """Return the default of a setting as written in a campaign, with its unit; of a required setting, its kind."""
     quantity = quantity_of(field)
     kind = f" ({quantity.kind})" if quantity is not None else ""
     if field.is_required():
@@ -43,7 +43,7 @@ def default_of(field: FieldInfo) -> str:
 
 
 def _written(value: float, quantity: Quantity) -> str:
-    """Return a value in the unit in which it is a short number."""
+    """Return a value in the unit in which its number is shortest."""
     units = _USUAL_UNITS.get(quantity.unit, ())
     texts = [format_quantity(value, unit, 6) for unit in units] if value and units else []
     short = min(texts, key=lambda text: (len(text.split()[0].strip("-")), texts.index(text)), default="")

@@ -1,4 +1,4 @@
-"""The time of a monitor, by which it reads, logs and retries."""
+"""The clock of a monitor."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from errormotion.datasets.clock import steady
 
 
 class Clock:
-    """The clock of the computer, which is monotonic; a subclass may run at another rate, as for simulated days."""
+    """The monotonic clock of the computer; a subclass may run at another rate, as for simulated days."""
 
     def now(self) -> float:
-        """Return the time, s; it is never set back."""
+        """Return the monotonic time, s."""
         return steady()
 
     def sleep(self, seconds: float) -> None:
-        """Wait."""
+        """Wait for a time, s."""
         time.sleep(seconds)
 
     def wait(self, event: threading.Event, seconds: float) -> None:
-        """Wait until an event happens, or a time has passed, s."""
+        """Wait for an event, at most for a time, s."""
         event.wait(seconds)

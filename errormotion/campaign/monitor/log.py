@@ -1,4 +1,4 @@
-"""The log of a monitor, read block by block and reduced to the resolution of a page, so that logs of weeks fit."""
+"""The log of a monitor, read in blocks and reduced to the resolution of a page, for logs of any length."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from errormotion.plugins import FigureOfMerit
 BINS = 600
 """Number of intervals of the reduced log: the resolution of a page."""
 BLOCK = 65536
-"""Rows that are read at a time."""
+"""Number of rows that are read at a time."""
 MISSED = 2.5
 """Time between two rows, in intervals, above which rows are missing."""
 
@@ -27,7 +27,7 @@ NUMBERS = (
     ("spindle_load", "Spindle load", "%", 100.0),
     ("feed", "Feed", "m/min", 60.0),
 )
-"""Working parameters: name in the log, title, unit on the page, and number of these in one SI unit."""
+"""Working parameters: name in the log, title, unit on the page, and factor from the SI unit to it."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Log:
     ----------
     rows : int
     interval : float
-        Stated interval of the rows, s; the median found if not stated.
+        Stated interval of the rows, s; the median interval if not stated.
     duration : float
         First to last row, s.
     time : (m,)
@@ -106,7 +106,7 @@ class Log:
 
 
 class _Thinner:
-    """Lowest and highest value of every interval, and statistics of whole columns (n, c), block by block."""
+    """Lowest and highest value of every interval, and statistics of whole columns (n, c), updated block by block."""
 
     def __init__(self, count: int, bins: int) -> None:
         self.low, self.high = np.full((bins, count), np.inf), np.full((bins, count), -np.inf)

@@ -171,9 +171,7 @@ def _numbers(log: Log) -> list[Block]:
         rows.append([title, unit, *_spans(channel, size), percent(channel.known / max(log.rows, 1))])
     if not rows:
         return [Text("The bench had no controller: working parameters were not recorded.", "note")]
-    return [
-        Table("Working parameters.", ["parameter", "unit", "lowest", "mean", "highest", "last", "known"], rows),
-    ]
+    return [Table("Working parameters.", ["parameter", "unit", "lowest", "mean", "highest", "last", "known"], rows)]
 
 
 def _spans(channel: Channel, size: float) -> list[Cell | str]:

@@ -1,4 +1,4 @@
-"""Instruments of a monitor, each read by a thread of its own so that none delays the others."""
+"""Instruments of a monitor; a separate thread for each, so that no instrument delays another."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from errormotion.campaign.bench import Answer
+from errormotion.campaign.bench import Answer, connect
 from errormotion.campaign.files import BenchInstrument
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.storage.journal import cause_of
@@ -43,7 +43,7 @@ class Reading:
 
 
 class Source:
-    """One instrument that is read periodically; after a failure it is retried without limit.
+    """One instrument that is read periodically; after a failure, reading is retried without limit.
 
     Parameters
     ----------
@@ -52,12 +52,12 @@ class Source:
     interval : float
         Time from one reading to the next, s.
     clock : Clock
-        Of the monitor.
+        Clock of the monitor.
 
     Attributes
     ----------
     answer : Answer or None
-        Its identity when it was last opened.
+        Identity when the instrument was last opened.
     error : str
         Cause of a missing reading; empty while readings arrive.
     readings : int
@@ -144,13 +144,7 @@ class Source:
         if self._driver is not None:
             return
         driver = self._unopened()
-        try:
-            driver.open()
-            identity = driver.identify()
-        except BaseException:
-            driver.close()
-            raise
-        self.answer, self._driver = Answer(self.instrument, driver, identity), driver
+        self.answer, self._driver = Answer(self.instrument, driver, connect(driver)), driver
 
     def _close(self) -> None:
         driver, self._driver = self._driver, None

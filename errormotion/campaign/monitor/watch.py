@@ -1,6 +1,6 @@
-"""Monitoring of a machine for hours or weeks: temperatures and working parameters on one clock, into a run folder.
+"""Monitoring of a machine for hours or weeks: temperatures and working parameters on one clock, in a run folder.
 
-Every instrument is read by a thread of its own. At each interval the latest reading of each instrument is logged if it
+Every instrument is read by a separate thread. At each interval the latest reading of each instrument is logged if it
 is recent; a missing reading is logged as NaN and marked in ``gap`` until the instrument answers again. Rows are on disk
 within a second, and only the last readings are kept in memory.
 """
@@ -24,7 +24,7 @@ import xarray as xr
 
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
-from errormotion.campaign.folder import FolderGoneError, RunFolder, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, new_entries, now
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.campaign.monitor.sources import Source
@@ -43,7 +43,7 @@ OLDEST_READING = 2.5
 """Greatest age of a reading that is logged, in intervals: one interval may pass without a new reading, two may not."""
 
 START_TIMEOUT = 10.0
-"""Time within which an instrument gives its first reading, s; then a gap is logged until it answers."""
+"""Longest wait for the first reading of an instrument, s; afterwards a gap is logged until it answers."""
 
 BLOCK = 4096
 """Rows of one chunk on disk: about an hour at 1 s; every commit rewrites the last chunk."""
@@ -65,7 +65,7 @@ class Snapshot:
     temperatures : mapping of str to float
         degC; NaN = unknown.
     flags : mapping of str to str
-        Reasons of the unknown ones.
+        Reasons of unknown temperatures.
     state : mapping
         State of the controller; empty without one, or while it does not answer.
     silent : mapping of str to str
@@ -91,13 +91,13 @@ class Monitor:
     Parameters
     ----------
     plan : BenchPlan
-        Its other instruments are not opened.
+        The bench; its thermometers and its controller are opened.
     runs : Path
         Folder of the run folder.
     interval : float
         Interval of the rows of the log, s.
     clock : Clock, optional
-        Its time; default that of the computer.
+        Clock; default: that of the computer.
     test : str
         Name of the test in the run folder.
 
@@ -176,7 +176,7 @@ class Monitor:
             self._state_end(failure)
 
     def _state_end(self, failure: Exception | None) -> None:
-        """Write how the log has ended to ``run.json``; where this fails as well, the failure before it is the cause."""
+        """Write the end of the log to ``run.json``; if this fails as well, the earlier failure is the cause."""
         if failure is not None:
             log.error("the monitor stopped", exc_info=failure)
         status, reason = ("finished", "") if failure is None else ("failed", cause_of(failure))
@@ -188,7 +188,7 @@ class Monitor:
             "invalid": {f"no answer of {name}": count for name, count in self._gaps.items()},
         }
         self.folder.step("monitor", "done" if failure is None else status, samples=self._recorder.committed)
-        if isinstance(failure, FolderGoneError):  # nothing is written where the folder was
+        if isinstance(failure, FolderGoneError):  # nothing is written to its former path
             return
         try:
             self.folder.save(status=status, reason=reason, acquired=failure is None)
@@ -269,8 +269,8 @@ class Monitor:
             coords["direction"] = ["x", "y", "z"]
         if self.controller is not None:
             coords["direction"] = ["x", "y", "z"]
-            place = snapshot.state.get("position") or [math.nan] * 3
-            data["position"] = (("time", "direction"), np.array([place[:3]], dtype=float), {"units": "m"})
+            position = snapshot.state.get("position") or [math.nan] * 3
+            data["position"] = (("time", "direction"), np.array([position[:3]], dtype=float), {"units": "m"})
             for name, unit in zip(NUMBERS, ("1/min", "1", "m/s"), strict=True):
                 value = snapshot.state.get(name, math.nan)
                 data[name] = ("time", np.array([math.nan if value is None else value], dtype=float), {"units": unit})
@@ -294,26 +294,7 @@ class Monitor:
             source.join()
 
     def _new_folder(self) -> RunFolder:
-        data = {
-            "status": "running",
-            "reason": "",
-            "acquired": False,
-            "bench": {
-                "name": self.plan.name,
-                "machine": self.plan.machine,
-                "file": self.plan.source.name,
-                "text": self.plan.text,
-            },
-            "settings": {"interval": self.interval},
-            "instruments": [],
-            "software": provenance.make({}, None, None)["software"],
-            "samples": {},
-            "raw": "raw.zarr",
-            "errors": None,
-            "report": None,
-            "log": "log.jsonl",
-            "steps": [],
-        }
+        data = new_entries(self.plan) | {"settings": {"interval": self.interval}, "instruments": []}
         return RunFolder.create(self.runs, self.test, uuid4().hex[:8], data)
 
 

@@ -1,1 +1,1 @@
-"""What a campaign will do and how well it will measure, before anything moves."""
+"""Motions and expected uncertainty of a campaign, before anything moves."""

@@ -1,4 +1,4 @@
-"""The uncertainty to expect of the tests of a campaign."""
+"""The expected uncertainty of the tests of a campaign."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from errormotion.tolerances.conformity import FIELD_UNITS
 
 
 def planned(plan: CampaignPlan, test: TestPlan) -> xr.Dataset:
-    """Return the error dataset that a method plans: its covariance is the one to expect."""
+    """Return the planned error dataset of a test, whose covariance is the expected one."""
     method, settings = test.method(), test.settings
     with looking_beside(plan.folder):
         if hasattr(method, "planning_settings"):
@@ -23,7 +23,7 @@ def planned(plan: CampaignPlan, test: TestPlan) -> xr.Dataset:
 
 
 def expected(errors: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the expanded uncertainty (k = 2) of every known estimate, the largest in the dataset."""
+    """Return the largest expanded uncertainty (k = 2) of every freedom in a planned error dataset."""
     variances = np.diagonal(errors.em.covariance().values, axis1=-2, axis2=-1)
     found = []
     for k, name in enumerate(errors.em.names):

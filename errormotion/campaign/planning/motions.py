@@ -1,4 +1,4 @@
-"""Path, duration and limits of the tests of a campaign, as numbers, text and picture; nothing moves."""
+"""Path, duration and limits of the tests of a campaign as numbers, text and drawing; nothing moves."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 9.0, 7.0  # inches
 
 @dataclass(frozen=True)
 class Motions:
-    """What one test asks of the machine: its steps, and their requirements."""
+    """Steps of the machine in one test, and their requirements."""
 
     test: str
     steps: list[Step]
@@ -31,12 +31,12 @@ class Motions:
 
 
 def motions(plan: CampaignPlan, test: TestPlan) -> Motions:
-    """Return what a test will do with the machine.
+    """Return the motions of the machine in a test.
 
     Raises
     ------
     BenchError
-        The method does not state what moves.
+        The method does not state its motions.
     """
     steps = steps_of(test.method, test.settings, plan.bench.chosen(test.instruments).settings_by_kind)
     if steps is None:
@@ -70,16 +70,16 @@ def beside_limits(found: Extent, limits: Limits) -> list[list[str]]:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration in words."""
+    """Return a duration as text."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"
 
 
 def picture(plan: CampaignPlan, found: Motions) -> Figure:
-    """Return a drawing of the path from above, from the front and from the side, and of the spindle speed over time.
+    """Return a drawing of the path in top, front and side view, and of the spindle speed over time.
 
-    Where no axis moves, only the spindle speed is drawn.
+    If no axis moves, only the spindle speed is drawn.
     """
     from matplotlib.figure import Figure
 

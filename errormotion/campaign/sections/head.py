@@ -1,4 +1,4 @@
-"""The head of reports: what bench and campaign state of the laboratory, the order and the calibrations."""
+"""The head of reports: laboratory, order and calibrations as stated by bench and campaign."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from errormotion.report.page import logo
 
 
 class Laboratory(BaseModel):
-    """``[laboratory]`` of a bench file: who tests."""
+    """``[laboratory]`` of a bench file: the testing laboratory."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: str = Field(max_length=200, description="name of the laboratory")
@@ -25,18 +25,18 @@ class Laboratory(BaseModel):
 
 
 class ReportTable(BaseModel):
-    """``[report]`` of a campaign file: the order, and how its reports are written."""
+    """``[report]`` of a campaign file: the order, and the form of the reports."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     customer: str = Field(default="", max_length=200, description="customer")
     order: str = Field(default="", max_length=200, description="number of the order")
-    number: str = Field(default="", max_length=100, description="number of the report; default: made of the data")
+    number: str = Field(default="", max_length=100, description="number of the report; default: derived from the data")
     language: Literal["", "en", "de"] = Field(default="", description="language of the report: en, de")
     paper: Literal["", "A4", "Letter"] = Field(default="", description="paper of the report: A4, Letter")
 
 
 def logo_mistakes(laboratory: Laboratory | None, folder: Path) -> list[str]:
-    """Return why the logo of a laboratory cannot be used; empty without one."""
+    """Return why the logo of a laboratory cannot be used; empty if it can, or without a logo."""
     found = logo.mistake(folder / laboratory.logo) if laboratory is not None and laboratory.logo else ""
     return [f"laboratory.logo: {found}"] if found else []
 
@@ -54,7 +54,7 @@ def until_mistakes(until: Mapping[str, date], instruments: Mapping[str, Any]) ->
 def stated(
     laboratory: Laboratory | None, report: ReportTable | None, until: Mapping[str, date], certified: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return the head of the reports of a campaign for a ``run.json``; without what is not stated."""
+    """Return the head of the reports of a campaign for ``run.json``; keys that are not stated are absent."""
     found: dict[str, Any] = {}
     if laboratory is not None:
         found |= {"laboratory": laboratory.name, "address": laboratory.address}

@@ -39,7 +39,7 @@ class Limits(BaseModel):
         return self
 
     def of_machine(self, forbidden: str = "") -> MachineLimits:
-        """Return the limits as drivers hold them; ``forbidden`` as in `MachineLimits`."""
+        """Return the limits in the form for drivers; ``forbidden`` as in `MachineLimits`."""
         spans = {axis: span for axis in AXES if (span := getattr(self, axis)) is not None}
         return MachineLimits(spans, self.feed, self.spindle_speed, forbidden)
 
@@ -55,14 +55,14 @@ class Extent:
     path : float
         Length of all moves, m.
     low, high : (3,) tuple of float
-        Lowest and highest position of X, Y, Z, m; NaN where nothing moves.
+        Lowest and highest position of X, Y, Z, m; NaN for an axis that does not move.
     feed : float
-        Highest feed, m/s; 0 where nothing moves.
+        Highest feed, m/s; 0 if nothing moves.
     spindle_speed : float
-        Highest, 1/min.
+        Highest spindle speed, 1/min.
     touches, moves : int
     rapid : int
-        Moves whose feed is that of the machine.
+        Moves at rapid traverse.
     untimed : int
         Steps whose duration is unknown.
     """
@@ -111,8 +111,8 @@ def violations(found: Extent, limits: Limits) -> list[str]:
             continue
         if found.low[k] < span[0] - _ROUNDING or found.high[k] > span[1] + _ROUNDING:
             exceeded.append(
-                f"{axis} would go from {_mm(found.low[k])} to {_mm(found.high[k])}; its limits are {_mm(span[0])} and "
-                f"{_mm(span[1])}"
+                f"{axis} would move from {_mm(found.low[k])} to {_mm(found.high[k])}; its limits are {_mm(span[0])} "
+                f"and {_mm(span[1])}"
             )
     if limits.feed is not None and found.feed > limits.feed * (1 + _ROUNDING):
         exceeded.append(f"the feed would be {_feed(found.feed)}; its limit is {_feed(limits.feed)}")
@@ -124,19 +124,19 @@ def violations(found: Extent, limits: Limits) -> list[str]:
 
 
 def steps_of(method: Any, settings: Any, instruments: dict[str, Any]) -> list[Step] | None:
-    """Return every step of the machine in a test; None where the method does not state its motions.
+    """Return every step of the machine in a test; None if the method does not state its motions.
 
     Parameters
     ----------
     method : class of a method
     settings : its settings
     instruments : dict
-        Settings of the bench's instruments by kind.
+        Settings of the instruments of the bench by kind.
 
     Raises
     ------
     MethodError
-        The method cannot tell, or states what is no step of a machine.
+        The method cannot determine its motions, or states an invalid step.
     """
     motions = getattr(method, "motions", None)
     if motions is None:
@@ -146,7 +146,7 @@ def steps_of(method: Any, settings: Any, instruments: dict[str, Any]) -> list[St
         if not isinstance(step, Step) or not _possible(step):
             raise MethodError(
                 f"motions of '{method.info.id}': expected steps with finite positions X, Y, Z (NaN for an axis that "
-                f"stays), feeds above 0 (NaN for rapid) and finite spindle speeds; found step {number}: {step}"
+                f"does not move), feeds above 0 (NaN for rapid) and finite spindle speeds; found step {number}: {step}"
             )
     return steps
 
@@ -165,9 +165,9 @@ def _possible(step: Any) -> bool:
 
 
 def announcement(test: str, steps: Sequence[Step] | None, limits: Limits) -> str:
-    """Return in one line what a test will do with the machine, beside its limits; ``steps`` as from `steps_of`."""
+    """Return the motions of a test and their limits in one line; ``steps`` as from `steps_of`."""
     if steps is None:
-        return f"{test}: states no motions; no order to the machine is allowed."
+        return f"{test}: the method states no motions; no command to the machine is allowed."
     found = extent(steps)
     parts = []
     for k, axis in enumerate(AXES):
@@ -179,7 +179,7 @@ def announcement(test: str, steps: Sequence[Step] | None, limits: Limits) -> str
         limit = "no limit" if limits.feed is None else f"limit {_feed(limits.feed)}"
         parts.append(f"feed up to {_feed(found.feed)} ({limit})")
     if found.rapid:
-        held = "not limited" if limits.feed is None else f"held to {_feed(limits.feed)}"
+        held = "not limited" if limits.feed is None else f"limited to {_feed(limits.feed)}"
         parts.append(f"rapid moves: {found.rapid} ({held})")
     if found.spindle_speed:
         limit = "no limit" if limits.spindle_speed is None else f"limit {limits.spindle_speed:g} /min"

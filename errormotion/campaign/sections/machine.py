@@ -1,4 +1,4 @@
-"""``[machine]`` of a bench file: read into the description of a machine, and compared with limits and settings."""
+"""``[machine]`` of a bench file: the description of a machine, and its comparison with limits and settings."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class Travel(BaseModel):
 
 
 class RotaryAxis(BaseModel):
-    """``[machine.rotary.NAME]``: where a rotary axis is, and its angle where it stands still."""
+    """``[machine.rotary.NAME]``: position of a rotary axis, and its angle if it is fixed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     position: tuple[Length, Length, Length] = Field(
-        description='a point on the axis\'s line with all axes at zero, such as ["0 mm", "0 mm", "-50 mm"]'
+        description='a point on the axis with all axes at zero, such as ["0 mm", "0 mm", "-50 mm"]'
     )
-    fixed: Angle | None = Field(default=None, description="angle of an axis that stands still")
+    fixed: Angle | None = Field(default=None, description="angle of a fixed axis")
 
 
 class MachineTable(BaseModel):
@@ -50,7 +50,7 @@ class MachineTable(BaseModel):
         description='the bodies and axes from workpiece to tool, such as "workpiece-X-Y-bed-Z-spindle-tool"'
     )
     travel: Travel = Field(default=Travel(), description="lowest and highest position of each axis")
-    spindle_axis: str = Field(default="Z", description="X, Y or Z: the direction of the spindle's axis of rotation")
+    spindle_axis: str = Field(default="Z", description="direction of the axis of rotation of the spindle: X, Y or Z")
     rotary: dict[str, RotaryAxis] = Field(default={}, description="the rotary axes by name")
 
 
@@ -60,9 +60,9 @@ def read_machine(data: Mapping[str, Any], *, key: str = "machine") -> tuple[Mach
     Parameters
     ----------
     data : mapping
-        As TOML gives it; units are compulsory.
+        Content of the table; units are compulsory.
     key : str
-        Position of the table in its file, for the messages.
+        Key of the table in its file, for messages.
     """
     table, mistakes = tomlfile.check(data, MachineTable, prefix=(key,))
     if table is None:
@@ -83,7 +83,7 @@ def read_machine(data: Mapping[str, Any], *, key: str = "machine") -> tuple[Mach
 
 
 def completed(method: Any, settings: Any, machine: MachineDescription | None) -> Any:
-    """Return the settings of a method with the values that the machine gives to those that are not stated."""
+    """Return the settings of a method; those that are not stated get the defaults of the machine."""
     defaults = getattr(method(), "machine_defaults", None)
     if defaults is None or machine is None:
         return settings
@@ -92,13 +92,13 @@ def completed(method: Any, settings: Any, machine: MachineDescription | None) ->
 
 
 def contradictions(method: Any, settings: Any, machine: MachineDescription | None) -> Mapping[str, str]:
-    """Return what contradicts the machine in the settings of a method, by setting."""
+    """Return the contradictions between the settings of a method and the machine, by setting."""
     check = getattr(method(), "check_machine", None)
     return {} if check is None or machine is None else dict(check(settings, machine))
 
 
 def limits_within(limits: Limits, machine: MachineDescription) -> tuple[Limits, list[str]]:
-    """Return the limits with the travel where a bench states none, and which limits are outside of the travel."""
+    """Return the limits, with the travel for axes without limits, and the limits that are outside the travel."""
     spans: dict[str, Any] = {}
     mistakes = []
     for axis in AXES:

@@ -1,1 +1,1 @@
-"""Raw data and the log of a run on disk: written while the method measures, complete at any time."""
+"""Raw data and the log of a run on disk, written during the measurement and complete at any time."""

@@ -1,4 +1,4 @@
-"""The log of a run: one JSON object a line, tracebacks included."""
+"""The log of a run: one JSON object per line, including tracebacks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROOT = "errormotion"
 
 
 def cause_of(error: BaseException) -> str:
-    """Return an error as text for the operator; with its class if it is a defect of a program."""
+    """Return an error as text for the operator; with its class if it is a defect of the software."""
     return str(error) if isinstance(error, ErrormotionError) else f"{type(error).__name__}: {error}"
 
 
@@ -41,7 +41,7 @@ class _Handler(logging.FileHandler):
     """Ignores write errors: a full disk must not end a measurement because of its log."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        with suppress(OSError):  # of the opening, which the standard handler lets out
+        with suppress(OSError):  # errors of opening, which the standard handler does not catch
             super().emit(record)
 
     def handleError(self, record: logging.LogRecord) -> None:
@@ -50,7 +50,7 @@ class _Handler(logging.FileHandler):
 
 @contextmanager
 def journal(path: Path, level: int = logging.INFO) -> Iterator[None]:
-    """Append all log records of errormotion to a file while the context lasts."""
+    """Append all log records of errormotion to a file until the end of the context."""
     logger = logging.getLogger(ROOT)
     handler = _Handler(path, encoding="utf-8", delay=True)
     handler.setFormatter(JsonLines())

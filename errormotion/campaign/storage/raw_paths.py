@@ -1,4 +1,4 @@
-"""Where the raw data of a path are: a file, a run folder, a folder of run folders."""
+"""Paths of raw data: of a file, a run folder, a folder of run folders."""
 
 from __future__ import annotations
 

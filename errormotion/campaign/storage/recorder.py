@@ -1,4 +1,4 @@
-"""The thread that writes raw data to disk while the method measures."""
+"""The thread that writes raw data to disk during the measurement."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import queue
 import threading
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import xarray as xr
@@ -19,7 +18,7 @@ from errormotion.datasets.clock import RecordClock
 from errormotion.errors import RunError
 
 COMMIT_INTERVAL = 0.5
-"""Longest time until a reader of the folder sees new samples, s; half of what a crash may lose."""
+"""Longest time until new samples are visible to readers, s; a crash loses at most twice as much."""
 
 log = logging.getLogger(__name__)
 
@@ -29,18 +28,18 @@ class DiskFullError(RunError):
 
 
 class Recorder:
-    """Write datasets in the background, at least twice a second.
+    """Writes datasets in the background, at least twice a second.
 
     Parameters
     ----------
     path : Path
-        The raw store; created with the first dataset where there is none.
+        The raw store; created with the first dataset if missing.
     dim : str
         The dimension that grows.
     expected : float
-        Expected total length; in seconds where the samples have a ``sample_rate``.
+        Expected total length; in seconds if the samples have a ``sample_rate``.
     attrs : dict
-        Attributes for the store, where the method does not set them.
+        Attributes of the store, unless the method sets them.
     """
 
     def __init__(self, path: Path, dim: str, expected: float, attrs: dict[str, Any]) -> None:
@@ -87,9 +86,7 @@ class Recorder:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         while self._thread.is_alive():
             try:
                 self._queue.put(None, timeout=0.2)

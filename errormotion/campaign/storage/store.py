@@ -1,6 +1,7 @@
 """The raw store: a Zarr v3 folder that grows during a measurement and is complete at any time.
 
-Samples are written in blocks along one dimension. The order of writing protects the folder against ``kill -9``:
+Samples are written in blocks along one dimension. The order of writing keeps the folder consistent if the process is
+killed at any time:
 
 1. the chunks of a block are written, each to a temporary file that is renamed;
 2. then the root ``zarr.json`` is replaced by a rename. It contains the (consolidated) metadata of all arrays, which
@@ -31,21 +32,21 @@ from errormotion.errors import RunError
 BLOCK_BYTES = 24 * 2**20
 """Largest size of one block of all appended variables in memory, bytes."""
 
-LONGEST_BLOCK = 2**18
+MAX_BLOCK_LENGTH = 2**18
 """Largest number of samples in one block."""
 
 BEFORE_COMMIT = {"zarr_format", "node_type", "attributes"}
 """Keys of the metadata of a store before its first commit."""
 
-MOST_SAMPLES = 2**53
-"""A length beyond this is no number of samples."""
+MAX_SAMPLES = 2**53
+"""A length from this on is invalid."""
 
 PER_CHUNK = ("dropped", "invalid", "time_start")
 """Attributes that differ between the datasets that a method yields."""
 
 
 class RawStore:
-    """Append datasets along one dimension.
+    """A raw store, to which datasets are appended along one dimension.
 
     Parameters
     ----------
@@ -99,9 +100,9 @@ class RawStore:
         dim : str
             The dimension that grows.
         expected : float
-            Expected total length, to size the chunks; in seconds where the samples have a ``sample_rate``.
+            Expected total length, from which the chunk size follows; in seconds if the samples have a ``sample_rate``.
         """
-        if not path.parent.is_dir():  # zarr would create it
+        if not path.parent.is_dir():  # otherwise zarr would create it
             raise RunError(f"{path.parent} is gone: it was moved or deleted before data were written to it")
         if dim not in first.dims:
             raise RunError(f"expected data along '{dim}'; the method yielded dims {', '.join(map(str, first.dims))}")
@@ -114,7 +115,7 @@ class RawStore:
         )
         skeleton = skeleton.drop_attrs(deep=False).assign_attrs(_plain(first.attrs))
         encoding: dict[str, dict[str, Any]] = {}
-        # Objects become texts of free length with every version of xarray; an empty array of objects has no type.
+        # Every version of xarray stores objects as texts of variable length; an empty array of objects has no type.
         texts = {
             name: variable.astype(object if variable.size else np.dtypes.StringDType())
             for name, variable in skeleton.variables.items()
@@ -133,7 +134,7 @@ class RawStore:
         part = path.with_name(path.name + ".part")
         # xarray's stub lacks zarr_format=3 with encodings per variable
         cast(Any, skeleton).to_zarr(part, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
-        for each in (*part.rglob("*"), part):  # a power cut would leave empty files under their names
+        for each in (*part.rglob("*"), part):  # otherwise a power failure would leave empty files
             _sync(each)
         part.rename(path)
         _sync(path.parent)
@@ -180,7 +181,7 @@ class RawStore:
         Raises
         ------
         FolderGoneError
-            The folder was moved or deleted; nothing is written where it was.
+            The folder was moved or deleted; nothing is written to its former path.
         OSError
             The data cannot be written.
         """
@@ -293,8 +294,8 @@ class _Column:
         """Write one block; return the file of its chunk."""
         self._resize(stop)
         self.array[self._at(start, stop)] = self._values[self._at(0, stop - start)]
-        place = tuple(start // self.block if axis == self.axis else 0 for axis in range(len(self.dims)))
-        return self.path / str(self.array.metadata.encode_chunk_key(place))
+        index = tuple(start // self.block if axis == self.axis else 0 for axis in range(len(self.dims)))
+        return self.path / str(self.array.metadata.encode_chunk_key(index))
 
     def _resize(self, length: int) -> None:
         if self.array.shape[self.axis] != length:
@@ -324,7 +325,7 @@ def committed_length(path: Path, dim: str) -> int:
         for metadata in root["consolidated_metadata"]["metadata"].values():
             if dim in _dims(metadata):
                 length = metadata["shape"][_dims(metadata).index(dim)]
-                if isinstance(length, int) and 0 <= length < MOST_SAMPLES:
+                if isinstance(length, int) and 0 <= length < MAX_SAMPLES:
                     return length
         raise ValueError(f"no variable has a length along '{dim}'")
     except OSError as error:
@@ -334,7 +335,7 @@ def committed_length(path: Path, dim: str) -> int:
 
 
 def _dims(metadata: Mapping[str, Any]) -> tuple[str, ...]:
-    return tuple(metadata.get("dimension_names") or ())  # a scalar has none
+    return tuple(metadata.get("dimension_names") or ())  # a scalar has no dimensions
 
 
 def _sync(path: Path) -> None:
@@ -401,8 +402,8 @@ def _encode(variable: xr.Variable, packing: Mapping[str, Any]) -> np.ndarray | N
 def _codec(stored: np.dtype[Any]) -> BloscCodec:
     """Return the compression of a variable as stored.
 
-    Noise fills the low byte of a reading of two bytes, and the high one hardly changes: shuffled bytes take 7 % less
-    than shuffled bits, in the same time.
+    In readings of two bytes the low byte is mostly noise and the high byte hardly changes: shuffling bytes saves 7 %
+    of the size compared with shuffling bits, in the same time.
     """
     if stored.kind in "iu" and stored.itemsize == 2:
         return BloscCodec(cname="zstd", clevel=5, shuffle="shuffle")
@@ -417,7 +418,7 @@ def _block_length(
     for name, variable in growing.items():
         size = np.dtype(packings[name].get("dtype", variable.dtype)).itemsize
         per_sample += max(size, 1) * int(np.prod([n for d, n in variable.sizes.items() if d != dim], dtype=np.int64))
-    most = min(LONGEST_BLOCK, max(BLOCK_BYTES // max(per_sample, 1), 1))
+    most = min(MAX_BLOCK_LENGTH, max(BLOCK_BYTES // max(per_sample, 1), 1))
     if np.isfinite(expected) and expected >= 1:
         most = min(most, 1 << int(np.ceil(np.log2(expected))))
     return 1 << int(np.log2(max(most, 1)))

@@ -1,1 +1,1 @@
-"""The commands, a folder for each group; `app` states their arguments. What they do is in the packages below."""
+"""The commands, a folder for each group; the modules ``interface`` state their arguments."""

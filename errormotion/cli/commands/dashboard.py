@@ -12,8 +12,8 @@ from errormotion.cli.output import show
 from errormotion.datasets.units import TIME
 from errormotion.errors import BenchError, RunError
 
-SHORTEST_INTERVAL = 0.1
-"""Of the rows of the monitor, s."""
+MIN_INTERVAL = 0.1
+"""Shortest interval between readings of the bench, s."""
 
 
 def run(
@@ -34,9 +34,9 @@ def run(
     Raises
     ------
     RunError
-        The extra is not installed, or the address cannot be listened on.
+        A package is missing, or the server cannot listen on the address.
     BenchError
-        The bench or the interval has mistakes.
+        The bench file or the interval is invalid.
     """
     if find_spec("bokeh") is None:
         raise RunError("The dashboard needs the package bokeh: pip install 'errormotion[dashboard]'")
@@ -44,8 +44,8 @@ def run(
         step = TIME.parse(interval)
     except ValueError as error:
         raise BenchError(f"--interval: {error}") from None
-    if not step >= SHORTEST_INTERVAL:
-        raise BenchError(f"--interval: expected {SHORTEST_INTERVAL:g} s or more; found '{interval}'")
+    if not step >= MIN_INTERVAL:
+        raise BenchError(f"--interval: expected {MIN_INTERVAL:g} s or more; found '{interval}'")
     from errormotion.dashboard.access import Access, is_loopback
     from errormotion.dashboard.server import Options, run
 
@@ -56,10 +56,10 @@ def run(
             if not access.secure and not is_loopback(host):
                 show("The connection is not encrypted: anyone on the network can read it. Give --cert and --key.")
         sys.stdout.flush()
-        if browser and is_loopback(host) and sys.stdout.isatty():  # in a thread: some browsers return when they end
+        if browser and is_loopback(host) and sys.stdout.isatty():  # in a thread: some browsers block until they exit
             threading.Thread(target=webbrowser.open, args=[address], daemon=True).start()
 
     try:
         run(Options(runs, host, port, tuple(names), cert, key, bench, step, control, campaigns), started)
-    except KeyboardInterrupt:  # the way to end it
+    except KeyboardInterrupt:  # Ctrl-C ends the command
         show()

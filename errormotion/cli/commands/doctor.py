@@ -1,4 +1,4 @@
-"""``errormotion doctor``: whether this computer has what errormotion needs."""
+"""``errormotion doctor``: checks that this computer has what errormotion needs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from pathlib import Path
 from errormotion.cli.guard import log_file
 from errormotion.errors import ErrormotionError
 
-LEAST_DISK = 2 * 2**30
-"""Bytes; four hours of five packed channels at 20 kHz take about 1 GB."""
+MIN_FREE_DISK = 2 * 2**30
+"""Required free disk space, bytes; four hours of five packed channels at 20 kHz take about 1 GB."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Return the result of every check; a check that fails is a result, too."""
+    """Run every check, and return the findings; a failed check is a finding."""
     checks: list[tuple[str, Callable[[], str]]] = [
         ("python", _python),
         ("packages", _packages),
@@ -64,7 +64,7 @@ def examine() -> list[Finding]:
 
 
 class _FailedError(Exception):
-    """What is wrong, and what to do."""
+    """A failed check; the message states the cause and the remedy."""
 
 
 def _python() -> str:
@@ -89,7 +89,7 @@ def _packages() -> str:
 
 
 def _checks_of_extras() -> list[tuple[str, Callable[[], str]]]:
-    """Return a check for each optional part of the distribution; a part that is not installed is no failure."""
+    """Return a check for each extra of the distribution; a missing extra is not a failure."""
     return [
         (f"optional: {name}", partial(_extra, name)) for name in metadata("errormotion").get_all("Provides-Extra") or ()
     ]
@@ -101,7 +101,7 @@ def _extra(name: str) -> str:
 
 
 def _lacking(extra: str) -> list[str]:
-    """Return the packages that the distribution, or one of its optional parts, requires and that are not installed."""
+    """Return the packages that the distribution, or one of its extras, requires and that are not installed."""
     found = []
     for requirement in requires("errormotion") or ():
         text, _, marker = requirement.partition(";")
@@ -118,7 +118,7 @@ def _lacking(extra: str) -> list[str]:
 
 
 def _applies(marker: str) -> bool:
-    """Whether a requirement is one for this version of Python."""
+    """Return whether a requirement applies to this version of Python."""
     limit = re.search(r"python_version *(<|>=) *['\"](\d+)\.(\d+)['\"]", marker)
     if limit is None:
         return True
@@ -127,7 +127,7 @@ def _applies(marker: str) -> bool:
 
 
 def _pip(what: str) -> str:
-    """Return the command that installs something into this environment."""
+    """Return the command that installs packages into this environment."""
     quoted = f"'{what}'" if any(sign in what for sign in "[<>=") and " " not in what else what
     return f"{sys.executable} -m pip install {quoted}"
 
@@ -164,11 +164,11 @@ def _loopback() -> str:
                 return f"a simulated {driver.identify().model} answers over the wire"
         except ErrormotionError as error:
             found.append(f"{cls.info.id}: {error}")
-    raise _FailedError("; ".join(found) or "no instrument has a simulator")
+    raise _FailedError("; ".join(found) or "no instrument plugin has a simulator")
 
 
 def _checks_of_plugins() -> list[tuple[str, Callable[[], str]]]:
-    """Return the checks that plugins bring: the attribute ``doctor``, name to function."""
+    """Return the checks of plugins: the attribute ``doctor``, name to function."""
     from errormotion import plugins
 
     return [check for _, checks in plugins.brought("doctor", "instruments", "methods") for check in checks.items()]
@@ -195,9 +195,9 @@ def _group(port: str) -> str:
 
 def _disk() -> str:
     free = shutil.disk_usage(Path.cwd()).free
-    if free < LEAST_DISK:
+    if free < MIN_FREE_DISK:
         raise _FailedError(
-            f"{free / 2**30:.1f} GiB free in {Path.cwd()}; a long record needs {LEAST_DISK / 2**30:.0f} GiB"
+            f"{free / 2**30:.1f} GiB free in {Path.cwd()}; a long measurement needs {MIN_FREE_DISK / 2**30:.0f} GiB"
         )
     return f"{free / 2**30:.0f} GiB free"
 

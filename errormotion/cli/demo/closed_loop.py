@@ -1,7 +1,7 @@
-"""The closed loop on the virtual machine, in simulated time: probe a warm-up, fit a model, compensate the next ones.
+"""The closed loop on the virtual machine, in simulated time: probe a warm-up, fit a model, compensate further ones.
 
-Each warm-up starts cold. Balls are probed in cycles, the thermometers read every period of the compensation, and the
-offsets act on the position of the tool, so that the probe measures what remains. Offsets are held while it probes.
+Each warm-up starts cold. Balls are probed in cycles, the thermometers are read in each period of the compensation, and
+the offsets move the tool, so that the probe measures the remaining errors. Offsets are constant during probing.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from errormotion.twin import Event, VirtualMachine
 
 METHOD = "normal_vector"
 OFF = {"X": False, "Y": False, "Z": False}
-"""The control's own compensation is switched off."""
+"""The compensation of the control is switched off."""
 DISPLACEMENTS = ("EX", "EY", "EZ")
 TRUTH_STEP = 60.0
 """Interval of the true errors, s."""
 
-LEAST_RISE = 1.0
-"""Change of a temperature in the training from which its sensor is used, K: noise and air make no feature."""
+MIN_RISE = 1.0
+"""Smallest change of a temperature in the training for the use of its sensor, K; it excludes noise and air."""
 
 SMALL = ModelSettings(variant="dynamics", most_sensors=2, time_constants=(600.0, 3600.0))
-"""At most 10 features: the 19 cycles of one warm-up determine no more, and the prediction of a larger model is so
-uncertain where speeds differ that it is not followed."""
+"""At most 10 features: the 19 cycles of one warm-up do not determine more, and the prediction of a larger model at
+other speeds would be too uncertain to be used."""
 
 Speeds = Sequence[tuple[float, float]]
 """Times after the start of the warm-up, s, and spindle speeds, 1/min."""
@@ -42,18 +42,18 @@ Speeds = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True)
 class Duty:
-    """How a machine is measured.
+    """Schedule and settings of the measurements.
 
     Attributes
     ----------
     duration, interval : float
-        Of a warm-up, and from one probing cycle to the next, s.
+        Duration of a warm-up, and interval between the starts of two probing cycles, s.
     cycle : float
         Duration of a cycle, s. The spindle starts after the first one.
     limits : Limits
-        Of the compensation.
+        Limits of the compensation.
     model : ModelSettings
-        Of the fit; default: `SMALL`.
+        Settings of the fit; default: `SMALL`.
     """
 
     duration: float = 10800.0
@@ -90,7 +90,7 @@ class WarmUp:
 
     @property
     def effect(self) -> Effect:
-        """What the compensation took off as the probe shows it."""
+        """Measured effect of the compensation."""
         return effect(self.before, self.after, freedoms=DISPLACEMENTS)
 
     @property
@@ -114,9 +114,9 @@ def close(machine: VirtualMachine, training: Speeds, further: Sequence[Speeds], 
     ----------
     machine : VirtualMachine
     training : Speeds
-        Of the warm-up that the model is fitted to.
+        Speeds of the warm-up to which the model is fitted.
     further : sequence of Speeds
-        Of the compensated ones.
+        Speeds of the compensated warm-ups.
     duty : Duty, optional
     """
     duty = duty or Duty()
@@ -156,10 +156,10 @@ def _measured(
 
 
 def with_warm_sensors(errors: xr.Dataset) -> xr.Dataset:
-    """Return errors with those temperatures alone that changed by `LEAST_RISE`."""
+    """Return errors without the temperatures that changed by less than `MIN_RISE`."""
     temperature = errors["temperature"]
     change = (temperature.max("time") - temperature.min("time")).values
-    return errors.isel(sensor=np.flatnonzero(change >= LEAST_RISE))
+    return errors.isel(sensor=np.flatnonzero(change >= MIN_RISE))
 
 
 def _truth(machine: VirtualMachine, duty: Duty, point: Sequence[float]) -> tuple[Array, Array]:

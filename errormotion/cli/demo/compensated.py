@@ -16,22 +16,22 @@ from errormotion.twin import VirtualMachine
 
 SEED = 3
 TRAINING: Speeds = ((0.0, 15000.0), (6600.0, 4000.0), (8400.0, 10000.0), (9600.0, 0.0))
-"""Of the warm-up that the model is fitted to: as hot as the machine becomes, then cooler."""
+"""Speeds of the warm-up to which the model is fitted: up to the highest temperature of the machine, then cooler."""
 FURTHER: tuple[Speeds, ...] = (
     ((0.0, 12000.0), (3600.0, 3000.0), (6000.0, 14000.0)),
     ((0.0, 6000.0), (2400.0, 15000.0), (7200.0, 0.0), (9000.0, 9000.0)),
 )
-"""Of the compensated ones."""
+"""Speeds of the compensated warm-ups."""
 
 
 def run(runs: Path, as_json: bool, duty: Duty | None = None) -> None:
-    """Close the loop, and print what the compensation took off, beside the truth."""
-    began = time.monotonic()
+    """Run the closed loop, and print the effect of the compensation and the truth."""
+    start = time.monotonic()
     duty = duty or Duty()
     machine = VirtualMachine("cframe", seed=SEED)
     loop = close(machine, TRAINING, FURTHER, duty)
-    folder = _kept(loop, runs)
-    seconds = time.monotonic() - began
+    folder = _save(loop, runs)
+    seconds = time.monotonic() - start
     if as_json:
         show_json({"ok": True, "seconds": seconds, "warm_ups": [_plain(each) for each in loop.warm_ups]})
         return
@@ -51,7 +51,7 @@ def _plain(each: WarmUp) -> dict[str, object]:
     return {"true_reduction": 1 - each.remaining, "effect": plain(each.effect)}
 
 
-def _kept(loop: Loop, runs: Path) -> Path:
+def _save(loop: Loop, runs: Path) -> Path:
     """Write model, errors and pages into a new folder."""
     folder = runs / f"closed-loop-{datetime.now(UTC):%Y%m%dT%H%M%S%f}"
     folder.mkdir(parents=True)

@@ -1,6 +1,6 @@
-"""``errormotion demo --controller linuxcnc --compensate``: the real LinuxCNC probes a warm-up, and compensates another.
+"""``errormotion demo --controller linuxcnc --compensate``: LinuxCNC probes a warm-up and compensates another.
 
-Both warm-ups have the same speeds. In the second one the compensation runs beside the campaign: it reads the
+Both warm-ups have the same speeds. In the second one the compensation runs in parallel to the campaign: it reads the
 thermometers, and LinuxCNC adds its offsets in the servo thread.
 """
 
@@ -30,20 +30,20 @@ from errormotion.errors import ErrormotionError
 
 CAMPAIGN = Path(__file__).parent / "linuxcnc" / "compensated.toml"
 MODEL = Settings(variant="lagged", lags=())
-"""Present temperatures alone: simulated minutes pass at once, and the compensation would take them for seconds."""
+"""Present temperatures only: the compensation would evaluate lags in real time, which differs from simulated time."""
 RAMP_TIMEOUT = 15.0
 """Time within which the offset is zero after the second warm-up, s."""
 
 
 def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
-    """Run both warm-ups, and print what the compensation took off.
+    """Run both warm-ups, and print the effect of the compensation.
 
     Raises
     ------
     BenchError
-        LinuxCNC is not installed, or does not come up.
+        LinuxCNC is not installed, or does not start.
     """
-    began = time.monotonic()
+    start = time.monotonic()
     plan = load_campaign(campaign)
     (first,) = work(plan, runs=runs, quiet=as_json)
     before = _errors(first)
@@ -54,7 +54,7 @@ def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
         (second,) = work(plan, runs=runs, quiet=as_json)
     found = effect(before, _errors(second))
     model.save(compensation.folder.path / "model.nc")
-    seconds = time.monotonic() - began
+    seconds = time.monotonic() - start
     if as_json:
         tests = [describe(folder) for folder in (first, second)]
         show_json({"ok": True, "seconds": seconds, "tests": tests, "states": dict(states), "effect": plain(found)})
@@ -67,8 +67,8 @@ def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
     show(f"in {seconds:.0f} s, the second one with offsets of a model that was fitted to the first one.\n")
     show("\n".join([*verdict(found), "", table(HEAD, rows(found))]))
     total = sum(states.values())
-    shares = ", ".join(f"{name} {100 * count / total:.0f} %" for name, count in states.most_common())
-    show(f"\ncompensation: {shares}; its log is in {compensation.folder.path}")
+    fractions = ", ".join(f"{name} {100 * count / total:.0f} %" for name, count in states.most_common())
+    show(f"\ncompensation: {fractions}; its log is in {compensation.folder.path}")
     for folder in (first, second):
         show(f"report: {describe(folder)['report']}")
 

@@ -22,22 +22,22 @@ CAMPAIGN = Path(__file__).parent / "linuxcnc" / "campaign.toml"
 
 
 def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
-    """Run the campaign, and print the errors after the last cycle beside the truth, and where the report is.
+    """Run the campaign, and print the errors after the last cycle, their true values, and the path of the report.
 
     Raises
     ------
     BenchError
-        LinuxCNC is not installed, or does not come up.
+        LinuxCNC is not installed, or does not start.
     """
-    began = time.monotonic()
+    start = time.monotonic()
     plan = load_campaign(campaign)
-    place = parse_address(plan.bench.instruments[0].address)
-    here = world(place.host, int(place.number("seed", 0)))  # the one that the simulators will meet in
+    address = parse_address(plan.bench.instruments[0].address)
+    simulated = world(address.host, int(address.number("seed", 0)))  # that of the simulators
     (folder,) = work(plan, runs=runs, quiet=as_json)
     with datasets.load(folder.errors or folder.path) as errors, datasets.load(folder.raw) as raw:
-        numbers = compare(here.machine, errors, float(raw.attrs["clock_origin"]))
+        numbers = compare(simulated.machine, errors, float(raw.attrs["clock_origin"]))
         minutes = float(errors["time"][-1]) / 60
-    seconds = time.monotonic() - began
+    seconds = time.monotonic() - start
     if as_json:
         test = describe(folder)
         show_json({"ok": True, "seconds": seconds, "tests": [test], "numbers": [n.__dict__ for n in numbers]})
@@ -49,12 +49,12 @@ def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
     show(f"warm-up in {seconds:.0f} s. Errors since the cold cycle:\n")
     rows = [[n.name, f"{n.measured:.2f}", f"{n.expanded_uncertainty:.2f}", f"{n.truth:.2f}", n.unit] for n in numbers]
     show(table(["", "measured", "U (k=2)", "truth", ""], rows))
-    show("\nEC is not seen: X and Y carry the table, and Z alone carries the tool.")
+    show("\nEC is not measured: X and Y move the table, and only Z moves the tool.")
     show(f"\nreport on {folder.data['test']}: {describe(folder)['report']}")
 
 
 def compare(machine: VirtualMachine, errors: xr.Dataset, origin: float) -> list[Number]:
-    """Return the errors that are seen at the last cycle beside those of the twin, which went through the same."""
+    """Return the measured errors at the last cycle, and the true errors of the virtual machine."""
     at = errors["time"].values + origin
     truth = machine.truth_probing(at, errors.attrs["functional_point"])
     numbers = []

@@ -27,7 +27,7 @@ CAMPAIGN = Path(__file__).parent / "campaign.toml"
 
 UM, ARCSEC = (1e6, "um"), (648000 / np.pi, "arcsec")
 AROUND_A_STEP = 10.0
-"""Seconds averaged before and after a compensation is switched off."""
+"""Interval of the mean before and after a compensation is switched off, s."""
 SWITCHED = 0.9
 """Time after which a compensation is off, s."""
 
@@ -44,13 +44,13 @@ class Number:
 
 
 def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
-    """Run the campaign, and print its results beside the truth, and the path of the report."""
-    began = time.monotonic()
+    """Run the campaign, and print its results, their true values, and the path of the report."""
+    start = time.monotonic()
     plan = load_campaign(campaign)
     beams, drift, balls = folders = work(plan, runs=runs, quiet=as_json)
     numbers = compare(plan, beams, drift)
     agreement = agree(drift, balls)
-    seconds = time.monotonic() - began
+    seconds = time.monotonic() - start
     if as_json:
         tests = [describe(folder) for folder in folders]
         plain = {"numbers": [number.__dict__ for number in numbers], "comparison": as_plain(agreement)}
@@ -59,7 +59,7 @@ def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
     settings = plan.tests[1].settings
     speed = settings.schedule[0].spindle_speed
     minutes = f"{settings.duration / 60:.0f} simulated minutes at {speed:.0f} /min"
-    show(f"{plan.bench.machine}: {minutes}, measured over the wire")
+    show(f"{plan.bench.machine}: {minutes}, measured over the network")
     show(f"through {len(plan.bench.instruments)} simulated instruments in {seconds:.0f} s.\n")
     rows = [
         [n.name, f"{n.measured:.2f}", f"{n.expanded_uncertainty:.2f}", f"{n.truth:.2f}", n.unit]
@@ -77,7 +77,7 @@ def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
 
 
 def compare(plan: CampaignPlan, beams: RunFolder, drift: RunFolder) -> list[Number]:
-    """Return the results with the truth of the same virtual machine."""
+    """Return the results with the true values of the virtual machine."""
     machine, clock = machine_of(drift), float(drift.data["clock"]["time"])
     with datasets.load(drift.errors or drift.path) as errors:
         settings = plan.tests[1].settings
@@ -88,7 +88,7 @@ def compare(plan: CampaignPlan, beams: RunFolder, drift: RunFolder) -> list[Numb
 
 
 def agree(drift: RunFolder, balls: RunFolder) -> xr.Dataset:
-    """Return the comparison of two methods and the truth, in the displacements that all three state."""
+    """Return the comparison of two methods and the truth, by their common displacements."""
     with datasets.load(drift.errors or drift.path) as bar, datasets.load(balls.errors or balls.path) as probed:
         found = {str(drift.data["test"]): bar, str(balls.data["test"]): probed, "truth": truth_of(balls)}
         return compared(found, at=probed.attrs["functional_point"], freedoms=DOF[:3])
@@ -98,7 +98,7 @@ def _drift_numbers(machine: VirtualMachine, errors: xr.Dataset, clock: float, se
     t = np.asarray(errors["time"].values) + float(errors.attrs["reference_time"])
     truth = _truth(machine, errors, clock, errors.attrs["functional_point"])
     off = [e for e in settings.schedule if e.compensation]
-    half = settings.average / 2  # a mean is stated at its middle
+    half = settings.average / 2  # the time of a mean is its middle
     end = int(np.searchsorted(t, off[0].at - half, side="right")) - 1
     numbers = []
     for k, (name, scale) in enumerate([("EX", UM), ("EY", UM), ("EZ", UM), ("EA", ARCSEC), ("EB", ARCSEC)]):
@@ -137,7 +137,7 @@ def _ranges(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> list[N
     hour = (t >= 0.0) & (t <= 3600.0)
     numbers = []
     low, high = np.asarray(errors["level_height"].values, dtype=float)
-    places = {
+    quantities = {
         "X1": (low, 0),
         "X2": (high, 0),
         "Y1": (low, 1),
@@ -146,7 +146,7 @@ def _ranges(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> list[N
         "A": (0.0, 3),
         "B": (0.0, 4),
     }
-    for name, (height, freedom) in places.items():
+    for name, (height, freedom) in quantities.items():
         truth = _truth(machine, errors, clock, (0.0, 0.0, height))[hour, freedom]
         factor, unit = ARCSEC if freedom > 2 else UM
         measured = errors["iso_value"].sel(quantity=name, measure="range_60min").item()

@@ -1,4 +1,4 @@
-"""The errors of one axis and of the volume on common ground, through the kinematic chain of the machine."""
+"""Errors of one axis and of the volume on common ground, by the kinematic chain of the machine."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["axis_of", "in_machine", "on_axis", "predict"]
 
 
 def axis_of(datasets: Mapping[str, xr.Dataset]) -> str:
-    """Return the axis that some of the datasets are of while others are of the volume; empty where there is none."""
+    """Return the axis of some datasets if the others are of the volume; otherwise an empty text."""
     axes = {str(ds.attrs["component"]) for ds in datasets.values()} - {"tool"}
     mixed = len(axes) == 1 and any(ds.attrs["component"] == "tool" for ds in datasets.values())
     axis = axes.pop() if mixed else ""
@@ -36,18 +36,18 @@ def on_axis(
     Parameters
     ----------
     datasets : mapping of str to Dataset
-        Of one axis (over ``position``, perhaps ``time``) and of the tool (over ``target``).
+        Errors of one axis (over ``position``, optionally ``time``) and of the tool (over ``target``).
     at : array_like, (3,), optional
         Functional point in machine coordinates with all axes at zero, m. Default: that of the first volume.
     same_start : bool
-        Compare an axis over time at its last instant where a start is not stated.
+        Use the last time of an axis over time if a start is not stated.
     notes : list of str
-        What was done is added.
+        Notes on the procedure are appended.
 
     Raises
     ------
     DatasetError
-        What is missing: chain, frame, coordinates, the same kind of reference, start in UTC, common positions.
+        Missing or contradictory: chain, frame, coordinates, kind of reference, start in UTC, or common positions.
     """
     axis = axis_of(datasets)
     volumes = {name: ds for name, ds in datasets.items() if ds.attrs["component"] == "tool"}
@@ -72,8 +72,8 @@ def on_axis(
     weights = reference_weights([each.value for each in found.values()], positions, axis)
     notes.append(
         f"Errors of {axis} from the volume ({', '.join(volumes)}) by the chain {first.attrs['chain']}, at "
-        f"{positions.size} positions. Positioning and rotations count from the first one, straightness from the line "
-        "through the first and the last one: squareness, datum and constant parts are not compared."
+        f"{positions.size} positions. Positioning and rotations are relative to the first, straightness to the line "
+        "through the first and the last: squareness, datum and constant parts are not compared."
     )
     return {
         name: _dataset(datasets[name], curve.relative(weights), axis, positions, point, first)
@@ -85,8 +85,8 @@ def _check_volume(name: str, ds: xr.Dataset, axis: str) -> None:
     dims = ", ".join(map(str, ds["EX"].dims)) or "nothing"
     if ds["EX"].dims != ("target",):
         raise DatasetError(
-            f"'{name}': the errors of {axis} follow from errors of the tool at targets in the volume; "
-            f"these depend on {dims}"
+            f"'{name}': the errors of {axis} can be derived only from errors of the tool at targets in the volume; "
+            f"these errors depend on {dims}"
         )
     if "chain" not in ds.attrs:
         raise DatasetError(
@@ -102,7 +102,7 @@ def _check_volume(name: str, ds: xr.Dataset, axis: str) -> None:
 
 
 def in_machine(ds: xr.Dataset) -> xr.Dataset:
-    """Return the dataset in machine coordinates where it states the origin of its own frame in them."""
+    """Return the dataset in machine coordinates, if it states the origin of its frame in machine coordinates."""
     if "frame_origin" not in ds.attrs:
         return ds
     origin = np.asarray(ds.attrs["frame_origin"], dtype=float)
@@ -118,33 +118,35 @@ def _check_reference(name: str, ds: xr.Dataset, volume_name: str, volume: xr.Dat
     one, other = ((name, ds), (volume_name, volume)) if changes[0] else ((volume_name, volume), (name, ds))
     raise DatasetError(
         f"'{one[0]}' states changes since a reference state ({one[1].attrs['reference']}), '{other[0]}' errors against "
-        f"the commanded positions ({other[1].attrs['reference']}): measure '{other[0]}' in the reference state too and "
-        "subtract it (ds.em.change_from(before), --change NAME=AFTER,BEFORE)"
+        f"the commanded positions ({other[1].attrs['reference']}): measure '{other[0]}' in the reference state as well "
+        "and subtract it (ds.em.change_from(before), --change NAME=AFTER,BEFORE)"
     )
 
 
 def _at_instant(
     name: str, ds: xr.Dataset, volume_name: str, volume: xr.Dataset, same_start: bool, notes: list[str]
 ) -> xr.Dataset:
-    """Return an axis over time at the instant of the volume."""
+    """Return the errors of an axis over time at the time of the volume."""
     if ds["EX"].dims not in (("time", "position"), ("position", "time"), ("position",)):
         found = ", ".join(map(str, ds["EX"].dims)) or "nothing"
-        raise DatasetError(f"'{name}': expected errors over position, and perhaps time; they depend on {found}")
+        raise DatasetError(
+            f"'{name}': expected errors over position, optionally also over time; they depend on {found}"
+        )
     if "time" not in ds["EX"].dims:
         return ds
     t = np.asarray(ds["time"].values, dtype=float)
     silent = [n for n, each in ((name, ds), (volume_name, volume)) if not each.attrs.get("start")]
     if silent and not same_start:
         raise DatasetError(
-            f"{', '.join(map(repr, silent))}: no attribute 'start' (UTC of time 0), so that the instant of '{name}' "
-            f"that belongs to '{volume_name}' is unknown. State it, or take the last instant (same_start, --same-start)"
+            f"{', '.join(map(repr, silent))}: no attribute 'start' (UTC of time 0), so that the time of '{name}' "
+            f"that corresponds to '{volume_name}' is unknown. State it, or use the last time (same_start, --same-start)"
         )
     wanted = t[-1] if silent else between(str(ds.attrs["start"]), str(volume.attrs["start"]))
     k = int(np.abs(t - wanted).argmin())
     step = np.abs(np.diff(t)).max(initial=0.0)
     if not t[0] - step <= wanted <= t[-1] + step:
         raise DatasetError(
-            f"'{volume_name}' starts {wanted:.0f} s after the start of '{name}', which holds {t[0]:.0f} s to "
+            f"'{volume_name}' starts {wanted:.0f} s after the start of '{name}', which covers {t[0]:.0f} s to "
             f"{t[-1]:.0f} s: they do not overlap in time"
         )
     notes.append(f"'{name}' at {t[k]:.0f} s, {abs(t[k] - wanted):.0f} s from the start of '{volume_name}'.")
@@ -153,10 +155,10 @@ def _at_instant(
 
 
 def _common_positions(axes: Mapping[str, xr.Dataset], volumes: Mapping[str, xr.Dataset], letter: str) -> Array:
-    """Return the positions of the axis that all datasets of it have, and that lie within all volumes."""
+    """Return the positions that all datasets of the axis have in common and that are within all volumes."""
     for name, ds in axes.items():
         if letter not in ds.variables or ds[letter].dims != ("position",):
-            raise DatasetError(f"'{name}': no coordinate {letter} along position, where its errors are")
+            raise DatasetError(f"'{name}': no coordinate {letter} along the dimension position")
     found = np.sort(np.asarray(next(iter(axes.values()))[letter].values, dtype=float))
     for ds in axes.values():
         found = np.array([q for q in found if (np.abs(ds[letter].values - q) <= SAME).any()])
@@ -167,7 +169,7 @@ def _common_positions(axes: Mapping[str, xr.Dataset], volumes: Mapping[str, xr.D
     if found.size < 2:
         raise DatasetError(
             f"{', '.join(map(repr, axes))}: {found.size} positions of {letter} in common within the volume; expected "
-            "at least two, since nothing is extrapolated"
+            "at least two, since errors are not extrapolated"
         )
     return found
 

@@ -13,7 +13,7 @@ from errormotion.datasets.results.reduction import influence_of
 from errormotion.kinematics.iso import direction_of
 
 REFERENCE = "reference position"
-"""Group of the sources that are the uncertainty of the reference positions."""
+"""Group of the sources from the uncertainty of the errors at the reference positions."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Curve:
     identity: list[str]
 
     def relative(self, weights: Array) -> Curve:
-        """Return the errors less a weighted sum of those at reference positions; ``weights`` (n, n, 6)."""
+        """Return the errors minus a weighted sum of those at reference positions; ``weights`` (n, n, 6)."""
         known = ~np.isnan(weights).any(axis=(0, 1))
         W = np.where(known, weights, 0.0)
         value = np.where(known, self.value, np.nan)
@@ -45,7 +45,9 @@ class Curve:
         gone = np.isnan(value)
         E = np.where(gone, np.nan, E - np.einsum("njk,jk->nk", W, E))
         F = np.concatenate([F - np.einsum("njk,sjk->snk", W, F), np.reshape(rows, (-1, *E.shape))])
-        F[np.abs(F) < 1e-15 * np.abs(F).max(axis=(0, 1), initial=0.0)] = 0.0  # rounding at the reference positions
+        F[np.abs(F) < 1e-15 * np.abs(F).max(axis=(0, 1), initial=0.0)] = (
+            0.0  # rounding errors at the reference positions
+        )
         F[:, gone] = np.nan
         own[gone[:, :, None] | gone[:, None, :]] = np.nan
         return Curve(
@@ -64,7 +66,7 @@ def measured(ds: xr.Dataset, letter: str, positions: Array) -> Curve:
 
 
 def reference_weights(values: Sequence[Array], positions: Array, axis: str) -> Array:
-    """Return the weights (n, n, 6) of the reference positions in what is subtracted; NaN for what is not comparable."""
+    """Return the weights (n, n, 6) of the subtracted reference positions; NaN for freedoms that cannot be compared."""
     n = positions.size
     W = np.zeros((n, n, 6))
     for dof in range(6):
@@ -86,7 +88,7 @@ def is_straightness(dof: int, axis: str) -> bool:
 
 
 def factor_of(matrix: Array, scale: Array) -> Array:
-    """Return R (n, part) with R R' = matrix; ``scale`` (n,) brings its rows to one size."""
+    """Return R (n, part) with R R' = matrix; ``scale`` (n,) equalises the size of its rows."""
     power, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     kept = power > 1e-12 * max(power.max(initial=0.0), 1e-300)
     found: Array = scale[:, None] * vectors[:, kept] * np.sqrt(power[kept])

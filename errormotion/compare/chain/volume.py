@@ -1,11 +1,12 @@
-"""The errors of an axis from those of the volume, through the kinematic chain of the machine.
+"""The errors of an axis from those of the volume, by the kinematic chain of the machine.
 
-The errors of the tool at a commanded position q are ``e = J(q) p + g(q) d``: p the errors of all axes, polynomials of
-their positions and squareness; d the six motions of the whole, in which the datum of a volume is free. Generalised
-least squares gives p as far as the volume determines it, and so the errors of one axis at chosen positions. A prior
-that falls off with the order, of greatest evidence, stands for what the targets do not show. What
-squareness, datum and the other axes share with an axis is taken off on both sides: positioning and rotations count
-from one position, straightness from the line through two. The derivation is in the explanation of comparisons.
+The errors of the tool at a commanded position q are ``e = J(q) p + g(q) d``: p are the errors of all axes (polynomials
+of their positions) and squareness errors, d the six rigid motions, in which the datum of a volume is free. Generalised
+least squares determines p as far as the volume allows, and thus the errors of one axis at chosen positions. A prior
+whose size decreases with the order, and which maximises the evidence, represents components that the targets do not
+determine. Components that cannot be distinguished from squareness, datum and the other axes are removed on both sides:
+positioning and rotations are relative to one position, straightness to the line through two positions. The derivation
+is in the explanation of comparisons.
 """
 
 from __future__ import annotations
@@ -29,29 +30,29 @@ from errormotion.kinematics.machines import Machine
 from errormotion.kinematics.twists import cross_matrix
 
 SAME = 1e-6
-"""Distance below which two positions of an axis are the same, m."""
+"""Distance below which two positions of an axis are regarded as equal, m."""
 HIGHEST = 12
-"""Highest order of the polynomials; what lies above adds to the uncertainty."""
+"""Highest order of the polynomials; higher orders contribute to the uncertainty."""
 TAIL = 60
-"""Highest order that adds to it."""
+"""Highest order that contributes to the uncertainty."""
 FALLOFFS = (1.0, 2.0, 3.0, 5.0)
 """Exponents p of the prior n^-p of coefficients of order n."""
-SEEN_BY = 2
+DECISIVE_ORDER = 2
 """Highest order that decides whether a freedom is determined."""
 PASSES, SETTLED = 30, 0.05
-"""Passes of the search for the size of the prior, and the change of its logarithm that ends it."""
+"""Largest number of iterations for the size of the prior, and the change of its logarithm that ends them."""
 ROUNDING = 1e-13
-"""Added to the diagonal of a scaled matrix before it is inverted."""
+"""Regularisation added to the diagonal of a scaled matrix before its inversion."""
 FLAT = 1e-13
-"""Weight of the prior of terms that have none, in units of one column's information."""
+"""Weight of the prior of terms without a prior, in units of the information of one column."""
 FALSE_ALARM = 1e-3
-"""Probability of residuals at which uncertainties are raised to match them."""
+"""Probability of the residuals below which the uncertainty is increased accordingly."""
 UNDETERMINED = 1e-10
-"""Share of the largest eigenvalue of the scaled normal matrix below which a direction is not determined."""
+"""Fraction of the largest eigenvalue of the scaled normal matrix below which a direction is not determined."""
 LEAKAGE = 1e-6
-"""Share of an error, squared, that may lie in directions that are not determined."""
+"""Largest fraction of the square of an error in directions that are not determined."""
 BLOCK = 20_000
-"""Targets at a time."""
+"""Number of targets that are processed at a time."""
 
 
 def predict(
@@ -63,7 +64,7 @@ def predict(
     notes: list[str] | None = None,
     name: str = "volume",
 ) -> Curve:
-    """Return the errors of an axis that a volume implies.
+    """Return the errors of an axis that follow from a volume.
 
     Parameters
     ----------
@@ -71,21 +72,21 @@ def predict(
         Errors of the tool over ``target`` with ``x y z`` and the attribute ``chain``.
     axis : str
     positions : array_like, (n,)
-        Of the axis, within the volume, m.
+        Positions of the axis within the volume, m.
     point : array_like, (3,)
         Functional point of the errors of the axis, m, in machine coordinates with all axes at zero.
     notes : list of str, optional
-        Order of the polynomials and misfit are added.
+        Order of the polynomials and misfit are appended.
 
     Returns
     -------
     Curve
-        Up to constants, and lines of the straightness; a freedom that the volume does not determine is NaN.
+        Errors up to constants, for straightness up to a line; a freedom that the volume does not determine is NaN.
 
     Raises
     ------
     DatasetError
-        Targets that do not determine any of them.
+        The targets do not determine any error of the axis.
     """
     positions = np.asarray(positions, dtype=float)
     model = Machine(str(volume.attrs["chain"]), {axis: point})
@@ -97,7 +98,7 @@ def predict(
         if order >= 0 and error // 6 == k:
             S[:, error % 6, column] = P[:, order]
     value, root = S @ fit.value, S @ fit.root
-    # What is determined is free of the directions that are not.
+    # Determined errors have no component in undetermined directions.
     left = (S @ fit.open) ** 2
     size = np.einsum("nkp->k", (S * fit.size) ** 2)
     seen = (size > 0) & (np.einsum("nkp->k", left) <= LEAKAGE * size)
@@ -106,13 +107,13 @@ def predict(
     shared = np.moveaxis(S @ fit.shared, 2, 0)
     if notes is not None:
         notes.append(
-            f"'{name}': error motions as polynomials up to order {HIGHEST}, whose coefficients fall off with the order "
-            f"n as n^-{fit.falloff:g} (greatest evidence)."
+            f"'{name}': error motions as polynomials up to order {HIGHEST}, with a prior of the coefficients of order "
+            f"n proportional to n^-{fit.falloff:g} (maximum evidence)."
         )
         if fit.factor > 1:
             notes.append(
-                f"'{name}': the errors of the axes leave {np.sqrt(fit.factor):.2g} times as much as its uncertainty "
-                "explains; the uncertainty of the derived errors is raised to match."
+                f"'{name}': the residuals of the fit are {np.sqrt(fit.factor):.2g} times as large as its uncertainty "
+                "allows; the uncertainty of the derived errors is increased by this factor."
             )
     F = np.concatenate([shared, np.moveaxis(root, 2, 0)])
     value[:, ~seen], F[:, :, ~seen] = np.nan, np.nan
@@ -131,12 +132,12 @@ def predict(
 
 @dataclass(frozen=True)
 class _Fit:
-    """Errors of all axes of a volume.
+    """Fitted errors of all axes of a volume.
 
-    Terms are (number of the error, order); order -1 is squareness; ``flat`` ones have no prior. ``root`` (term, part)
-    of their covariance without the sources, ``shared`` (term, source), ``open`` (term, direction) what is not
-    determined, ``size`` (term,) the typical size of a term that decides this, ``tau`` and ``falloff`` of the prior by
-    group, ``factor`` by which the covariance was raised.
+    Terms are (number of the error, order); order -1 is squareness; ``flat`` terms have no prior. ``root`` (term, part)
+    is the square root of the covariance without the sources, ``shared`` (term, source) the influence of the sources,
+    ``open`` (term, direction) the undetermined directions, ``size`` (term,) the typical size of a term that decides
+    this, ``tau`` and ``falloff`` are parameters of the prior by group, ``factor`` increases the covariance.
     """
 
     terms: list[tuple[int, int]]
@@ -153,20 +154,20 @@ class _Fit:
     high: Array
 
     def tail(self, q: Array, k: int) -> Array:
-        """Return the variance of what lies above the highest order at positions of axis k, for a prior of size 1."""
+        """Return the variance of the orders above the highest one at positions of axis k, for a prior of size 1."""
         P = legendre.legvander(self.scaled(q, k), TAIL)[:, HIGHEST + 1 :]
         found: Array = (P**2) @ np.arange(HIGHEST + 1.0, TAIL + 1.0) ** (-2 * self.falloff)
         return found
 
     def scaled(self, q: Array, k: int) -> Array:
-        """Return positions of axis k in -1 to 1."""
+        """Return positions of axis k, scaled to -1 to 1."""
         half = max((self.high[k] - self.low[k]) / 2, SAME)
         found: Array = (q - (self.low[k] + self.high[k]) / 2) / half
         return found
 
 
 def _fitted(volume: xr.Dataset, model: Machine, name: str) -> _Fit:
-    """Return the errors of the axes by generalised least squares; shared sources are nuisances with variance 1."""
+    """Return the errors of the axes by generalised least squares; sources are nuisance parameters with variance 1."""
     q = np.stack([np.asarray(volume[axis.lower()].values, dtype=float) for axis in model.axis_names], axis=-1)
     y = np.asarray(volume.em.twist().values, dtype=float)
     F = influence_of(volume)
@@ -185,7 +186,7 @@ def _fitted(volume: xr.Dataset, model: Machine, name: str) -> _Fit:
         P = [legendre.legvander(blank.scaled(q[part, k], k), HIGHEST) for k in range(q.shape[1])]
         J = model.jacobian(q[part], tool)
         A = np.stack([J[:, :, e] * (P[e // 6][:, [o]] if o >= 0 else 1.0) for e, o in terms], axis=2)
-        A = np.concatenate([A, _whole(model, q[part], tool, turns), np.moveaxis(F[:, part], 0, 2)], axis=2)
+        A = np.concatenate([A, _rigid_motions(model, q[part], tool, turns), np.moveaxis(F[:, part], 0, 2)], axis=2)
         W = Information.of(Estimate(name, y[part], own[part], F[:, part], ()), {}).W
         A, data = np.where(known[part][:, :, None], A, 0.0), np.where(known[part], y[part], 0.0)
         WA = np.einsum("tij,tjp->tip", W, A)
@@ -199,11 +200,11 @@ def _fitted(volume: xr.Dataset, model: Machine, name: str) -> _Fit:
         gain = np.asarray(np.linalg.solve(M, right.T).T)
     square -= float(b[columns:] @ np.linalg.solve(M, b[columns:])) if s else 0.0
     b, N = b[:columns] - gain @ b[columns:], N[:columns, :columns] - gain @ right.T
-    return _most_evident(blank, N, b, gain, square, int(known.sum()))
+    return _maximum_evidence(blank, N, b, gain, square, int(known.sum()))
 
 
-def _most_evident(blank: _Fit, N: Array, b: Array, gain: Array, square: float, count: int) -> _Fit:
-    """Return the coefficients under the prior of greatest evidence, with their covariance."""
+def _maximum_evidence(blank: _Fit, N: Array, b: Array, gain: Array, square: float, count: int) -> _Fit:
+    """Return the coefficients for the prior of maximum evidence, with their covariance."""
     n = len(blank.terms)
     order = np.concatenate([[o for _, o in blank.terms], np.full(len(N) - n, -1)]).astype(float)
     group = np.concatenate([[-1 if flat else _group(e) for (e, _), flat in zip(blank.terms, blank.flat, strict=True)],
@@ -217,11 +218,11 @@ def _most_evident(blank: _Fit, N: Array, b: Array, gain: Array, square: float, c
     factor = rest / degrees if chi2.sf(rest, degrees) < FALSE_ALARM else 1.0
     shared = C @ gain
     own = np.sqrt(factor) * factor_of(C - shared @ shared.T, np.sqrt(np.diag(C)))
-    low = np.flatnonzero((order <= SEEN_BY) | (group < 0))
+    low = np.flatnonzero((order <= DECISIVE_ORDER) | (group < 0))
     power, vectors = np.linalg.eigh((N * np.outer(unit, unit))[np.ix_(low, low)])
     lost = np.zeros((len(N), int((power <= UNDETERMINED * power[-1]).sum())))
     lost[low] = unit[low, None] * vectors[:, power <= UNDETERMINED * power[-1]]
-    weight = np.where((order <= SEEN_BY) | (group < 0), unit, 0.0)
+    weight = np.where((order <= DECISIVE_ORDER) | (group < 0), unit, 0.0)
     return replace(
         blank, value=value[:n], root=own[:n], shared=shared[:n], open=lost[:n], size=weight[:n], tau=best.tau,
         falloff=best.falloff, factor=factor,
@@ -229,8 +230,8 @@ def _most_evident(blank: _Fit, N: Array, b: Array, gain: Array, square: float, c
 
 
 @dataclass(frozen=True)
-class _Evident:
-    """Coefficients in scaled units with their covariance; size of each group's prior (its falloff is that of n^-p)."""
+class _Posterior:
+    """Coefficients in scaled units with covariance, size of the prior of each group, and its exponent p in n^-p."""
 
     value: Array
     covariance: Array
@@ -239,8 +240,8 @@ class _Evident:
     evidence: float
 
 
-def _with_falloff(N: Array, b: Array, unit: Array, order: Array, group: Array, p: float) -> _Evident:
-    """Return the coefficients for priors ``tau n^-p``, tau of each group by expectation and maximisation."""
+def _with_falloff(N: Array, b: Array, unit: Array, order: Array, group: Array, p: float) -> _Posterior:
+    """Return the coefficients for priors ``tau n^-p``, tau of each group by expectation maximisation."""
     shape = np.where(group >= 0, np.maximum(order, 1.0) ** -p, 1.0)
     groups = {int(g): np.flatnonzero(group == g) for g in np.unique(group[group >= 0])}
     least = {g: 1e-3 * float(np.median(unit[members])) for g, members in groups.items()}
@@ -258,11 +259,11 @@ def _with_falloff(N: Array, b: Array, unit: Array, order: Array, group: Array, p
         if all(abs(np.log(tau[g] / before[g])) < SETTLED for g in groups):
             break
     evidence = float(b @ x) - log_det + float(np.log(prior).sum())
-    return _Evident(x, C, tau, p, evidence)
+    return _Posterior(x, C, tau, p, evidence)
 
 
 def _inverse(matrix: Array) -> tuple[Array, float]:
-    """Return the inverse of a positive matrix, and the logarithm of its determinant; scaled, against rounding."""
+    """Return the inverse of a positive definite matrix, scaled for accuracy, and the logarithm of its determinant."""
     scale = 1 / np.sqrt(np.diag(matrix))
     factor = linalg.cholesky(matrix * np.outer(scale, scale) + ROUNDING * np.eye(len(matrix)), lower=True)
     half = linalg.solve_triangular(factor, np.diag(scale), lower=True)
@@ -276,7 +277,7 @@ def _group(error: int) -> int:
 
 
 def _terms(model: Machine) -> tuple[list[tuple[int, int]], list[bool]]:
-    """Return all terms, squareness and polynomials from the first order of each error, and which have no prior."""
+    """Return all terms (squareness, and polynomials from the first order of each error), and which have no prior."""
     motions = 6 * len(model.axis_names)
     terms = [(error, -1) for error in range(motions, len(model.error_names))]
     flat = [True] * len(terms)
@@ -288,11 +289,11 @@ def _terms(model: Machine) -> tuple[list[tuple[int, int]], list[bool]]:
     return terms, flat
 
 
-def _whole(model: Machine, q: Array, tool: Array, turns: bool) -> Array:
-    """Return the effect of the motions of the whole (m, 6, 6); with rotations of the tool alone (m, 6, 9)."""
-    place = model.nominal_pose(q).apply(tool)
+def _rigid_motions(model: Machine, q: Array, tool: Array, turns: bool) -> Array:
+    """Return the effect of rigid motions (m, 6, 6); if rotations are known, with rotations of the tool (m, 6, 9)."""
+    position = model.nominal_pose(q).apply(tool)
     G = np.zeros((len(q), 6, 9 if turns else 6))
     G[:, :3, :3], G[:, 3:, 3:6] = np.eye(3), np.eye(3)
-    G[:, :3, 3:6] = -cross_matrix(place)
+    G[:, :3, 3:6] = -cross_matrix(position)
     G[:, 3:, 6:] = np.eye(3)[:, : G.shape[2] - 6]
     return G

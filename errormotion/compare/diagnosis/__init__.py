@@ -1,10 +1,10 @@
-"""What explains a difference: single causes, ranked by likelihood ratio.
+"""Diagnosis of a difference: single causes, ranked by likelihood ratio.
 
-Each cause has an effect on the difference of two datasets that is linear in its size (a functional point, a rotation of
-the frame, a scale, a shift in time, a constant, a step, an expansion) or fixed (a sign, exchanged axes, a unit). With
-the covariance V of the difference d and the effects G of a cause, its size is the generalised least squares estimate,
-and twice the logarithm of the likelihood ratio is ``d' V^-1 G' (G V^-1 G')^-1 G V^-1 d``. Causes are ranked by it, less
-the logarithm of the number of values for each parameter (Schwarz 1978).
+The effect of a cause on the difference of two datasets is linear in its size (a functional point, a rotation of the
+frame, a scale, a shift in time, a constant, a step, an expansion) or fixed (a sign, exchanged axes, a unit). With the
+covariance V of the difference d and the effects G of a cause, its size is the generalised least squares estimate, and
+twice the logarithm of the likelihood ratio is ``d' V^-1 G' (G V^-1 G')^-1 G V^-1 d``. Causes are ranked by this value
+minus the logarithm of the number of values for each parameter (Schwarz 1978).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from errormotion.compare.diagnosis.shift import Course, fitted
 from errormotion.compare.low_rank import Whitener, whitener
 from errormotion.compare.stack import Estimate, difference
 
-CLOSE = 6.0
-"""Difference of scores up to which the data cannot tell two causes apart: a likelihood ratio of 20."""
+SCORE_MARGIN = 6.0
+"""Difference of scores below which two causes are indistinguishable: a likelihood ratio of 20."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Cause:
-    """A cause, and how well it explains a difference.
+    """A cause, with measures of how well it explains a difference.
 
     Attributes
     ----------
@@ -45,13 +45,13 @@ class Cause:
     sizes : tuple of Size
         Empty for a fixed cause.
     log_likelihood_ratio : float
-        Against "the datasets agree".
+        Relative to the hypothesis that the datasets agree.
     score : float
-        Twice that, less the penalty for the parameters.
+        Twice the log likelihood ratio, minus the penalty for the parameters.
     p : float
-        Probability of a larger rest if this cause is the only one.
+        Probability of larger residuals if this cause is the only one.
     alike : tuple of str
-        Causes that these data cannot tell from it.
+        Causes that are indistinguishable from it with these data.
     """
 
     name: str
@@ -72,27 +72,27 @@ def diagnose(
     turns: Mapping[str, Array] | None = None,
     courses: Mapping[str, Course] | None = None,
 ) -> list[Cause]:
-    """Return the causes that could explain the difference of two estimates, the most likely one first.
+    """Return the possible causes of the difference of two estimates, the most likely one first.
 
     Parameters
     ----------
     a, b : Estimate
-        On one grid, (n, d).
+        Estimates on one grid, (n, d).
     freedoms : sequence of str
-        Of the d columns.
+        Freedoms of the d columns.
     time : ndarray, (n,), optional
-        s; without it no cause in time is tried.
+        Times, s; without them no cause in time is tested.
     temperatures : mapping of str to ndarray (n,), optional
         Recorded temperatures, degC, for an expansion.
     turns : mapping of str to ndarray (n, 3), optional
-        Rotations by the name of the dataset, rad: for its functional point, where rotations are not compared.
+        Rotations by dataset, rad; for its functional point, if rotations are not compared.
     courses : mapping of str to Course, optional
-        Smooth courses by the name of the dataset, over its whole record, for a shift in time.
+        Smoothed errors by dataset, over its whole record, for a shift in time.
 
     Returns
     -------
     list of Cause
-        Empty without known values. The first one may explain nothing: see `Cause.explains`.
+        Empty without known values. The first cause may be insignificant; see `Cause.p`.
     """
     d = difference(a, b)
     white = whitener(d.own, d.influence)
@@ -106,7 +106,7 @@ def diagnose(
             continue
         kind = (candidate.kind if isinstance(candidate, Candidate) else "") or found.name
         if kind not in by_kind or found.score > by_kind[kind].score:
-            by_kind[kind] = found  # of a search the best one
+            by_kind[kind] = found  # the best one of a search
     causes = sorted(by_kind.values(), key=lambda each: -each.score)
     return [_with_alike(cause, causes) for cause in causes]
 
@@ -126,7 +126,7 @@ def _judged(
     effects = np.where(np.isfinite(d.value), np.nan_to_num(candidate.effects), 0.0)
     normal, gradient = white.product(effects, effects), white.product(effects, d.value[None])[:, 0]
     choices = candidate.choices or (tuple(range(len(effects))),)
-    # A search is a maximum of dependent statistics: it costs the logarithm of the number of its tries.
+    # A search is a maximum of dependent statistics; its penalty is the logarithm of the number of trials.
     search = 2 * np.log(candidate.tries * len(choices))
     best: tuple[float, float, list[int], Array, Array] | None = None
     for choice in choices:
@@ -149,7 +149,7 @@ def _judged(
 
 
 def _sizes(normal: Array, gradient: Array) -> tuple[Array, Array, float] | None:
-    """Return sizes, their covariance, and the fall of the sum of squares; None where they are not determined."""
+    """Return sizes, their covariance, and the decrease of the sum of squares; None if they are not determined."""
     scale = np.sqrt(np.diag(normal))
     if not (scale > 0).all():
         return None
@@ -162,10 +162,10 @@ def _sizes(normal: Array, gradient: Array) -> tuple[Array, Array, float] | None:
 
 
 def _corrected(candidate: Corrected, d: Estimate, white: Whitener, whole: float) -> Cause:
-    """Judge a cause by the likelihood of both datasets: the correction changes the covariance as well.
+    """Evaluate a cause by the likelihood of both datasets, since the correction changes the covariance as well.
 
-    With ``a' = A a``, ``b' = B b`` and the covariance V' of their difference, ``-2 ln L = chi'^2 + ln |V'|``, less
-    ``ln |A| + ln |B|``: a factor that is applied to one dataset or inversely to the other is the same statement.
+    With ``a' = A a``, ``b' = B b`` and the covariance V' of their difference, ``-2 ln L = chi'^2 + ln |V'|``, minus
+    ``ln |A| + ln |B|``: a factor on one dataset and its inverse on the other one are equivalent.
     """
     right = difference(candidate.a, candidate.b)
     its = whitener(right.own, right.influence)
@@ -178,5 +178,5 @@ def _corrected(candidate: Corrected, d: Estimate, white: Whitener, whole: float)
 
 
 def _with_alike(cause: Cause, causes: Sequence[Cause]) -> Cause:
-    names = [other.name for other in causes if other is not cause and abs(other.score - cause.score) <= CLOSE]
+    names = [other.name for other in causes if other is not cause and abs(other.score - cause.score) <= SCORE_MARGIN]
     return replace(cause, alike=tuple(names))

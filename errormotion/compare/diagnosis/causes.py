@@ -1,4 +1,4 @@
-"""The causes that are tried: what each would do to the difference of two datasets."""
+"""Possible causes, with their effect on the difference of two datasets."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from errormotion.compare.diagnosis.shift import Course, smooth
 from errormotion.compare.stack import Estimate
 from errormotion.kinematics.iso import DOF
 
-MOST_STEPS = 60
-"""Instants at which a step is tried."""
+MAX_STEPS = 60
+"""Largest number of times at which a step is tested."""
 FACTORS = {
     "mm taken as m, or m as mm": 1e3,
     "um taken as mm, or mm as um": 1e-3,
@@ -32,23 +32,23 @@ TURNS = {
 
 @dataclass(frozen=True)
 class Candidate:
-    """A cause with sizes: effects (p, n, d) of one unit of each, and the name and unit of each.
+    """A cause with sizes: effects (p, n, d) of one unit of each size, and its name and unit.
 
-    ``choices`` are the sets of sizes that may be other than zero together: a tool that is too long has one of the three
-    coordinates of a functional point, a holder expands along one axis.
+    ``choices`` are the sets of sizes that may differ from zero simultaneously: a wrong tool length changes one of the
+    three coordinates of a functional point, a holder expands along one axis.
     """
 
     name: str
     effects: Array
     labels: tuple[tuple[str, str], ...]
-    tries: int = 1  # of a search over instants
-    kind: str = ""  # what is searched for
+    tries: int = 1  # number of trials of a search over time
+    kind: str = ""  # kind of the search
     choices: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True)
 class Shifted:
-    """A shift in time: the course of the first dataset (sign 1) or of the second (-1)."""
+    """A shift in time: smoothed errors of the first dataset (sign 1) or of the second one (-1)."""
 
     course: Course
     sign: float
@@ -57,12 +57,12 @@ class Shifted:
 
 @dataclass(frozen=True)
 class Corrected:
-    """A cause without a size: the estimates as they would be without it."""
+    """A cause without a size: the estimates after its correction."""
 
     name: str
     a: Estimate
     b: Estimate
-    stretch: Array | None = None  # (d,) factors that were applied to the freedoms of one of them
+    stretch: Array | None = None  # (d,) factors by which the freedoms of one estimate were multiplied
 
 
 def candidates(
@@ -74,7 +74,7 @@ def candidates(
     turns: Mapping[str, Array],
     courses: Mapping[str, Course],
 ) -> Iterator[Candidate | Corrected | Shifted]:
-    """Yield every cause that can be tried on two estimates."""
+    """Yield every cause that can be tested with two estimates."""
     mean = _six(np.nan_to_num(consensus([a, b]).estimate.value), freedoms)
     k = [DOF.index(name) for name in freedoms]
     yield from _geometric(mean, k)
@@ -86,7 +86,7 @@ def candidates(
     yield from _fixed(a, b, freedoms)
     n = len(a.value)
     units = tuple((name, "m" if name in DOF[:3] else "rad") for name in freedoms)
-    choices = _alone_and_together(freedoms)
+    choices = _freedom_sets(freedoms)
     yield Candidate("constant difference (reference state)", _columns(np.ones(n), len(k)), units, choices=choices)
     if time is not None and n > 2:
         yield from _shift(a, b, time, courses)
@@ -144,7 +144,7 @@ def _scales(E: Array, k: list[int], freedoms: Sequence[str]) -> Iterator[Candida
 
 
 def _fixed(a: Estimate, b: Estimate, freedoms: Sequence[str]) -> Iterator[Corrected]:
-    """Yield causes without a size: a sign, exchanged axes, a unit of one of the datasets."""
+    """Yield causes without a size: a sign, exchanged axes, a unit of one dataset."""
     d = len(freedoms)
     for j, name in enumerate(freedoms):
         sign = np.eye(d)
@@ -170,7 +170,7 @@ def _fixed(a: Estimate, b: Estimate, freedoms: Sequence[str]) -> Iterator[Correc
 
 
 def _mapped(each: Estimate, A: Array) -> Estimate:
-    """Return an estimate with its freedoms under a matrix with one entry in each row; unknown ones stay unknown."""
+    """Return an estimate whose freedoms are transformed by a matrix with one entry per row; NaN remains NaN."""
     value = np.nan_to_num(each.value) @ A.T
     gone = (np.abs(A) @ np.isnan(each.value).T.astype(float)).T > 0
     value[gone] = np.nan
@@ -182,16 +182,16 @@ def _mapped(each: Estimate, A: Array) -> Estimate:
 def _steps(
     n: int, units: tuple[tuple[str, str], ...], time: Array, choices: tuple[tuple[int, ...], ...]
 ) -> Iterator[Candidate]:
-    """Yield a step at each instant: something was moved or struck."""
-    instants = np.unique(np.linspace(2, max(n - 2, 2), max(min(n - 3, MOST_STEPS), 0)).astype(int)).tolist()
-    for i in instants:
+    """Yield a step at each time: an object was moved or struck."""
+    indices = np.unique(np.linspace(2, max(n - 2, 2), max(min(n - 3, MAX_STEPS), 0)).astype(int)).tolist()
+    for i in indices:
         after = np.where(np.arange(n) >= i, 1.0, 0.0)
         name = f"step at {time[i]:.0f} s (something moved)"
-        yield Candidate(name, _columns(after, len(units)), units, tries=len(instants), kind="step", choices=choices)
+        yield Candidate(name, _columns(after, len(units)), units, tries=len(indices), kind="step", choices=choices)
 
 
 def _columns(profile: Array, d: int) -> Array:
-    """Return the effects of one size for each freedom with the same course, (d, n, d)."""
+    """Return the effects of one size for each freedom with the same profile, (d, n, d)."""
     found: Array = np.einsum("n,ij->inj", profile, np.eye(d))
     return found
 
@@ -203,8 +203,8 @@ def _six(values: Array, freedoms: Sequence[str]) -> Array:
     return found
 
 
-def _alone_and_together(freedoms: Sequence[str]) -> tuple[tuple[int, ...], ...]:
-    """Return which freedoms something may act on: one, all displacements, all rotations, or all."""
+def _freedom_sets(freedoms: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """Return the sets of freedoms that a cause may affect: one, all displacements, all rotations, or all."""
     parts = [tuple(i for i, name in enumerate(freedoms) if name in names) for names in (DOF[:3], DOF[3:], DOF)]
     singles = [(i,) for i in range(len(freedoms))]
     return tuple(dict.fromkeys([*singles, *(part for part in parts if part)]))

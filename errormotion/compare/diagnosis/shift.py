@@ -1,10 +1,10 @@
-"""A shift in time between two datasets: its effect from the smooth course of one of them, and its size.
+"""A shift in time between two datasets: its effect, from the smoothed errors of one of them, and its size.
 
-With the course E(t) of the first dataset the second one, whose clock is late by s, states E(t - s), and the difference
-of the changes since the first common instant is ``E(t) - E(t - s)`` less the same at this instant. The course is a
-smoothing spline over all instants of a dataset, also those before and after the common ones; its residuals are as large
-as the noise. Beyond the record it is constant. The effect is not linear in s: sizes are tried, and the best one is
-refined by Gauss and Newton.
+If the errors of the first dataset are E(t) and the clock of the second one is late by s, the second one states
+E(t - s), and the difference of the changes since the first common time is ``E(t) - E(t - s)`` minus its value at this
+time. E(t) is a smoothing spline over all times of a dataset, also those before and after the common ones; its residuals
+are as large as the noise. Beyond the record it is constant. The effect is not linear in s: several sizes are tested,
+and the best one is refined by the Gauss-Newton method.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from errormotion.compare.low_rank import Whitener
 from errormotion.datasets.results.reduction import influence_of
 from errormotion.kinematics.iso import DOF
 
-SMALLEST = 1.0
-"""Smallest shift that is tried, s."""
+MIN_SHIFT = 1.0
+"""Smallest shift that is tested, s."""
 TRIES = 16
-"""Shifts of each sign that are tried, up to a quarter of the common time."""
+"""Number of shifts of each sign that are tested, up to a quarter of the common time."""
 REFINEMENTS = 12
 
 
 class Shift(NamedTuple):
-    """Shift of the second dataset with its standard uncertainty, s, and the fall of the sum of squares."""
+    """Shift of the second dataset with its standard uncertainty, s, and the decrease of the sum of squares."""
 
     value: float
     standard_uncertainty: float
@@ -40,15 +40,15 @@ class Shift(NamedTuple):
 
 @dataclass(frozen=True)
 class Course:
-    """Smooth errors of one dataset over the common time axis, one curve for each freedom.
+    """Smoothed errors of one dataset over the common time axis, one curve for each freedom.
 
     Attributes
     ----------
     curves : tuple of BSpline
     first, last : float
-        Of the record, s.
+        First and last time of the record, s.
     instants : int
-        Number of values that it was made of.
+        Number of times of the record.
     """
 
     curves: tuple[BSpline, ...]
@@ -57,19 +57,19 @@ class Course:
     instants: int
 
     def __call__(self, time: Array) -> Array:
-        """Return the errors at instants, (n, d)."""
+        """Return the errors at times, (n, d)."""
         inside = np.clip(time, self.first, self.last)
         return np.stack([np.asarray(curve(inside), dtype=float) for curve in self.curves], axis=-1)
 
     def effect(self, time: Array, shift: float, sign: float) -> Array:
-        """Return the difference of changes that a shift of the second dataset makes; sign -1: of its own course."""
+        """Return the difference of the changes for a shift of the second dataset; sign -1: the curves are its own."""
         found = sign * (self(time) - self(time - sign * shift))
         changed: Array = found - found[0]
         return changed
 
 
 def smooth(time: Array, values: Array, u: Array) -> Course | None:
-    """Return the smooth course of values (n, d) with standard uncertainties (n, d); None where too few are known."""
+    """Return smoothed values (n, d) with standard uncertainties (n, d); None if too few are known."""
     curves = []
     for y, sigma in zip(values.T, u.T, strict=True):
         known = np.isfinite(y) & np.isfinite(sigma)
@@ -77,7 +77,7 @@ def smooth(time: Array, values: Array, u: Array) -> Course | None:
             return None
         least = max(float(sigma[known].max()), 1e-6 * float(np.ptp(y[known])), np.finfo(float).tiny)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a curve that is less smooth than asked for serves as well
+            warnings.simplefilter("ignore")  # a curve that is less smooth than requested is acceptable
             weights = 1 / np.maximum(sigma[known], 1e-3 * least)
             t, c, k = splrep(time[known], y[known], w=weights, s=float(known.sum()))
         curves.append(BSpline(t, c, k, extrapolate=True))
@@ -85,7 +85,7 @@ def smooth(time: Array, values: Array, u: Array) -> Course | None:
 
 
 def course_of(ds: xr.Dataset, freedoms: Sequence[str]) -> Course | None:
-    """Return the course of a dataset over time."""
+    """Return the smoothed errors of a dataset over time."""
     columns = [DOF.index(name) for name in freedoms]
     own = np.asarray(ds["covariance"].values, dtype=float) - products(influence_of(ds))
     u = np.sqrt(np.maximum(np.diagonal(own, axis1=1, axis2=2), 0.0))
@@ -94,33 +94,33 @@ def course_of(ds: xr.Dataset, freedoms: Sequence[str]) -> Course | None:
 
 
 def fitted(course: Course, sign: float, time: Array, difference: Array, white: Whitener) -> Shift | None:
-    """Return the shift that explains a difference (n, d) best; None where the course does not change.
+    """Return the shift that explains a difference (n, d) best; None if the errors do not change.
 
     Parameters
     ----------
     course : Course
     sign : float
-        1: the course is that of the first dataset of the pair; -1: of the second.
+        1: the smoothed errors are those of the first dataset of the pair; -1: of the second one.
     time : ndarray, (n,)
-        s.
+        Times, s.
     difference : ndarray, (n, d)
-        First less second dataset; NaN where unknown.
+        First minus second dataset; NaN if unknown.
     white : Whitener
-        Of its covariance.
+        Whitener of its covariance.
     """
     known = np.isfinite(difference)
 
     def effect(shift: float) -> Array:
         return np.where(known, course.effect(time, shift, sign), 0.0)
 
-    sizes = np.geomspace(SMALLEST, max(float(np.ptp(time)) / 4, 2 * SMALLEST), TRIES)
+    sizes = np.geomspace(MIN_SHIFT, max(float(np.ptp(time)) / 4, 2 * MIN_SHIFT), TRIES)
     tries = np.concatenate([-sizes[::-1], sizes])
     squares = [white.square(difference - effect(shift)) for shift in tries]
     best = int(np.argmin(squares))
     shift, least = float(tries[best]), squares[best]
     information = 0.0
     for _ in range(REFINEMENTS):
-        step = max(SMALLEST, 0.02 * abs(shift))
+        step = max(MIN_SHIFT, 0.02 * abs(shift))
         slope = (effect(shift + step) - effect(shift - step)) / (2 * step)
         both = np.stack([slope, difference - effect(shift)])
         normal = white.product(both, both)

@@ -1,4 +1,4 @@
-"""The page of a comparison: the verdict, the curves with their bands, the normalised errors, and the causes."""
+"""The page of a comparison: verdict, curves with bands, normalised errors, and causes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from errormotion.report.write import PLAIN, Form, write_page
 
 
 def write(comparison: xr.Dataset, out: Path, form: Form = PLAIN) -> Path:
-    """Write the page of a comparison; an older one is replaced in one step."""
+    """Write the page of a comparison; an existing page is replaced."""
     source = Source(comparison, None, {}, {})
     return write_page([source], lambda: [part(comparison, source.key)], out, form=form)
 
@@ -49,7 +49,9 @@ def _key_figures(ds: xr.Dataset) -> list[KeyFigure]:
         KeyFigure(
             "Agreement of all datasets", Cell(probability(float(ds.attrs["fit_p"]))), "", "joint chi-square test"
         ),
-        KeyFigure("Birge ratio", Cell(f"{float(ds.attrs['birge_ratio']):.2f}"), "", "1 if the uncertainties fit"),
+        KeyFigure(
+            "Birge ratio", Cell(f"{float(ds.attrs['birge_ratio']):.2f}"), "", "1 if the uncertainties are consistent"
+        ),
         KeyFigure("Largest |En|", Cell(f"{largest:.2f}"), "", "k = 2"),
     ]
 
@@ -87,7 +89,7 @@ def _pair_tables(ds: xr.Dataset) -> list[Table]:
         rows.append([*row, probability(ds["p"].values[j])])
         single.append([str(name), *(probability(p) for p in ds["curve_p"].values[j])])
     whole = Table(
-        "Agreement of each pair: share of points within the expanded uncertainty, and the joint test of all points and "
+        "Agreement of each pair: fraction of points within the expanded uncertainty, and joint test of all points and "
         "freedoms. A p below 0.05 contradicts agreement.",
         ["pair", "|En| ≤ 1", "chi-square", "degrees", "p"],
         rows,
@@ -104,15 +106,22 @@ def _cause_blocks(ds: xr.Dataset) -> list[Block]:
             if text is not None:
                 rows.append([str(rank + 1), text.name, text.size, f"{text.ratio:.1f}", probability(text.p), text.alike])
         if rows:
-            head = ["", "cause", "size (U, k = 2)", "ln likelihood ratio", "p of the rest", "cannot be told from"]
+            head = [
+                "",
+                "cause",
+                "size (U, k = 2)",
+                "ln likelihood ratio",
+                "p of the residuals",
+                "indistinguishable from",
+            ]
             found.append(
-                Table(f"Single causes that could explain {name}, the most likely one first", head, rows, numeric=False)
+                Table(f"Possible single causes of {name}, the most likely one first", head, rows, numeric=False)
             )
     return found
 
 
 def _repeats(ds: xr.Dataset) -> list[Section]:
-    """Return the section of repeatability and reproducibility; none without groups."""
+    """Return the section of repeatability and reproducibility; empty without groups."""
     rows: list[Sequence[Cell | str]] = [list(row) for row in spreads(ds)]
     if not rows:
         return []
@@ -121,9 +130,9 @@ def _repeats(ds: xr.Dataset) -> list[Section]:
         groups.setdefault(str(group), []).append(str(name))
     text = "Groups: " + "; ".join(f"{group} ({', '.join(names)})" for group, names in groups.items()) + "."
     caption = (
-        "Standard deviations over all points. Found: from the differences of the datasets. Stated: what their "
-        "uncertainties let expect. p: probability of a larger spread if these are right. Shared by all: uncertainty of "
-        "sources that all groups have in common, which no repeat shows."
+        "Standard deviations over all points. Found: from the differences of the datasets. Stated: expected from "
+        "their uncertainties. p: probability of a larger spread if the uncertainties are correct. Shared by all: "
+        "uncertainty from sources that all groups have in common, which repeats do not show."
     )
     return [Section("repeats", "Repeatability and reproducibility", [Text(text), Table(caption, SPREAD_HEAD, rows)])]
 

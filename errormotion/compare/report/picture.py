@@ -1,4 +1,4 @@
-"""The figure of a comparison: for each freedom the values of all datasets with their bands, and En of each pair."""
+"""The figure of a comparison: for each freedom the values of all datasets with bands, and En of each pair."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ PANEL = 1.6
 """Height of a panel, inches."""
 SIZE = 9.0
 """Width of the figure, inches."""
-MOST_NAMED = 7
-"""Datasets, groups or pairs that a legend names."""
+MAX_NAMED = 7
+"""Largest number of entries of a legend."""
 GREY = "#777777"
-"""Colour of pairs that are too many to be named."""
-LEAST_EN = 1.5
-"""Half the height of a panel of En."""
+"""Colour of pairs without entries in the legend."""
+MIN_EN = 1.5
+"""Smallest limit of the ordinate of En."""
 
 
 def plot(ds: xr.Dataset) -> Figure:
@@ -41,7 +41,7 @@ def height(ds: xr.Dataset) -> float:
 
 
 def paint(figure: Figure, ds: xr.Dataset) -> None:
-    """Fill a figure with the panels of a comparison."""
+    """Draw the panels of a comparison into a figure."""
     names = [str(name) for name in ds["dof"].values]
     panels = figure.subplots(
         len(names), 2, sharex="col" if common(ds) else False, squeeze=False, gridspec_kw={"hspace": 0.16, "wspace": 0.2}
@@ -96,12 +96,12 @@ def _normalised(axes: Axes, ds: xr.Dataset, en: Array) -> None:
         x, _, joined = abscissa(ds)
         for j, colour in enumerate(colours):
             axes.plot(x, en[j], color=colour, lw=1, ls="-" if joined else "", marker="" if joined else ".", alpha=0.8)
-    largest = max(LEAST_EN, float(np.nanmax(np.abs(en), initial=0.0)) * 1.08)
+    largest = max(MIN_EN, float(np.nanmax(np.abs(en), initial=0.0)) * 1.08)
     axes.set_ylim(-largest, largest)
 
 
 def _groups(ds: xr.Dataset) -> list[str]:
-    """Return what tells the curves apart: the group of each dataset, or its name."""
+    """Return the label of each curve: the group of the dataset, or its name."""
     return [str(name) for name in (ds["group"] if "group" in ds.variables else ds["dataset"]).values]
 
 
@@ -112,20 +112,20 @@ def _colours(ds: xr.Dataset) -> list[str]:
 
 
 def _pair_colours(count: int) -> list[str]:
-    if count > MOST_NAMED:
+    if count > MAX_NAMED:
         return [GREY] * count
-    return [COLOURS[(j + 3) % len(COLOURS)] for j in range(count)]  # other colours than the first datasets have
+    return [COLOURS[(j + 3) % len(COLOURS)] for j in range(count)]  # not the colours of the first datasets
 
 
 def _named(ds: xr.Dataset) -> tuple[dict[str, str], dict[str, str]]:
     """Return the entries of both legends, with their colours."""
     curves = dict(zip(_groups(ds), _colours(ds), strict=True))
-    if len(curves) > MOST_NAMED:
-        kept = list(curves.items())[: MOST_NAMED - 1]
+    if len(curves) > MAX_NAMED:
+        kept = list(curves.items())[: MAX_NAMED - 1]
         curves = {**dict(kept), f"and {len(curves) - len(kept)} more": "none"}
     pairs = [str(name) for name in ds["pair"].values]
     colours = _pair_colours(len(pairs))
-    shown = dict(zip(pairs, colours, strict=True)) if len(pairs) <= MOST_NAMED else {f"{len(pairs)} pairs": GREY}
+    shown = dict(zip(pairs, colours, strict=True)) if len(pairs) <= MAX_NAMED else {f"{len(pairs)} pairs": GREY}
     return curves, shown
 
 
@@ -147,7 +147,7 @@ def abscissa(ds: xr.Dataset) -> tuple[Array, str, bool]:
 
 
 def field(name: str) -> tuple[float, str]:
-    """Return the factor from SI to the unit of a freedom in print, and this unit; what is no freedom stays in SI."""
+    """Return factor and name of the printed unit of a freedom; 1 and an empty name for other quantities."""
     if name not in DOF:
         return 1.0, ""
     return (1e6, "µm") if name in DOF[:3] else (648000 / np.pi, "arcsec")

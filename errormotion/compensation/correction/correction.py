@@ -1,4 +1,4 @@
-"""The inverse of the errors: what is added to a command so that the tool is where it was meant."""
+"""The inverse of the errors: the translation added to a command so that the tool reaches the commanded position."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TOLERANCE = 1e-10
 """Change of the offset at which the iteration ends, m."""
 
 ITERATIONS = 60
-"""Most evaluations of the errors for one correction."""
+"""Maximum number of evaluations of the errors for one correction."""
 
 _CHUNK = 2000
 """Points whose covariance is computed at a time."""
@@ -34,11 +34,11 @@ class CorrectionValues:
     offset : (n, 3)
         Translation that is added to the commands of X, Y, Z, m.
     covariance : (n, 3, 3) or None
-        Of the offset, m^2; None where it was not asked for. NaN where it is not valid, for a component that is left as
-        it is, and where too few places were measured for an estimate of the interpolation.
+        Of the offset, m^2; None if it was not requested. NaN where the offset is not valid, for a component without
+        correction, and where too few positions were measured to estimate the uncertainty of the interpolation.
     valid : (n,) of bool
-        Whether place, time and temperatures lie within what was measured. Elsewhere the offset is held at its value
-        at the edge.
+        Whether position, time and temperatures lie within the measured range. Elsewhere the offset is that at the
+        limit of the range.
     residual_rotation : (n, 3)
         Rotation of the tool that remains, EA, EB, EC, rad; NaN = unknown.
     """
@@ -56,11 +56,11 @@ class Correction:
     Attributes
     ----------
     fields : tuple of Field
-        The errors, which add up.
+        The errors, which are added.
     left : tuple of str
-        Displacements that no source knows: these components stay as they are.
+        Displacements without known errors: these components are not corrected.
     partial : bool
-        Whether freedoms that a source does not know are left out.
+        Whether unknown freedoms of a source are omitted.
     notes : tuple of str
         Sentences for the reader.
     """
@@ -81,7 +81,7 @@ class Correction:
         Raises
         ------
         DatasetError
-            A rotation that is not known acts at this point; not three finite coordinates.
+            An unknown rotation displaces this point; not three finite coordinates.
         """
         point = np.array(functional_point, dtype=float)
         if point.shape != (3,) or not np.isfinite(point).all():
@@ -99,57 +99,56 @@ class Correction:
         positions : (n, 3)
             Commanded X, Y, Z in machine coordinates, m.
         time : float or (n,), optional
-            s on the clock of the sources; needed where the errors depend on time.
+            s on the clock of the sources; required if the errors depend on time.
         covariance : bool
             Whether the covariance is computed; it takes longer than the correction.
 
         Raises
         ------
         DatasetError
-            Wrong shapes, no time where it is needed, or errors that change as fast as the commands: they have no
-            inverse.
+            Wrong shapes, a missing time, or errors that change as fast as the commands: they have no inverse.
         """
-        places, times = _points(positions, time)
-        weights = [field.weights(places, times) for field in self.fields]
-        offset = -_sum(field.displacement(places, each) for field, each in zip(self.fields, weights, strict=True))
+        positions, times = _points(positions, time)
+        weights = [field.weights(positions, times) for field in self.fields]
+        offset = -_sum(field.displacement(positions, each) for field, each in zip(self.fields, weights, strict=True))
         last = float(np.abs(offset).max(initial=0.0))
         for _ in range(ITERATIONS):
-            new = -self._displacement(places + offset, times)
+            new = -self._displacement(positions + offset, times)
             change = float(np.abs(new - offset).max(initial=0.0))
             offset = new
             if change <= TOLERANCE or change**2 <= TOLERANCE * last:  # the next change would be change**2 / last
                 break
             last = change
         else:
-            worst = places[int(np.abs(offset).max(axis=1).argmax())]
+            worst = positions[int(np.abs(offset).max(axis=1).argmax())]
             raise DatasetError(
-                f"The errors change too fast with the place to be inverted: the correction near {worst.tolist()} m "
-                f"does not settle (last change {1e6 * change:g} um). Check the errors"
+                f"The errors change too fast with the position to be inverted: the correction near {worst.tolist()} "
+                f"m does not converge (last change {1e6 * change:g} um). Check the errors"
             )
-        valid, turn = np.ones(len(places), dtype=bool), np.zeros(places.shape)
+        valid, turn = np.ones(len(positions), dtype=bool), np.zeros(positions.shape)
         for field, each in zip(self.fields, weights, strict=True):
             valid &= each.inside & (each.of((~field.trained).astype(float)) == 0)
             turn += np.where(field.known[3:], each.of(field.values[:, 3:]), np.nan)
-        found = self._covariance(places, times) if covariance else None
+        found = self._covariance(positions, times) if covariance else None
         if found is not None:
             found[~valid] = np.nan
         return CorrectionValues(offset, found, valid, turn)
 
-    def _displacement(self, places: Array, time: Array | None) -> Array:
-        return _sum(field.displacement(places, field.weights(places, time)) for field in self.fields)
+    def _displacement(self, positions: Array, time: Array | None) -> Array:
+        return _sum(field.displacement(positions, field.weights(positions, time)) for field in self.fields)
 
-    def _covariance(self, places: Array, time: Array | None) -> Array:
+    def _covariance(self, positions: Array, time: Array | None) -> Array:
         """Return the covariance of the offset, which is that of the displacement to second order, (n, 3, 3)."""
-        found = np.empty((len(places), 3, 3))
-        for first in range(0, len(places), _CHUNK):
+        found = np.empty((len(positions), 3, 3))
+        for first in range(0, len(positions), _CHUNK):
             part = slice(first, first + _CHUNK)
-            at, when = places[part], None if time is None else time[part]
+            at, when = positions[part], None if time is None else time[part]
             total = np.zeros((len(at), 3, 3))
             shared: dict[str, Array] = {}
             for number, field in enumerate(self.fields):
                 own, effects = field.spread(at, field.weights(at, when), when)
                 total += own
-                for k, effect in enumerate(effects):  # one draw in several fields: its effects add up
+                for k, effect in enumerate(effects):  # fully correlated between fields: its effects add up
                     key = field.identity[k] or f"{number} {k}"
                     shared[key] = shared[key] + effect if key in shared else effect
             if shared:
@@ -174,18 +173,18 @@ def correction(
     Parameters
     ----------
     source : Dataset, ThermalModel or sequence of these
-        Error datasets over position, target or time, or time and a place; thermal models. The errors of several
-        sources add up: state each error once.
+        Error datasets over position, target or time, or time and one of these; thermal models. The errors of several
+        sources are added: state each error once.
     functional_point : (3,), optional
-        Point of the tool that is to be where it was commanded, m, in the coordinates in which the source states its
-        own; default: that of each source. For an axis and for the volume: where it is with all axes at zero.
+        Point of the tool that is corrected, m, in the coordinates in which the source states its own; default: that of
+        each source. For an axis and for the volume: its position with all axes at zero.
     data : Dataset, optional
         Temperatures and working parameters over time for the thermal models; see `ThermalModel.predict`.
     chain : str, optional
-        Bodies from workpiece to tool, where a dataset does not state them: the travel of the axes behind an axis is a
+        Bodies from workpiece to tool if a dataset does not state them: the travel of the axes behind an axis is a
         lever of its rotations.
     partial : bool
-        Leave out the freedoms that a source does not know, instead of refusing: an axis of which the positioning alone
+        Omit unknown freedoms of a source instead of raising an error, for example if only the positioning of an axis
         was measured.
 
     Returns
@@ -195,33 +194,34 @@ def correction(
     Raises
     ------
     DatasetError
-        No source; a source that cannot be used; a freedom that is needed and not known; no data for a model.
+        No source; a source that cannot be used; an unknown freedom that is required; no data for a model.
     """
     sources = [source] if isinstance(source, (xr.Dataset, ThermalModel)) else list(source)
     if not sources:
         raise DatasetError("Expected an error dataset or a thermal model; found none")
-    fields, notes = [], []
+    fields: list[Field] = []
+    notes: list[str] = []
     for number, each in enumerate(sources, start=1):
         name = _name(each, number if len(sources) > 1 else 0)
         if isinstance(each, ThermalModel):
             if data is None:
                 raise DatasetError(f"{name}: a thermal model needs the temperatures over time (data, --temperatures)")
             each = each.predict(data)
-        field, said = field_of(each, name, chain)
+        field, remarks = field_of(each, name, chain)
         fields.append(field)
-        notes += said
+        notes += remarks
     unknown = tuple(name for k, name in enumerate(DOF[:3]) if not any(field.known[k] for field in fields))
     part = [name for k, name in enumerate(DOF[:3]) if any(not field.known[k] for field in fields)]
     if part and not partial:
         raise DatasetError(
-            f"{', '.join(part)}: not known by {'the source' if len(fields) == 1 else 'every source'}. Leave what is "
-            "not known as it is (partial, --partial), or take a source that knows it"
+            f"{', '.join(part)}: unknown in {'the source' if len(fields) == 1 else 'at least one source'}. Use a "
+            "source that states them, or omit unknown freedoms (partial, --partial)"
         )
     if part:
-        notes.append(f"Not known, and left as they are: {', '.join(part)}.")
+        notes.append(f"Unknown, and not corrected: {', '.join(part)}.")
     for field in fields:
         if missing := _unknown_rotations(field):
-            notes.append(f"{field.name}: {_not_known(missing)}; the correction holds on the line of the measurement.")
+            notes.append(f"{field.name}: {_unknown(missing)}; the correction is valid on the line of the measurement.")
     if not partial:
         _check_rotations(fields)
     made = Correction(tuple(fields), unknown, partial, tuple(notes))
@@ -232,20 +232,20 @@ def _check_rotations(fields: Sequence[Field]) -> None:
     for field in fields:
         if missing := _unknown_rotations(field):
             raise DatasetError(
-                f"{field.name}: {_not_known(missing)}, and displace{'s' if len(missing) == 1 else ''} the tool at the "
+                f"{field.name}: {_unknown(missing)} and displace{'s' if len(missing) == 1 else ''} the tool at the "
                 f"functional point {np.round(field.point, 6).tolist()} m or along the travel. Use the functional point "
-                "of the measurement, or a source that knows the rotations"
+                "of the measurement, or a source that states the rotations"
             )
 
 
-def _not_known(names: Sequence[str]) -> str:
-    """Return that these are not known: 'EA is not known', 'EA and EB are not known'."""
+def _unknown(names: Sequence[str]) -> str:
+    """Return 'EA is unknown', 'EA and EB are unknown'."""
     listed = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-    return f"{listed} {'is' if len(names) == 1 else 'are'} not known"
+    return f"{listed} {'is' if len(names) == 1 else 'are'} unknown"
 
 
 def _unknown_rotations(field: Field) -> list[str]:
-    """Return the rotations that displace the tool and are not known."""
+    """Return the unknown rotations that displace the tool."""
     return [name for name in field.needed() if name in DOF[3:] and not field.known[DOF.index(name)]]
 
 
@@ -261,12 +261,12 @@ def _sum(parts: Iterable[Array]) -> Array:
 
 
 def _points(positions: ArrayLike, time: ArrayLike | None) -> tuple[Array, Array | None]:
-    places = np.asarray(positions, dtype=float)
-    if places.ndim != 2 or places.shape[1] != 3 or not np.isfinite(places).all():
-        raise DatasetError(f"positions: expected finite coordinates (n, 3) in m; found shape {places.shape}")
+    positions = np.asarray(positions, dtype=float)
+    if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
+        raise DatasetError(f"positions: expected finite coordinates (n, 3) in m; found shape {positions.shape}")
     if time is None:
-        return places, None
+        return positions, None
     times = np.asarray(time, dtype=float)
-    if times.shape not in ((), (len(places),)) or not np.isfinite(times).all():
-        raise DatasetError(f"time: expected a finite number or ({len(places)},) in s; found shape {times.shape}")
-    return places, np.broadcast_to(times, (len(places),))
+    if times.shape not in ((), (len(positions),)) or not np.isfinite(times).all():
+        raise DatasetError(f"time: expected a finite number or ({len(positions)},) in s; found shape {times.shape}")
+    return positions, np.broadcast_to(times, (len(positions),))

@@ -1,4 +1,4 @@
-"""The errors of one source as a function of place and time, at the functional point of a tool."""
+"""The errors of one source as a function of position and time, at the functional point of a tool."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array, products
-from errormotion.compensation.correction.places import Anywhere, Line, Places, Weights, of_targets
+from errormotion.compensation.correction.nodes import Constant, Line, Nodes, Weights, of_targets
 from errormotion.datasets.results.reduction import influence_of
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.errors import DatasetError
@@ -22,37 +22,37 @@ _AXES = "XYZ"
 
 @dataclass(frozen=True)
 class Field:
-    """Errors at nodes, and how they act at a place.
+    """Errors at nodes, and their effect at a position.
 
     Attributes
     ----------
     name : str
         For messages.
     instants : Line or None
-        Times of the errors, s; None where they do not depend on time.
-    places : Places
-        Where they were measured; the nodes count fastest.
+        Times of the errors, s; None if they do not depend on time.
+    nodes : Nodes
+        Positions of the errors; they vary faster than the times.
     columns : tuple of int
-        Which of the commanded X, Y, Z the places are coordinates of.
+        Indices of the commanded X, Y, Z that are coordinates of the nodes.
     values, own, influence : (node, 6), (node, 6, 6), (source, node, 6)
-        Errors, covariance that is drawn anew at every node, effects of the sources; 0 for freedoms that are not known.
+        Errors, covariance that is independent between nodes, effects of the sources; 0 for unknown freedoms.
     identity : tuple of str
-        What makes a source the same draw in another field; empty: nothing.
+        Sources of equal identity are fully correlated between fields; empty: independent.
     known : (6,) of bool
         Which freedoms are known.
     trained : (node,) of bool
-        False where a prediction lies outside of what its model has seen.
+        False where a prediction lies outside the training range of its model.
     point : (3,)
         Functional point of the values, m.
     lever : (3,)
-        From there to the functional point of the tool where all axes are at zero, m.
+        From there to the functional point of the tool with all axes at zero, m.
     travel : (3,)
         1 for axes whose travel adds to the lever, else 0.
     """
 
     name: str
     instants: Line | None
-    places: Places
+    nodes: Nodes
     columns: tuple[int, ...]
     values: Array
     own: Array
@@ -68,20 +68,20 @@ class Field:
         """Return the field at another functional point."""
         return replace(self, lever=self.lever + point - self.point, point=point)
 
-    def weights(self, places: Array, time: Array | None) -> Weights:
-        """Return what the errors at commanded places (n, 3) and times (n,) are made of."""
-        found = self.places.weights(places[:, self.columns])
+    def weights(self, positions: Array, time: Array | None) -> Weights:
+        """Return the weights of the nodes for the errors at commanded positions (n, 3) and times (n,)."""
+        found = self.nodes.weights(positions[:, self.columns])
         if self.instants is None:
             return found
         if time is None:
             raise DatasetError(f"{self.name}: the errors depend on time; state the time of each point (s)")
-        return self.instants.weights(time[:, None]).times(found, self.places.size)
+        return self.instants.weights(time[:, None]).times(found, self.nodes.size)
 
-    def displacement(self, places: Array, weights: Weights) -> Array:
-        """Return the displacement of the tool at commanded places, (n, 3), m, from their weights."""
+    def displacement(self, positions: Array, weights: Weights) -> Array:
+        """Return the displacement of the tool at commanded positions, (n, 3), m, from their weights."""
         found = weights.of(self._moved)
         if self.travel.any():
-            found += np.cross(weights.of(self.values[:, 3:]), self.travel * places)
+            found += np.cross(weights.of(self.values[:, 3:]), self.travel * positions)
         return found
 
     @cached_property
@@ -94,35 +94,35 @@ class Field:
         turns = [k for k in range(3) if any((self.lever[j] != 0 or self.travel[j]) for j in range(3) if j != k)]
         return [*DOF[:3], *(DOF[3 + k] for k in turns)]
 
-    def spread(self, places: Array, weights: Weights, time: Array | None) -> tuple[Array, Array]:
+    def spread(self, positions: Array, weights: Weights, time: Array | None) -> tuple[Array, Array]:
         """Return the covariance of the displacement, (n, 3, 3), and the effects of the sources, (source, n, 3).
 
-        The covariance is that without the sources, with what interpolation adds.
+        The covariance is that without the sources, including that of the interpolation.
         """
-        n = len(places)
+        n = len(positions)
         own = weights.squared(self.own)
-        own[:, range(6), range(6)] += np.where(self.known, self._added(places, time), 0.0)
+        own[:, range(6), range(6)] += np.where(self.known, self._added(positions, time), 0.0)
         L = np.zeros((n, 3, 6))
         L[:, :, :3] = np.eye(3)
-        L[:, :, 3:] = -cross_matrix(self.lever + self.travel * places)
+        L[:, :, 3:] = -cross_matrix(self.lever + self.travel * positions)
         effects = [weights.of(each) for each in self.influence]
         moved = np.array([np.einsum("nij,nj->ni", L, each) for each in effects]).reshape(-1, n, 3)
         return L @ own @ np.swapaxes(L, 1, 2), moved
 
-    def _added(self, places: Array, time: Array | None) -> Array:
-        """Return the variance that interpolation adds in space and in time, (n, 6)."""
+    def _added(self, positions: Array, time: Array | None) -> Array:
+        """Return the variance of the interpolation in space and in time, (n, 6)."""
         T = 1 if self.instants is None else self.instants.size
         E = self.values.reshape(T, -1, 6)
         C = self.own.reshape(T, -1, 6, 6)
-        points = places[:, self.columns]
+        points = positions[:, self.columns]
         if self.instants is None or time is None:
-            return self.places.added(points, E[0], C[0])
-        found = self.places.added(points, E.mean(axis=0), C.mean(axis=0) / T)
+            return self.nodes.added(points, E[0], C[0])
+        found = self.nodes.added(points, E.mean(axis=0), C.mean(axis=0) / T)
         return np.asarray(found + self.instants.added(time[:, None], E, C))
 
 
 def field_of(ds: xr.Dataset, name: str, chain: str) -> tuple[Field, list[str]]:
-    """Return the field of an error dataset at its own functional point, and sentences for the reader.
+    """Return the field of an error dataset at its own functional point, and notes.
 
     Parameters
     ----------
@@ -136,8 +136,8 @@ def field_of(ds: xr.Dataset, name: str, chain: str) -> tuple[Field, list[str]]:
     Raises
     ------
     DatasetError
-        Errors along one direction only, of beams, over other dimensions, in another frame than the machine's; nothing
-        known; coordinates that do not increase.
+        Errors along one direction only, of beams, over other dimensions, not in the frame of the machine; no known
+        errors; coordinates that do not increase.
     """
     _check(ds, name)
     dims = tuple(str(dim) for dim in ds["EX"].dims)
@@ -150,22 +150,22 @@ def field_of(ds: xr.Dataset, name: str, chain: str) -> tuple[Field, list[str]]:
     F = influence_of(arranged.transpose("source", ..., missing_dims="ignore")).reshape(-1, *shape, 6)
     known = np.isfinite(E).any(axis=(0, 1))
     if not known.any():
-        raise DatasetError(f"{name}: no error is known; nothing can be corrected")
+        raise DatasetError(f"{name}: all errors are unknown; nothing can be corrected")
     lost = ~np.isfinite(E[..., known]).all(axis=-1)
     times = ~lost.all(axis=1)
     kept = ~lost[times].any(axis=0)
     if not kept.any():
-        raise DatasetError(f"{name}: no place has known errors at all times; select one time (--select time=NUMBER)")
+        raise DatasetError(f"{name}: no position has known errors at all times; select one time (--select time=NUMBER)")
     notes = []
     if gaps := int((~times).sum()):
-        notes.append(f"{name}: {gaps} of {shape[0]} times have no errors and are bridged by their neighbours.")
+        notes.append(f"{name}: {gaps} of {shape[0]} times have no errors; interpolated from their neighbours.")
     if gaps := int((~kept).sum()):
-        notes.append(f"{name}: {gaps} of {shape[1]} places lack errors and are bridged by their neighbours.")
+        notes.append(f"{name}: {gaps} of {shape[1]} positions lack errors; interpolated from their neighbours.")
     instants = _line(ds, "time", times, name) if "time" in dims else None
-    places, columns, rows = _places(ds, place, np.flatnonzero(kept), name)
+    nodes, columns, rows = _nodes(ds, place, np.flatnonzero(kept), name)
     E, total, F = (
         each[np.ix_(times, rows)] for each in (E, total, np.moveaxis(F, 0, 2))
-    )  # F: (time, place, source, 6)
+    )  # F: (time, position, source, 6)
     size = E.shape[0] * E.shape[1]
     E, total, F = (np.nan_to_num(each.reshape(size, *each.shape[2:])) for each in (E, total, F))
     F = np.moveaxis(F, 1, 0)
@@ -177,7 +177,7 @@ def field_of(ds: xr.Dataset, name: str, chain: str) -> tuple[Field, list[str]]:
     lever, travel, note = _lever(ds, point, chain or str(ds.attrs.get("chain", "")), place, name)
     identity = ds["source_id"].values.tolist() if "source_id" in ds.coords else [""] * len(F)
     field = Field(
-        name, instants, places, columns, E, total - products(F), F, tuple(map(str, identity)), known, trained, point,
+        name, instants, nodes, columns, E, total - products(F), F, tuple(map(str, identity)), known, trained, point,
         lever, travel,
     )  # fmt: skip
     return field, [*notes, *note]
@@ -187,7 +187,7 @@ def _check(ds: xr.Dataset, name: str) -> None:
     if ds.attrs.get("schema") != SCHEMA:
         raise DatasetError(f"{name}: expected schema {SCHEMA}; found {ds.attrs.get('schema', 'none')}")
     if "deviation" in ds.variables:
-        raise DatasetError(f"{name}: the errors are known along one direction only, which corrects no command")
+        raise DatasetError(f"{name}: the errors are known along one direction only and cannot be corrected")
     if ds.attrs["component"] == "beam":
         raise DatasetError(f"{name}: the errors are those of beams, not of the machine")
     dims = [str(dim) for dim in ds["EX"].dims]
@@ -199,7 +199,7 @@ def _check(ds: xr.Dataset, name: str) -> None:
     if ds.attrs["frame"] != "machine" and "frame_origin" not in ds.attrs:
         raise DatasetError(
             f"{name}: expected errors in machine coordinates; found the frame '{ds.attrs['frame']}'. Transform them "
-            "(ds.em.in_frame), or state its origin (attribute frame_origin) where its directions are the machine's"
+            "(ds.em.in_frame), or state its origin (attribute frame_origin) if its directions are those of the machine"
         )
 
 
@@ -210,12 +210,12 @@ def _line(ds: xr.Dataset, coordinate: str, kept: NDArray[np.bool_], name: str) -
     return Line(values)
 
 
-def _places(
+def _nodes(
     ds: xr.Dataset, dim: str, rows: NDArray[np.intp], name: str
-) -> tuple[Places, tuple[int, ...], NDArray[np.intp]]:
-    """Return the places of the errors, which of X, Y, Z are their coordinates, and the rows of the dataset in order."""
+) -> tuple[Nodes, tuple[int, ...], NDArray[np.intp]]:
+    """Return the nodes of the errors, which of X, Y, Z are their coordinates, and the rows of the dataset in order."""
     if not dim:
-        return Anywhere(), (), rows
+        return Constant(), (), rows
     found = [k for k, axis in enumerate("xyz") if axis in ds.variables and ds[axis].dims == (dim,)]
     if dim == "position":
         own = _AXES.find(str(ds.attrs["component"]))
@@ -234,11 +234,11 @@ def _places(
         return Line(kept), (found[0],), rows
     if len(found) != 3:
         raise DatasetError(f"{name}: expected x, y and z of the targets; found {', '.join('xyz'[k] for k in found)}")
-    nodes = np.stack([np.asarray(ds[axis].values, dtype=float) for axis in "xyz"], axis=1)[rows]
-    if not np.isfinite(nodes).all():
+    targets = np.stack([np.asarray(ds[axis].values, dtype=float) for axis in "xyz"], axis=1)[rows]
+    if not np.isfinite(targets).all():
         raise DatasetError(f"{name}: expected finite x, y and z of the targets")
-    places, order = of_targets(nodes)
-    return places, (0, 1, 2), rows[order]
+    nodes, order = of_targets(targets)
+    return nodes, (0, 1, 2), rows[order]
 
 
 def _lever(ds: xr.Dataset, point: Array, chain: str, place: str, name: str) -> tuple[Array, Array, list[str]]:
@@ -249,11 +249,11 @@ def _lever(ds: xr.Dataset, point: Array, chain: str, place: str, name: str) -> t
         travel = np.array([float(axis in levers) for axis in _AXES])
         return -travel * point, travel, []
     if place != "position" or component not in _AXES:
-        note = f"{name}: the errors of the {component} are taken as the same at every place." if not place else ""
+        note = f"{name}: the errors of the {component} are treated as equal at all positions." if not place else ""
         return np.zeros(3), np.zeros(3), [note] if note else []
     if not chain:
         return np.zeros(3), np.zeros(3), [
-            f"{name}: no chain of the machine is known, so the travel of the other axes is no lever of its rotations. "
+            f"{name}: the chain of the machine is unknown: the travel of the other axes is no lever of its rotations. "
             "State it (--chain workpiece-X-Y-bed-Z-spindle-tool)."
         ]  # fmt: skip
     try:
@@ -263,6 +263,8 @@ def _lever(ds: xr.Dataset, point: Array, chain: str, place: str, name: str) -> t
     if component not in carries_tool:
         raise DatasetError(f"{name}: the chain {chain} has no axis {component}")
     behind = list(carries_tool)[list(carries_tool).index(component) + 1 :]
-    if not carries_tool[component]:  # its point rides on the body at the workpiece's side, so its own travel is a lever
+    if not carries_tool[
+        component
+    ]:  # its point is fixed to the body on the workpiece side, so its own travel is a lever
         behind.append(component)
     return np.zeros(3), np.array([float(axis in behind) for axis in _AXES]), []

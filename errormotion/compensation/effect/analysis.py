@@ -24,10 +24,10 @@ from errormotion.tolerances.conformity import judge, judge_figures
 from errormotion.tolerances.table import Tolerances
 
 DISPLACEMENT = "displacement"
-"""The part of EX, EY and EZ together: the length of the vector."""
+"""Name of the part of EX, EY and EZ together: the length of the vector."""
 
 ANY_START = "1970-01-01T00:00:00+00:00"
-"""Start of results that state none; the difference of the starts is not used."""
+"""Start of results without start; the difference of the starts is not used."""
 
 
 def effect(
@@ -39,10 +39,10 @@ def effect(
     since: float | None = None,
     tolerances: Tolerances | None = None,
 ) -> Effect:
-    """Compare two results of one machine: what a compensation took off, and what it left.
+    """Compare two results of one machine, without and with compensation.
 
-    Errors over time are compared at the same time since time 0 of each result, as changes since the first common
-    instant; errors over places at the places that both have.
+    Errors over time are compared at equal time since time 0 of each result, as changes since the first common time;
+    other errors at the common positions or targets.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def effect(
     at, freedoms, since
         As of `errormotion.compare.ground.common_ground`.
     tolerances : Tolerances, optional
-        Limits of figures and freedoms, and of figures named ``reduction of EX``.
+        Limits of figures and freedoms, also of figures such as ``reduction of EX``.
 
     Returns
     -------
@@ -60,11 +60,11 @@ def effect(
     Raises
     ------
     DatasetError
-        The results cannot be compared; what is missing.
+        The results cannot be compared.
     """
     results = {"before": before, "after": after}
     if planned := [name for name, ds in results.items() if is_planned(ds)]:
-        raise DatasetError(f"'{planned[0]}': a plan states no errors; expected a measurement")
+        raise DatasetError(f"'{planned[0]}': a plan has no errors; expected a measurement")
     ground = common_ground(_aligned(results), at=at, freedoms=freedoms, since=since)
     names = [*ground.freedoms]
     groups: list[tuple[tuple[int, ...], str]] = [((k,), name) for k, name in enumerate(names)]
@@ -81,7 +81,7 @@ def effect(
 
 
 def _aligned(results: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
-    """Return the results with one start: time 0 of both is the same instant of the warm-up."""
+    """Return the results with a common start: time 0 of both is the same time of the warm-up."""
     start = results["before"].attrs.get("start", "") or ANY_START
     return {name: ds.assign_attrs(start=start) for name, ds in results.items()}
 
@@ -147,14 +147,14 @@ def _remarks(ground: Ground, parts: Sequence[Part], results: dict[str, xr.Datase
     found = []
     if ground.dim == "time":
         found.append(
-            "Time 0 of both results is taken as the same instant of the warm-up. The reduction is that of the "
+            "Time 0 of both results is treated as the same time of the warm-up. The reduction is that of the "
             "compensation if both had the same duty."
         )
         if text := _heat(ground, results):
             found.append(text)
     if any(not part.correctable for part in parts):
         found.append(
-            "Linear axes take off displacements at the functional point. Rotations remain, and displace the tool by "
+            "Linear axes compensate displacements at the functional point. Rotations remain, and displace the tool by "
             "0.1 um for each urad and 100 mm of distance from it."
         )
     return found

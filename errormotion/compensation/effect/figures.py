@@ -1,8 +1,8 @@
 """Figures of merit of two results side by side, with the reduction of each.
 
-The figures are those of the plugin that made a result. The covariance of two figures follows from the effects of the
-sources that both results share, where the plugin states them. Where it does not, and the results share sources, the
-interval is that of the least favourable correlation.
+The figures are those of the plugin that made a result. The covariance of two figures follows from the effects of their
+common sources if the plugin states them. If it does not, and the results have common sources, the interval is that of
+the least favourable correlation.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from errormotion.datasets.results.merit import figures_of
 from errormotion.plugins import FigureOfMerit
 
 ERRORS = ("m", "rad")
-"""Units of figures that a compensation is to reduce."""
+"""Units of the figures that a compensation reduces."""
 
 K = 1.959964
 """Coverage factor of 95 %."""
@@ -31,14 +31,14 @@ log = logging.getLogger(__name__)
 
 
 def paired(before: xr.Dataset, after: xr.Dataset) -> tuple[tuple[FigurePair, ...], list[str]]:
-    """Return the figures of both results, and what could not be computed."""
+    """Return the figures of both results, and messages about those that could not be computed."""
     failures: list[str] = []
     found = []
     for name, errors in (("before", before), ("after", after)):
         try:
             found.append(figures_of(errors))
         except Exception as error:  # of a foreign plugin
-            log.exception("the figures of merit failed")
+            log.exception("figures of merit of '%s' failed", name)
             failures.append(f"The figures of '{name}' could not be computed: {type(error).__name__}: {error}")
             found.append([])
     first, second = found
@@ -64,7 +64,7 @@ def _identities(errors: xr.Dataset) -> dict[str, str]:
 
 
 def _partners(first: Sequence[FigureOfMerit], second: Sequence[FigureOfMerit]) -> dict[str, FigureOfMerit]:
-    """Return the figure of the second result for each of the first: of the same name, else but for its numbers."""
+    """Return the figure of the second result for each of the first: of equal name, else apart from numbers."""
     same = {each.name: each for each in second}
     found = {each.name: same[each.name] for each in first if each.name in same}
     rest = [each for each in second if each.name not in found]
@@ -95,7 +95,7 @@ def _pair(
 
 
 def _covariance(a: FigureOfMerit, b: FigureOfMerit, keys: tuple[Mapping[str, str], Mapping[str, str]]) -> float | None:
-    """Return the covariance by the shared sources; None where the plugin does not state their effects."""
+    """Return the covariance by the common sources; None if the plugin does not state their effects."""
     if a.influence is None or b.influence is None:
         return None
     of_a = {keys[0][name]: value for name, value in a.influence.items() if name in keys[0]}
@@ -111,7 +111,7 @@ def reduction_of(before: tuple[float, float], after: tuple[float, float], covari
     before, after : (float, float)
         Value and standard uncertainty.
     covariance : float or None
-        Of both; None: unknown, then the one that makes the interval widest.
+        Of both; None: unknown, then the one of the widest interval.
     """
     (b, ub), (a, ua) = before, after
     if not all(map(math.isfinite, (a, b, ua, ub))) or b == 0:

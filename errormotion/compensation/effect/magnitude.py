@@ -1,12 +1,12 @@
 """Magnitudes of measured curves, and the ratio of two of them, with intervals of 95 %.
 
-The sum of squares ``y'y`` of measured values ``y = m + e``, ``cov e = V``, is larger than ``m'm`` by ``tr V`` in the
-mean: noise looks like error. Estimates are therefore ``m'm = y'y - tr V``, 0 where this is negative. An interval holds
-the magnitudes that a test does not reject. The statistic of the ratio r of two curves is the quadratic form
+The sum of squares ``y'y`` of measured values ``y = m + e``, ``cov e = V``, is larger than ``m'm`` by ``tr V`` on
+average. Estimates are therefore ``m'm = y'y - tr V``, 0 where this is negative. An interval contains the
+magnitudes that a test does not reject. The statistic of the ratio r of two curves is the quadratic form
 
     q(r) = a'a - r^2 b'b,
 
-with the joint covariance of both, so that a source that both share is one draw. Its distribution under the hypothesis
+with the joint covariance of both: a common source is fully correlated. Its distribution under the hypothesis
 ``|m_a| = r |m_b|`` is approximated by a shifted gamma distribution of the same mean, variance and third moment
 (Imhof 1961, Biometrika 48, 419; Pearson's type III). The cumulants of a quadratic form ``y'Ay`` are
 
@@ -31,15 +31,14 @@ from errormotion.arrays import Array
 ENDS = (0.025, 0.975)
 """Probabilities below the ends of the intervals."""
 
-LARGEST_RATIO = 1e6
+MAX_RATIO = 1e6
 """Ratios above are unbounded."""
 
 NORMAL = 1e-4
-"""Skewness below which the distribution is taken as normal."""
-
+"""Skewness below which a normal distribution is used."""
 
 ROUNDING = 1e-10
-"""Share of the largest value below which another one is taken as 0."""
+"""Fraction of the largest value below which a value is set to 0."""
 
 
 class Interval(NamedTuple):
@@ -52,7 +51,7 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True)
 class Curve:
-    """Measured values with a covariance that is diagonal plus low rank, reduced to what the cumulants need.
+    """Measured values with a covariance that is diagonal plus low rank, reduced to the sums in the cumulants.
 
     Attributes
     ----------
@@ -86,11 +85,11 @@ class Curve:
         value : (n, d)
             Without unknown values.
         own : (n, d, d)
-            Covariance of what is drawn anew at each point.
+            Covariance that is independent between points.
         influence : (source, n, d)
             Effect of one standard uncertainty of each source.
         """
-        variance, axes = np.linalg.eigh((own + np.swapaxes(own, 1, 2)) / 2)  # a rotation leaves sums of squares as is
+        variance, axes = np.linalg.eigh((own + np.swapaxes(own, 1, 2)) / 2)  # rotations keep sums of squares
         y = np.einsum("nij,ni->nj", axes, value).ravel()
         F = np.einsum("nij,sni->snj", axes, influence).reshape(len(influence), y.size)
         D = np.maximum(variance, 0.0).ravel()
@@ -105,7 +104,7 @@ class Curve:
 
     @property
     def expected(self) -> float:
-        """Mean of the square of values whose true magnitude is 0: tr V."""
+        """Expected square of values with a true magnitude of 0: tr V."""
         return float(self.noise[0] + np.trace(self.inner[0]))
 
     @property
@@ -147,16 +146,16 @@ def scaled(weight: float, curve: Curve, true_square: float) -> Term:
 
 
 def displaced(weighted: Sequence[tuple[float, Curve]], target: float) -> list[Term] | None:
-    """Return the hypothesis that sources made the curves smaller than they are.
+    """Return the hypothesis that effects of the sources reduce the measured curves.
 
     Of all effects z of the sources for which the sum of weight times m'm is ``target``, with ``m = y + F'z`` (y scaled
     down by its noise), the most likely one is ``z = x F A m``: one scalar equation for x, from the eigenvalues of F'AF.
-    None where no effect of the sources makes the sum as large.
+    None if no effect of the sources yields this sum.
     """
-    shares = [math.sqrt(max(1 - c.noise[0] / c.square, 0.0)) if c.square > 0 else 0.0 for _, c in weighted]
-    start = sum(w * s**2 * c.square for (w, c), s in zip(weighted, shares, strict=True)) - target
+    factors = [math.sqrt(max(1 - c.noise[0] / c.square, 0.0)) if c.square > 0 else 0.0 for _, c in weighted]
+    start = sum(w * s**2 * c.square for (w, c), s in zip(weighted, factors, strict=True)) - target
     L, Q = np.linalg.eigh(sum(w * c.inner[0] for w, c in weighted))
-    g = Q.T @ sum(w * s * c.along[0] for (w, c), s in zip(weighted, shares, strict=True))
+    g = Q.T @ sum(w * s * c.along[0] for (w, c), s in zip(weighted, factors, strict=True))
     if not len(L) or not np.abs(L).max() > 0:
         return None
     L = np.where(np.abs(L) > ROUNDING * np.abs(L).max(), L, 0.0)
@@ -171,11 +170,11 @@ def displaced(weighted: Sequence[tuple[float, Curve]], target: float) -> list[Te
         return None
     x = brentq(excess, min(most, 0.0), max(most, 0.0), xtol=1e-12 * abs(most), rtol=1e-10)
     z = x * (Q @ (g / (1 - x * L)))
-    return [Term(w, c, s, z) for (w, c), s in zip(weighted, shares, strict=True)]
+    return [Term(w, c, s, z) for (w, c), s in zip(weighted, factors, strict=True)]
 
 
 def below(q: float, terms: Sequence[Term]) -> float:
-    """Return the probability that the sum of weight times y'y is below q. The sources of the curves are the same."""
+    """Return the probability that the sum of weight times y'y is below q, for common sources of the curves."""
     k1 = k2 = k3 = 0.0
     inner: Array = sum((t.weight * t.curve.inner[0] for t in terms), start=np.zeros(()))  # F'AF
     powered: Array = sum((t.weight**2 * t.curve.inner[1] for t in terms), start=np.zeros(()))  # F'ADAF
@@ -248,7 +247,7 @@ def _ends(value: float, curve: Curve, probability: Callable[[float, float], floa
     top = max(value, math.sqrt(curve.expected)) if value == 0 else value
     while probability(top, square) > low_p:
         top *= 2.0
-        if top > LARGEST_RATIO * max(1.0, value):
+        if top > MAX_RATIO * max(1.0, value):
             return low, math.inf
     bottom = 0.0 if value == 0 else value
     return low, float(brentq(lambda v: probability(v, square) - low_p, bottom, top, rtol=1e-6, xtol=1e-12 * top))

@@ -1,4 +1,4 @@
-"""The page of an effect: what was taken off, the errors before and after, figures side by side, limits."""
+"""The page of an effect: the reduction, the errors before and after, figures side by side, limits."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def write(found: Effect, after: xr.Dataset, out: Path, form: Form = PLAIN) -> Pa
         The result with the compensation, for machine and date in the head.
     out : Path
     form : Form, optional
-        Language, paper, and what is written beside the page.
+        Language, paper, and files written in addition to the page.
     """
     source = Source(after, None, {}, {})
     title = f"Effect of a compensation: {found.ground.machine}"
@@ -87,9 +87,9 @@ def _curves(found: Effect, key: str) -> Figure:
 def _tables(found: Effect) -> list[Block]:
     rows: Rows = [row[:-1] for row in text.rows(found)]
     whole = Table(
-        "Root mean squares over all common points, the measurement uncertainty taken off, and their reduction with "
-        "intervals of 95 %. Perfect model: what the second measurement would show in the mean if the correction were "
-        "free of error: its uncertainty; of rotations, which linear axes do not take off, also what was there before.",
+        "Root mean squares over all common points, the measurement uncertainty subtracted, and their reduction with "
+        "intervals of 95 %. Perfect model: expected value of the second measurement for a correction without error: "
+        "its uncertainty, and for rotations, which linear axes do not compensate, also the errors before.",
         text.HEAD[:-1],
         rows,
     )
@@ -98,8 +98,7 @@ def _tables(found: Effect) -> list[Block]:
         factor, unit = FIELD_UNITS[each.unit]
         floors.append([each.name, f"{factor * each.floor:.3f}", f"{factor * each.reference:.3f}", unit])
     floor = Table(
-        "Uncertainty of the second measurement as a root mean square (k = 1), and the part of it that comes from the "
-        "reference state",
+        "Uncertainty of the second measurement as a root mean square (k = 1), and its part due to the reference state",
         ["", "measurement", "reference state", "unit"],
         floors,
     )
@@ -158,7 +157,7 @@ def _draw(axes: Axes, places: Array, estimate: Estimate, k: int, factor: float, 
 
 
 def abscissa(found: Effect) -> tuple[Array, str, bool]:
-    """Return the places of the common points, their label, and whether lines join the values."""
+    """Return the abscissae of the common points, their label, and whether lines join the values."""
     ground = found.ground
     if ground.dim == "time":
         return np.asarray(ground.coords["time"].values, dtype=float) / 60.0, "time / min", True

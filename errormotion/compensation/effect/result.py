@@ -1,4 +1,4 @@
-"""What the analysis of a compensation returns."""
+"""Results of the analysis of a compensation."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class Part:
     unit : str
         SI.
     before, after : Interval
-        Root mean squares over the common points, the uncertainty of the measurement taken off.
+        Root mean squares over the common points, the uncertainty of the measurement subtracted.
     reduction : Interval
         1 less their ratio.
     correctable : bool
-        Whether linear axes can take it off; they cannot take off rotations.
+        Whether linear axes can compensate it; False for rotations.
     floor : float
-        Root mean square that AFTER would show in the mean if nothing were left: its measurement uncertainty.
+        Expected root mean square of AFTER without remaining errors: its measurement uncertainty.
     reference : float
-        The part of ``floor`` that comes from the reference state, on which every value depends.
+        The part of ``floor`` due to the reference state, on which all values depend.
     """
 
     name: str
@@ -44,22 +44,22 @@ class Part:
 
     @property
     def perfect(self) -> float:
-        """Root mean square that AFTER would show in the mean with a perfect model.
+        """Expected root mean square of AFTER with a perfect model.
 
-        For a displacement ``floor``; for a rotation what BEFORE had, and ``floor``.
+        ``floor`` for a displacement; BEFORE and ``floor`` together for a rotation.
         """
         left = 0.0 if self.correctable else self.before.value
         return float((left**2 + self.floor**2) ** 0.5)
 
     @property
     def outcome(self) -> str:
-        """REDUCED or WORSE where the interval of the reduction excludes 0, else OPEN."""
+        """REDUCED or WORSE if the interval of the reduction excludes 0, else OPEN."""
         return REDUCED if self.reduction.low > 0 else WORSE if self.reduction.high < 0 else OPEN
 
 
 @dataclass(frozen=True)
 class FigurePair:
-    """A figure of merit of both results; SI, U with k = 2, NaN where one result does not have it."""
+    """A figure of merit of both results; SI units, U with k = 2, NaN if a result does not have it."""
 
     name: str
     unit: str
@@ -70,12 +70,12 @@ class FigurePair:
 
 @dataclass(frozen=True)
 class Effect:
-    """What a compensation changed.
+    """Effect of a compensation.
 
     Attributes
     ----------
     parts : tuple of Part
-        Each freedom that both results see, then the displacement as a whole.
+        Each common freedom, then the displacement as a whole.
     figures : tuple of FigurePair
     ground : Ground
         Both results, ``before`` and ``after``, at the same points.

@@ -1,4 +1,4 @@
-"""The effect of a compensation in words and in rows of a table, in the field's units."""
+"""The effect of a compensation as sentences and as rows of a table, in the customary units."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from errormotion.report.text import DASH
 from errormotion.tolerances.conformity import FIELD_UNITS
 
 HEAD = ["", "before", "after", "95 %", "reduction", "95 %", "perfect model", "", "outcome"]
-"""Columns of `rows`: root mean squares of the errors, but for the reduction."""
+"""Columns of `rows`: root mean squares of the errors, and the reduction."""
 
 FIGURES_HEAD = ["figure", "before", "U (k=2)", "after", "U (k=2)", "", "reduction", "95 %"]
 
 
 def verdict(found: Effect) -> list[str]:
-    """Return what the compensation did in sentences, the most important one first."""
+    """Return the effect of the compensation as sentences, the most important one first."""
     lines = []
     whole = next((part for part in found.parts if part.name == DISPLACEMENT), found.parts[0])
     if not math.isfinite(whole.reduction.value):
-        lines.append("Nothing can be said: the errors before the compensation cannot be distinguished from 0.")
+        lines.append("No conclusion: the errors before the compensation cannot be distinguished from 0.")
     else:
         gained = whole.reduction.value
         change = f"{percent(gained)} less" if gained >= 0 else f"{percent(-gained)} more"
@@ -34,11 +34,9 @@ def verdict(found: Effect) -> list[str]:
         for outcome in (REDUCED, WORSE, OPEN)
     }
     lines += [f"{', '.join(of[WORSE])}: larger with the compensation."] if of[WORSE] else []
-    lines += [f"{', '.join(of[OPEN])}: no change shown."] if of[OPEN] else []
+    lines += [f"{', '.join(of[OPEN])}: no significant change."] if of[OPEN] else []
     if none_left := [part.name for part in found.parts if part.correctable and part.after.low == 0]:
-        lines.append(
-            f"{', '.join(none_left)}: what is left cannot be distinguished from the uncertainty of the measurement."
-        )
+        lines.append(f"{', '.join(none_left)}: the remaining error is not significant compared with the uncertainty.")
     return lines + limits(found)
 
 
@@ -50,7 +48,7 @@ def limits(found: Effect) -> list[str]:
 
 
 def unused(found: Effect) -> list[str]:
-    """Return the limits that apply to nothing."""
+    """Return the limits that apply to no figure and no freedom."""
     judged = [each for each in (found.before, found.after, found.gained) if each is not None]
     return [name for name in judged[0].unused if all(name in each.unused for each in judged)] if judged else []
 
@@ -95,13 +93,13 @@ def span(interval: Interval) -> str:
     return f"{percent(interval.low)} to {percent(interval.high)}"
 
 
-def percent(share: float) -> str:
-    """Return a share as a person reads it."""
-    if math.isnan(share):
+def percent(fraction: float) -> str:
+    """Return a fraction in percent, with one decimal above 95 %."""
+    if math.isnan(fraction):
         return DASH
-    if share < -9.995:
+    if fraction < -9.995:
         return "below -1000 %"
-    return f"{100 * share:.1f} %" if share > 0.95 else f"{100 * share:.0f} %"
+    return f"{100 * fraction:.1f} %" if fraction > 0.95 else f"{100 * fraction:.0f} %"
 
 
 def _number(value: float) -> str:

@@ -1,4 +1,4 @@
-"""The audit log: one JSON object a line, each with the hash of all lines before it; lines are only appended."""
+"""The audit log: one JSON object per line, each with the hash of all lines before it; lines are only appended."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from errormotion.datasets.files.reading import require_regular
@@ -17,8 +16,8 @@ from errormotion.errors import CompensationError
 START = "0" * 64
 """Hash before the first line."""
 
-LONGEST_LINE = 1 << 16
-"""Bytes."""
+MAX_LINE = 1 << 16
+"""Maximum length of a line, bytes."""
 
 
 class AuditLog:
@@ -27,12 +26,12 @@ class AuditLog:
     Parameters
     ----------
     path : Path
-        Is made, or continued where it is a valid audit log.
+        Created if it does not exist; an existing audit log is continued.
 
     Raises
     ------
     CompensationError
-        The file is there and its chain of hashes is broken.
+        The chain of hashes of the existing file is broken.
     """
 
     def __init__(self, path: Path) -> None:
@@ -43,13 +42,11 @@ class AuditLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         os.close(self._file)
 
     def write(self, entry: Mapping[str, Any], *, sync: bool = False) -> None:
-        """Append an entry; ``sync`` waits until the disk has it.
+        """Append an entry; ``sync`` waits until it is stored on the disk.
 
         Raises
         ------
@@ -62,7 +59,7 @@ class AuditLog:
         line = f'{{"hash":"{self._hash}","entry":{text}}}\n'.encode()
         try:
             if os.write(self._file, line) != len(line):
-                raise OSError("only a part was written")
+                raise OSError("the line was written incompletely")
             if sync:
                 os.fdatasync(self._file)
         except OSError as error:
@@ -81,7 +78,7 @@ class AuditReader:
     count : int
         Entries so far.
     hash : str
-        Of the last of them.
+        Hash of the last entry.
     """
 
     def __init__(self, path: Path) -> None:
@@ -89,7 +86,7 @@ class AuditReader:
         self._at = 0
 
     def read(self, most: int) -> list[dict[str, Any]]:
-        """Return the next entries, ``most`` of them at the most; a line that is not complete yet is left for later.
+        """Return the next entries, at most ``most``; an incomplete last line is read by a later call.
 
         Raises
         ------
@@ -101,8 +98,8 @@ class AuditReader:
             require_regular(self.path)
             with self.path.open("rb") as file:
                 file.seek(self._at)
-                while len(found) < most and (line := file.readline(LONGEST_LINE)):
-                    if not line.endswith(b"\n") and len(line) < LONGEST_LINE:
+                while len(found) < most and (line := file.readline(MAX_LINE)):
+                    if not line.endswith(b"\n") and len(line) < MAX_LINE:
                         break
                     last, text = _follows(self.path, self.count, self.hash, line)
                     found.append(_entry(text))
@@ -113,16 +110,16 @@ class AuditReader:
 
 
 def verify(path: Path) -> tuple[int, str]:
-    """Return how many entries an audit log has, and its last hash.
+    """Return the number of entries of an audit log, and its last hash.
 
     Raises
     ------
     CompensationError
-        A line was changed, removed or added; the message names it.
+        A line was changed, removed or added; its number is in the message.
     """
     count, last = 0, START
     with path.open("rb") as file:
-        while line := file.readline(LONGEST_LINE):
+        while line := file.readline(MAX_LINE):
             last, _ = _follows(path, count, last, line)
             count += 1
     return count, last
@@ -142,7 +139,7 @@ def _follows(path: Path, count: int, before: str, line: bytes) -> tuple[str, str
 
 
 def _entry(text: str) -> dict[str, Any]:
-    """Return an entry; an empty one where a stranger wrote a chain of something else."""
+    """Return an entry; an empty one if the text is not a JSON object."""
     try:
         found = json.loads(text)
     except (ValueError, RecursionError):

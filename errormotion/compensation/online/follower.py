@@ -2,11 +2,11 @@
 
 ===========  ==========================================================================================
 ``off``      nothing is written; the offset is zero
-``armed``    the machine was named; the offset stays where it is, and the first valid target is awaited
-``following``  the offset moves towards the target, no faster than the slew limit
+``armed``    enabled by an operator who named the machine; the offset is constant until the first valid target
+``following``  the offset moves towards the target within the slew limit
 ``holding``  the offset does not change: the target is not valid, or the machine must not be disturbed
-``ramping``  the offset moves to zero, no faster than the slew limit
-``fault``    the machine does not take offsets; the machine's own watchdog ramps to zero. Arm again.
+``ramping``  the offset moves to zero within the slew limit
+``fault``    the machine does not accept offsets; its watchdog ramps to zero. Arm again.
 ===========  ==========================================================================================
 """
 
@@ -22,8 +22,8 @@ from errormotion.arrays import Array
 from errormotion.compensation.online.settings import Limits
 from errormotion.errors import CompensationError
 
-LONGEST_STEP = 2.0
-"""Longest interval for which an offset may change in one step, in periods: a program that was stopped does not jump."""
+MAX_STEP = 2.0
+"""Maximum interval for the change of one step, in periods: no jump after a suspended program."""
 
 ROUNDING = 1e-9
 
@@ -41,18 +41,18 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Conditions:
-    """What is known at one instant.
+    """Conditions of one decision.
 
     Attributes
     ----------
     target : (3,), optional
-        Offset that the prediction asks for, m; None where there is no valid one.
+        Offset required by the prediction, m; None without a valid prediction.
     cause : str
-        Why there is no valid target.
+        Reason of a missing target.
     busy : str
-        Why the offset must not change now: a probing cycle, a thread, a request of the program. Empty: it may.
+        Why the offset must not change now: a probing cycle, a thread, a request of the program. Empty: it may change.
     fault : str
-        Why the machine does not take offsets. Empty: it does.
+        Why the machine does not accept offsets. Empty: it does.
     """
 
     target: Array | None = None
@@ -71,7 +71,7 @@ class Step:
     offset : (3,)
         Offset to be written, m.
     cause : str
-        Why the offset does not follow the target; empty where it does.
+        Why the offset does not follow the target; empty if it does.
     limited : tuple of int
         Axes whose target is beyond the limit.
     """
@@ -98,28 +98,28 @@ class Follower:
         self._invalid_since: float | None = None
         self._valid_since: float | None = None
         self.stopping = False
-        """Whether it was asked to ramp to zero and end."""
+        """Whether it ramps to zero and then ends."""
 
     def arm(self, applied: Array) -> None:
-        """Allow offsets to be written; the first one is the offset that the machine has now, so that nothing jumps.
+        """Enable the output of offsets, beginning with the present offset of the machine, so that it does not jump.
 
-        After a fault, a stop that was asked for before stays in force.
+        After a fault, an earlier stop remains in force.
 
         Parameters
         ----------
         applied : (3,)
-            Offset that the machine has now, m.
+            Present offset of the machine, m.
 
         Raises
         ------
         CompensationError
-            It is armed already, or the machine's offset is unknown or beyond the limit.
+            It is armed already, or the offset of the machine is unknown or beyond the limit.
         """
         if self.state not in (State.OFF, State.FAULT):
             raise CompensationError(f"The compensation is {self.state} already.")
         values = np.asarray(applied, dtype=float)
         if values.shape != (3,) or not np.isfinite(values).all():
-            raise CompensationError("The offset that the machine has now is not known; it must be before it changes.")
+            raise CompensationError("The present offset of the machine is unknown; it is required before a change.")
         if (np.abs(values) > self.limits.limit * (1 + 1e-9)).any():
             raise CompensationError(
                 f"The machine has an offset of {_um(values)} um, beyond the limit of {self.limits.limit * 1e6:g} um. "
@@ -130,7 +130,7 @@ class Follower:
         self._last = self._invalid_since = self._valid_since = None
 
     def fail(self) -> None:
-        """Write nothing until it is armed again: the machine did not take an offset."""
+        """Write nothing until it is armed again: the machine did not accept an offset."""
         if self.state is not State.OFF:
             self.state = State.FAULT
 
@@ -139,7 +139,7 @@ class Follower:
         self.stopping = True
 
     def step(self, now: float, conditions: Conditions) -> Step:
-        """Return what to write now.
+        """Return the decision for the present time.
 
         Parameters
         ----------
@@ -147,7 +147,7 @@ class Follower:
             Steady time, s.
         conditions : Conditions
         """
-        dt = 0.0 if self._last is None else min(max(now - self._last, 0.0), LONGEST_STEP * self.limits.period)
+        dt = 0.0 if self._last is None else min(max(now - self._last, 0.0), MAX_STEP * self.limits.period)
         self._last = now
         if self.state in (State.OFF, State.FAULT):
             return Step(self.state, self.offset.copy(), conditions.fault)
@@ -175,7 +175,7 @@ class Follower:
             return None, conditions.cause or "no prediction"
         target = np.asarray(conditions.target, dtype=float)
         if target.shape != (3,) or not np.isfinite(target).all():
-            return None, "the prediction is no number"
+            return None, "the prediction is not finite"
         return target, ""
 
     def _note(self, now: float, valid: bool) -> None:

@@ -1,4 +1,4 @@
-"""What a model must offer to be followed: predictions of the errors from the latest readings."""
+"""Interface of a model for online compensation: predictions of the errors from the latest readings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PARAMETERS = ("spindle_speed", "feed")
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted errors at one instant.
+    """Predicted errors at one time.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Prediction:
 
 
 def refusal(prediction: Prediction, limits: Limits) -> str:
-    """Return why a prediction must not be followed; empty where it may be."""
+    """Return why a prediction must not be used; empty if it may be."""
     if prediction.missing:
         return f"no reading for {limits.oldest:g} s: {', '.join(prediction.missing)}"
     if prediction.outside:
@@ -55,7 +55,7 @@ class Predictor(Protocol):
     Attributes
     ----------
     temperatures, parameters : sequence of str
-        Names of the sensors, and those of `PARAMETERS`, that it needs.
+        Required names of sensors, and of `PARAMETERS`.
     """
 
     @property
@@ -67,7 +67,7 @@ class Predictor(Protocol):
         """Names of the working parameters."""
 
     def update(self, time: float, temperature: Mapping[str, float], parameter: Mapping[str, float]) -> Prediction:
-        """Take the readings of one instant, and return the prediction for it.
+        """Process the readings of one time, and return the prediction for it.
 
         Parameters
         ----------
@@ -87,12 +87,12 @@ def predictor(model: xr.Dataset, functional_point: Array | None = None) -> Predi
     ----------
     model : Dataset
     functional_point : (3,), optional
-        Where the translations apply, m, in the frame of the model; default: that of the model.
+        Point of the translations, m, in the frame of the model; default: that of the model.
 
     Raises
     ------
     CompensationError
-        No plugin predicts from such a dataset, or the model does not state what an offset needs.
+        No plugin predicts from such a dataset, or the model does not predict all freedoms that an offset requires.
     """
     schema = str(model.attrs.get("schema", "none"))
     owner = plugins.owner_of_schema(schema)

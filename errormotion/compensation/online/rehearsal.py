@@ -1,4 +1,4 @@
-"""A compensation in simulated time: what it would have written for given readings, by the decisions of the real one."""
+"""A compensation in simulated time: the offsets for given readings, by the same decisions as in operation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from errormotion.compensation.online.settings import Limits
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """What was decided at each of n instants.
+    """The decisions at n times.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class Rehearsal:
     offset : (n, 3)
         m.
     state, cause : tuple of str
-        State, and why the offset did not follow.
+        State, and why the offset did not follow the prediction.
     """
 
     time: Array
@@ -33,8 +33,8 @@ class Rehearsal:
     state: tuple[str, ...]
     cause: tuple[str, ...]
 
-    def share(self, state: str) -> float:
-        """Return the share of the instants in a state."""
+    def fraction(self, state: str) -> float:
+        """Return the fraction of the times in a state."""
         return self.state.count(state) / len(self.state)
 
 
@@ -46,7 +46,7 @@ def rehearse(
     parameter: Mapping[str, Array],
     busy: NDArray[np.bool_] | None = None,
 ) -> Rehearsal:
-    """Follow readings from the reference state on, armed with an offset of 0.
+    """Return the decisions for readings from the reference state on, armed with an offset of 0.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def rehearse(
     temperature, parameter : mapping of str to (n,)
         Readings by their names; NaN: unknown.
     busy : (n,) of bool, optional
-        When the machine must not be disturbed, as by probing.
+        Times at which the offset must not change, for example during probing.
     """
     follower = Follower(limits)
     follower.arm(np.zeros(3))

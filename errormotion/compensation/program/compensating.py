@@ -1,4 +1,4 @@
-"""A program file in, the corrected program file out."""
+"""Correction of a program file."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ from errormotion.compensation.program.interpreter.screening import screen
 from errormotion.compensation.program.reading.frames import Triple
 from errormotion.compensation.program.reading.offsets import Offsets
 from errormotion.compensation.program.reading.reader import Reader
-from errormotion.compensation.program.reading.words import LONGEST_LINE, lines_of
+from errormotion.compensation.program.reading.words import MAX_LINE, lines_of
 from errormotion.compensation.program.writing.dividing import Correcting
 from errormotion.compensation.program.writing.rewriting import Rewriting, Summary
 from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import ProgramError
 
-LARGEST_PROGRAM = 1 << 29
-"""Of a program file, bytes."""
+MAX_PROGRAM = 1 << 29
+"""Maximum size of a program file, bytes."""
 
 ROUTES = ("auto", "plain", "interpreter")
-"""Who reads the program: the plain reader and, for what it does not know, LinuxCNC's interpreter; or one of them."""
+"""Reader of the program: the plain reader and, for unsupported programs, LinuxCNC's interpreter, or only one."""
 
 _COMMENT = 70  # characters
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a program is read and corrected.
+    """Settings of the reading and correction of a program.
 
     Attributes
     ----------
     tolerance, step : float
-        Largest distance from the corrected path; of two points at which it is examined, m.
+        Largest distance from the corrected path, and between two points at which it is examined, m.
     unit : str
         ``mm`` or ``inch``, of the program before its first G20 or G21.
     start : (x, y, z), optional
-        Position of the machine's axes before the program starts, m.
+        Position of the machine axes before the program starts, m.
     deleted : bool, optional
-        Whether blocks that start with ``/`` are skipped; without it they are refused.
+        Whether blocks that start with ``/`` are skipped; None: they raise an error.
     route : str
         One of `ROUTES`.
     check : bool
-        Whether LinuxCNC's interpreter reads the new program too, and must move as planned.
+        Whether the new program is compared with the moves of LinuxCNC's interpreter.
     """
 
     tolerance: float = 1e-6
@@ -61,7 +61,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a program.
+    """Result of the correction of a program.
 
     Attributes
     ----------
@@ -69,9 +69,9 @@ class Outcome:
     route : str
         ``plain`` or ``interpreter``.
     why : str
-        Why the plain reader was not used; empty where it was.
+        Why the plain reader was not used; empty if it was.
     checked : int
-        Moves of the new program that LinuxCNC's interpreter agrees on; 0 where it was not asked.
+        Moves of the new program that agree with LinuxCNC's interpreter; 0 without the check.
     digest : str
         SHA-256 of the program that was read.
     """
@@ -92,29 +92,29 @@ def compensate(
     *,
     head: Sequence[str] = (),
 ) -> Outcome:
-    """Write a program whose cuts are where those of another were meant.
+    """Write the corrected program of a program.
 
     Parameters
     ----------
     program, out : Path
-        ``out`` is written beside its place and renamed.
+        Original and corrected program; ``out`` appears when it is complete.
     correcting : callable
     offsets : Offsets
-        What the control knows before the program starts.
+        Offsets of the control before the program starts.
     settings : Settings, optional
     head : sequence of str
-        Sentences that the new program starts with, as comments.
+        Comments at the start of the new program.
 
     Raises
     ------
     ProgramError
-        A line is not understood by any of the readers, or what it does is not determined. Nothing is written then.
+        A line is not supported by any of the readers, or its effect is not determined. Then no file is written.
     """
     chosen = settings or Settings()
     if chosen.route not in ROUTES:
         raise ProgramError(f"reader '{chosen.route}': expected one of {', '.join(ROUTES)}")
-    if require_regular(program).st_size > LARGEST_PROGRAM:
-        raise ProgramError(f"{program}: expected a file of at most {LARGEST_PROGRAM} bytes")
+    if require_regular(program).st_size > MAX_PROGRAM:
+        raise ProgramError(f"{program}: expected a file of at most {MAX_PROGRAM} bytes")
     why = ""
     beside = out.with_name(out.name + ".part")
     try:
@@ -174,7 +174,7 @@ def _written(
 
 
 def _with_head(lines: Iterable[str], head: Sequence[str]) -> Iterator[str]:
-    """Yield lines with comments before the first, or behind it where it is ``%``."""
+    """Yield lines with comments before the first, or after it if it is ``%``."""
     comments = [f"({_plain(sentence)})" for sentence in head]
     for number, text in enumerate(lines):
         if number == 0 and text.strip() != "%":
@@ -185,15 +185,15 @@ def _with_head(lines: Iterable[str], head: Sequence[str]) -> Iterator[str]:
 
 
 def _plain(sentence: str) -> str:
-    """Return a sentence that can be a comment of a program."""
+    """Return a sentence as the text of a comment in a program."""
     text = sentence.encode("ascii", "replace").decode("ascii").replace("(", "[").replace(")", "]").replace("\n", " ")
     return text if len(text) <= _COMMENT else text[: _COMMENT - 3] + "..."
 
 
 def _lines(path: Path) -> Generator[str]:
-    """Yield the lines of a file; a longer one than any program has comes in pieces, and is refused."""
+    """Yield the lines of a file, read up to a length that `lines_of` rejects."""
     with path.open(encoding="latin-1", newline="") as file:
-        while line := file.readline(LONGEST_LINE + 3):
+        while line := file.readline(MAX_LINE + 3):
             yield line
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure as Canvas
 
 from errormotion.arrays import Array
 from errormotion.compensation.program.compensating import Outcome, Settings
-from errormotion.compensation.program.reading.items import LEFT
+from errormotion.compensation.program.reading.items import UNCHANGED
 from errormotion.compensation.program.writing.rewriting import Summary
 from errormotion.report import Form, canvas, provenance, write_page
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text
@@ -43,17 +43,17 @@ def write_program_report(
     out : Path
         The file; an older one is replaced in one step.
     errors : Dataset
-        What the correction was made of, for the head of the page.
+        Errors that the correction is based on, for the head of the page.
     outcome : Outcome
     settings : Settings
     program : str
         Name of the program.
     uncertainty : array (n, 3), optional
-        Standard uncertainty of the correction at ``outcome.summary.places``, m; NaN where it is not known.
+        Standard uncertainty of the correction at ``outcome.summary.positions``, m; NaN where it is unknown.
     notes : tuple of str
-        On the correction.
+        Notes on the correction.
     form : Form, optional
-        Language, paper, and what is written beside the page.
+        Language, paper, and files written in addition to the page.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def _part(
             [
                 axis,
                 fixed(1e6 * largest[k], 2),
-                Cell(fixed(1e6 * known[k], 2)) if known[k] == known[k] else Cell(DASH, reason="not known"),
+                Cell(fixed(1e6 * known[k], 2)) if known[k] == known[k] else Cell(DASH, reason="unknown"),
             ]
             for k, axis in enumerate(_AXES)
         ],
@@ -108,13 +108,13 @@ def _part(
         figures,
         _summary(outcome, settings),
         [
-            Section("path", "Path", [_path(found, "program-path")] if len(found.places) else []),
+            Section("path", "Path", [_path(found, "program-path")] if len(found.positions) else []),
             Section(
                 "correction",
                 "Correction along the path",
-                [_along(found, uncertainty), axes] if len(found.places) else [],
+                [_along(found, uncertainty), axes] if len(found.positions) else [],
             ),
-            Section("left", "Moves that stay as they are", _left(outcome)),
+            Section("left", "Moves without correction", _left(outcome)),
             Section("reading", "Reading of the program", [*_reading(outcome, settings), *remarks]),
         ],
         kind="Corrected NC program",
@@ -131,25 +131,25 @@ def _summary(outcome: Outcome, settings: Settings) -> list[str]:
     if found.outside[0]:
         count, line = found.outside
         words.append(
-            f"{integer(count)} moves lead outside of what was measured, the first in line {line}: "
-            "there the correction is held at the edge."
+            f"{integer(count)} moves end outside the measured range, the first in line {line}: "
+            "there the correction is that at its limit."
         )
     if found.uncorrected[0]:
         count, line = found.uncorrected
-        words.append(f"{integer(count)} cuts start where no correction acts yet, the first in line {line}.")
+        words.append(f"{integer(count)} cuts start at a position without correction, the first in line {line}.")
     if outcome.checked:
         words.append(f"LinuxCNC's interpreter reads the new program as planned: {integer(outcome.checked)} moves.")
     return words
 
 
 def _left(outcome: Outcome) -> list[Block]:
-    left = outcome.summary.left
+    left = outcome.summary.unchanged
     if not left:
         return [Text("None.")]
     rows: list[list[Cell | str]] = [
-        [LEFT[kind], integer(count), str(line)] for kind, (count, line) in sorted(left.items())
+        [UNCHANGED[kind], integer(count), str(line)] for kind, (count, line) in sorted(left.items())
     ]
-    return [Table("Moves that were not corrected.", ["kind", "number", "first line"], rows, numeric=False)]
+    return [Table("Moves without correction.", ["kind", "number", "first line"], rows, numeric=False)]
 
 
 def _reading(outcome: Outcome, settings: Settings) -> list[Block]:
@@ -159,11 +159,11 @@ def _reading(outcome: Outcome, settings: Settings) -> list[Block]:
         ["SHA-256 of the original", outcome.digest],
         ["tolerance", f"{significant(1e6 * settings.tolerance, 3)} µm"],
         ["sampling interval", f"{significant(1e3 * settings.step, 3)} mm"],
-        ["cuts whose feed is not known", integer(outcome.summary.unfed)],
+        ["cuts with unknown feed", integer(outcome.summary.unfed)],
     ]
     if outcome.why:
-        rows.append(["not read by the plain reader because of", outcome.why])
-    return [Table("How the program was read.", ["", ""], rows, numeric=False)]
+        rows.append(["reason of the expansion", outcome.why])
+    return [Table("Reading of the program.", ["", ""], rows, numeric=False)]
 
 
 def _path(found: Summary, key: str) -> Figure:
@@ -173,7 +173,7 @@ def _path(found: Summary, key: str) -> Figure:
     edges = np.linspace(low, max(high, low + 0.01), _SHADES + 1)
     shade = np.clip(np.searchsorted(edges, size, side="right") - 1, 0, _SHADES - 1)
     shades = [_colour(number) for number in range(_SHADES)]
-    places = 1e3 * found.places
+    positions = 1e3 * found.positions
     cut = found.lines > 0
 
     def paint(axes: Axes, first: int, second: int) -> None:
@@ -181,14 +181,14 @@ def _path(found: Summary, key: str) -> Figure:
             x, y = [], []
             for k in np.flatnonzero(cut & (shade == number)):
                 if k:
-                    x += [places[k - 1, first], places[k, first], math.nan]
-                    y += [places[k - 1, second], places[k, second], math.nan]
+                    x += [positions[k - 1, first], positions[k, first], math.nan]
+                    y += [positions[k - 1, second], positions[k, second], math.nan]
             axes.plot(x, y, color=colour, linewidth=1.2)
         x, y = [], []
         for k in np.flatnonzero(~cut):
             if k:
-                x += [places[k - 1, first], places[k, first], math.nan]
-                y += [places[k - 1, second], places[k, second], math.nan]
+                x += [positions[k - 1, first], positions[k, first], math.nan]
+                y += [positions[k - 1, second], positions[k, second], math.nan]
         axes.plot(x, y, color="#999999", linewidth=0.6, linestyle=(0, (3, 2)))
         axes.set_xlabel(f"{_AXES[first]} / mm")
         axes.set_ylabel(f"{_AXES[second]} / mm")
@@ -206,15 +206,15 @@ def _path(found: Summary, key: str) -> Figure:
             figure.text(left + 0.02, 0.94, span, fontsize=7)
 
     caption = (
-        "Path in machine coordinates, from above and from the front. Colour: size of the correction in µm; grey: rapid "
-        "moves. Positions are those of the axes, with the offsets of work and tool."
+        "Path in machine coordinates, from above and from the front. Colour: magnitude of the correction in µm; grey: "
+        "rapid moves. Positions are those of the axes, including the offsets of work and tool."
     )
     alt = f"Two views of the path; the correction is at most {fixed(found.largest * 1e6, 1)} µm."
     return Figure(canvas.draw(draw, key, 3.4), caption, alt)
 
 
 def _colour(number: int) -> tuple[float, float, float]:
-    """Return a colour between blue and red, over grey: visible to readers who cannot tell red from green."""
+    """Return a colour between blue and red through grey, for readers with red-green colour blindness."""
     part = number / (_SHADES - 1)
     stops = np.array([[0.27, 0.51, 0.78], [0.62, 0.62, 0.62], [0.80, 0.25, 0.10]])
     low = min(int(2 * part), 1)
@@ -223,7 +223,7 @@ def _colour(number: int) -> tuple[float, float, float]:
 
 
 def _along(found: Summary, uncertainty: Array | None) -> Figure:
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(found.places, axis=0), axis=1))])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(found.positions, axis=0), axis=1))])
 
     def draw(figure: Canvas) -> None:
         panels = figure.subplots(3, 1, sharex=True)

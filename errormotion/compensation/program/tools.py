@@ -18,25 +18,27 @@ class ByTool:
         Functional point of a tool of length 0, in the coordinates of the errors, m: a tool with the offset (0, 0, L)
         has its tip at ``gauge - (0, 0, L)``. Without it, all tools have the functional point of the correction.
     time : float, optional
-        s, on the clock of the errors; needed where they depend on time.
+        s, on the clock of the errors; required if they depend on time.
     """
 
     def __init__(self, correction: Correction, gauge: Array | None = None, time: float | None = None) -> None:
         self._correction, self._gauge, self._time = correction, gauge, time
         self._known: dict[bytes, Correction] = {}
 
-    def __call__(self, places: Array, tools: Array) -> CorrectionValues:
+    def __call__(self, positions: Array, tools: Array) -> CorrectionValues:
         """Return the corrections of positions (n, 3) of the axes with tool offsets (n, 3), m."""
-        return self.values(places, tools)
+        return self.values(positions, tools)
 
-    def values(self, places: Array, tools: Array, *, covariance: bool = False) -> CorrectionValues:
-        """Return the corrections, with their covariance where it is asked for."""
+    def values(self, positions: Array, tools: Array, *, covariance: bool = False) -> CorrectionValues:
+        """Return the corrections, optionally with their covariance."""
         if self._gauge is None:
-            return self._correction.at(places, self._time, covariance=covariance)
+            return self._correction.at(positions, self._time, covariance=covariance)
         changes = np.flatnonzero((tools[1:] != tools[:-1]).any(axis=1)) + 1
-        parts = np.split(np.arange(len(places)), changes)
+        parts = np.split(np.arange(len(positions)), changes)
         found = [
-            self._of(tools[part[0]]).at(places[part], self._time, covariance=covariance) for part in parts if part.size
+            self._of(tools[part[0]]).at(positions[part], self._time, covariance=covariance)
+            for part in parts
+            if part.size
         ]
         if len(found) == 1:
             return found[0]

@@ -1,7 +1,7 @@
-"""Compensation tables of controllers: an axis's correction at points along it, in the form that a control reads.
+"""Compensation tables of controls: the correction at points along an axis, in the file format of a control.
 
 `axis_table` samples a correction along an axis; `export` writes it in a format of the entry point group
-``errormotion.table_formats`` and states what rounding and interpolation leave.
+``errormotion.table_formats`` and states the errors of rounding and interpolation.
 """
 
 from errormotion.compensation.tables.contract import FileText, TableFormat, TableSettings, Written

@@ -1,4 +1,4 @@
-"""What a format of compensation tables is."""
+"""Interface of a format of compensation tables."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ class TableSettings(PluginSettings):
 
 @dataclass(frozen=True)
 class Written:
-    """A table as a control would hold it.
+    """A table as stored in a control.
 
     Attributes
     ----------
     files : mapping of str to str or bytes
-        Name of each file, and its content.
+        Content of each file by its name.
     forward, backward : (n,)
-        Offsets at the points of the table as they are in the files, rounded, m; alike where the control knows one
-        direction.
+        Offsets at the points of the table as in the files, rounded, m; equal if the control does not distinguish
+        directions.
     between : {"lines", "steps"}
-        What the control does between two points: straight lines, or the value of the nearest point.
+        Interpolation of the control between two points: straight lines, or the value of the nearest point.
     removed : float
-        Constant that the format cannot hold, m: the offsets in the files are the corrections less this one.
+        Constant that the format cannot represent, m: the offsets in the files are the corrections less this one.
     remarks : tuple of str
-        What is to be done at the control, and what was left out; one sentence each.
+        Steps at the control, and omitted parts; one sentence each.
     """
 
     files: Mapping[str, FileText]
@@ -54,9 +54,9 @@ class TableFormat(Protocol):
     ----------
     id : str
     title : str
-        Control and kind of table, for people.
+        Control and kind of table, for display.
     source : str
-        Where the format is described; what is from memory is labelled so.
+        Documents of the format; statements from memory are labelled so.
     Settings : type
         A `TableSettings`.
     """
@@ -72,5 +72,5 @@ class TableFormat(Protocol):
         Raises
         ------
         DatasetError
-            A table that the control would refuse, or hold wrongly.
+            A table that the control would reject or misinterpret.
         """

@@ -1,4 +1,4 @@
-"""A table in the files of a control, and what rounding and interpolation leave of the errors."""
+"""A table in the files of a control, and its errors of rounding and interpolation."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class Exported:
     rounding : float
         Largest difference at the points of the table between the files and the correction, m.
     interpolation : float
-        Largest difference over all of the measured range, rounding included, m.
+        Largest difference over the measured range, including rounding, m.
     uncertainty : float
-        Largest standard uncertainty of the correction over all of the measured range, m; NaN = unknown.
+        Largest standard uncertainty of the correction over the measured range, m; NaN = unknown.
     largest : float
         Largest offset in the files, m.
     points : int
     remarks : tuple of str
-        Sentences for the reader.
+        Notes and remarks for the user.
     """
 
     files: Mapping[str, FileText]
@@ -47,7 +47,7 @@ class Exported:
         Raises
         ------
         DatasetError
-            A file exists; nothing is written then.
+            A file exists; then no file is written.
         """
         paths = {folder / name: content for name, content in self.files.items()}
         if existing := [str(path) for path in paths if path.exists()]:
@@ -65,7 +65,7 @@ def export(table: AxisTable, form: TableFormat, settings: TableSettings | None =
     Raises
     ------
     DatasetError
-        A table that the control would refuse.
+        A table that the control would reject.
     """
     written = form.write(table, form.Settings() if settings is None else settings)
     rounding, between = [], []
@@ -73,9 +73,9 @@ def export(table: AxisTable, form: TableFormat, settings: TableSettings | None =
         (table.forward, table.fine_forward, written.forward),
         (table.backward, table.fine_backward, written.backward),
     )
-    for wanted, fine, held in directions:
-        rounding.append(np.abs(held + written.removed - wanted).max())
-        control = applied(table.fine, table.positions, held, written.between)
+    for exact, fine, stored in directions:
+        rounding.append(np.abs(stored + written.removed - exact).max())
+        control = applied(table.fine, table.positions, stored, written.between)
         between.append(np.abs(control + written.removed - fine).max())
     return Exported(
         written.files,

@@ -1,4 +1,4 @@
-"""Formats of tables: found through the entry points of all distributions, the built-in ones as well."""
+"""Formats of tables, found through the entry points of all distributions, including the built-in ones."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ def get(name: str) -> TableFormat:
     Raises
     ------
     PluginError
-        Unknown, claimed by several distributions, or one that does not load.
+        Unknown, provided by several distributions, or cannot be loaded.
     """
     points = [point for point in _points() if point.name == name]
     if not points:
         near = get_close_matches(name, available(), n=1)
         hint = f" Did you mean '{near[0]}'?" if near else ""
-        raise PluginError(f"No format of tables '{name}'; there are: {', '.join(available()) or 'none'}.{hint}")
+        raise PluginError(f"Unknown table format '{name}'; available: {', '.join(available()) or 'none'}.{hint}")
     if Counter(point.name for point in _points())[name] > 1:
         sources = ", ".join(point.dist.name if point.dist else "unknown" for point in points)
-        raise PluginError(f"Several distributions claim the format '{name}': {sources}. Remove all but one.")
+        raise PluginError(f"Several distributions provide the format '{name}': {sources}. Remove all but one.")
     try:
         cls = points[0].load()
         if missing := [each for each in _REQUIRED if not hasattr(cls, each)]:
             raise PluginError(f"the class lacks {', '.join(missing)}")
         found: TableFormat = cls()
     except (Exception, SystemExit) as error:
-        raise PluginError(f"The format '{name}' does not load: {type(error).__name__}: {error}") from error
+        raise PluginError(f"The format '{name}' cannot be loaded: {type(error).__name__}: {error}") from error
     if found.id != name:
-        raise PluginError(f"The entry point is called '{name}', but the format calls itself '{found.id}'")
+        raise PluginError(f"The entry point is named '{name}', but its format has the id '{found.id}'")
     return found

@@ -16,11 +16,11 @@ from errormotion.datasets.schemas import DOF, SIGN
 from errormotion.errors import DatasetError
 from errormotion.kinematics.iso import iso_names
 
-MOST_POINTS = 100_000
-"""Points of a table before the limits of its format are applied."""
+MAX_POINTS = 100_000
+"""Maximum number of points of a table, before the limits of its format are applied."""
 
-LINE = 160
-"""Longest comment."""
+MAX_COMMENT = 160
+"""Maximum length of a comment, characters."""
 
 _FINE = 10
 """Points between two of the table at which its error is computed."""
@@ -35,22 +35,22 @@ class AxisTable:
     Attributes
     ----------
     axis, component : str
-        ``X``, ``Y`` or ``Z``: the axis along which the points are, and that which is corrected.
+        ``X``, ``Y`` or ``Z``: the axis of the points, and the corrected axis.
     positions : (n,)
         Commanded positions of the axis, increasing, m.
     forward, backward : (n,)
-        Offset that is added to the command of the component after a motion in the positive and in the negative
-        direction, m; alike where the errors state no reversal.
+        Offset added to the command of the component after a motion in the positive and in the negative direction,
+        m; equal if the errors state no reversal.
     uncertainty : (n,)
         Standard uncertainty of the offset, m; NaN = unknown.
     fine, fine_forward, fine_backward, fine_uncertainty : (m,)
-        The same at many positions over all of the measured range, for the error of the table.
+        The same at many positions over the measured range, to compute the error of the table.
     name : str
         For file names: machine and axis.
     comments : tuple of str
-        What every file states: machine, date, run, method, sign, unit, reference temperature, uncertainty.
+        Comments of every file: machine, date, run, method, sign, unit, reference temperature, uncertainty.
     notes : tuple of str
-        Sentences for the reader.
+        Notes for the user.
     """
 
     axis: str
@@ -69,7 +69,7 @@ class AxisTable:
 
     @property
     def step(self) -> float:
-        """Distance between points, m; NaN where it is not constant."""
+        """Distance between points, m; NaN if it is not constant."""
         steps = np.diff(self.positions)
         return float(steps.mean()) if np.ptp(steps) <= 1e-8 else float("nan")
 
@@ -101,18 +101,18 @@ def axis_table(
     Parameters
     ----------
     errors : Dataset
-        Error dataset over position or targets, and perhaps time. Where it has ``reversal(freedom, position)`` (mean
-        forward less mean backward), both directions of approach have corrections of their own.
+        Error dataset over position or targets, and optionally time. With ``reversal(freedom, position)`` (mean forward
+        less mean backward) the corrections of both directions of approach differ.
     axis : str
         ``X``, ``Y`` or ``Z``.
     component : str
-        What is corrected: ``X``, ``Y`` or ``Z``; default: the axis itself.
+        Corrected axis: ``X``, ``Y`` or ``Z``; default: ``axis``.
     step : float, optional
         Distance between points, m; they are multiples of it. Default: the measured positions.
     at : (3,)
         Positions of the other axes, m.
     time : float, optional
-        Instant of errors over time, s.
+        Time of the correction for errors over time, s.
     functional_point : (3,), optional
         See `errormotion.compensation.correction.correction`.
     chain : str
@@ -123,7 +123,7 @@ def axis_table(
     Raises
     ------
     DatasetError
-        No such axis, errors that do not depend on its position, an unknown component, no or too many points.
+        Unknown axis or component, errors that do not depend on the position of the axis, no or too many points.
     """
     component = component or axis
     for what, letter in (("axis", axis), ("component", component)):
@@ -132,7 +132,7 @@ def axis_table(
     made = correction(errors, functional_point, chain=chain, partial=True)
     k, c = _AXES.index(axis), _AXES.index(component)
     if DOF[c] in made.left:
-        raise DatasetError(f"{DOF[c]} is not known: no correction of {component} follows from these errors")
+        raise DatasetError(f"{DOF[c]} is unknown: {component} cannot be corrected by these errors")
     measured = _measured(errors, axis)
     positions = measured if step is None else _multiples(measured, step)
     fine = np.unique(np.concatenate([np.linspace(a, b, _FINE, endpoint=False) for a, b in _pairs(measured, positions)]))
@@ -140,11 +140,11 @@ def axis_table(
     offset, u, _ = _along(made, positions, k, c, at, time)
     fine_offset, fine_u, valid = _along(made, fine, k, c, at, time)
     half, half_fine = (_reversal(errors, axis, component, x) / 2 for x in (positions, fine))
-    notes = [note for note in made.notes if "left as they are" not in note]
+    notes = [note for note in made.notes if "not corrected" not in note]
     if not valid.all():
-        notes.append("Parts of the table lie outside of what was measured: the correction is held at the edge there.")
+        notes.append("Parts of the table lie outside the measured range: the correction there is that at its limit.")
     elif not np.isfinite(fine_u).all():
-        notes.append("The uncertainty between measured places is unknown: there are too few of them.")
+        notes.append("The uncertainty between measured positions is unknown: their number is too small.")
     return AxisTable(
         axis, component, positions, offset - half, offset + half, u, fine, fine_offset - half_fine,
         fine_offset + half_fine, fine_u, _file_name(f"{errors.attrs['machine']}-{axis}{component.strip(axis)}"),
@@ -155,10 +155,10 @@ def axis_table(
 def _measured(errors: xr.Dataset, axis: str) -> Array:
     letter = axis.lower()
     if letter not in errors.variables or errors[letter].dims not in (("position",), ("target",)):
-        raise DatasetError(f"The errors have no positions of {axis}; a table of {axis} needs errors along it")
+        raise DatasetError(f"The errors have no positions of {axis}; a table of {axis} requires errors along it")
     if errors[letter].dims == ("position",) and str(errors.attrs["component"]) in _AXES.replace(axis, ""):
         raise DatasetError(
-            f"The errors are those of {errors.attrs['component']}; a table of {axis} needs errors along it"
+            f"The errors are those of {errors.attrs['component']}; a table of {axis} requires errors along it"
         )
     found: Array = np.unique(np.round(np.asarray(errors[letter].values, dtype=float), 9))
     found = found[np.isfinite(found)]
@@ -174,12 +174,10 @@ def _multiples(measured: Array, step: float) -> Array:
     first, last = np.ceil(low / step - 1e-6), np.floor(high / step + 1e-6)
     if last - first < 1:
         raise DatasetError(
-            f"step: {1e3 * step:g} mm gives fewer than two points from {1e3 * low:g} to {1e3 * high:g} mm; state less"
+            f"step: {1e3 * step:g} mm: fewer than two points from {1e3 * low:g} to {1e3 * high:g} mm; reduce it"
         )
-    if last - first >= MOST_POINTS:
-        raise DatasetError(
-            f"step: {1e3 * step:g} mm gives {last - first + 1:.0f} points; expected at most {MOST_POINTS}"
-        )
+    if last - first >= MAX_POINTS:
+        raise DatasetError(f"step: {1e3 * step:g} mm: {last - first + 1:.0f} points; expected at most {MAX_POINTS}")
     return np.asarray(np.arange(first, last + 1) * step)
 
 
@@ -199,7 +197,7 @@ def _along(
 
 
 def _reversal(errors: xr.Dataset, axis: str, component: str, x: Array) -> Array:
-    """Return mean forward less mean backward error at positions, m; 0 where the errors state none."""
+    """Return mean forward less mean backward error at positions, m; 0 if the errors state none."""
     if "reversal" not in errors.variables or set(errors["reversal"].dims) != {"freedom", "position"}:
         return np.zeros(x.size)
     name = iso_names(axis)[f"E{component}"]
@@ -233,7 +231,7 @@ def _comments(errors: xr.Dataset, axis: str, component: str, u: Array, run: str)
         f"reference temperature: {'unknown' if temperature is None else f'{float(temperature):.2f} degC'}{mean}",
         f"uncertainty of the correction (k = 2): {f'{2e6 * known.max():.2f} um' if known.size else 'unknown'}",
     )
-    return tuple("".join(letter if letter.isprintable() else " " for letter in line)[:LINE] for line in lines)
+    return tuple("".join(letter if letter.isprintable() else " " for letter in line)[:MAX_COMMENT] for line in lines)
 
 
 def _file_name(text: str) -> str:
@@ -242,7 +240,7 @@ def _file_name(text: str) -> str:
 
 
 def applied(x: Array, positions: Array, values: Array, between: str) -> Array:
-    """Return what a control applies at positions x, (m,): lines between points or the nearest one, held outside."""
+    """Return the offsets of a control at positions x, (m,): linear or nearest point, constant outside the table."""
     if between == "steps":
         nearest = np.abs(x[:, None] - positions).argmin(axis=1)
         return np.asarray(values[nearest])

@@ -82,12 +82,12 @@ def matrix(inputs: Inputs, features: Sequence[Feature]) -> Array:
 
 
 def _column(inputs: Inputs, feature: Feature) -> Array:
-    held: dict[str, Array] = inputs.parameter if feature.parameter else inputs.temperature
-    if feature.source not in held:
-        names = ", ".join(held) or "none"
+    available: dict[str, Array] = inputs.parameter if feature.parameter else inputs.temperature
+    if feature.source not in available:
+        names = ", ".join(available) or "none"
         what = "the working parameter" if feature.parameter else "the temperature"
-        raise DatasetError(f"The model needs {what} '{feature.source}'; the data have {names}.")
-    values: Array = held[feature.source] ** feature.power
+        raise DatasetError(f"The model requires {what} '{feature.source}'; found {names}.")
+    values: Array = available[feature.source] ** feature.power
     known = np.isfinite(values)
     if not known.any():
         return np.full(values.size, np.nan)

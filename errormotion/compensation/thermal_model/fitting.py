@@ -1,10 +1,9 @@
 """Fit of a thermal model: selection of sensors, lags or time constants, and regularisation.
 
-Everything is selected by cross-validation that leaves out whole campaigns: neighbouring samples of a warm-up are so
-similar that leaving out single samples would favour any model. A single campaign is left out by blocks in time, which
-have the speeds of the rest: they show neither what its coefficients are worth at other speeds, nor a model without
-sensors that knows nothing else of the heat. There the variance of the coefficients counts, too, and one sensor is the
-least.
+All are selected by cross-validation that leaves out whole campaigns: neighbouring samples of a warm-up are so similar
+that leaving out single samples would favour any model. A single campaign is divided into blocks in time. These have the
+same speeds and therefore validate neither the coefficients at other speeds nor a model without sensors. The score then
+includes the variance of the coefficients, and the model has at least one sensor.
 """
 
 from __future__ import annotations
@@ -33,17 +32,17 @@ TIME_CONSTANTS: tuple[tuple[float, ...], ...] = (
     (600.0, 3600.0),
     (300.0, 1800.0, 7200.0),
 )
-"""Candidates where the settings have none, s."""
+"""Candidates if the settings have none, s."""
 
 SAME = ("component", "frame", "reference", "machine", "lever_axes")
 """Attributes that must be equal in the campaigns of one model."""
 
-FEWEST_SAMPLES = 8
+MIN_SAMPLES = 8
 """Smallest number of known values of an error."""
 
-MOST_SENSORS = 500
-MOST_VALUES = 1_000_000
-"""Temperatures, times by sensors, of all campaigns: the time of a fit grows with them, memory with a multiple."""
+MAX_SENSORS = 500
+MAX_VALUES = 1_000_000
+"""Maximum number of temperatures (times by sensors) of all campaigns: it limits duration and memory of a fit."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,8 @@ class Candidate:
         Lags or time constants, s.
     features : tuple of Feature
     score : float
-        Sum over the errors of the mean square residual over the mean square of the error; of a single campaign with
-        the mean variance by the coefficients where each source has any share of what it had in the training.
+        Sum over the errors of the mean square residual over the mean square of the error; for a single campaign
+        including the variance by the coefficients (see `_in_use`).
     """
 
     variant: str
@@ -87,7 +86,7 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     ------
     DatasetError
         Campaigns of different machines, components or functional points, no common sensors, too few values, or more
-        than `MOST_VALUES` or `MOST_SENSORS`.
+        than `MAX_VALUES` or `MAX_SENSORS`.
     """
     settings = settings or Settings()
     if not campaigns:
@@ -95,11 +94,9 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     _check_size(campaigns)
     _check_alike(campaigns)
     records = [read_record(ds, f"campaign {number + 1}") for number, ds in enumerate(campaigns)]
-    seen = [k for k in range(6) if sum(int(np.isfinite(r.errors[:, k]).sum()) for r in records) >= FEWEST_SAMPLES]
+    seen = [k for k in range(6) if sum(int(np.isfinite(r.errors[:, k]).sum()) for r in records) >= MIN_SAMPLES]
     if not seen:
-        raise DatasetError(
-            f"Expected at least {FEWEST_SAMPLES} known values of an error in all campaigns together; found fewer."
-        )
+        raise DatasetError(f"Expected at least {MIN_SAMPLES} known values of an error in all campaigns; found fewer.")
     columns = regression.Columns(records)
     best, tried = _chosen(columns, seen, settings)
     return _made(campaigns, columns, seen, best, tried, settings)
@@ -107,12 +104,12 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
 
 def _check_size(campaigns: Sequence[xr.Dataset]) -> None:
     sensors = max(ds.sizes.get("sensor", 0) for ds in campaigns)
-    if sensors > MOST_SENSORS:
-        raise DatasetError(f"Expected at most {MOST_SENSORS} temperature sensors; found {sensors}.")
+    if sensors > MAX_SENSORS:
+        raise DatasetError(f"Expected at most {MAX_SENSORS} temperature sensors; found {sensors}.")
     values = sum(ds.sizes.get("time", 0) * max(1, ds.sizes.get("sensor", 0)) for ds in campaigns)
-    if values > MOST_VALUES:
+    if values > MAX_VALUES:
         raise DatasetError(
-            f"Expected at most {MOST_VALUES} temperatures (times by sensors) in all campaigns together; "
+            f"Expected at most {MAX_VALUES} temperatures (times by sensors) in all campaigns together; "
             f"found {values}. Select every tenth time, or fewer sensors."
         )
 
@@ -197,7 +194,7 @@ def _with_sensors(
 
     if settings.sensors is not None:
         return candidate(settings.sensors)
-    # One warm-up has one course of the speed: without a sensor its effect cannot be separated from that of the heat.
+    # One warm-up has one profile of the speed: without a sensor its effect cannot be separated from that of the heat.
     sensed = len(columns.records) == 1 and bool(common) and settings.most_sensors > 0
     best = None if sensed else candidate(())
     while len(best.sensors if best else ()) < settings.most_sensors:
@@ -231,10 +228,10 @@ def _score(columns: regression.Columns, seen: Sequence[int], features: Sequence[
 
 
 def _in_use(X: Array, features: Sequence[Feature]) -> Array:
-    """Return the mean product of each two features where each source has a share of 0 to 1 of its training, (p, p).
+    """Return the mean product of two features if each source has 0 to 1 times its values in training, (p, p).
 
-    In one warm-up all sources rise and fall together; at other speeds and in other air they do not. With shares s, each
-    uniform and independent, E[s_i s_j] is 1/3 for one source and 1/4 for two.
+    In one warm-up all sources rise and fall together; at other speeds and air temperatures they do not. With uniform
+    and independent factors s, E[s_i s_j] is 1/3 for one source and 1/4 for two.
     """
     known = X[np.isfinite(X).all(axis=1)]
     sources = [(feature.source, feature.power) for feature in features]
@@ -257,14 +254,14 @@ def _made(
     covariance = np.full((6, p, p), np.nan)
     misfit = np.full(6, np.nan)
     strengths = np.full(6, np.nan)
-    share = np.full(6, np.nan)
+    removed = np.full(6, np.nan)
     for k in seen:
         y, weight = regression.target(columns.records, k)
         strength, _, residual = regression.best_strength(X, y, weight, group)
         known = (weight > 0) & np.isfinite(X).all(axis=1)
         strengths[k] = strength
         coefficient[k] = regression.solve(X[known], y[known], weight[known], np.array([strength]))[0] / scale
-        # The campaign with the largest residuals is taken for the uncertainty of a new one.
+        # The campaign with the largest residuals determines the uncertainty of a new one.
         square = max(
             found
             for number in np.unique(group)
@@ -275,10 +272,10 @@ def _made(
         misfit[k] = np.sqrt(square) * student.ppf(0.975, freedom) / student.ppf(0.975, np.inf)
         of_scaled = regression.covariance(X, weight, strength, square, residual, group)
         covariance[k] = of_scaled / np.outer(scale, scale)
-        share[k] = 1 - np.sqrt(regression.mean_square(residual, weight) / regression.mean_square(y, weight))
+        removed[k] = 1 - np.sqrt(regression.mean_square(residual, weight) / regression.mean_square(y, weight))
     physical = X[np.isfinite(X).all(axis=1)] * scale
     parts = Parts(
-        best.features, coefficient, covariance, misfit, strengths, share, physical.min(axis=0), physical.max(axis=0)
+        best.features, coefficient, covariance, misfit, strengths, removed, physical.min(axis=0), physical.max(axis=0)
     )
     table = [
         {"variant": c.variant, "sensors": list(c.sensors), "constants": list(c.constants), "score": c.score}

@@ -39,7 +39,7 @@ ROWS = (
     Row("coefficient_covariance", ("dof", "feature", "feature_"), "", *_FREE, "of the coefficients of each error"),
     Row("misfit", ("dof",), "", *_POSITIVE, "standard uncertainty of a prediction, from campaigns that were left out"),
     Row("strength", ("dof",), "", *_POSITIVE, "of the regularisation, from cross-validation"),
-    Row("removed", ("dof",), "1", -1e3, 1.0, "removed fraction of the error's RMS at campaigns that were left out"),
+    Row("removed", ("dof",), "1", -1e3, 1.0, "removed fraction of the RMS of the error at left-out campaigns"),
     Row("feature_power", ("feature",), "", 1, 2, "power of the working parameter"),
     Row("feature_lag", ("feature",), "s", *_POSITIVE, "lag"),
     Row("feature_time_constant", ("feature",), "s", *_POSITIVE, "of the first-order response; 0: the value itself"),
@@ -243,9 +243,9 @@ class ThermalModel:
         return result
 
     def _identities(self, names: list[str], kinds: list[str], own_hash: str) -> dict[str, str]:
-        """Return the identity of the coefficients' parts, which all predictions of one model share; not of its misfit.
+        """Return the identities of the parts of the coefficients, which are common to all predictions of one model.
 
-        The parts are eigenvectors, whose sense is not determined: it is part of the identity.
+        The misfit has none. The parts are eigenvectors, whose sense is arbitrary: it is part of the identity.
         """
         found = {}
         covariance = self.dataset["coefficient_covariance"].values
@@ -313,7 +313,7 @@ def violations(dataset: xr.Dataset) -> list[str]:
     for dim in ("dof", "feature"):
         labels = [str(each) for each in dataset[dim].values.ravel()] if dim in dataset.coords else []
         if len(labels) != dataset.sizes.get(dim) or len({*labels}) < len(labels):
-            found.append(f"{dim}: expected a label for each element, and labels that differ")
+            found.append(f"{dim}: expected one unique label for each element")
         elif dim == "dof" and tuple(labels) != DOF:
             found.append(f"dof: expected {' '.join(DOF)}; found {' '.join(labels)}")
     point: Any = dataset.attrs.get("functional_point")

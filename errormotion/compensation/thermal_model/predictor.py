@@ -26,12 +26,12 @@ class ThermalPredictor:
     model : Dataset
         A thermal model.
     functional_point : (3,), optional
-        Where the translations apply, m, in the frame of the model; default: the functional point of the model.
+        Point of the translations, m, in the frame of the model; default: the functional point of the model.
 
     Raises
     ------
     CompensationError
-        The model has no prediction for one of the translations, or for a rotation that the functional point needs.
+        The model does not predict one of the translations, or a rotation that the functional point requires.
     """
 
     def __init__(self, model: xr.Dataset, functional_point: Array | None = None) -> None:
@@ -45,8 +45,8 @@ class ThermalPredictor:
         needed = known if lever.any() else known[:3]
         if not needed.all():
             raise CompensationError(
-                "The model predicts " + ", ".join(str(d) for d in ds["dof"].values[known]) + "; an offset needs "
-                "EX, EY and EZ, and at another functional point than the model's also the three rotations."
+                "The model predicts " + ", ".join(str(d) for d in ds["dof"].values[known]) + "; an offset "
+                "requires EX, EY and EZ, and at another functional point than that of the model the three rotations."
             )
         self._coefficient = np.where(known[:, None], coefficient, np.nan)
         self._covariance = ds["coefficient_covariance"].values
@@ -72,7 +72,7 @@ class ThermalPredictor:
         return tuple(dict.fromkeys(each.source for each in found if each.parameter == parameter))
 
     def update(self, time: float, temperature: Mapping[str, float], parameter: Mapping[str, float]) -> Prediction:
-        """Take the readings of one instant, and return the prediction for it.
+        """Process the readings of one time, and return the prediction for it.
 
         Parameters
         ----------
@@ -90,7 +90,9 @@ class ThermalPredictor:
         speeds = {name: parameter[name] * factor for name, factor in PARAMETERS.items() if name in parameter}
         row = np.array([self._input(column, values, speeds, time) for column in self._columns])
         unknown = ~np.isfinite(row)
-        missing = tuple(dict.fromkeys(c.feature.source for c, gone in zip(self._columns, unknown, strict=True) if gone))
+        missing = tuple(
+            dict.fromkeys(c.feature.source for c, absent in zip(self._columns, unknown, strict=True) if absent)
+        )
         if missing:
             return Prediction(np.full(6, np.nan), np.full(6, np.nan), missing)
         errors = self._coefficient @ row
@@ -121,7 +123,7 @@ class _Column:
         self._past: deque[tuple[float, float]] = deque()  # for a lag
 
     def update(self, time: float, value: float) -> float:
-        """Take the input at a time, and return the feature; NaN where the input is unknown."""
+        """Process the input at a time, and return the feature; NaN if the input is unknown."""
         if not math.isfinite(value):
             return math.nan
         value = value**self.feature.power

@@ -53,7 +53,7 @@ class Record:
     variance: Array
 
 
-MOST_TIMES = 1_000_000
+MAX_TIMES = 1_000_000
 """Times of one dataset: 11 days at one a second. The covariance of a prediction alone takes 288 bytes for each."""
 PARAMETERS = {"spindle_speed": 1e-3, "feed": 60.0}
 """Factors of the working parameters to the units of the model."""
@@ -65,14 +65,12 @@ def read_inputs(ds: xr.Dataset, what: str = "the data") -> Inputs:
     Raises
     ------
     DatasetError
-        No time, more than `MOST_TIMES`, no temperature, or times that do not increase.
+        No time, more than `MAX_TIMES`, no temperature, or times that do not increase.
     """
     if "time" not in ds.dims or "time" not in ds.coords:
         raise DatasetError(f"{what}: expected temperatures over time; found the dims {', '.join(map(str, ds.dims))}")
-    if ds.sizes["time"] > MOST_TIMES:
-        raise DatasetError(
-            f"{what}: expected at most {MOST_TIMES} times; found {ds.sizes['time']}. Select fewer first."
-        )
+    if ds.sizes["time"] > MAX_TIMES:
+        raise DatasetError(f"{what}: expected at most {MAX_TIMES} times; found {ds.sizes['time']}. Select fewer first.")
     if "temperature" not in ds or set(ds["temperature"].dims) != {"time", "sensor"}:
         raise DatasetError(f"{what}: expected temperature(time, sensor); found none. Add a thermometer to the bench.")
     time = np.asarray(ds["time"].values, dtype=float)

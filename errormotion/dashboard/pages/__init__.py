@@ -1,1 +1,1 @@
-"""Handlers of the dashboard's pages."""
+"""Request handlers of the pages."""

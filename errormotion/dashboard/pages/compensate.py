@@ -1,4 +1,4 @@
-"""Compensate: choose bench and model, start as a shadow or armed, see every offset and its cause, ramp to zero."""
+"""Page Compensate: choose bench and model, start in shadow mode or armed, show every offset, ramp to zero."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from tornado.web import HTTPError
 
 from errormotion.arrays import Array
 from errormotion.campaign.compensation.following import Status, is_working, read_status, request_stop
+from errormotion.dashboard.cache import TimedCache
 from errormotion.dashboard.compensations import Compensations, Start, rows
-from errormotion.dashboard.course import thin
+from errormotion.dashboard.curves import thin
 from errormotion.dashboard.figures import following_item
-from errormotion.dashboard.kept import Lately
 from errormotion.dashboard.pages.effect import EffectOfRuns, Report
-from errormotion.dashboard.pages.page import LONGEST_MESSAGE, Context, Guarded
+from errormotion.dashboard.pages.page import MAX_MESSAGE, Context, Guarded
 from errormotion.errors import CompensationError, ErrormotionError
 
 SPANS = (("10 min", 600), ("1 h", 3600), ("8 h", 28800))
-"""Lengths of the curves that a reader chooses from, s."""
+"""Possible time spans of the curves, s."""
 STATES = ("off", "armed", "following", "holding", "ramping", "fault")
-MOST_POINTS = 1000
-"""Points of a reduced curve."""
+MAX_POINTS = 1000
+"""Number of points of a reduced curve."""
 LATE = 3.0
-"""Time without a new state after which a compensation at work counts as hanging, in periods and at least in s."""
+"""Time without a new state after which a running compensation is reported as late, in periods, and at least in s."""
 
 
 class _Compensating(Guarded):
     def initialize(self, context: Context, compensations: Compensations) -> None:  # type: ignore[override]
-        """Take what the server knows, and its compensations."""
+        """Set the context and the compensations of the server."""
         super().initialize(context)
         self.compensations = compensations
 
     def page(self, wrong: str = "") -> None:
-        """Write the page; ``wrong`` is why the last request was refused."""
+        """Send the page; ``wrong`` states why the last request was refused."""
         known = self.compensations
         benches, models = (known.benches(), known.models()) if self.context.control else ([], [])
         self.show(
@@ -51,34 +51,34 @@ class _Compensating(Guarded):
             states=STATES,
             spans=SPANS,
             asked={name: self.get_argument(name, "")[:400] for name in ("bench", "model", "mode")},
-            chosen=self.word("run"),
-            wrong=wrong[:LONGEST_MESSAGE],
+            chosen=self.value("run"),
+            wrong=wrong[:MAX_MESSAGE],
         )
 
 
 class Compensate(_Compensating):
-    """The page; its values come from `State` and `Curves`."""
+    """The page; `State` and `Curves` provide its values."""
 
     async def get(self) -> None:
-        """Show the frame."""
-        await self.apart_slow(self.compensations.models)  # read here, in a thread; the page finds them kept
+        """Send the page without values."""
+        await self.in_slow_thread(self.compensations.models)  # read in a thread; the page takes them from the cache
         self.page()
 
 
 class Begin(_Compensating):
-    """Starts a command."""
+    """Start of a compensation."""
 
     controls = True
 
     async def post(self) -> None:
-        """Start a compensation as a shadow, or armed by the name of the machine."""
+        """Start a compensation in shadow mode, or armed by the name of the machine."""
         mode = self.get_body_argument("mode", "shadow")
         if mode not in ("shadow", "armed"):
             raise HTTPError(400, reason="Expected shadow or armed")
         arm = self.get_body_argument("machine", "", strip=False) if mode == "armed" else None
         chosen = [self.get_body_argument(name, "") for name in ("bench", "model")]
         try:
-            await self.apart_slow(self.compensations.start, *chosen, arm)
+            await self.in_slow_thread(self.compensations.start, *chosen, arm)
         except ErrormotionError as error:
             self.set_status(400)
             self.page(str(error))
@@ -87,15 +87,15 @@ class Begin(_Compensating):
 
 
 class Stop(_Compensating):
-    """Asks a compensation to ramp to zero and end."""
+    """Request to a compensation to ramp to zero and end."""
 
     controls = True
 
     async def post(self) -> None:
-        """Write the request; the compensation looks for it at each of its periods."""
+        """Write the request, which the compensation checks for in each period."""
         key = self.get_body_argument("run", "")
         try:
-            await self.apart(request_stop, self.compensations.following(key).folder)
+            await self.in_thread(request_stop, self.compensations.following(key).folder)
         except ErrormotionError as error:
             self.set_status(400)
             self.page(str(error))
@@ -104,39 +104,41 @@ class Stop(_Compensating):
 
 
 class State(_Compensating):
-    """What the compensations do now, as JSON."""
+    """Present state of the compensations, as JSON."""
 
     async def get(self) -> None:
-        """Send it."""
-        key = self.word("run", 255)
+        """Send the state."""
+        key = self.value("run", 255)
         self.set_header("Content-Type", "application/json")
         known = self.compensations
-        self.finish(await self.apart(_STATES.get, (known.runs, key, len(known.starts)), lambda: _state(known, key)))
+        self.finish(await self.in_thread(_STATES.get, (known.runs, key, len(known.starts)), lambda: _state(known, key)))
 
 
 class Curves(_Compensating):
-    """Prediction, offset and offset in effect over time, as JSON: reduced, in um, with nulls where unknown."""
+    """Prediction, offset and offset in effect over time, as JSON: reduced, in um, null if unknown."""
 
     async def get(self) -> None:
         """Send the curves of one compensation."""
-        span = self.word("span") or str(SPANS[0][1])
+        span = self.value("span") or str(SPANS[0][1])
         if span not in {str(each) for _, each in SPANS}:
             raise HTTPError(400, reason="Unknown span")
         self.set_header("Content-Type", "application/json")
-        known, key = self.compensations, self.word("run", 255)
-        self.finish(await self.apart(_CURVES.get, (known.runs, key, span), lambda: _curves(known, key, float(span))))
+        known, key = self.compensations, self.value("run", 255)
+        self.finish(
+            await self.in_thread(_CURVES.get, (known.runs, key, span), lambda: _curves(known, key, float(span)))
+        )
 
 
 class Figure(_Compensating):
-    """The axes of the curves, as JSON for BokehJS; `Curves` fills them."""
+    """Axes of the curves, as JSON for BokehJS; `Curves` provides their data."""
 
     async def get(self) -> None:
-        """Send axes."""
-        self.finish({"item": await self.apart(following_item)})
+        """Send the axes."""
+        self.finish({"item": await self.in_thread(following_item)})
 
 
 def handlers(context: Context) -> list[tuple[str, type[Guarded], dict[str, Any]]]:
-    """Return the addresses of this page."""
+    """Return the routes of this page."""
     bench = context.watch.plan.source if context.watch is not None else None
     given = {"context": context, "compensations": Compensations(context.lab.runs, context.campaigns, bench)}
     pages = {"": Compensate, "/start": Begin, "/stop": Stop}
@@ -146,13 +148,13 @@ def handlers(context: Context) -> list[tuple[str, type[Guarded], dict[str, Any]]
     return [*own, *((path, handler, {"context": context}) for path, handler in effects.items())]
 
 
-_STATES: Lately[str] = Lately(0.2)
-_CURVES: Lately[str] = Lately(1.0)
-"""What many clients ask for is read and made once for all of them."""
+_STATES: TimedCache[str] = TimedCache(0.2)
+_CURVES: TimedCache[str] = TimedCache(1.0)
+"""Answers that are computed once for all clients."""
 
 
 def _state(known: Compensations, key: str) -> str:
-    """Return the list of compensations, and one of them, as a JSON document."""
+    """Return the list of compensations, and the details of one, as a JSON document."""
     listed = known.listed()
     found: dict[str, Any] = {
         "list": [_row(*each) for each in listed],
@@ -232,7 +234,7 @@ def _curves(known: Compensations, key: str, seconds: float) -> str:
             _column([points[i] for i in kept], name, k, factor)
             for name, factor in (("target", 1e6), ("uncertainty", 2e6), ("offset", 1e6), ("applied", 1e6))
         )
-        some = np.unique(np.concatenate([thin(each, MOST_POINTS) for each in (asked, offset)])) if len(kept) else kept
+        some = np.unique(np.concatenate([thin(each, MAX_POINTS) for each in (asked, offset)])) if len(kept) else kept
         columns = {"x": times[kept], "asked": asked, "low": asked - half, "high": asked + half}
         columns |= {"offset": offset, "applied": applied}
         found[axis] = {name: [_plain(each) for each in values[some]] for name, values in columns.items()}
@@ -240,7 +242,7 @@ def _curves(known: Compensations, key: str, seconds: float) -> str:
 
 
 def _column(points: Sequence[dict[str, Any]], name: str, k: int, factor: float) -> Array:
-    """Return one number of each entry; NaN where unknown, or where a stranger wrote something else."""
+    """Return one number of each entry; NaN if it is unknown or invalid."""
 
     def of(values: Any) -> float:
         value = values[k] if isinstance(values, list) and len(values) == 3 else None

@@ -1,4 +1,4 @@
-"""The page that asks for the token."""
+"""The page that requests the token."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ import asyncio
 from errormotion.dashboard.pages.page import Guarded
 
 DELAY = 1.0
-"""Time until a wrong token is refused, s."""
+"""Delay of the answer to a wrong token, s."""
 
 
 class Login(Guarded):
-    """Asks for the token; the right one opens the dashboard to this browser until the server ends."""
+    """Request for the token; with the correct one this browser has access until the server ends."""
 
     public = True
 
     def get(self) -> None:
         """Show the form."""
-        if self.context.access.knows(self.get_cookie(self.context.cookie)):
+        if self.context.access.accepts_session(self.get_cookie(self.context.cookie)):
             self.redirect("/")
             return
         self.show("login.html.j2", refused=False)
 
     async def post(self) -> None:
-        """Compare the token."""
+        """Check the token."""
         access = self.context.access
-        if not access.opens(self.get_body_argument("token", "")):
+        if not access.accepts_token(self.get_body_argument("token", "")):
             await asyncio.sleep(DELAY)
             self.set_status(403)
             self.show("login.html.j2", refused=True)

@@ -1,4 +1,4 @@
-"""Measure: choose or edit a campaign, see its plan, start it, follow it, answer it and stop it."""
+"""Page Measure: edit a campaign, show its plan, start it, show its progress, answer requests, stop it."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from typing import Any
 from tornado.web import HTTPError
 
 from errormotion.campaign.background import processes
-from errormotion.campaign.background.elsewhere import measuring_elsewhere
+from errormotion.campaign.background.other_processes import runs_of_other_processes
 from errormotion.campaign.background.preliminary import preliminary, samples
 from errormotion.campaign.background.processes import Background
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.form.fields import Form
+from errormotion.dashboard.cache import TimedCache
 from errormotion.dashboard.campaigns import Campaigns, hash_of
-from errormotion.dashboard.course import course
+from errormotion.dashboard.curves import curves_of
 from errormotion.dashboard.figures import errors_item
-from errormotion.dashboard.kept import Lately
 from errormotion.dashboard.pages.page import Guarded
 from errormotion.datasets.files.reading import parse_json
 from errormotion.errors import ErrormotionError, RunError
 from errormotion.report.text import signs
 
 SHOWN = 8
-"""Processes that have ended and are shown."""
+"""Number of ended processes that are shown."""
 
 
 class _OfCampaigns(Guarded):
@@ -35,12 +35,12 @@ class _OfCampaigns(Guarded):
         return Campaigns(self.context.campaigns, self.context.control, bench)
 
     def body(self, *names: str) -> list[str]:
-        """Return texts of the JSON that a request carries.
+        """Return texts of the JSON document of a request.
 
         Raises
         ------
         HTTPError
-            It is no JSON object, or one of them is missing or no text.
+            The document is no JSON object, or a text is missing.
         """
         try:
             found = parse_json(self.request.body)
@@ -56,12 +56,12 @@ class Measure(_OfCampaigns):
     """The page."""
 
     async def get(self) -> None:
-        """Show the campaign files and one of them."""
+        """Show the list of campaign files and one campaign."""
         campaigns = self.campaigns()
-        names = await self.apart(campaigns.names)
+        names = await self.in_thread(campaigns.names)
         name = self.get_query_argument("file", None)
-        name = (names[0] if names else "") if name is None else self.word("file")
-        text = await self.apart(campaigns.read, name)
+        name = (names[0] if names else "") if name is None else self.value("file")
+        text = await self.in_thread(campaigns.read, name)
         self.show(
             "measure.html.j2",
             control=self.context.control,
@@ -73,9 +73,9 @@ class Measure(_OfCampaigns):
 
 
 class Fields(_OfCampaigns):
-    """The form of a text, as JSON, after a change that a request may state.
+    """Form of a campaign text, as JSON, after an optional change.
 
-    ``place`` and ``value``: of a field; ``add``: true, a test is added; ``remove``: number of the test to be removed.
+    ``place`` and ``value`` change a field; ``add``: true adds a test; ``remove`` is the number of a test to remove.
     """
 
     async def post(self) -> None:
@@ -83,120 +83,120 @@ class Fields(_OfCampaigns):
         name, text = self.body("file", "text")
         number = self.found.get("remove")
         if self.found.get("add") is True:
-            form = await self.apart(self.campaigns().with_test, name, text)
+            form = await self.in_thread(self.campaigns().with_test, name, text)
         elif number is not None:
             if type(number) is not int or number < 0:
                 raise HTTPError(400, reason="remove: expected the number of a test")
-            form = await self.apart(self.campaigns().without_test, name, text, number)
+            form = await self.in_thread(self.campaigns().without_test, name, text, number)
         else:
             place = self.found.get("place", [])
             if not isinstance(place, list) or not all(type(each) in (str, int) for each in place) or len(place) > 20:
                 raise HTTPError(400, reason="place: expected keys")
             written = self.found.get("value", "")
-            form = await self.apart(self.campaigns().form, name, text, tuple(place), str(written))
+            form = await self.in_thread(self.campaigns().form, name, text, tuple(place), str(written))
         self.finish(_plain(form))
 
 
 class Plan(_OfCampaigns):
-    """What a campaign will do and how well it will measure, as JSON."""
+    """Motions and expected uncertainty of a campaign, as JSON."""
 
     async def post(self) -> None:
-        """Compute it."""
+        """Send the plan."""
         name, text = self.body("file", "text")
-        self.finish({"tests": await self.apart_slow(self.campaigns().plan, name, text)})
+        self.finish({"tests": await self.in_slow_thread(self.campaigns().plan, name, text)})
 
 
 class Save(_OfCampaigns):
-    """Write a campaign file."""
+    """Saving of a campaign file."""
 
     controls = True
 
     async def post(self) -> None:
-        """Save it, and send the hash of what is saved."""
+        """Save the file, and send its hash."""
         name, text, before = self.body("file", "text", "before")
-        await self.apart(self.campaigns().save, name, text, before)
+        await self.in_thread(self.campaigns().save, name, text, before)
         self.finish({"file": name, "before": hash_of(text)})
 
 
 class Start(_OfCampaigns):
-    """Save a campaign and run it in a process of its own."""
+    """Saving of a campaign, and its start in a separate process."""
 
     controls = True
 
     async def post(self) -> None:
-        """Start it."""
+        """Start the campaign."""
         name, text, before = self.body("file", "text", "before")
-        path = await self.apart(self.campaigns().save, name, text, before)
-        process = await self.apart(processes.start, path, self.context.lab.runs)
+        path = await self.in_thread(self.campaigns().save, name, text, before)
+        process = await self.in_thread(processes.start, path, self.context.lab.runs)
         self.finish({"process": process, "before": hash_of(text)})
 
 
 class Resume(_OfCampaigns):
-    """Continue the campaign of a run in a process of its own."""
+    """Continuation of the campaign of a run in a separate process."""
 
     controls = True
 
     async def post(self) -> None:
-        """Start it."""
+        """Continue the campaign."""
         (key,) = self.body("run")
-        self.finish({"process": await self.apart(processes.resume, self.context.lab.folder(key))})
+        self.finish({"process": await self.in_thread(processes.resume, self.context.lab.folder(key))})
 
 
 class Stop(_OfCampaigns):
-    """Ask a process to stop."""
+    """Stop of a process."""
 
     controls = True
 
     async def post(self) -> None:
-        """Send the request to end."""
+        """Stop the process."""
         (name,) = self.body("process")
-        await self.apart(processes.stop, self.context.lab.runs, name)
+        await self.in_thread(processes.stop, self.context.lab.runs, name)
         self.finish({})
 
 
 class Answer(_OfCampaigns):
-    """State that a request to the operator is done."""
+    """Answer to a request to the operator."""
 
     controls = True
 
     async def post(self) -> None:
-        """Pass it on."""
+        """State that the request is done."""
         (name,) = self.body("process")
         number = self.found.get("number")
         if type(number) is not int:
             raise HTTPError(400, reason="number: expected a whole number")
-        await self.apart(processes.answer, self.context.lab.runs, name, number)
+        await self.in_thread(processes.answer, self.context.lab.runs, name, number)
         self.finish({})
 
 
 class Processes(Guarded):
-    """The processes of the folder of runs, as JSON."""
+    """Processes of the folder of runs, as JSON."""
 
     async def get(self) -> None:
-        """Send those that live, and the last ones that have ended."""
+        """Send the running processes, and the last ended ones."""
         runs = self.context.lab.runs
-        self.finish({"processes": await self.apart(_PROCESSES.get, runs, lambda: _processes(runs))})
+        self.finish({"processes": await self.in_thread(_PROCESSES.get, runs, lambda: _processes(runs))})
 
 
 class Live(Guarded):
-    """The errors of a run that is still measuring, as JSON for BokehJS."""
+    """Errors of a run in progress, as JSON for BokehJS."""
 
     async def get(self) -> None:
-        """Identify the samples so far, and draw the errors with their uncertainty."""
-        path = self.context.lab.folder(self.word("run", 600))
-        self.finish(await self.apart_slow(_LIVE.get, path, lambda: _live(path)))
+        """Identify the samples so far, and send the figure of the errors."""
+        path = self.context.lab.folder(self.value("run", 600))
+        self.finish(await self.in_slow_thread(_LIVE.get, path, lambda: _live(path)))
 
 
-_PROCESSES: Lately[list[dict[str, Any]]] = Lately(0.3)
-_LIVE: Lately[dict[str, Any]] = Lately(2.0)
-"""Figures of growing runs, so that many clients do not keep the server identifying."""
+_PROCESSES: TimedCache[list[dict[str, Any]]] = TimedCache(0.3)
+_LIVE: TimedCache[dict[str, Any]] = TimedCache(2.0)
+"""Answers that are computed once for all clients."""
 
 
 def _live(path: Path) -> dict[str, Any]:
     folder = RunFolder.open(path)
     count = samples(folder)
     try:
-        return {"samples": count, "item": errors_item(course(preliminary(folder))), "why": ""}
+        return {"samples": count, "item": errors_item(curves_of(preliminary(folder))), "why": ""}
     except ErrormotionError as error:
         return {"samples": count, "item": None, "why": str(error)}
 
@@ -205,7 +205,7 @@ def _processes(runs: Path) -> list[dict[str, Any]]:
     found = processes.found(runs)
     shown = [each for each in found if each.alive] + [each for each in found if not each.alive][:SHOWN]
     busy = {name for each in found if each.alive for name in each.tests.values()}
-    others = measuring_elsewhere(runs, busy)
+    others = runs_of_other_processes(runs, busy)
     busy |= {each.name for each in others}
     own = [_process(runs, each, busy) | {"elsewhere": False} for each in shown]
     return [*(_process(runs, each, busy) | {"elsewhere": True} for each in others), *own]
@@ -221,7 +221,7 @@ def _process(runs: Path, each: Background, busy: set[str]) -> dict[str, Any]:
 
 
 def _status(path: Path) -> str:
-    """Return the state of a run; empty where its folder is gone."""
+    """Return the state of a run; empty if its folder is gone."""
     try:
         return str(RunFolder.open(path).data.get("status", ""))
     except RunError:
@@ -249,4 +249,4 @@ HANDLERS: tuple[tuple[str, type[Guarded]], ...] = (
     (r"/measure/processes\.json", Processes),
     (r"/measure/live\.json", Live),
 )
-"""Addresses of this page."""
+"""Routes of this page."""

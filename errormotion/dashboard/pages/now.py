@@ -1,4 +1,4 @@
-"""Now: what the instruments of the bench say, and the last hours."""
+"""Page Now: present readings of the instruments of the bench, and those of the last hours."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from errormotion.dashboard.watch import SPAN, Present, Watch
 from errormotion.kinematics.description import MachineDescription
 
 SPANS = (("10 min", 600), ("1 h", 3600), ("8 h", int(SPAN)))
-"""Lengths of the history that a reader chooses from, s."""
+"""Possible time spans of the history, s."""
 SHOWN = 8
-"""Curves that are chosen at first."""
+"""Number of curves that are selected initially."""
 _SENT: WeakKeyDictionary[Present, str] = WeakKeyDictionary()
 
 
 class _OfTheBench(Guarded):
     def watch(self) -> Watch:
-        """Return the watch of this server; there are no such pages without a bench."""
+        """Return the watch of this server; HTTPError 404 without a bench."""
         if self.context.watch is None:
             raise HTTPError(404, reason="The dashboard was started without a bench")
         return self.context.watch
 
 
 class Now(_OfTheBench):
-    """The page; its values come from `Values`."""
+    """The page; `Values` provides its values."""
 
     def get(self) -> None:
-        """Show the frame."""
+        """Send the page without values."""
         watch = self.watch()
         names = list(watch.units.items())
         groups: dict[str, list[str]] = {}
@@ -47,10 +47,10 @@ class Now(_OfTheBench):
 
 
 class Values(_OfTheBench):
-    """Everything that the bench says now, as JSON."""
+    """Present readings of the bench, as JSON."""
 
     def get(self) -> None:
-        """Send it; computed once for all clients that ask between two rows."""
+        """Send the readings; the document is computed once for all clients."""
         present = self.watch().present()
         if present not in _SENT:
             _SENT[present] = json.dumps(_plain(present), ensure_ascii=False)
@@ -59,34 +59,34 @@ class Values(_OfTheBench):
 
 
 class Figure(_OfTheBench):
-    """The axes of the history, as JSON for BokehJS; `History` fills them."""
+    """Axes of the history, as JSON for BokehJS; `History` provides their data."""
 
     async def get(self) -> None:
-        """Send axes for the quantities that are chosen."""
+        """Send axes for the selected quantities."""
         units, names = self.watch().units, self.get_query_arguments("name")
         chosen = {name: units[name] for name in dict.fromkeys(names) if name in units}
         if not chosen:
             raise HTTPError(400, reason="None of these quantities is known")
-        self.finish({"item": await self.apart(live_item, chosen)})
+        self.finish({"item": await self.in_thread(live_item, chosen)})
 
 
 class History(_OfTheBench):
-    """The last hours of some quantities, as JSON: reduced, with nulls where they are unknown."""
+    """Selected quantities over the last hours, as JSON: reduced, null if unknown."""
 
     async def get(self) -> None:
         """Send the curves."""
         watch, names = self.watch(), self.get_query_arguments("name")
-        text = self.word("span") or str(SPANS[0][1])
+        text = self.value("span") or str(SPANS[0][1])
         if text not in {str(span) for _, span in SPANS} or len(names) > len(watch.units):
             raise HTTPError(400, reason="Unknown span, or too many names")
         self.set_header("Content-Type", "application/json")
-        self.finish(await self.apart(_curves, watch, names, float(text)))
+        self.finish(await self.in_thread(_curves, watch, names, float(text)))
 
 
 def machine_outline(machine: MachineDescription | None) -> dict[str, Any] | None:
-    """Return what a drawing of a machine needs: travel of X, Y, Z in mm, axes that carry workpiece and tool, spindle.
+    """Return data for the drawing of a machine: travel of X, Y, Z in mm, axes of workpiece and tool side, spindle.
 
-    None without a description, or where the travel of one of these axes is not known.
+    None without a description, or if the travel of one of these axes is unknown.
     """
     if machine is None or any(axis not in machine.travel for axis in "XYZ"):
         return None
@@ -99,7 +99,7 @@ def machine_outline(machine: MachineDescription | None) -> dict[str, Any] | None
 
 
 def _curves(watch: Watch, names: list[str], seconds: float) -> str:
-    """Return the last seconds as a JSON document: times in ms since 1970, UTC, and values."""
+    """Return quantities over the last seconds as a JSON document: times in ms since 1970, UTC, and values."""
     found = {}
     for name, (times, values) in watch.history(names, seconds).items():
         y = [each if math.isfinite(each) else None for each in np.round(values, 6).tolist()]
@@ -108,7 +108,7 @@ def _curves(watch: Watch, names: list[str], seconds: float) -> str:
 
 
 def _plain(present: Present) -> dict[str, Any]:
-    """Return the present for a JSON document: NaN becomes null, a time ISO 8601."""
+    """Return the readings for a JSON document: NaN becomes null, times are in ISO 8601."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):

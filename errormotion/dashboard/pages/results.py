@@ -1,4 +1,4 @@
-"""Results: the table of runs, and one run with its report, its figure and its files."""
+"""Page Results: the table of runs, and one run with its report, figure and files."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ import xarray as xr
 from tornado.web import HTTPError
 
 from errormotion import datasets
-from errormotion.dashboard.course import Course, as_csv, course
+from errormotion.dashboard.cache import Cache, stamp
+from errormotion.dashboard.curves import CurveSet, as_csv, curves_of
 from errormotion.dashboard.figures import errors_item
-from errormotion.dashboard.kept import Kept, stamp
 from errormotion.dashboard.lab import Choice, figure_text
 from errormotion.dashboard.pages.page import POLICY, Guarded
 from errormotion.dashboard.space import Drawing, drawing, has_volume
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
-from errormotion.record.runs.entry import MOST_FIGURES
+from errormotion.record.runs.entry import MAX_FIGURES
 
 PAGE = 100
-"""Runs on one page of the table."""
+"""Number of runs on one page of the table."""
 CHUNK = 1 << 18
-"""Bytes that are sent at a time."""
+"""Size of the parts in which a file is sent, bytes."""
 SEND_TIMEOUT = 30.0
-"""Time within which a client takes a chunk, s."""
-FARTHEST = 20.0
-"""Coordinates of a functional point, m."""
+"""Time limit for the transfer of a chunk, s."""
+MAX_COORDINATE = 20.0
+"""Largest coordinate of a functional point, m."""
 REPORT_POLICY = (
     "sandbox allow-scripts allow-downloads; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "img-src data:; font-src data:; form-action 'none'; base-uri 'none'; frame-ancestors 'self'"
 )
-"""Of a report, on top of its own: it reaches neither the network nor the dashboard, whoever wrote the file."""
+"""Content security policy of a report: the file has access to neither the network nor the dashboard."""
 TYPES = {"report": "text/html; charset=utf-8", "run": "application/json", "log": "application/x-ndjson"}
 
 
@@ -44,10 +44,10 @@ class Results(Guarded):
     """The table of runs with filters."""
 
     async def get(self) -> None:
-        """Show the runs that fit."""
-        choice = Choice(**{each.name: self.word(each.name) for each in fields(Choice)})
-        table = await self.apart(self.context.lab.table, choice)
-        first = PAGE * (_whole(self.word("page") or "1", 1, 10**6) - 1)
+        """Show the runs that match the filters."""
+        choice = Choice(**{each.name: self.value(each.name) for each in fields(Choice)})
+        table = await self.in_thread(self.context.lab.table, choice)
+        first = PAGE * (_whole(self.value("page") or "1", 1, 10**6) - 1)
         kept = {name: value for name, value in asdict(choice).items() if value}
         last = max(1, math.ceil(len(table.rows) / PAGE))
         links = {number: "?" + urlencode({**kept, "page": number}) for number in range(1, last + 1)}
@@ -66,86 +66,90 @@ class Run(Guarded):
     """One run."""
 
     async def get(self) -> None:
-        """Show its figures of merit, its figure, its report and its files."""
-        key = self.word("run", 600)
-        entry = await self.apart(self.context.lab.entry, key)
+        """Show figures of merit, figure, report and files of a run."""
+        key = self.value("run", 600)
+        entry = await self.in_thread(self.context.lab.entry, key)
         files = self.context.lab.files(key)
-        shown = await self.apart(_stated, self.context.lab.file(key, "errors")) if "errors" in files else None
+        shown = await self.in_thread(_stated, self.context.lab.file(key, "errors")) if "errors" in files else None
         merit = entry.figures if entry.figures is not None or shown is None else shown["figures"]
         figures = [(each.name, *figure_text(each)) for each in merit or ()]
         self.show("run.html.j2", key=key, entry=entry, files=files, figures=figures, result=shown)
 
 
 class Figure(Guarded):
-    """The figure of a run, as JSON for BokehJS."""
+    """Figure of a run, as JSON for BokehJS."""
 
     async def get(self) -> None:
-        """Compute the errors at the functional point that is asked for, and draw them."""
-        found = await self.apart(_course, self.context.lab.file(self.word("run", 600), "errors"), *self.wanted())
+        """Send the figure of the errors at the functional point of the query."""
+        found = await self.in_thread(
+            _course, self.context.lab.file(self.value("run", 600), "errors"), *self.point_and_indices()
+        )
         freedoms = [text for text in self.get_query_arguments("freedom") if len(text) < 20]
-        item = await self.apart(errors_item, found, freedoms)
+        item = await self.in_thread(errors_item, found, freedoms)
         point = [1e3 * float(each) if math.isfinite(each) else None for each in found.point]
         self.finish({"item": item, "point": point})
 
-    def wanted(self) -> tuple[tuple[float, ...] | None, dict[str, int]]:
+    def point_and_indices(self) -> tuple[tuple[float, ...] | None, dict[str, int]]:
         """Return functional point (m) and indices of the query.
 
         Raises
         ------
         DatasetError
-            A coordinate or an index is no number.
+            A coordinate or an index is not a number.
         """
-        texts = [self.word(axis) for axis in "xyz"]
+        texts = [self.value(axis) for axis in "xyz"]
         point = None if not any(texts) else tuple(millimetres(text) for text in texts)
         others = [text.partition(":") for text in self.get_query_arguments("at")[:10]]
         return point, {dim: _whole(index, 0, 10**9) for dim, _, index in others}
 
 
 class Space(Figure):
-    """The errors of a volume in space, as a page for a frame."""
+    """Errors of a volume in space, as a page for a frame."""
 
     async def get(self) -> None:
-        """Draw the error vectors at the functional point that is asked for."""
-        found = await self.apart(_drawing, self.context.lab.file(self.word("run", 600), "errors"), *self.wanted())
+        """Send the drawing of the error vectors at the functional point of the query."""
+        found = await self.in_thread(
+            _drawing, self.context.lab.file(self.value("run", 600), "errors"), *self.point_and_indices()
+        )
         self.set_header("Content-Security-Policy", POLICY.replace("frame-ancestors 'none'", "frame-ancestors 'self'"))
         self.show("space.html.j2", found=found)
 
 
 class Values(Figure):
-    """The values of a run at a functional point, as comma-separated text."""
+    """Values of a run at a functional point, as comma-separated text."""
 
     async def get(self) -> None:
         """Send the table."""
-        key = self.word("run", 600)
-        found = await self.apart(_course, self.context.lab.file(key, "errors"), *self.wanted())
+        key = self.value("run", 600)
+        found = await self.in_thread(_course, self.context.lab.file(key, "errors"), *self.point_and_indices())
         self.set_header("Content-Type", "text/csv; charset=utf-8")
         self.set_header("Content-Disposition", f'attachment; filename="{_safe(key)}.csv"')
-        self.finish(await self.apart(as_csv, found))
+        self.finish(await self.in_thread(as_csv, found))
 
 
 class File(Guarded):
     """A file of a run folder."""
 
     async def get(self) -> None:
-        """Send it; a report is shown in a sandbox, everything else is saved."""
-        key, word = self.word("run", 600), self.word("file")
-        path = await self.apart(self.context.lab.file, key, word)
+        """Send the file; a report is shown in a sandbox, other files are downloaded."""
+        key, word = self.value("run", 600), self.value("file")
+        path = await self.in_thread(self.context.lab.file, key, word)
         self.set_header("Content-Type", TYPES.get(word, "application/octet-stream"))
-        if word == "report" and not self.word("save"):
+        if word == "report" and not self.value("save"):
             self.set_header("Content-Security-Policy", REPORT_POLICY)
         else:
             self.set_header("Content-Disposition", f'attachment; filename="{_safe(key)}-{_safe(path.name)}"')
         with path.open("rb") as file:
-            while chunk := await self.apart(file.read, CHUNK):
+            while chunk := await self.in_thread(file.read, CHUNK):
                 self.write(chunk)
                 try:
                     await asyncio.wait_for(self.flush(), SEND_TIMEOUT)
                 except TimeoutError:
-                    raise HTTPError(408, reason="The client does not take the file") from None
+                    raise HTTPError(408, reason="The client does not accept the file") from None
 
 
-LOADED: Kept[xr.Dataset] = Kept(6)
-"""Results that were asked for last, so that another functional point does not read the file again."""
+LOADED: Cache[xr.Dataset] = Cache(6)
+"""Results used last, so that a change of the functional point does not read the file again."""
 
 
 def loaded(path: Path) -> xr.Dataset:
@@ -154,7 +158,7 @@ def loaded(path: Path) -> xr.Dataset:
     Raises
     ------
     DatasetError
-        The file cannot be read, or holds no error dataset.
+        The file cannot be read, or is no error dataset.
     """
 
     def load() -> xr.Dataset:
@@ -165,8 +169,8 @@ def loaded(path: Path) -> xr.Dataset:
     return LOADED.get(stamp(path), load)
 
 
-def _course(path: Path, point: tuple[float, ...] | None, select: dict[str, int]) -> Course:
-    return course(loaded(path), point, select)
+def _course(path: Path, point: tuple[float, ...] | None, select: dict[str, int]) -> CurveSet:
+    return curves_of(loaded(path), point, select)
 
 
 def _drawing(path: Path, point: tuple[float, ...] | None, select: dict[str, int]) -> Drawing:
@@ -174,14 +178,14 @@ def _drawing(path: Path, point: tuple[float, ...] | None, select: dict[str, int]
 
 
 def _stated(path: Path) -> dict[str, Any]:
-    """Return what the page of a run says of its result: freedoms, functional point (mm), further dimensions, notes."""
+    """Return the result of a run for its page: freedoms, functional point (mm), further dimensions, notes."""
     ds = loaded(path)
-    found = course(ds)
+    found = curves_of(ds)
     names = [(each.freedom, each.name, each.unit) for each in found.curves]
     point = [f"{1e3 * each:.10g}" for each in found.point]
     others = {dim: size - 1 for dim, size in found.others.items()}
     return {
-        "figures": figures_of(ds)[:MOST_FIGURES],
+        "figures": figures_of(ds)[:MAX_FIGURES],
         "freedoms": names,
         "point": point,
         "movable": ds.attrs.get("component") != "beam",
@@ -193,18 +197,18 @@ def _stated(path: Path) -> dict[str, Any]:
 
 
 def millimetres(text: str) -> float:
-    """Return a coordinate of a functional point that a browser states in mm, m.
+    """Return a coordinate in m from a text in mm.
 
     Raises
     ------
     DatasetError
-        It is no number, or too far away.
+        The text is not a number, or the number is too large.
     """
     try:
         value = float(text) / 1e3
     except ValueError:
         value = math.nan
-    if not abs(value) <= FARTHEST:
+    if not abs(value) <= MAX_COORDINATE:
         raise DatasetError(f"functional point: expected three numbers in mm, as in 0, 0, -150; found {text[:40]!r}")
     return value
 
@@ -216,5 +220,5 @@ def _whole(text: str, low: int, high: int) -> int:
 
 
 def _safe(text: str) -> str:
-    """Return a name for a file that is safe in a header and on every system."""
+    """Return a file name that is safe in a header and on every system."""
     return "".join(each if each.isascii() and (each.isalnum() or each in "-_.") else "_" for each in text)[-150:]

@@ -1,4 +1,4 @@
-// The page "Compensate": asks for states every second and for curves every two. Text is only set as text.
+// The page "Compensate": requests states every second and curves every two. Text is only set as text.
 "use strict";
 
 const INTERVAL = 1000, CURVES = 2000; // ms
@@ -28,7 +28,7 @@ function stopButton(each) {
   return form;
 }
 
-function showStops(list) { // made anew only when something has changed, so that a button stays under the pointer
+function showStops(list) { // replaced only after a change, so that a button stays under the pointer
   const working = list.filter((each) => each.working && each.machine !== undefined);
   const key = JSON.stringify(working.map((each) => [each.key, each.state, each.stopping]));
   if (key === stops) return;
@@ -36,7 +36,7 @@ function showStops(list) { // made anew only when something has changed, so that
   byId("none").hidden = working.length > 0;
   byId("stops").replaceChildren(byId("none"), ...working.map((each) => {
     const bar = element("div", undefined, each.armed ? "at-work armed" : "at-work");
-    bar.append(element("strong", each.machine), element("span", each.armed ? "armed: offsets are written" : "shadow: nothing is written"), element("span", each.state, "said"));
+    bar.append(element("strong", each.machine), element("span", each.armed ? "armed: offsets are written" : "shadow mode: nothing is written"), element("span", each.state, "said"));
     bar.append(control ? stopButton(each) : element("span", `errormotion compensate stop RUNS/${each.key} ramps to zero`, "how"));
     return bar;
   }));
@@ -66,7 +66,7 @@ function alarms(found) {
   const { status, audit } = found, said = [];
   if (status.estop === true) said.push("Emergency stop of the machine");
   if (status.state === "fault") said.push(`Fault: ${status.cause}. The watchdog of the machine ramps its offset to zero.`);
-  if (found.late) said.push(`The command works, and has said nothing for ${number(found.late, 0)} s.`);
+  if (found.late) said.push(`The command is running, but has reported no state for ${number(found.late, 0)} s.`);
   if (!found.working && !status.ended) said.push("The command ended without an orderly stop. The watchdog of the machine ramps its offset to zero.");
   if (audit.broken) said.push(`Audit log: ${audit.broken}`);
   const key = said.join("\n");
@@ -88,7 +88,7 @@ function showChosen(found) {
   alarms(found);
   const minutes = Math.floor(status.elapsed / 60);
   const program = status.program ? `, program ${status.program}` : "";
-  byId("about").textContent = `${status.machine}: ${status.armed ? `armed, offsets are written by ${status.compensator}` : "shadow, nothing is written"}; ${found.working ? `at work for ${minutes} min` : "ended"}, ${clock(status.time)}${program}`;
+  byId("about").textContent = `${status.machine}: ${status.armed ? `armed, offsets are written by ${status.compensator}` : "shadow mode, nothing is written"}; ${found.working ? `running for ${minutes} min` : "ended"}, ${clock(status.time)}${program}`;
   for (const each of byId("states").children) {
     const here = each.dataset.state === status.state;
     each.className = here ? `here ${status.state}` : "";
@@ -108,7 +108,7 @@ function showChosen(found) {
   }));
   byId("zero").className = `cause-line ${found.zero ? "good" : ""}`;
   byId("zero").textContent = !status.armed ? "" : found.zero === null ? "The machine does not report the offset in effect."
-    : found.zero ? "✓ The machine reports an offset of zero." : status.stopping ? "Ramping: the machine has not reported zero yet." : "";
+    : found.zero ? "✓ The machine reports an offset of zero." : status.stopping ? "Ramping to zero: the machine has not reported an offset of zero yet." : "";
   byId("inputs").replaceChildren(...Object.entries(status.inputs).map(([input, value]) => {
     const [unit, factor] = UNITS[input] ?? ["°C", 1];
     const row = element("tr"), name = element("th", input);
@@ -122,7 +122,7 @@ function showChosen(found) {
   byId("limits").replaceChildren(...limits.flatMap(([name, value]) => [element("dt", name), element("dd", value)]));
   byId("chain").className = audit.broken ? "bad" : "good";
   byId("chain").textContent = audit.broken ? "✕ The chain of hashes is broken."
-    : audit.complete ? `✓ ${audit.entries} entries, the chain of hashes is unbroken.` : `${audit.entries} entries are checked so far.`;
+    : audit.complete ? `✓ ${audit.entries} entries, the chain of hashes is unbroken.` : `${audit.entries} entries checked so far.`;
   byId("hash").textContent = `Last hash ${audit.hash.slice(0, 16)}…, model ${audit.model.split(":").at(-1).slice(0, 16)}…, started ${audit.started}`;
   byId("log").replaceChildren(...found.rows.map((each) => {
     return cells(element("tr"), [[each.time.replace("T", " ").slice(0, 19), "time"], [each.what], [each.offset, "number"], [each.cause]]);
@@ -140,7 +140,7 @@ async function states() {
   } catch (error) {
     document.body.classList.add("lost");
     byId("alarms").dataset.key = "lost";
-    byId("alarms").replaceChildren(element("li", "The dashboard does not answer; what is shown is the last state. Compensations go on; Ctrl-C or the emergency stop of the machine end them."));
+    byId("alarms").replaceChildren(element("li", "The dashboard does not answer; the last known state is shown. Compensations continue; Ctrl-C in their terminal or the emergency stop of the machine ends them."));
   }
   setTimeout(states, INTERVAL);
 }
@@ -163,9 +163,9 @@ async function curves() {
   const own = ++asked;
   try {
     if (drawing) {
-      const question = new URLSearchParams(new FormData(form));
-      question.set("run", drawing);
-      const found = await answerOf(`/compensate/curves.json?${question}`);
+      const query = new URLSearchParams(new FormData(form));
+      query.set("run", drawing);
+      const found = await answerOf(`/compensate/curves.json?${query}`);
       if (own !== asked) return;
       await frame();
       for (const [axis, data] of Object.entries(found)) { // local time, as at the machine

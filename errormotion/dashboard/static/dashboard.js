@@ -1,20 +1,20 @@
-// Figures that follow a form: the server computes, BokehJS draws. Text from the server is only ever set as text.
+// Figures controlled by a form: the server computes, BokehJS draws. Text from the server is only set as text.
 "use strict";
 
-function questionOf(form) {
-  const question = new URLSearchParams();
+function queryOf(form) {
+  const query = new URLSearchParams();
   const home = [...form.querySelectorAll("[data-home]")].every((field) => field.value === field.dataset.home);
   for (const field of form.elements) {
     if (!field.name || (field.type === "checkbox" && !field.checked)) continue;
     if (field.dataset.home !== undefined) {
-      if (!home) question.append(field.name, field.value);
+      if (!home) query.append(field.name, field.value);
     } else if (field.dataset.dim !== undefined) {
-      question.append(field.name, `${field.dataset.dim}:${field.value}`);
+      query.append(field.name, `${field.dataset.dim}:${field.value}`);
     } else {
-      question.append(field.name, field.value);
+      query.append(field.name, field.value);
     }
   }
-  return question;
+  return query;
 }
 
 function follow(form) {
@@ -26,13 +26,13 @@ function follow(form) {
   async function draw() {
     const own = ++number;
     if (form.querySelector("[type=checkbox][name=freedom]") && !form.querySelector("[name=freedom]:checked")) {
-      note.textContent = "No freedom is chosen.";
+      note.textContent = "No freedom is selected.";
       return;
     }
-    const question = questionOf(form);
+    const query = queryOf(form);
     target.classList.add("waiting");
     try {
-      const answer = await fetch(`${form.dataset.figure}?${question}`, { headers: { Accept: "application/json" } });
+      const answer = await fetch(`${form.dataset.figure}?${query}`, { headers: { Accept: "application/json" } });
       const found = await answer.json();
       if (own !== number) return;
       if (!answer.ok) throw new Error(found.error);
@@ -45,8 +45,8 @@ function follow(form) {
       const place = (found.point || []).map((each) => each.toLocaleString("en", { maximumFractionDigits: 4 }));
       note.textContent = form.querySelector("[data-home]") && place.length && !found.point.includes(null) ? `At the functional point X ${place[0]}, Y ${place[1]}, Z ${place[2]} mm.` : "";
       const space = document.getElementById("space");
-      if (space && own > 1) space.src = `${space.dataset.base}?${question}`;
-      if (link) link.href = `${link.dataset.base}?${question}`;
+      if (space && own > 1) space.src = `${space.dataset.base}?${query}`;
+      if (link) link.href = `${link.dataset.base}?${query}`;
       target.dataset.drawn = String(own);
     } catch (error) {
       if (own === number) note.textContent = error instanceof TypeError ? "The dashboard does not answer." : error.message;

@@ -1,4 +1,4 @@
-// The page "Measure": form and text of a campaign are made by the server from one text. Text is only set as text.
+// The page "Measure": the server makes the form from the text of a campaign. Text is only set as text.
 "use strict";
 
 const INTERVAL = 1000, LIVE_INTERVAL = 3000; // ms
@@ -42,7 +42,7 @@ function fieldOf(each, number) {
   return row;
 }
 
-function fill(each) { // values and messages, in the fields that are there
+function fill(each) { // values and messages of the existing fields
   const input = document.querySelector(`[data-place="${CSS.escape(keyOf(each.place))}"]`);
   if (input !== document.activeElement || input.tagName === "SELECT" || !each.mistakes.length) input.value = each.text;
   const wrong = byId(`${input.id}-wrong`), message = each.mistakes.join("\n");
@@ -114,11 +114,11 @@ async function check(change) {
   }
 }
 
-let queue = Promise.resolve(); // fields change one after the other, each the text of the one before
+let queue = Promise.resolve(); // changes of fields are applied one after the other, each to the text after the previous one
 function changed(place, value) {
   queue = queue.then(() => check({ place, value }));
 }
-function tests(change) { // added or removed; the form is made anew, and the new test is shown
+function tests(change) { // add or remove a test; the form is replaced, and the new test gets the focus
   queue = queue.then(async () => {
     await check(change);
     if (change.add) byId("form").lastElementChild?.querySelector("input, select")?.focus();
@@ -151,7 +151,7 @@ function plan(test) {
   const card = element("section", undefined, "planned"), beside = element("div", undefined, "beside"), tables = element("div");
   card.append(element("h3", `${test.test} (${test.method})`), element("p", test.headline));
   if (test.limits.length) tables.append(element("h4", "Motions"), table(["", "planned", "limits"], test.limits));
-  if (test.expected.length) tables.append(element("h4", "Largest uncertainty to expect"), table(["", "U (k=2)", "unit"], test.expected));
+  if (test.expected.length) tables.append(element("h4", "Largest expected uncertainty"), table(["", "U (k=2)", "unit"], test.expected));
   beside.append(tables);
   if (test.picture) beside.append(Object.assign(element("img"), { src: test.picture, alt: `Path of ${test.test} in three views, and the spindle speed over time; the extent is in the table` }));
   card.append(beside, ...test.notes.map((each) => element("p", each, "note")));
@@ -205,7 +205,7 @@ if (control) {
 
 // Processes
 
-const WORDS = { finished: "✓ finished", interrupted: "■ stopped", failed: "✕ failed", killed: "✕ ended without a word" };
+const WORDS = { finished: "✓ finished", interrupted: "■ stopped", failed: "✕ failed", killed: "✕ ended without a report" };
 const cards = new Map();
 
 async function command(path, body, pressed) {
@@ -220,7 +220,7 @@ async function command(path, body, pressed) {
   pressed.disabled = false;
 }
 
-function process(each) { // made anew only when something but the progress has changed, so that buttons keep the focus
+function process(each) { // replaced only if more than the progress has changed, so that buttons keep the focus
   const { done, expected, note, ...rest } = each, key = JSON.stringify(rest);
   let card = cards.get(each.name);
   if (!card || card.dataset.key !== key) {
@@ -232,7 +232,7 @@ function process(each) { // made anew only when something but the progress has c
     made.append(element("p", each.alive ? `${where}${each.stopping ? "stopping" : each.stage}` : WORDS[each.ended], `state ${each.ended || "live"}`));
     if (each.alive) {
       const bar = element("progress");
-      bar.setAttribute("aria-label", "Part of this stage that is done");
+      bar.setAttribute("aria-label", "Progress of this stage");
       made.append(bar, element("p", "", "note course"));
       if (each.announcements.length) made.append(...each.announcements.map((line) => element("p", line, "note")));
     } else if (each.message) {
@@ -252,7 +252,7 @@ function process(each) { // made anew only when something but the progress has c
       link.href = `/run?${new URLSearchParams({ run: test.run })}`;
       links.append(link, " ");
     }
-    if (each.elsewhere) links.append(element("span", "It was started in a terminal or another program: Ctrl-C there stops it.", "note"));
+    if (each.elsewhere) links.append(element("span", "It was started in a terminal or by another program; stop it there with Ctrl-C.", "note"));
     else if (control && each.alive) links.append(button("Stop", (event) => command("/measure/stop", { process: each.name }, event.target), "stop"));
     if (control && each.resume) links.append(button("Resume", (event) => command("/measure/resume", { run: each.resume }, event.target)));
     if (links.childNodes.length) made.append(links);
@@ -268,7 +268,7 @@ function process(each) { // made anew only when something but the progress has c
   return card;
 }
 
-let running = null, reveal = ""; // the run that measures, and the process that was started here just now
+let running = null, reveal = ""; // the run in progress, and the process that was just started on this page
 
 async function processes() {
   try {
@@ -297,7 +297,7 @@ async function processes() {
 
 let drawn = "", views = null;
 
-async function live() { // the errors of the run that measures; the pause grows with the time that they take
+async function live() { // the errors of the run in progress; the interval grows with the time of the computation
   const began = performance.now();
   if (running) {
     try {

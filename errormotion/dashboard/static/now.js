@@ -1,4 +1,4 @@
-// The page "Now": asks for values every second and for curves when they have changed visibly. Text is only set as text.
+// The page "Now": requests values every second, and curves at an interval that depends on their span. Text is only set as text.
 "use strict";
 
 const INTERVAL = 1000; // ms
@@ -12,12 +12,12 @@ function show(found) {
     : !found.running ? "The monitor has stopped."
     : found.lent ? `${clock(found.time)}, ${found.rows} samples${found.run ? ` in ${found.run}` : ""}`
     : found.rows ? `${clock(found.time)}, ${found.rows} rows in ${found.run}` : "Waiting for the first readings.";
-  byId("lent").textContent = found.lent && `${found.lent} This page reads the instruments again when it ends.`;
+  byId("lent").textContent = found.lent && `${found.lent} This page reads the instruments again after its end.`;
   byId("lent").hidden = !found.lent;
   byId("alarms").replaceChildren(...found.alarms.map((text) => element("li", `Alarm: ${text}`)));
   byId("instruments").replaceChildren(...found.instruments.map((each) => {
     const tile = element("li", undefined, each.state);
-    const words = { answers: "● answers", waiting: "○ waiting", silent: `■ silent since ${clock(each.since)}`, lent: `◐ lent since ${clock(each.since)}` };
+    const words = { answers: "● answers", waiting: "○ waiting", silent: `■ no answer since ${clock(each.since)}`, lent: `◐ used by another program since ${clock(each.since)}` };
     tile.append(element("strong", each.name), element("span", words[each.state], "said"), element("small", each.model || each.kind));
     if (each.why) tile.append(element("small", each.why));
     if (each.rate !== null) tile.append(element("small", `${number(each.rate, each.rate < 10 ? 2 : 0)} readings/s`, "rate"));
@@ -52,7 +52,7 @@ function show(found) {
   }));
 }
 
-// Cividis, which every colour vision tells apart, from cold to warm.
+// Cividis, a colour map that is distinguishable with every colour vision, from cold to warm.
 const SHADES = ["#00224e", "#2a3f6d", "#575d6d", "#7d7c78", "#a69c75", "#d3bf66", "#fee838"];
 const WIDTH = 520, HEIGHT = 260, MARGIN = 46;
 
@@ -65,7 +65,7 @@ function shape(name, attributes, text) {
 
 const MACHINE = JSON.parse(byId("map").dataset.machine);
 
-function bodies([h, v], position) { // bed, table, frame and head in one view, mm; only a scheme: sizes follow the travel
+function bodies([h, v], position) { // bed, table, frame and head in one view, mm; a schematic whose sizes follow from the travel
   if (!MACHINE) return [];
   const [[h0, h1], [v0, v1]] = [MACHINE.travel[h], MACHINE.travel[v]], size = 0.16 * Math.max(h1 - h0, v1 - v0);
   const at = (k, low, high) => position[k] ?? (low + high) / 2;
@@ -83,10 +83,10 @@ function bodies([h, v], position) { // bed, table, frame and head in one view, m
   ];
 }
 
-// Where texts of a drawing go: boxes [left, top, right, bottom] in its units. A text takes one of the first of its places,
-// and rather one that covers no edge; a place over a text or a circle is none.
+// Positions of texts in a drawing: boxes [left, top, right, bottom] in its units. A text takes one of its first positions,
+// preferably one that covers no edge; a position over another text or a circle is not allowed.
 const INK = document.createElement("canvas").getContext("2d");
-const UP = 11, DOWN = 4; // of a line of text, from its base
+const UP = 11, DOWN = 4; // extent of a line of text above and below its baseline
 
 class Room {
   constructor(width, height, edges) {
@@ -104,7 +104,7 @@ class Room {
     return this.edges.filter((edge) => !apart(edge) && !inside(edge)).length;
   }
 
-  place(text, starts) { // starts of the base line, the best first; null where none is free
+  place(text, starts) { // starts of the baseline, the best first; null if no position is free
     INK.font = getComputedStyle(byId("map")).font.replace(/[\d.]+px/, "12.5px");
     const width = INK.measureText(text).width + 4, most = starts(width);
     const boxes = most.map(([x, y]) => [x - 2, y - UP, x + width - 2, y + DOWN]), costs = boxes.map((box, k) => this.cost(box) + k / 10);
@@ -115,7 +115,7 @@ class Room {
   }
 }
 
-function inBody([left, top, right, bottom]) { // inside from the top down, then beside it
+function inBody([left, top, right, bottom]) { // inside from the top down, then beside the body
   return (width) => {
     const rows = [];
     for (let y = top + UP + 3; y + DOWN < bottom; y += 12) rows.push(y);
@@ -127,7 +127,7 @@ function inBody([left, top, right, bottom]) { // inside from the top down, then 
   };
 }
 
-function atSensor([x, y]) { // beside it, then below and above, then further away
+function atSensor([x, y]) { // beside the circle, then below and above, then further away
   return (width) => {
     const sides = (by) => [[x + 13, y + DOWN + by], [x - 11 - width, y + DOWN + by]];
     const further = Array.from({ length: 12 }, (_, k) => 8 * (k + 1)).flatMap((by) => [...sides(by), ...sides(-by)]);
@@ -166,7 +166,7 @@ function view(sensors, [h, v], low, high, position) { // one view of the machine
     const circle = shape("circle", { cx, cy, r: 8, fill: shade }), whole = room.place(text, atSensor(places[k]));
     const start = whole ?? room.place(value, atSensor(places[k]));
     circle.append(shape("title", {}, `${each.name} ${value}`));
-    if (start && Math.abs(start[1] - cy) > 30) { // a line to a label that is not at its circle
+    if (start && Math.abs(start[1] - cy) > 30) { // a line to a label that is not beside its circle
       svg.append(shape("line", { x1: cx, y1: cy, x2: start[0] > cx ? start[0] - 3 : cx - 13, y2: start[1] - DOWN, class: "lead" }));
     }
     svg.append(circle);
@@ -188,9 +188,9 @@ function map(temperatures, position) {
   const views = [[0, 2], [1, 2]].map((axes) => view(sensors, axes, low, high, position));
   byId("map").replaceChildren(...views);
   const named = Math.min(...views.map((each) => each.querySelectorAll(".sensor").length));
-  const scheme = MACHINE ? " A scheme of the machine: the dashed frame is the travel, the head is where the axes are." : "";
-  const crowded = named < sensors.length ? " Not every sensor has room for its name: the pointer on a circle shows it." : "";
-  byId("map-note").textContent = (known.length ? `Dark is ${number(low, 1)} °C, bright ${number(Math.max(high, low + 0.5), 1)} °C; white is unknown.` : sensors.length ? "No temperature is known." : "No sensor has a place in the bench file.") + scheme + crowded;
+  const scheme = MACHINE ? " Schematic of the machine: the dashed frame is the travel, the head is at the present position of the axes." : "";
+  const crowded = named < sensors.length ? " Names without enough space are shown when the pointer is on the circle." : "";
+  byId("map-note").textContent = (known.length ? `Dark is ${number(low, 1)} °C, bright ${number(Math.max(high, low + 0.5), 1)} °C; white is unknown.` : sensors.length ? "All temperatures are unknown." : "The bench file states no positions of sensors.") + scheme + crowded;
 }
 
 async function values() {
@@ -199,16 +199,16 @@ async function values() {
     document.body.classList.remove("lost");
   } catch (error) {
     document.body.classList.add("lost");
-    byId("clock").textContent = "The dashboard does not answer; the values below are the last ones.";
+    byId("clock").textContent = "The dashboard does not answer; the last known values are shown.";
   }
   setTimeout(values, INTERVAL);
 }
 
 const form = byId("history");
-const PAUSES = { 600: 2000, 3600: 5000, 28800: 20000 }; // ms between curves, by span
+const INTERVALS = { 600: 2000, 3600: 5000, 28800: 20000 }; // ms between curves, by span
 let drawn = null, asked = 0, timer = 0;
 
-async function frame(names) { // the axes, without data; drawn anew only when other quantities are chosen
+async function frame(names) { // the axes without data; replaced only if other quantities are selected
   const key = names.join("\n");
   if (drawn && drawn.key === key) return;
   const found = await answerOf(`/now/figure.json?${new URLSearchParams(names.map((name) => ["name", name]))}`);
@@ -225,13 +225,13 @@ async function frame(names) { // the axes, without data; drawn anew only when ot
 
 async function curves() {
   clearTimeout(timer);
-  const question = new URLSearchParams(new FormData(form));
-  const names = question.getAll("name"), own = ++asked;
+  const query = new URLSearchParams(new FormData(form));
+  const names = query.getAll("name"), own = ++asked;
   byId("curves").hidden = !names.length;
-  byId("history-note").textContent = names.length ? "" : "Nothing is chosen.";
+  byId("history-note").textContent = names.length ? "" : "No quantity is selected.";
   try {
     if (names.length) {
-      const found = await answerOf(`/now/history.json?${question}`);
+      const found = await answerOf(`/now/history.json?${query}`);
       if (own !== asked) return;
       await frame(names);
       for (const [name, curve] of Object.entries(found)) { // local time, as at the machine
@@ -243,7 +243,7 @@ async function curves() {
   } catch (error) {
     byId("history-note").textContent = error.name === "Error" ? error.message : "The dashboard does not answer.";
   }
-  if (own === asked) timer = setTimeout(curves, PAUSES[question.get("span")]);
+  if (own === asked) timer = setTimeout(curves, INTERVALS[query.get("span")]);
 }
 
 form.addEventListener("input", curves);

@@ -1,4 +1,4 @@
-// What the scripts of the pages share. Figures have larger text and height on large screens, as the page has by its style.
+// Shared functions of the pages. On large screens figures have larger text and height, as pages have by their style.
 "use strict";
 
 const byId = (id) => document.getElementById(id);
@@ -10,8 +10,8 @@ function element(name, text, className) {
   return made;
 }
 
-// Ask the server; with a body, post it. A 403 leads to the login, since the dashboard may have been started again with
-// another token; not with stay, where the page holds what a person has written.
+// Send a request to the server; with a body by POST. A status of 403 leads to the login, since the dashboard may have been
+// restarted with another token; not with stay, if the page contains input of the user.
 async function answerOf(path, { body, limit = 10000, stay = false } = {}) {
   const options = { headers: { Accept: "application/json" }, signal: limit ? AbortSignal.timeout(limit) : undefined };
   if (body !== undefined) {
@@ -32,7 +32,7 @@ async function answerOf(path, { body, limit = 10000, stay = false } = {}) {
 
 const LARGE = matchMedia("(min-width: 2600px)").matches;
 
-function sized(item) { // of a figure for BokehJS, before it is drawn
+function sized(item) { // adapt the size of a figure for BokehJS before it is drawn
   if (!LARGE) return item;
   return JSON.parse(JSON.stringify(item), (key, value) => {
     if (key.endsWith("font_size") && /^\d+px$/.test(value)) return `${Math.round(1.55 * parseInt(value, 10))}px`;

@@ -1,1 +1,1 @@
-"""The runs of one or more folders: what each states, their index, selection, and decisions on their tolerances."""
+"""The runs of one or more folders: entries, index, selection, and decisions on tolerances."""

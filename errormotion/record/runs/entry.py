@@ -1,4 +1,4 @@
-"""One run in the record: what its ``run.json`` states, bounded and printable."""
+"""One run in the record: the content of its ``run.json``, with printable texts of limited length."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 
 SCHEMA = "errormotion.run/1"
-LARGEST_FILE = 16 << 20
-"""Bytes of a run.json that are read."""
-LONGEST_TEXT = 200
-"""Characters of a text that are kept."""
-MOST_FIGURES = 200
-"""Figures of merit that are kept of a run."""
+MAX_FILE = 16 << 20
+"""Largest size of a ``run.json``, bytes."""
+MAX_TEXT = 200
+"""Longest text, characters."""
+MAX_FIGURES = 200
+"""Largest number of figures of merit of a run."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What one run states.
+    """Entry of one run.
 
     Attributes
     ----------
@@ -38,15 +38,15 @@ class Entry:
     machine, test, method, campaign, status : str
         Empty if unknown.
     errors : str
-        Path of the error dataset in the folder; empty where there is none.
+        Path of the error dataset in the folder; empty without errors.
     figures : tuple of FigureOfMerit or None
-        Figures of merit, SI; None if they are in the error dataset only, and were not read yet.
+        Figures of merit, SI; None if they are in the error dataset only and were not read yet.
     verdict : str
         Decision on the tolerances; empty without tolerances.
     notes : tuple of Event
-        What people noted on the run.
+        Notes on the run.
     damaged_notes : tuple of str
-        Lines of its notes that cannot be read, one sentence each.
+        A sentence for each note that cannot be read.
     """
 
     folder: str
@@ -73,8 +73,8 @@ class Entry:
         return self.figures is None and bool(self.errors)
 
     def with_figures(self, figures: list[FigureOfMerit]) -> Entry:
-        """Return the entry with figures that were read from its error dataset."""
-        return replace(self, figures=tuple(figures[:MOST_FIGURES]))
+        """Return the entry with figures from its error dataset."""
+        return replace(self, figures=tuple(figures[:MAX_FIGURES]))
 
     def plain(self) -> dict[str, Any]:
         """Return the entry for a JSON file."""
@@ -84,7 +84,7 @@ class Entry:
 
 
 def read_entry(folder: Path) -> Entry:
-    """Read what a run folder states.
+    """Read the entry of a run folder.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def read_entry(folder: Path) -> Entry:
     """
     file = folder / "run.json"
     try:
-        raw = read_bytes(file, LARGEST_FILE)
+        raw = read_bytes(file, MAX_FILE)
     except OSError as error:
         raise RunError(f"{file}: cannot be read: {error.strerror}") from error
     try:
@@ -102,7 +102,7 @@ def read_entry(folder: Path) -> Entry:
         raise RunError(f"{file}: is not valid JSON ({error})") from error
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         found = data.get("schema") if isinstance(data, dict) else type(data).__name__
-        raise RunError(f"{file}: expected schema '{SCHEMA}'; found {str(found)[:LONGEST_TEXT]!r}")
+        raise RunError(f"{file}: expected schema '{SCHEMA}'; found {str(found)[:MAX_TEXT]!r}")
     return Entry(
         folder.name,
         _text(data.get("created")),
@@ -139,11 +139,11 @@ def from_plain(data: Any) -> Entry | None:
 
 
 def figures_from(data: Any) -> tuple[FigureOfMerit, ...] | None:
-    """Return the figures of a JSON file; None where there are none, or damaged ones."""
+    """Return the figures of a JSON file; None if they are missing or damaged."""
     if not isinstance(data, list):
         return None
     found = []
-    for entry in data[:MOST_FIGURES]:
+    for entry in data[:MAX_FIGURES]:
         if not isinstance(entry, dict):
             return None
         limit = _number(entry.get("limit"))
@@ -175,13 +175,13 @@ def _text(value: Any, key: str = "") -> str:
         value = value.get(key) if isinstance(value, Mapping) else None
     if not isinstance(value, str):
         return ""
-    text = value[:LONGEST_TEXT]
+    text = value[:MAX_TEXT]
     return text if text.isprintable() else "".join(each if each.isprintable() else "?" for each in text)
 
 
 def _inside(value: Any) -> str:
-    """Return a path that stays in the run folder; empty for any other."""
-    if not isinstance(value, str) or not value or "\0" in value or len(value) > LONGEST_TEXT:
+    """Return a path inside the run folder; empty for any other path."""
+    if not isinstance(value, str) or not value or "\0" in value or len(value) > MAX_TEXT:
         return ""
     path = PurePosixPath(value.replace("\\", "/"))
     return "" if path.is_absolute() or ".." in path.parts or ":" in path.parts[0] else str(path)

@@ -1,7 +1,7 @@
-"""The index of a folder of runs: what its ``run.json`` files state, kept for the next call.
+"""The index of a folder of runs: a cache of the entries of its runs.
 
-The index is never the truth. An entry counts only while time of change and size of its ``run.json`` and of its notes
-are those that it was read from; a missing, damaged or unwritable index costs time and nothing else.
+An entry is valid only while modification time and size of its ``run.json`` and of its notes are unchanged. A missing,
+damaged or read-only index only costs time.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from errormotion.record.runs.entry import Entry, from_plain
 
 FILE = ".errormotion-index.json"
 SCHEMA = "errormotion.index/1"
-LARGEST = 256 << 20
-"""Bytes of an index that is read."""
+MAX_SIZE = 256 << 20
+"""Largest size of an index, bytes."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """Time of change, ns, and size, bytes, of a ``run.json`` and of the notes beside it; 0 where there are none."""
+    """Modification time, ns, and size, bytes, of a ``run.json`` and of the notes beside it; 0 without notes."""
 
     changed: int
     size: int
@@ -36,19 +36,19 @@ class Stamp:
 
 
 STAMP = tuple(field.name for field in fields(Stamp))
-Kept = dict[str, tuple[Stamp, Entry]]
+Entries = dict[str, tuple[Stamp, Entry]]
 
 
-def load(folder: Path) -> Kept:
+def load(folder: Path) -> Entries:
     """Return the entries of an index with their stamps, by name of the run folder; empty if it cannot be used."""
     file = folder / FILE
     try:
-        data = json.loads(read_bytes(file, LARGEST))
+        data = json.loads(read_bytes(file, MAX_SIZE))
     except (OSError, ValueError, RecursionError):
         return {}
     if not isinstance(data, dict) or data.get("schema") != SCHEMA or not isinstance(data.get("runs"), list):
         return {}
-    kept: Kept = {}
+    kept: Entries = {}
     for each in data["runs"]:
         entry = from_plain(each)
         numbers = [each.get(name) for name in STAMP] if entry is not None else []
@@ -58,7 +58,7 @@ def load(folder: Path) -> Kept:
 
 
 def save(folder: Path, kept: Mapping[str, tuple[Stamp, Entry]]) -> None:
-    """Write an index in one step; where the folder cannot be written there is none."""
+    """Write an index by a rename; without write permission nothing is written."""
     runs = [{**entry.plain(), **asdict(stamp)} for stamp, entry in kept.values()]
     part = folder / f"{FILE}.{os.getpid()}.part"
     try:

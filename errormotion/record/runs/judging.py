@@ -1,4 +1,4 @@
-"""Decisions on the tolerances of runs in the record, with other limits than those that the runs state."""
+"""Decisions on the tolerances of runs in the record, with limits other than those of the runs."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from errormotion.record.runs.entry import Entry
 from errormotion.tolerances.conformity import Conformity, judge, judge_figures
 from errormotion.tolerances.table import Tolerances
 
-MOST_READ = 1000
-"""Error datasets that one call opens, the newest first; limits of freedoms need them."""
+MAX_READ = 1000
+"""Largest number of error datasets that one call reads, newest first; limits of freedoms need them."""
 
 
 def judge_runs(runs: Sequence[tuple[Path, Entry]], tolerances: Tolerances) -> list[Conformity | None]:
     """Return the decision on each run, newest first; None for a run without errors.
 
-    A run whose error dataset cannot be read, or is beyond MOST_READ, is not decided; ``failure`` states why.
+    The decision on a run whose error dataset cannot be read, or is beyond `MAX_READ`, is open; ``failure`` states why.
     """
     found = list[Conformity | None]()
     read = 0
@@ -29,7 +29,7 @@ def judge_runs(runs: Sequence[tuple[Path, Entry]], tolerances: Tolerances) -> li
             found.append(judge_figures(entry.figures, tolerances))
         else:
             read += 1
-            found.append(_of_dataset(path / entry.errors, entry, tolerances, read > MOST_READ))
+            found.append(_of_dataset(path / entry.errors, entry, tolerances, read > MAX_READ))
     return found
 
 
@@ -38,7 +38,7 @@ def _of_dataset(file: Path, entry: Entry, tolerances: Tolerances, too_many: bool
 
     stated = judge_figures(entry.figures or (), tolerances)
     if too_many:
-        return replace(stated, unused=(), failure=f"only {MOST_READ} error datasets are read; select runs with --since")
+        return replace(stated, unused=(), failure=f"only {MAX_READ} error datasets are read; select runs with --since")
     try:
         return judge(datasets.load(file), tolerances)
     except ErrormotionError as error:

@@ -1,4 +1,4 @@
-"""Every run of one or more folders, newest first, and a selection of them."""
+"""Listing and selection of the runs of one or more folders."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from errormotion.record.runs import index
 from errormotion.record.runs.entry import Entry, read_entry
 from errormotion.record.runs.index import Stamp
 
-DEEPEST = 3
-"""Folders between the given one and a run folder, at most."""
-MOST_RUNS = 200_000
-"""Run folders of one call."""
-MOST_READ = 100
-"""Error datasets that one call opens, for runs whose run.json has no figures of merit."""
+MAX_DEPTH = 3
+"""Largest depth of a run folder below the given folder."""
+MAX_RUNS = 200_000
+"""Largest number of run folders of one call."""
+MAX_READ = 100
+"""Largest number of error datasets that one call reads, for runs without figures of merit in ``run.json``."""
 SETTLING_TIME = 2_000_000_000
-"""A file that was changed less than this before it was read may change again within its time stamp, ns."""
+"""Age from which a modification time is reliable, ns: a younger file may change again within the same time stamp."""
 
 
 @dataclass
 class Folder:
-    """One folder of runs: what its run folders state, and what could not be read."""
+    """One folder of runs: the entries of its runs, and the runs that could not be read."""
 
     path: Path
     entries: dict[str, Entry] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
-    _kept: index.Kept = field(default_factory=dict)
+    _kept: index.Entries = field(default_factory=dict)
     _stale: bool = False
 
     def read(self, names: Iterable[str], whole: bool) -> None:
-        """Read the run folders of these names, those that have not changed from the index.
+        """Read the run folders of these names; unchanged ones are taken from the index.
 
-        ``whole``: these are all run folders; the index forgets others.
+        ``whole`` states that these are all run folders; others are removed from the index.
         """
         known, now = index.load(self.path), time.time_ns()
         self._kept = {} if whole else dict(known)
@@ -68,7 +68,7 @@ class Folder:
             self._stale = True
 
     def keep(self) -> None:
-        """Write the index where it has changed."""
+        """Write the index if it has changed."""
         if self._stale:
             index.save(self.path, self._kept)
             self._stale = False
@@ -90,8 +90,8 @@ class Note:
 class Listing:
     """Runs, newest first, with their paths, and the notes on them and on their machines, oldest first.
 
-    ``skipped`` states for each run folder that could not be read the reason, ``waiting`` how many runs have figures
-    of merit that were not read yet, ``undated`` how many were left out because their time is unknown.
+    ``skipped`` states the reason for each run folder that could not be read, ``waiting`` the number of runs whose
+    figures of merit were not read yet, ``undated`` the number of runs left out because their time is unknown.
     """
 
     runs: tuple[tuple[Path, Entry], ...]
@@ -118,14 +118,14 @@ def list_runs(
     paths : sequence of Path
         Run folders, folders of runs, or folders of those.
     machine, method, test : str, optional
-        Only runs of this machine, of this method, or with this name; upper and lower case are the same.
+        Only runs of this machine, this method or this test; upper and lower case are equivalent.
     since : datetime, optional
-        Only runs that were created at this time or later; without a time zone it is UTC.
+        Only runs created at this time or later; without a time zone it is in UTC.
 
     Raises
     ------
     RunError
-        A path does not exist, or holds more than MOST_RUNS runs.
+        A path does not exist, or contains more than `MAX_RUNS` runs.
     """
     folders = []
     for path, (names, whole) in _found(paths).items():
@@ -165,16 +165,16 @@ def _notes(
     machine: str | None,
     start: datetime | None,
 ) -> tuple[tuple[Note, ...], list[str]]:
-    """Return the notes on the chosen runs and on machines, and a sentence for each that cannot be read."""
+    """Return the notes on the chosen runs and on machines, and a sentence for each unreadable note."""
     found = [
         Note(events.instant(each.at) or entry.time, entry.machine, entry.folder, each.text, each.by, each.noted)
         for _, entry in chosen
         for each in entry.notes
     ]
     damaged: list[str] = []
-    places = {folder.path for folder in folders} | {path.resolve() for path in paths}
-    for place in sorted(place for place in places if not (place / "run.json").exists()):
-        made, wrong = events.read(place)
+    noted = {folder.path for folder in folders} | {path.resolve() for path in paths}
+    for path in sorted(path for path in noted if not (path / "run.json").exists()):
+        made, wrong = events.read(path)
         damaged += wrong
         found += [
             Note(events.instant(each.at), each.machine, "", each.text, each.by, each.noted)
@@ -187,7 +187,7 @@ def _notes(
 
 
 def _stamp(folder: str) -> Stamp:
-    """Return times of change and sizes of the files of a run that an entry is read from."""
+    """Return modification times and sizes of the files from which an entry is read."""
     status = os.stat(os.path.join(folder, "run.json"))
     try:
         notes = os.stat(os.path.join(folder, events.FILE))
@@ -205,10 +205,10 @@ def _same(wanted: str | None, found: str) -> bool:
 
 
 def _complete(chosen: Iterable[tuple[Folder, Entry]]) -> int:
-    """Read figures of merit from error datasets, MOST_READ at most; return how many runs still lack theirs."""
+    """Read figures of merit from at most `MAX_READ` error datasets; return how many runs are still without figures."""
     lacking = [(folder, entry) for folder, entry in chosen if entry.lacks_figures]
-    for folder, entry in lacking[:MOST_READ]:
-        from errormotion import datasets  # 0.5 s to load: only where a dataset is opened
+    for folder, entry in lacking[:MAX_READ]:
+        from errormotion import datasets  # takes 0.5 s to import
         from errormotion.datasets.results.merit import figures_of
 
         try:
@@ -218,24 +218,24 @@ def _complete(chosen: Iterable[tuple[Folder, Entry]]) -> int:
             kind = "" if isinstance(error, ErrormotionError) else f"{type(error).__name__}: "
             name = f"{entry.folder} (figures)"
             folder.skipped[name] = f"{folder.path / entry.folder}: figures of merit cannot be read: {kind}{error}"
-    return max(0, len(lacking) - MOST_READ)
+    return max(0, len(lacking) - MAX_READ)
 
 
 def _found(paths: Sequence[Path]) -> dict[Path, tuple[list[str], bool]]:
-    """Return the folders of runs below paths with the names of their run folders, and whether these are all of them."""
+    """Return the folders of runs below paths, the names of their run folders, and whether these are all run folders."""
     found: dict[Path, dict[str, None]] = {}
     whole = set()
     count = 0
     for path in paths:
         if not path.is_dir():
-            raise RunError(f"{path}: expected a run folder, or a folder of runs; there is no such folder")
+            raise RunError(f"{path}: no such folder; expected a run folder or a folder of runs")
         single = (path / "run.json").exists()
         for parent, name in (
-            [(path.resolve().parent, path.resolve().name)] if single else _walk(path.resolve(), DEEPEST)
+            [(path.resolve().parent, path.resolve().name)] if single else _walk(path.resolve(), MAX_DEPTH)
         ):
             count += 1
-            if count > MOST_RUNS:
-                raise RunError(f"{path}: expected at most {MOST_RUNS} runs; give a folder with fewer")
+            if count > MAX_RUNS:
+                raise RunError(f"{path}: expected at most {MAX_RUNS} runs; choose a folder with fewer runs")
             found.setdefault(parent, {})[name] = None
             if not single:
                 whole.add(parent)

@@ -1,4 +1,4 @@
-"""A lab's own plugins in a distribution of their own: a counter, and a method that records what it counts.
+"""Plugins of a laboratory in a separate distribution: a counter, and a method that records its counts.
 
 Sample i is i micrometres, so every sample that is lost, doubled or out of place shows.
 """

@@ -1,4 +1,4 @@
-"""What may be written to a machine: never beyond limit or slew limit, never while it must not be disturbed."""
+"""Offsets written to a machine: never beyond limit or slew limit, never while it must not be disturbed."""
 
 import math
 
@@ -149,7 +149,7 @@ def test_a_stop_is_kept_when_it_is_armed_again_after_a_fault() -> None:
     assert follower.step(9.0, wanted(9, 0, 0)).state is State.FOLLOWING
 
 
-def test_a_restart_begins_with_the_offset_of_the_machine() -> None:
+def test_a_restart_continues_from_the_offset_of_the_machine() -> None:
     follower = armed(applied=np.array([7e-6, 0, 0]))
     assert run(follower, wanted(9, 0, 0), 100.0, 3) == [
         (State.FOLLOWING, 7),
@@ -158,14 +158,14 @@ def test_a_restart_begins_with_the_offset_of_the_machine() -> None:
     ]
 
 
-def test_a_program_that_was_stopped_for_an_hour_does_not_jump() -> None:
+def test_no_jump_after_a_program_was_suspended_for_an_hour() -> None:
     follower = armed()
     follower.step(0.0, wanted(40, 0, 0))
     assert follower.step(3600.0, wanted(40, 0, 0)).offset[0] == pytest.approx(2e-6)
 
 
 @pytest.mark.parametrize(
-    ("applied", "message"), [([math.nan, 0, 0], "not known"), ([60e-6, 0, 0], "beyond the limit of 50 um")]
+    ("applied", "message"), [([math.nan, 0, 0], "is unknown"), ([60e-6, 0, 0], "beyond the limit of 50 um")]
 )
 def test_a_machine_with_an_unknown_or_large_offset_is_not_armed(applied: list[float], message: str) -> None:
     with pytest.raises(CompensationError, match=message):

@@ -1,4 +1,4 @@
-"""A compensation in simulated time decides as the real one: it follows, holds while the machine is busy, and ramps."""
+"""A compensation in simulated time has the decisions of a real one: follow, hold while the machine is busy, ramp."""
 
 from __future__ import annotations
 
@@ -41,4 +41,4 @@ def test_it_follows_holds_and_ramps() -> None:
     assert found.cause[30] == "outside the training range: spindle"
     assert found.state[36] == "ramping"
     np.testing.assert_array_equal(found.offset[-1], 0)
-    assert found.share("following") == 25 / 60
+    assert found.fraction("following") == 25 / 60

@@ -1,4 +1,4 @@
-"""LinuxCNC's own interpreter: it moves as the plain reader reads, and runs what that does not know."""
+"""LinuxCNC's interpreter: its moves are those of the plain reader, and it expands unsupported programs."""
 
 import os
 from contextlib import closing
@@ -30,7 +30,7 @@ bent = field(lambda p: 20e-6 * np.sin(p[:, [1, 2, 0]] / 0.04))
 
 
 def expanded(lines: list[str], offsets: Offsets = ORIGINS) -> list[str]:
-    """Return the plain program that LinuxCNC's interpreter makes of lines."""
+    """Return the plain program of lines expanded by LinuxCNC's interpreter."""
     with closing(canonical.commands(lines, offsets)) as commands:
         return list(Expansion(lines, offsets, 1e-6).lines(commands))
 
@@ -44,7 +44,7 @@ def test_the_reader_and_linuxcnc_move_along_one_path(seed: int) -> None:
 
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 2**40))
-def test_linuxcnc_reads_the_new_program_as_it_was_planned(seed: int) -> None:
+def test_linuxcnc_reads_the_new_program_as_planned(seed: int) -> None:
     new = rewritten(Programs(Random(seed)).lines(25), bent)
     assert check(new, ORIGINS, Reader(ORIGINS)) == len(moves_of(new))
 
@@ -83,7 +83,7 @@ def test_the_plain_code_of_a_program_moves_as_the_program() -> None:
         assert np.allclose(moves_of(new)[-1].end, old[-1].end, atol=1e-4)
 
 
-def test_offsets_tools_and_switches_survive() -> None:
+def test_offsets_tools_and_switches_are_kept() -> None:
     lines = [
         *("G21 G90", "T2 M6", "G43 H2", "G55", "S900 M3", "G0 X0 Y0 Z0", "G92 X5 Y6", "F60 G1 X[6+1]", "M62 P1"),
         *("G92.1", "G10 L2 P3 X1 Y2 Z3 R30", "G56", "G0 X0 Y0 Z0", "G1 X1", "M5", "G64 P0.01 Q0.02", "G4 P1.5", "M2"),
@@ -103,7 +103,7 @@ def test_offsets_tools_and_switches_survive() -> None:
     ("lines", "why"),
     [
         (["G1 X[1/0]"], r"line 4.*divide by zero"),
-        (["o1 while [1]", "G1 X1", "o1 endwhile"], "loop may not end"),
+        (["o1 while [1]", "G1 X1", "o1 endwhile"], "endless loop"),
         (["#1=1", "G33 Z-1 K1"], r"line 5.*G33"),
         (["#1=1", "G20", "G1 X1"], r"line 5.*inches"),
         (["#1=1", "G1 A5"], r"line 5.*another axis"),
@@ -123,10 +123,10 @@ def test_offsets_tools_and_switches_survive() -> None:
         (["G1 X1 ; " + "x" * 300], r"line 4.*250 characters"),
     ],
 )
-def test_refuses_what_neither_understands(
+def test_a_program_that_neither_reader_supports_is_an_error(
     lines: list[str], why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(canonical, "MOST_COMMANDS", 2000)
+    monkeypatch.setattr(canonical, "MAX_COMMANDS", 2000)
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_text("\n".join([*HEAD, *lines, "M2"]) + "\n")
     with pytest.raises(ProgramError, match=why):
@@ -134,7 +134,7 @@ def test_refuses_what_neither_understands(
     assert [path.name for path in tmp_path.iterdir()] == ["a.ngc"]
 
 
-def test_the_tools_of_a_running_control_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_tools_of_a_running_control_are_not_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))  # LinuxCNC keeps the tools of a running machine in a file there
     expanded([*HEAD, "T1 M6", "G43", "M2"])
     assert list(tmp_path.iterdir()) == []
@@ -156,7 +156,7 @@ def test_a_loop_that_prints_nothing_is_ended(monkeypatch: pytest.MonkeyPatch) ->
 )
 def test_an_expansion_invents_no_position(lines: list[str], tmp_path: Path) -> None:
     head = HEAD if "G38" in lines[0] else ["G21 G54 F100"]
-    with pytest.raises(ProgramError, match="not known"):
+    with pytest.raises(ProgramError, match="unknown"):
         expanded([*head, "#1=1 #2=2", *lines, "M2"])
 
 
@@ -167,7 +167,7 @@ def test_the_first_moves_name_only_the_axes_of_the_program() -> None:
     ]
 
 
-def test_the_route_is_chosen_and_told(tmp_path: Path) -> None:
+def test_the_route_is_selected_and_reported(tmp_path: Path) -> None:
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_bytes("\r\n".join(["%", *HEAD, "#1=50", "G1 X#1 Y30", "M2", "%", ""]).encode())
     found = compensate(program, out, bent, ORIGINS, Settings(check=True), head=["machine (test) ü"])

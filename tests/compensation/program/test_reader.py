@@ -1,4 +1,4 @@
-"""What the plain reader understands, and what it refuses with the number of the line."""
+"""Lines that the plain reader supports, and errors with the number of the line."""
 
 import math
 from pathlib import Path
@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from nc_paths import ORIGINS, moves_of
 
-from errormotion.compensation.program.reading.items import Left, Text
+from errormotion.compensation.program.reading.items import Text, Unchanged
 from errormotion.compensation.program.reading.offsets import Offsets, read_parameters, read_tools
 from errormotion.compensation.program.reading.reader import Reader
-from errormotion.compensation.program.reading.words import LONGEST_LINE
+from errormotion.compensation.program.reading.words import MAX_LINE
 from errormotion.errors import ProgramError
 
 HEAD = ["G21 G90 G17", "G0 X0 Y0 Z0"]
@@ -24,17 +24,17 @@ HEAD = ["G21 G90 G17", "G0 X0 Y0 Z0"]
         ("o100 call", "control word"),
         ("G81 X1 Y1 Z-1 R1", "canned cycle"),
         ("G41 D1", "cutter compensation"),
-        ("G33 Z-1 K1", "G33 is not known"),
+        ("G33 Z-1 K1", "G33 is not supported"),
         ("G1 A10", "the word A"),
-        ("M101", "M101 is not known"),
+        ("M101", "M101 is not supported"),
         ("G1 X1 (never closed", "expected words"),
-        ("G1 X1 X2", "stands twice"),
+        ("G1 X1 X2", "is repeated"),
         ("G0 G1 X1", "two motions"),
-        ("G1.5 X1", "not known"),
+        ("G1.5 X1", "not supported"),
         ("G2 X10 Y0 I4", "radii at start and end differ"),
         ("G2 X10 R4", "too small"),
         ("G2 X10", "without a centre"),
-        ("G43 H9", "length of tool 9 is not known"),
+        ("G43 H9", "length of tool 9 is unknown"),
         ("/G1 X1", "block delete"),
         ("G53 G1 X1", "G53"),
         ("G93 G1 X1", "G93 without F"),
@@ -42,14 +42,14 @@ HEAD = ["G21 G90 G17", "G0 X0 Y0 Z0"]
         ("G1 X1 G92 Y1", "two|uses its axis words"),
         ("X1", "without a motion"),
         ("G28.1", "stores a position"),
-        ("G2 I5 P2 M62 P1", "stands twice"),
+        ("G2 I5 P2 M62 P1", "is repeated"),
         ("G2 I5 M62 P1", "share a word"),
         ("G2 X10 R5 M19", "share a word"),
-        ("G1 X1" + " " * LONGEST_LINE, "at most"),
+        ("G1 X1" + " " * MAX_LINE, "at most"),
         ("G1 X1\x00", "control characters"),
     ],
 )
-def test_refuses_a_line_by_its_number(line: str, why: str) -> None:
+def test_an_unsupported_line_is_reported_with_its_number(line: str, why: str) -> None:
     head = HEAD if line != "X1" else [*HEAD, "G80"]
     with pytest.raises(ProgramError, match=f"(?s)line {len(head) + 1}.*({why})"):
         list(Reader(ORIGINS).items([*head, line]))
@@ -65,12 +65,12 @@ def test_refuses_a_line_by_its_number(line: str, why: str) -> None:
         [*HEAD, "G38.2 Z-5 F10", "G92 Z0", "G0 Z1", "G1 X1"],
     ],
 )
-def test_refuses_a_cut_whose_position_is_not_known(lines: list[str]) -> None:
+def test_a_cut_with_an_unknown_position_is_an_error(lines: list[str]) -> None:
     with pytest.raises(ProgramError, match=f"line {len(lines)} .*unknown position"):
         list(Reader(ORIGINS).items(lines))
 
 
-def test_refuses_a_cut_where_the_work_offset_is_not_known() -> None:
+def test_a_cut_with_an_unknown_work_offset_is_an_error() -> None:
     with pytest.raises(ProgramError, match=r"line 3 .*origin of G55.*--offset G55=X,Y,Z"):
         list(
             Reader(Offsets().with_system("G54", (0, 0, 0))).items(
@@ -88,13 +88,13 @@ def test_positions_of_the_machine_follow_from_all_offsets() -> None:
     assert np.allclose(move.frame.machine(move.end), expected, atol=1e-12)
 
 
-def test_arcs_of_all_planes_turn_as_they_should() -> None:
+def test_arcs_of_all_planes_have_the_correct_sense() -> None:
     lines = [*HEAD, "F1", "G17 G3 X10 Y10 J10", "G18 G2 X20 Z10 K10", "G19 G3 Y20 Z20 K10 P2"]
     sweeps = [move.sweep for move in moves_of(lines)[1:]]
     assert np.allclose(sweeps, [math.pi / 2, -math.pi / 2, math.pi / 2 + 2 * math.pi])
 
 
-def test_what_stands_behind_the_end_is_kept_and_not_read() -> None:
+def test_text_after_the_end_is_kept_and_not_read() -> None:
     items = list(Reader(ORIGINS).items(["%", *HEAD, "M2", "G1 X[nonsense", "%", "anything"]))
     assert [type(item) for item in items[-3:]] == [Text, Text, Text]
 
@@ -109,9 +109,9 @@ def test_skipped_blocks_do_nothing() -> None:
     assert run[-1].end == (5, 1, 0)
 
 
-def test_moves_of_the_machine_are_left() -> None:
+def test_moves_in_machine_coordinates_are_unchanged() -> None:
     items = list(Reader(ORIGINS).items([*HEAD, "G53 G0 Z0", "G28 X0", "G1 X1 F1"]))
-    assert [item.kind for item in items if isinstance(item, Left)] == ["machine", "machine"]
+    assert [item.kind for item in items if isinstance(item, Unchanged)] == ["machine", "machine"]
     end = items[-1].frame.machine(items[-1].start)
     assert np.allclose(end, [0.0, 0.001, 0.0])  # home of G28 in X; Y of the program's start; Z of G53
 
@@ -132,14 +132,14 @@ def test_parameters_and_tools_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["5221 nan\n", "5221\n", "abc 1\n", "5220 12\n", "\xff\n"])
-def test_refuses_what_is_no_parameter_file(tmp_path: Path, text: str) -> None:
+def test_an_invalid_parameter_file_is_an_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.var").write_text(text, encoding="latin-1")
     with pytest.raises(ProgramError, match=r"a\.var"):
         read_parameters(tmp_path / "a.var")
 
 
 @pytest.mark.parametrize("text", ["P1 Z3\n", "T1 Zabc\n", "T1 Z1e999\n", "%PDF\n"])
-def test_refuses_what_is_no_tool_table(tmp_path: Path, text: str) -> None:
+def test_an_invalid_tool_table_is_an_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.tbl").write_text(text)
     with pytest.raises(ProgramError, match=r"a\.tbl, line 1"):
         read_tools(tmp_path / "a.tbl")

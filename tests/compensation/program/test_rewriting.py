@@ -1,4 +1,4 @@
-"""The new program: its cuts are where they were meant, and everything else stays."""
+"""The new program: its cuts follow the corrected path, and everything else is unchanged."""
 
 import contextlib
 import math
@@ -38,7 +38,7 @@ shift = field(lambda p: np.tile([1.2345e-5, -3e-6, 8e-6], (len(p), 1)))
 
 @settings(max_examples=30, deadline=None)
 @given(SEEDS)
-def test_no_errors_give_the_same_program(seed: int) -> None:
+def test_without_errors_the_program_is_unchanged(seed: int) -> None:
     lines = Programs(Random(seed)).lines(40)
     assert rewritten(lines, zero) == lines
 
@@ -53,7 +53,7 @@ def test_cuts_are_on_the_corrected_path(seed: int) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(SEEDS)
-def test_a_correction_that_is_undone_gives_the_original(seed: int) -> None:
+def test_a_reversed_correction_returns_the_original_program(seed: int) -> None:
     lines = Programs(Random(seed), plain=True).lines(20)
     back = field(lambda q: -waves(q - waves(q - waves(q - waves(q)))))
     there = [f"{line} (@{k})" if line else line for k, line in enumerate(lines)]
@@ -69,7 +69,7 @@ def test_a_correction_that_is_undone_gives_the_original(seed: int) -> None:
         assert math.dist(ends[tag], move.frame.machine(move.end)) <= 4 * DIGITS
 
 
-def test_the_same_correction_everywhere_moves_arcs_as_they_are() -> None:
+def test_a_constant_correction_shifts_arcs() -> None:
     lines = [*HEAD, "G2 X20 Y0 I10", "G3 X20 Y0 I-3 J0", "G90.1 G2 X30 Y0 I25 J0"]
     new = rewritten(lines, shift)
     assert new[3:] == [
@@ -79,7 +79,7 @@ def test_the_same_correction_everywhere_moves_arcs_as_they_are() -> None:
     ]
 
 
-def test_no_more_pieces_than_the_tolerance_demands() -> None:
+def test_no_more_pieces_than_the_tolerance_requires() -> None:
     def pieces(sag: float) -> int:
         parabola = field(lambda p: np.stack([0 * p[:, 0], sag * (p[:, 0] / 0.1) ** 2 * 4, 0 * p[:, 0]], axis=1))
         return len(rewritten([*HEAD, "G1 X100"], parabola, tolerance=1e-6, step=1e-4)) - len(HEAD)
@@ -102,7 +102,7 @@ def test_a_program_is_written_while_it_is_read(monkeypatch: pytest.MonkeyPatch) 
     assert max(ahead) <= 50 + len(HEAD)
 
 
-def test_words_comments_and_codes_stay_in_place() -> None:
+def test_words_comments_and_codes_keep_their_order() -> None:
     lines = [*HEAD, "N10 g1 x100 y50 (to the side) M8 S800 f200 ; and on", "N20 X0 M0"]
     new = rewritten(lines, bent)
     assert new[3].startswith("N10 g1 X")
@@ -121,7 +121,7 @@ def test_inverse_time_feed_is_divided_with_the_move() -> None:
     assert max(speeds) / min(speeds) < 1.001
 
 
-def test_offsets_that_are_set_from_a_position_stay_what_they_were() -> None:
+def test_offsets_set_from_a_position_are_unchanged() -> None:
     lines = [*HEAD, "G1 X10 Y10", "G92 X0 Y0", "G1 X5", "G10 L20 P0 Z3", "G1 Y5 Z2"]
     old, new = moves_of(lines), moves_of(rewritten(lines, shift))
     for before, after in zip(old, new, strict=True):
@@ -144,11 +144,11 @@ def test_an_axis_that_is_not_named_is_corrected_too() -> None:
     assert new[-1] == "G1 X10 Z0.0100"
 
 
-def test_moves_that_stay_are_counted_with_their_lines() -> None:
+def test_unchanged_moves_are_counted_with_their_lines() -> None:
     lines = ["G21 G90", "G0 Z50", "G0 X0 Y0", "G1 Z0 F100", "G53 G0 Z0", "G1 X5", "G38.2 Z-5"]
     made = Rewriting(Reader(ORIGINS), shift)
     new = list(made.lines(lines))
-    assert made.summary.left == {"unknown": (1, 2), "machine": (1, 5), "probe": (1, 7)}
+    assert made.summary.unchanged == {"unknown": (1, 2), "machine": (1, 5), "probe": (1, 7)}
     assert [new[k] for k in (1, 4, 6)] == [lines[k] for k in (1, 4, 6)]
 
 
@@ -158,7 +158,7 @@ def test_a_cut_from_an_uncorrected_position_is_counted() -> None:
     assert made.summary.uncorrected == (1, 5)
 
 
-def test_the_summary_states_what_was_done() -> None:
+def test_the_summary_states_the_changes() -> None:
     made = Rewriting(Reader(ORIGINS), shift)
     list(made.lines([*HEAD, "G1 X100", "G95 F0.1 S600", "X40", "G93 G1 X0 F2", "G94 G1 X1", "G4 P2"]))
     found = made.summary
@@ -167,17 +167,17 @@ def test_the_summary_states_what_was_done() -> None:
     assert found.unfed == 1
     assert found.length == pytest.approx(0.201)
     assert found.largest == pytest.approx(math.hypot(12.345e-6, 3e-6, 8e-6))
-    assert len(found.places) == 5
+    assert len(found.positions) == 5
     assert np.allclose(found.offsets, [1.2345e-5, -3e-6, 8e-6])
 
 
 def test_the_path_for_the_page_is_bounded() -> None:
     made = Rewriting(Reader(ORIGINS), bent)
     list(made.lines([*HEAD, *(f"G1 X{k % 90} Y{k % 70}.5" for k in range(9_000))]))
-    assert 1000 < len(made.summary.places) <= 4000
+    assert 1000 < len(made.summary.positions) <= 4000
 
 
-def test_places_outside_of_what_was_measured_are_counted() -> None:
+def test_positions_outside_the_measured_range_are_counted() -> None:
     def limited(places: np.ndarray, _: np.ndarray) -> object:
         found = shift(places, _)
         found.valid = places[:, 0] < 0.05
@@ -188,47 +188,47 @@ def test_places_outside_of_what_was_measured_are_counted() -> None:
     assert made.summary.outside == (3, 5)
 
 
-def test_corrections_that_are_not_known_are_refused() -> None:
-    with pytest.raises(ProgramError, match="not known"):
+def test_unknown_corrections_are_an_error() -> None:
+    with pytest.raises(ProgramError, match="unknown"):
         rewritten([*HEAD, "G1 X1"], field(lambda p: np.full_like(p, np.nan)))
 
 
 @pytest.mark.parametrize("wrong", [{"tolerance": 0.0}, {"tolerance": math.nan}, {"step": 0.0}, {"step": math.inf}])
-def test_refuses_settings_without_sense(wrong: dict[str, float]) -> None:
+def test_invalid_settings_are_an_error(wrong: dict[str, float]) -> None:
     with pytest.raises(ProgramError, match="expected"):
         rewritten(HEAD, zero, **wrong)
 
 
 def test_too_many_pieces_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dividing, "MOST_PIECES", 50)
+    monkeypatch.setattr(dividing, "MAX_PIECES", 50)
     noise = field(lambda p: 1e-3 * np.sin(p * 1e7))
     with pytest.raises(ProgramError, match="at most"):
         rewritten([*HEAD, "G2 X0 I0.1"], noise, tolerance=1e-8, step=1e-5)
 
 
-def test_arcs_stay_arcs() -> None:
+def test_arcs_remain_arcs() -> None:
     new = moves_of(rewritten([*HEAD, "G0 X40", "G3 X40 Y0 I-40 J0"], bent))[2:]
     assert 4 <= len(new) <= 12
     assert all(move.kind > LINE for move in new)
 
 
-def test_the_points_for_the_page_have_the_correction_that_acts_there() -> None:
+def test_the_points_for_the_page_have_their_correction() -> None:
     for seed in range(3):
         made = Rewriting(Reader(ORIGINS), bent)
         list(made.lines(Programs(Random(seed)).lines(40)))
         found = made.summary
-        assert np.abs(found.offsets - waves(found.places)).max() < 2e-6
+        assert np.abs(found.offsets - waves(found.positions)).max() < 2e-6
         assert found.largest <= np.linalg.norm(found.offsets, axis=1).max() + 2e-6
 
 
-def test_a_line_does_not_become_longer_than_controls_read() -> None:
-    with pytest.raises(ProgramError, match=r"line 4 would get longer"):
+def test_a_line_does_not_exceed_the_length_that_controls_read() -> None:
+    with pytest.raises(ProgramError, match=r"line 4 would exceed"):
         rewritten([*HEAD, "G1 X1 (" + "x" * 240 + ")"], shift)
 
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**40), st.data())
-def test_altered_programs_are_read_or_refused_by_line(seed: int, data: st.DataObject) -> None:
+def test_altered_programs_are_read_or_rejected_with_the_line(seed: int, data: st.DataObject) -> None:
     lines = Programs(Random(seed)).lines(12)
     alphabet = st.text("GMXYZIJKRPFNSTHLDQO0123456789.-+ /%;()#[]<=ä\t", min_size=1, max_size=4)
     for _ in range(data.draw(st.integers(1, 4))):

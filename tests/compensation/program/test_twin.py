@@ -1,4 +1,4 @@
-"""Programs on a virtual machine whose errors are known: the tool is where the program meant it."""
+"""Programs on a virtual machine with known errors: the tool reaches the programmed positions."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def machine_and_truth(kind: str) -> tuple[VirtualMachine, object]:
 
 
 def displaced(machine: VirtualMachine, tool: np.ndarray) -> object:
-    """Return where the tool is when positions are commanded."""
+    """Return the positions of the tool for commanded positions."""
     geometry = machine.geometry
 
     def actual(commanded: np.ndarray) -> np.ndarray:
@@ -51,7 +51,7 @@ def displaced(machine: VirtualMachine, tool: np.ndarray) -> object:
 
 
 @pytest.mark.parametrize("tool", [0.0, 0.1])
-def test_cuts_on_the_machine_are_where_they_were_meant(tool: float) -> None:
+def test_cuts_on_the_machine_follow_the_programmed_path(tool: float) -> None:
     machine, truth = machine_and_truth("cframe")
     point = np.array([0.0, 0.002, -tool]) if tool else np.zeros(3)
     correcting = ByTool(correction(truth), np.array([0.0, 0.004, 0.0]) if tool else None)
@@ -82,7 +82,7 @@ def test_tools_without_a_gauge_point_share_the_functional_point() -> None:
     assert ORIGINS.tools
 
 
-def test_what_remains_on_the_machine_is_within_the_stated_uncertainty() -> None:
+def test_the_remaining_error_on_the_machine_is_within_the_stated_uncertainty() -> None:
     machine, truth = machine_and_truth("cframe")
     rng = np.random.default_rng(5)
     sigma = 0.5e-6

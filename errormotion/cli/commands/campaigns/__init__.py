@@ -1,1 +1,1 @@
-"""Campaigns: files, uncertainty to expect, programs, and runs in this process or in the background."""
+"""Commands on campaigns: files, expected uncertainty, NC programs, runs in this process or in the background."""

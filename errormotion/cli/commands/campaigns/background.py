@@ -1,4 +1,4 @@
-"""``errormotion background``: campaigns that run in processes of their own."""
+"""``errormotion background``: campaigns that run in separate processes."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from errormotion.errors import RunError
 
 
 def started(name: str, runs: Path, as_json: bool) -> None:
-    """Print where a campaign runs now."""
+    """Print the name of the process that runs a campaign."""
     if as_json:
         show_json({"ok": True, "process": name, "runs": str(runs)})
         return
-    show(f"Started as {name}. 'errormotion background list {runs}' shows where it is.")
+    show(f"Started as {name}. 'errormotion background list {runs}' shows its progress.")
 
 
 def listed(runs: Path, as_json: bool) -> None:
-    """Print every process, the newest first, with the request that waits."""
+    """Print every process, the newest first, with its open request to the operator."""
     found = processes.found(runs)
     if as_json:
-        plain = [{k: None if v != v else v for k, v in asdict(each).items()} for each in found]  # NaN is no JSON
+        plain = [{k: None if v != v else v for k, v in asdict(each).items()} for each in found]  # JSON has no NaN
         show_json({"ok": True, "processes": plain})
         return
     rows = [[each.name, each.campaign, each.machine, each.test, each.ended or each.stage] for each in found]
@@ -34,17 +34,17 @@ def listed(runs: Path, as_json: bool) -> None:
 
 
 def answer(runs: Path, name: str | None) -> None:
-    """State that the request that waits is done.
+    """State that the open request to the operator is done.
 
     Raises
     ------
     RunError
-        No request waits, or requests of several processes do.
+        No process, or more than one, has an open request.
     """
     waiting = [each for each in processes.found(runs) if each.request is not None and name in (None, each.name)]
     if len(waiting) != 1 or waiting[0].request is None:
         names = ", ".join(each.name for each in waiting) or "none"
-        raise RunError(f"{runs}: expected one process with a request; found {names}. Choose it with --process.")
+        raise RunError(f"{runs}: expected one process with an open request; found {names}. Choose one with --process.")
     processes.answer(runs, waiting[0].name, waiting[0].request.number)
     show(f"Done: {waiting[0].request.text}")
 
@@ -55,11 +55,11 @@ def stop(runs: Path, name: str | None) -> None:
     Raises
     ------
     RunError
-        Nothing runs, or several processes do.
+        No process, or more than one, is running.
     """
     alive = [each for each in processes.found(runs) if each.alive and name in (None, each.name)]
     if len(alive) != 1:
         names = ", ".join(each.name for each in alive) or "none"
-        raise RunError(f"{runs}: expected one process that runs; found {names}. Choose it with --process.")
+        raise RunError(f"{runs}: expected one process that runs; found {names}. Choose one with --process.")
     processes.stop(runs, alive[0].name)
-    show(f"{alive[0].campaign}: was asked to stop. 'errormotion run --resume' continues it.")
+    show(f"{alive[0].campaign}: stop requested. 'errormotion run --resume' continues it.")

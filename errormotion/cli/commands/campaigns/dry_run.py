@@ -1,4 +1,4 @@
-"""``errormotion run --dry-run``: path and duration of a campaign; nothing moves."""
+"""``errormotion run --dry-run``: path and duration of a campaign, without any motion."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from errormotion.errors import BenchError
 
 
 def run(campaign: Path, out: Path | None, as_json: bool) -> None:
-    """Print path and duration of every test, and draw them into a folder.
+    """Print path and duration of every test, and draw the paths into a folder.
 
     Raises
     ------
     BenchError
-        The campaign cannot be read, leaves the limits of its bench, or a method does not state what moves.
+        The campaign cannot be read, exceeds the limits of its bench, or a method does not state its motions.
     """
     plan = load_campaign(campaign)
     found_tests: list[dict[str, Any]] = []
@@ -39,10 +39,10 @@ def run(campaign: Path, out: Path | None, as_json: bool) -> None:
 
 
 def _drawn(plan: CampaignPlan, found: Motions, out: Path) -> Path:
-    """Draw the motions of a test; return the file."""
+    """Draw the motions of a test, and return the file."""
     path = out / f"{found.test}-dry-run.png"
     if path.exists():
-        raise BenchError(f"{path} exists already: choose another folder, or remove the file.")
+        raise BenchError(f"{path}: exists already; choose another folder, or remove the file")
     out.mkdir(parents=True, exist_ok=True)
     picture(plan, found).savefig(path, dpi=110)
     return path

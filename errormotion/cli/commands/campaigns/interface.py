@@ -1,4 +1,4 @@
-"""Arguments of the commands on campaigns. What a command needs is imported when it runs."""
+"""Arguments of the commands on campaigns; imports of a command are inside its function."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from typing import Annotated
 
 import typer
 
-from errormotion.cli.guard import USAGE, guarded
-from errormotion.cli.root import Json, Runs, Tolerances, app, background_app
+from errormotion.cli import options
+from errormotion.cli.guard import USAGE
+from errormotion.cli.root import app, background_app
 
 Process = Annotated[str | None, typer.Option(help="Name of the process; needed if there are several.")]
 OfRuns = Annotated[Path, typer.Argument(help="The folder of runs.")]
 
 
 @app.command()
-@guarded
 def init(
     folder: Annotated[Path, typer.Argument(help="The folder for bench.toml and campaign.toml.")] = Path(),
     machine: Annotated[str, typer.Option(help="Name of the machine.")] = "",
-    chain: Annotated[str, typer.Option(help="Its kinematic chain, such as workpiece-X-Y-bed-Z-spindle-tool.")] = "",
+    chain: Annotated[str, typer.Option(help="Kinematic chain, such as workpiece-X-Y-bed-Z-spindle-tool.")] = "",
     travel: Annotated[
         list[str] | None,
         typer.Option(metavar="AXIS=LOW,HIGH", help="Travel of an axis of the chain, such as X=-300mm,300mm."),
@@ -27,17 +27,15 @@ def init(
     instrument: Annotated[
         list[str] | None, typer.Option(metavar="NAME=ID@ADDRESS", help="An instrument of the bench; may be repeated.")
     ] = None,
-    test: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=ID", help="A test of the campaign; may be repeated.")
-    ] = None,
+    test: Annotated[list[str] | None, typer.Option(metavar="NAME=ID", help="A test; may be repeated.")] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME.KEY=VALUE", help="One setting of an instrument or of a test."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that exist.")] = False,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
-    """Write a bench and a campaign for the instruments at hand; on a terminal, ask for what is not stated."""
+    """Write a bench and a campaign file; on a terminal, ask for what is not stated."""
     from errormotion.cli.commands.campaigns.init import command
 
     command.init(
@@ -46,35 +44,34 @@ def init(
 
 
 @app.command()
-@guarded
 def run(
     campaign: Annotated[
         Path | None,
-        typer.Argument(help="A campaign file; with --resume optional, or a run folder.", show_default=False),
+        typer.Argument(
+            help="A campaign file; with --resume it is optional and may be a run folder.", show_default=False
+        ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the newest unfinished campaign.")] = False,
-    runs: Runs = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Assume that every request to the operator is done.")] = False,
+    runs: options.Runs = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Treat every request to the operator as done.")] = False,
     report: Annotated[bool, typer.Option(help="Write a report for each test.")] = True,
-    tolerances: Tolerances = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Report path and duration only; nothing is opened or moved.")
-    ] = False,
-    out: Annotated[Path | None, typer.Option(help="With --dry-run: a folder for pictures of the path.")] = None,
+    tolerances: options.Tolerances = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report path and duration, without motion.")] = False,
+    out: Annotated[Path | None, typer.Option(help="With --dry-run: folder for drawings of the path.")] = None,
     detach: Annotated[
-        bool, typer.Option("--detach", help="Run in a process of its own, which outlives this terminal.")
+        bool, typer.Option("--detach", help="Run in a separate process, which continues after this terminal is closed.")
     ] = False,
     publish: Annotated[
-        Path | None, typer.Option(help="Publish the progress in this folder, and wait there for answers.")
+        Path | None, typer.Option(help="Write the progress into this folder, and read answers to requests from it.")
     ] = None,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
     """Run the tests of a campaign: acquire, identify, report."""
     if dry_run:
         from errormotion.cli.commands.campaigns import dry_run as dry
 
         if campaign is None or resume or campaign.is_dir():
-            typer.echo("--dry-run: expected a campaign file, without --resume.", err=True)
+            typer.echo("--dry-run: expected a campaign file and no --resume.", err=True)
             raise typer.Exit(USAGE)
         dry.run(campaign, out, json_)
         return
@@ -93,25 +90,22 @@ def run(
 
 
 @background_app.command("list")
-@guarded
-def background_list(runs: OfRuns = Path("runs"), json_: Json = False) -> None:
-    """List the processes of a folder of runs: where they are, and what they request."""
+def background_list(runs: OfRuns = Path("runs"), json_: options.Json = False) -> None:
+    """List the processes of a folder of runs with their progress and their requests to the operator."""
     from errormotion.cli.commands.campaigns import background as command
 
     command.listed(runs, json_)
 
 
 @background_app.command("answer")
-@guarded
 def background_answer(runs: OfRuns = Path("runs"), process: Process = None) -> None:
-    """State that the request to the operator is done."""
+    """State that the open request to the operator is done."""
     from errormotion.cli.commands.campaigns import background as command
 
     command.answer(runs, process)
 
 
 @background_app.command("stop")
-@guarded
 def background_stop(runs: OfRuns = Path("runs"), process: Process = None) -> None:
     """Stop a campaign, as Ctrl-C does; it can be resumed."""
     from errormotion.cli.commands.campaigns import background as command
@@ -120,26 +114,24 @@ def background_stop(runs: OfRuns = Path("runs"), process: Process = None) -> Non
 
 
 @app.command()
-@guarded
 def plan(
     campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
     test: Annotated[str | None, typer.Option(help="One test; default: every test.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="A file for the plan of one test.")] = None,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
-    """Report the uncertainty to expect of the tests of a campaign, and how to reduce it."""
+    """Report the expected uncertainty of the tests of a campaign, and how to reduce it."""
     from errormotion.cli.commands.campaigns import plan as command
 
     command.expect(campaign, test, out, json_)
 
 
 @app.command()
-@guarded
 def program(
     campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
     out: Annotated[Path, typer.Option(help="The folder for the programs; existing files are not replaced.")],
     test: Annotated[str | None, typer.Option(help="One test; default: every test that has programs.")] = None,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
     """Write the NC programs of the tests of a campaign."""
     from errormotion.cli.commands.campaigns import program as command

@@ -1,4 +1,4 @@
-"""``errormotion plan``: the uncertainty to expect of the tests of a campaign."""
+"""``errormotion plan``: the expected uncertainty of the tests of a campaign."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from errormotion.errors import BenchError
 
 
 def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) -> None:
-    """Print the largest uncertainty to expect of every freedom, and the notes of the method, test by test.
+    """Print the largest expected uncertainty of every freedom, and the notes of the method, for each test.
 
     Raises
     ------
     BenchError
-        No such test, or one file for the plans of several tests.
+        The test does not exist, or several plans are to be written into one file.
     """
     plan = load_campaign(campaign)
     chosen = [entry for entry in plan.tests if test is None or entry.name == test]
@@ -27,8 +27,8 @@ def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) ->
             f"{campaign}: expected one of the tests {', '.join(entry.name for entry in plan.tests)}; found '{test}'"
         )
     if out is not None and len(chosen) > 1:
-        raise BenchError(f"{campaign}: one file holds the plan of one test; name it with --test")
-    with working("Computing the uncertainty to expect"):
+        raise BenchError(f"{campaign}: --out writes the plan of one test; choose it with --test")
+    with working("Computing the expected uncertainty"):
         found = [(entry, planned(plan, entry)) for entry in chosen]
     if out is not None:
         datasets.save(found[0][1], out)

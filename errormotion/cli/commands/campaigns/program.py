@@ -1,4 +1,4 @@
-"""``errormotion program``: the NC programs of a campaign's tests, as files."""
+"""``errormotion program``: the NC programs of the tests of a campaign."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from errormotion.errors import BenchError
 
 
 def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
-    """Write the programs of one test, or of every test whose method has some; existing files are not replaced.
+    """Write the NC programs of one test, or of every test whose method has programs; files are never replaced.
 
-    What the programs move is printed on one line a test, on stderr.
+    The motions of the programs are printed on stderr, one line for each test. With several such tests, each has a
+    folder in ``out``.
 
-    With several such tests, each has its own folder in ``out``.
+        With several such tests, each has its own folder in ``out``.
 
     Raises
     ------
-    BenchError
-        No such test, a method without programs, or a file that exists. Nothing is written then.
+        BenchError
+            The test does not exist, its method has no programs, or a file exists already. Nothing is written.
     """
     plan = load_campaign(campaign)
     chosen = [entry for entry in plan.tests if test is None or entry.name == test]
@@ -34,7 +35,7 @@ def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
     with_programs = [entry for entry in chosen if hasattr(entry.method, "programs")]
     if not with_programs:
         names = ", ".join(sorted({entry.method.info.id for entry in chosen}))
-        raise BenchError(f"{campaign}: {names} has no NC programs: nothing to write for {test or 'any of its tests'}.")
+        raise BenchError(f"{campaign}: the method {names} has no NC programs; nothing was written")
     files: list[tuple[str, Path, str]] = []
     announced: list[str] = []
     for entry in with_programs:
@@ -47,7 +48,7 @@ def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
         files += [(entry.name, folder / name, text) for name, text in texts.items()]
     if existing := [str(path) for _, path, _ in files if path.exists()]:
         raise BenchError(
-            f"{existing[0]} exists already: choose another folder, or remove the file. Nothing was written."
+            f"{existing[0]} exists already; choose another folder, or remove the file. Nothing was written."
         )
     for line in announced:
         typer.echo(line, err=True)
@@ -71,6 +72,6 @@ def _show(files: list[tuple[str, Path, str]], as_json: bool) -> None:
 
 
 def _comments(text: str) -> list[str]:
-    """Return the comments that stand on lines of their own."""
+    """Return the comments that take a whole line."""
     lines = [line.strip() for line in text.splitlines()]
     return [line[1:-1] for line in lines if line.startswith("(") and line.endswith(")")]

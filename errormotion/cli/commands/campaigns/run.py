@@ -1,4 +1,4 @@
-"""``errormotion run``: a campaign with bars, questions to the operator, and a summary at the end."""
+"""``errormotion run``: runs a campaign with progress bars, requests to the operator, and a final summary."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def run(
 ) -> None:
     """Run or resume a campaign and print its results."""
     if campaign is None and not resume:
-        typer.echo("Give a campaign file, or --resume to go on with the newest unfinished one.", err=True)
+        typer.echo("Expected a campaign file, or --resume to continue the newest unfinished campaign.", err=True)
         raise typer.Exit(USAGE)
     if tolerances is not None and (resume or campaign is None):
         typer.echo(
@@ -87,7 +87,7 @@ def work(
     """Run or resume a campaign with progress bars on a terminal; without a plan, the newest unfinished one."""
     with Bars(quiet, announcing=announcing) if publish is None else Published(publish) as bars:
         answered = publish is not None or (sys.stdin.isatty() and sys.stderr.isatty())
-        ask = _agree if yes else bars.ask if answered else None
+        ask = _assume_done if yes else bars.ask if answered else None
         report = report_of_run if with_report else None
         if resume or plan is None:
             return runner.resume(plan, run_id=run_id, runs=runs, progress=bars, ask=ask, report=report)
@@ -95,9 +95,9 @@ def work(
 
 
 def detach(campaign: Path | None, *, resume: bool, runs: Path | None, as_json: bool) -> None:
-    """Start or resume a campaign in a process of its own, and print its name."""
+    """Start or resume a campaign in a separate process, and print the name of the process."""
     if campaign is None:
-        typer.echo("--detach: expected a campaign file, or with --resume a run folder.", err=True)
+        typer.echo("--detach: expected a campaign file, or a run folder with --resume.", err=True)
         raise typer.Exit(USAGE)
     if resume:
         command.started(processes.resume(campaign), campaign.parent, as_json)
@@ -114,7 +114,7 @@ def report_of_run(folder: Path) -> Path:
 
 
 def describe(folder: RunFolder) -> dict[str, Any]:
-    """Return the state and the results of a run, for a program."""
+    """Return the state and the results of a run, for JSON output."""
     data = folder.data
     errors = folder.errors
     result = datasets.load(errors) if errors else None
@@ -135,7 +135,7 @@ def describe(folder: RunFolder) -> dict[str, Any]:
 
 
 def report_error(folder: RunFolder) -> str | None:
-    """Return the reason why the last report could not be written; None where it was written or not requested."""
+    """Return why the last report could not be written; None where it was written or not requested."""
     reports = [step for step in folder.data["steps"] if step["step"] == "report"]
     return str(reports[-1]["reason"]) if reports and reports[-1]["outcome"] == "failed" else None
 
@@ -146,7 +146,7 @@ def _lines(folder: RunFolder) -> list[str]:
     lines = judge(datasets.load(found["errors"]), table).lines() if table is not None and found["errors"] else []
     lines += [f"report  {found['report']}"] if found["report"] else []
     if found["report_error"]:
-        lines.append(f"no report: {found['report_error']}; after the correction: errormotion report {folder.path}")
+        lines.append(f"no report: {found['report_error']}; when corrected, run: errormotion report {folder.path}")
     lines.append(f"errors  {found['errors']}")
     if found["results"]:
         lines += figure_table(found["results"]).splitlines()
@@ -157,6 +157,6 @@ def _lines(folder: RunFolder) -> list[str]:
     return lines + [f"note: {note}" for note in found["notes"]]
 
 
-def _agree(message: str) -> None:
-    """Assume that the request is done, and print it."""
+def _assume_done(message: str) -> None:
+    """Print a request to the operator, and continue as if it were done."""
     typer.echo(f"assumed done (--yes): {message}", err=True)

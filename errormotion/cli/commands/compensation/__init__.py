@@ -1,1 +1,1 @@
-"""Thermal models, and what makes corrections of errors: tables, programs, offsets that follow the temperatures."""
+"""Commands on thermal models and compensation: tables, NC programs, offsets that follow the temperatures."""

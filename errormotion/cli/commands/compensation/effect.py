@@ -1,4 +1,4 @@
-"""``errormotion compensate effect``: what a compensation took off, from a result before and one with it."""
+"""``errormotion compensate effect``: the reduction of errors by a compensation, from results without and with it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from typing import Any
 
 from errormotion.cli.commands.results.compare import Stated, over_one
 from errormotion.cli.output import show, show_json, table
-from errormotion.cli.page import Page
+from errormotion.cli.page import Page, new_files
 from errormotion.cli.results import load
 from errormotion.cli.tolerances import exit_code
 from errormotion.compensation.effect import Effect, effect
 from errormotion.compensation.effect.magnitude import Interval
 from errormotion.compensation.effect.text import FIGURES_HEAD, HEAD, figure_rows, limits, rows, verdict
-from errormotion.errors import DatasetError
 from errormotion.tolerances.table import load_tolerances
 
 
@@ -32,18 +31,16 @@ def run(
     page: Page | None,
     as_json: bool,
 ) -> int:
-    """Compare two results, print the effect, and write the page. Return the exit code of the limits.
+    """Compare two results, print the effect, and write the page. Return the exit code of the decisions on tolerances.
 
     Raises
     ------
     DatasetError
-        The results cannot be read or compared, or the page exists already.
+        The results cannot be read or compared, or a file exists already.
     BenchError
-        The file of tolerances is damaged.
+        The file of tolerances is invalid.
     """
-    for path in page.files if page is not None else ():
-        if path.exists():
-            raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
+    files = new_files(page)
     limited = None if tolerances is None else load_tolerances(tolerances)
     results, _ = load([], {"before": before, "after": after})
     stated = Stated([], [], {}, None, over=over, select=select)
@@ -57,31 +54,31 @@ def run(
         show_json(plain(found))
     else:
         show(text(found))
-        for path in page.files if page is not None else ():
+        for path in files:
             show(f"written: {path}")
     return code_of(found)
 
 
 def code_of(found: Effect) -> int:
-    """Return the exit code of the decisions on the result with the compensation, and on the reduction."""
+    """Return the exit code of the decisions on the result with compensation and on the reduction."""
     return exit_code([each.plain() for each in (found.after, found.gained) if each is not None])
 
 
 def text(found: Effect) -> str:
-    """Return the effect for a person."""
-    said = verdict(found)
+    """Return the effect as text."""
+    sentences = verdict(found)
     limited = set(limits(found))
-    lines = [line for line in said if line not in limited]
+    lines = [line for line in sentences if line not in limited]
     lines += ["", table(HEAD, rows(found))]
     if found.figures:
         lines += ["", table(FIGURES_HEAD, figure_rows(found))]
     if limited:
-        lines += ["", *[line for line in said if line in limited]]
+        lines += ["", *[line for line in sentences if line in limited]]
     return "\n".join([*lines, "", *found.notes])
 
 
 def plain(found: Effect) -> dict[str, Any]:
-    """Return the effect for a program, SI."""
+    """Return the effect for JSON output, SI."""
     judged = {"before": found.before, "after": found.after, "reduction": found.gained}
     return {
         "ok": True,

@@ -1,4 +1,4 @@
-"""``errormotion compensate run``: offsets that follow the temperatures of a machine, live in the terminal."""
+"""``errormotion compensate run``: offsets that follow the temperatures of a machine, shown live in the terminal."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ from rich.text import Text
 from errormotion.campaign.compensation.compensating import Compensation, Moment
 from errormotion.campaign.files import load_bench
 from errormotion.campaign.folder import RunFolder
+from errormotion.cli import options
 from errormotion.cli.output import show
 from errormotion.compensation.online.follower import State
 from errormotion.datasets import load
-from errormotion.datasets.units import TIME
-from errormotion.errors import BenchError, CompensationError
 
 COLOURS = {State.FOLLOWING: "green", State.HOLDING: "yellow", State.RAMPING: "yellow", State.FAULT: "bold red"}
 
@@ -41,8 +40,8 @@ def run(
     duration: str | None,
     as_json: bool,
 ) -> int:
-    """Follow until Ctrl-C or for a time, then ramp to zero; print where the log is. Return the exit code."""
-    length = math.inf if duration is None else _time(duration)
+    """Compensate until Ctrl-C or for a duration, then ramp to zero, and print the summary. Return the exit code."""
+    length = math.inf if duration is None else options.duration("--duration", duration)
     compensation = Compensation(
         load_bench(file),
         load(model),
@@ -76,16 +75,16 @@ def run(
 
 @contextmanager
 def _ramping_when_stopped(compensation: Compensation, console: Console) -> Iterator[None]:
-    """Take Ctrl-C and a request to end: the first ramps to zero, the second ends at once."""
-    asked = False
+    """Handle Ctrl-C and SIGTERM: the first one ramps to zero, the second one ends the command at once."""
+    stopping = False
 
     def stop(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
-        nonlocal asked
-        if asked or compensation.state in (State.FAULT, State.OFF):
+        nonlocal stopping
+        if stopping or compensation.state in (State.FAULT, State.OFF):
             raise KeyboardInterrupt
-        asked = True
+        stopping = True
         compensation.stop()
-        console.print("Ramping to zero. Ctrl-C again ends at once; then the machine's own watchdog ramps to zero.")
+        console.print("Ramping to zero. Ctrl-C again ends at once; the watchdog of the machine then ramps to zero.")
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -96,34 +95,26 @@ def _ramping_when_stopped(compensation: Compensation, console: Console) -> Itera
             signal.signal(number, handler)
 
 
-def _time(text: str) -> float:
-    try:
-        value = TIME.parse(text)
-    except ValueError as error:
-        raise BenchError(f"--duration: {error}") from None
-    if not value > 0:
-        raise CompensationError(f"--duration: expected more than 0 s; found '{text}'")
-    return value
-
-
 def announcement(compensation: Compensation) -> str:
-    """Return what will be changed, in one line."""
+    """Return a line that states the machine, the mode and the limits."""
     limits, plan = compensation.limits, compensation.plan
     bounds = f"at most {limits.limit * 1e6:g} um for each axis, {limits.slew * 1e6:g} um/s"
     if not compensation.armed:
-        return f"Shadow: offsets of '{plan.machine}' are computed and logged; nothing is written. Limits: {bounds}."
+        return (
+            f"Shadow mode: offsets of '{plan.machine}' are computed and logged; nothing is written. Limits: {bounds}."
+        )
     driver = plan.compensator.driver.info.id if plan.compensator else ""
     return f"Armed: offsets of '{plan.machine}' are written by {driver}: {bounds}. Ctrl-C ramps to zero."
 
 
 def page(compensation: Compensation, moment: Moment) -> Group:
-    """Return what the terminal shows."""
+    """Return the live view of the terminal."""
     step = moment.step
     head = Text.assemble(
         (compensation.plan.machine, "bold"), "  ", (str(step.state), COLOURS.get(step.state, "")), f"  {step.cause}"
     )
     if not compensation.armed:
-        head.append("  shadow, nothing is written", style="dim")
+        head.append("  shadow mode, nothing is written", style="dim")
     table = Table(box=None, pad_edge=False, header_style="dim")
     for name in ("axis", "predicted error/um", "U (k=2)/um", "offset/um", "in effect/um"):
         table.add_column(name, justify="right")
@@ -135,7 +126,7 @@ def page(compensation: Compensation, moment: Moment) -> Group:
 
 
 def summary(compensation: Compensation, last: Moment | None, states: Counter[str]) -> str:
-    """Return what a person reads at the end."""
+    """Return the summary that is printed at the end."""
     if last is None:
         return f"Nothing was computed; the log is in {compensation.folder.path}."
     total = sum(states.values())
@@ -145,7 +136,9 @@ def summary(compensation: Compensation, last: Moment | None, states: Counter[str
         final = ", ".join(f"{axis} {_um(value)} um" for axis, value in zip("XYZ", last.step.offset, strict=True))
         lines.append(f"Last state: {last.step.state}; last offset written: {final}.")
     if last.step.state is State.FAULT:
-        lines.append(f"Fault: {last.step.cause}. The watchdog of the machine ramps its offset to zero; look at it.")
+        lines.append(
+            f"Fault: {last.step.cause}. The watchdog of the machine ramps its offset to zero; check the machine."
+        )
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""``errormotion compensate status`` and ``stop``: compensations that other processes work on."""
+"""``errormotion compensate status`` and ``stop``: compensations that run in other processes."""
 
 from __future__ import annotations
 
@@ -11,19 +11,24 @@ from errormotion.compensation.online.audit import verify
 from errormotion.errors import CompensationError
 
 
-def status(place: Path, as_json: bool) -> int:
-    """Print what the compensations of a folder of runs, or one of them, do now; check their audit logs.
+def status(path: Path, as_json: bool) -> int:
+    """Print the state of one compensation, or of those of a folder of runs, and check their audit logs.
 
-    Return 1 where the chain of hashes of one of them is broken.
+    Return the exit code: 1 if the hash chain of an audit log is broken, else 0.
     """
-    folders = [place] if (place / AUDIT).is_file() else list(compensations(place))
+    folders = [path] if (path / AUDIT).is_file() else list(compensations(path))
     if not folders:
-        raise CompensationError(f"{place}: expected a run folder of a compensation, or a folder of such runs")
-    found = [_of(folder) for folder in folders]
+        raise CompensationError(f"{path}: expected the run folder of a compensation, or a folder of such runs")
+    found = [_state_of(folder) for folder in folders]
     if as_json:
         show_json({"ok": not any(each["broken"] for each in found), "compensations": found})
     else:
-        show(table(["run", "machine", "mode", "state", "offset X Y Z/um", "in effect/um", "audit log"], _rows(found)))
+        show(
+            table(
+                ["run", "machine", "mode", "state", "offset X Y Z/um", "in effect/um", "audit log"],
+                [_row(each) for each in found],
+            )
+        )
     for each in found:
         if each["broken"] and not as_json:
             show(each["broken"])
@@ -31,15 +36,15 @@ def status(place: Path, as_json: bool) -> int:
 
 
 def stop(folder: Path, as_json: bool) -> None:
-    """Ask a compensation to ramp to zero and end."""
+    """Request a compensation to ramp to zero and end."""
     request_stop(folder)
     if as_json:
         show_json({"ok": True, "folder": str(folder)})
     else:
-        show(f"Asked: {folder.name} ramps to zero and ends. 'errormotion compensate status {folder}' shows it.")
+        show(f"{folder.name}: stop requested; it ramps to zero and ends. State: errormotion compensate status {folder}")
 
 
-def _of(folder: Path) -> dict[str, Any]:
+def _state_of(folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = {"folder": str(folder), "working": is_working(folder), "broken": "", "entries": None}
     try:
         found["status"] = read_status(folder).model_dump(mode="json")
@@ -52,18 +57,14 @@ def _of(folder: Path) -> dict[str, Any]:
     return found
 
 
-def _rows(found: list[dict[str, Any]]) -> list[list[str]]:
-    return [_row(each) for each in found]
-
-
 def _row(each: dict[str, Any]) -> list[str]:
     name, log = Path(each["folder"]).name, "broken" if each["broken"] else f"{each['entries']} entries, unbroken"
-    said = each["status"]
-    if said is None:
-        return [name, "unknown", "", "at work" if each["working"] else "unknown", "", "", log]
-    state = said["state"] if each["working"] else f"ended: {said['state']}"
-    mode = "armed" if said["armed"] else "shadow"
-    return [name, said["machine"], mode, state, _um(said["offset"]), _um(said["applied"]), log]
+    last = each["status"]
+    if last is None:
+        return [name, "unknown", "", "running" if each["working"] else "unknown", "", "", log]
+    state = last["state"] if each["working"] else f"ended: {last['state']}"
+    mode = "armed" if last["armed"] else "shadow"
+    return [name, last["machine"], mode, state, _um(last["offset"]), _um(last["applied"]), log]
 
 
 def _um(values: list[float | None] | None) -> str:

@@ -1,4 +1,4 @@
-"""``errormotion model``: make a thermal model, predict with it, and check it on a campaign that it has not seen."""
+"""``errormotion model``: fits a thermal model, predicts errors, and checks a model with other measurements."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.output import show, show_json, table
-from errormotion.cli.page import Page
+from errormotion.cli.page import Page, new_dataset
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.compensation.thermal_model import SCHEMA as MODEL_SCHEMA
@@ -30,9 +30,9 @@ def make(campaigns: list[Path], out: Path, assignments: list[str], settings_file
     Raises
     ------
     DatasetError
-        The errors cannot be read or do not make a model, or the file is there already.
+        The errors cannot be read or do not determine a model, or the file exists already.
     """
-    new_file(out)
+    new_dataset(out)
     settings = read_settings(Settings, settings_file, assignments)
     with Bars(as_json) as bars:
         bars.stage("fitting")
@@ -59,14 +59,14 @@ def make(campaigns: list[Path], out: Path, assignments: list[str], settings_file
 
 
 def predict(model: Path, data: Path, out: Path, as_json: bool) -> None:
-    """Predict the errors of temperatures and working parameters, and write them.
+    """Predict errors from temperatures and working parameters, and write them.
 
     Raises
     ------
     DatasetError
-        The model or the data cannot be read, an input is missing, or the file is there already.
+        The model or the data cannot be read, an input is missing, or the file exists already.
     """
-    new_file(out)
+    new_dataset(out)
     used, inputs = ThermalModel.load(model), dataset_of(data)
     with reading(f"{data} with {model}"), explained(data, inputs):
         predicted = used.predict(inputs)
@@ -85,7 +85,7 @@ def predict(model: Path, data: Path, out: Path, as_json: bool) -> None:
 
 
 def check_model(model: Path, errors: Path, page: Page | None, as_json: bool) -> None:
-    """Compare what the model predicts of a campaign with what was measured in it.
+    """Compare the errors that a model predicts with measured errors.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def check_model(model: Path, errors: Path, page: Page | None, as_json: bool) -> 
 
 
 def text(found: Check) -> str:
-    """Return a check for a person."""
+    """Return a check as text."""
     rows = [
         [
             name,
@@ -128,7 +128,7 @@ def text(found: Check) -> str:
     ]
     lines = [table(["error", "RMS", "remaining", "removed/%", "95 % held/%", "unit"], rows)]
     if found.outside:
-        lines.append(f"{100 * found.outside:.0f} % of the times lie beyond what the model was trained on.")
+        lines.append(f"{100 * found.outside:.0f} % of the times are outside the range of the training data.")
     return "\n".join(lines)
 
 
@@ -148,21 +148,13 @@ def source_of(path: Path) -> xr.Dataset | ThermalModel:
 
 
 def dataset_of(path: Path) -> xr.Dataset:
-    """Return the dataset of a file; of a run folder its errors, or its raw data where it has none."""
+    """Return the dataset of a file; of a run folder, its errors, or its raw data if it has no errors."""
     if (path / "run.json").exists():
         folder = RunFolder.open(path)
         path = folder.errors or folder.raw
         if not path.exists():
-            raise RunError(f"{folder.path}: has neither errors nor raw data yet")
+            raise RunError(f"{folder.path}: the run has neither errors nor raw data yet")
     with reading(path), datasets.load(path) as ds:
         if ds.attrs.get("schema") == SCHEMA:
             datasets.validate(ds)
         return ds.load()
-
-
-def new_file(out: Path) -> None:
-    """Refuse a name that is no NetCDF file, or is there already."""
-    if out.suffix != ".nc":
-        raise DatasetError(f"{out}: expected a name that ends in .nc (NetCDF-4 file)")
-    if out.exists():
-        raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")

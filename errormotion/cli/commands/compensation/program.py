@@ -1,4 +1,4 @@
-"""``errormotion compensate program``: an NC program whose cuts are where they were meant."""
+"""``errormotion compensate program``: writes a corrected NC program."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from pydantic import TypeAdapter, ValidationError
 
 import errormotion
 from errormotion.cli.commands.compensation.model import dataset_of, source_of
+from errormotion.cli.options import quantity
 from errormotion.cli.output import show, show_json
 from errormotion.cli.page import Page
 from errormotion.compensation.correction import Correction, correction
-from errormotion.compensation.program import LEFT, ByTool, Offsets, Outcome, Settings, compensate
+from errormotion.compensation.program import UNCHANGED, ByTool, Offsets, Outcome, Settings, compensate
 from errormotion.compensation.program.reading.offsets import read_parameters, read_tools
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.units import Length, Time
@@ -28,7 +28,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Choice:
-    """What the command line states; lengths in m, texts as they were typed."""
+    """Options of the command; points in m, quantities as text."""
 
     temperatures: Path | None
     time: str | None
@@ -50,19 +50,19 @@ class Choice:
 
 
 def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, as_json: bool) -> None:
-    """Write the corrected program, and tell what was done.
+    """Write the corrected program, and print a summary.
 
     Raises
     ------
     DatasetError, ProgramError
-        The errors or the program cannot be read, or what the program does is not determined. Nothing is written.
+        The errors or the program cannot be read, or the motions of the program are not determined. Nothing is written.
     """
     target = out or part.with_name(f"{part.stem}.corrected{part.suffix}")
     if target.exists():
-        raise ProgramError(f"{target}: exists already, and is not replaced; give another name to --out")
+        raise ProgramError(f"{target}: exists already, and is not replaced; give another name")
     settings = Settings(
-        tolerance=_quantity("--tolerance", choice.tolerance, Length),
-        step=_quantity("--sampling", choice.sampling, Length),
+        tolerance=quantity("--tolerance", choice.tolerance, Length),
+        step=quantity("--sampling", choice.sampling, Length),
         unit=_one_of("--unit", choice.unit, ("mm", "inch")),
         start=choice.start,
         deleted=None
@@ -77,7 +77,7 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
         found = _correction(given, choice)
     time = None
     if found.timed:
-        time = _last(found) if choice.time is None else _quantity("--time", choice.time, Time)
+        time = _last(found) if choice.time is None else quantity("--time", choice.time, Time)
     gauge = None if choice.gauge_point is None else np.array(choice.gauge_point)
     by_tool = ByTool(found, gauge, time)
     head = _head(part, sources, errors, settings, time)
@@ -86,16 +86,16 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
         outcome = compensate(part, target, by_tool, offsets, settings, head=head)
     summary = outcome.summary
     expanded = np.empty((0, 3))
-    if len(summary.places):
-        pick = slice(None, None, max(1, len(summary.places) // 400))
-        covariance = by_tool.values(summary.places[pick], summary.tools[pick], covariance=True).covariance
+    if len(summary.positions):
+        pick = slice(None, None, max(1, len(summary.positions) // 400))
+        covariance = by_tool.values(summary.positions[pick], summary.tools[pick], covariance=True).covariance
         assert covariance is not None
         variance = np.diagonal(covariance, axis1=1, axis2=2)
         expanded = 2 * np.sqrt(np.where(variance >= 0, variance, np.nan))
         if choice.page is not None:
             from errormotion.compensation.program.report import write_program_report
 
-            at = np.arange(len(summary.places))
+            at = np.arange(len(summary.positions))
             uncertainty = np.stack([np.interp(at, at[pick], expanded[:, k] / 2) for k in range(3)], axis=1)
             write_program_report(
                 choice.page.file,
@@ -118,7 +118,7 @@ def _correction(sources: list[Any], choice: Choice) -> Correction:
 
 
 def _last(found: Correction) -> float:
-    """Return the last instant at which the errors are known, s."""
+    """Return the last time at which the errors are known, s."""
     return max(float(field.instants.nodes[-1]) for field in found.fields if field.instants is not None)
 
 
@@ -143,7 +143,7 @@ def _head(
         lines.append(f"errors at {time:.0f} s after the start of their clock")
     lines.append(f"tolerance {1e6 * settings.tolerance:g} um, sampling {1e3 * settings.step:g} mm")
     lines.append(f"original SHA-256 {sha256(part.read_bytes()).hexdigest()[:32]}")
-    lines.append("valid for the work offsets, tools and start it was made with")
+    lines.append("valid only for the work offsets, tools and start position used here")
     return lines
 
 
@@ -175,7 +175,7 @@ def _show(
                 "unfed",
             )
         }
-        counted = {name: {"number": count, "first_line": line} for name, (count, line) in summary.left.items()}
+        counted = {name: {"number": count, "first_line": line} for name, (count, line) in summary.unchanged.items()}
         more = {
             name: {"number": value[0], "first_line": value[1]}
             for name, value in (("outside", summary.outside), ("uncorrected", summary.uncorrected))
@@ -206,13 +206,13 @@ def _show(
         show(f"  expanded by LinuxCNC's interpreter, because of {outcome.why}")
     if outcome.checked:
         show(f"  LinuxCNC's interpreter reads the new program as planned: {outcome.checked} moves")
-    for kind, (count, line) in sorted(summary.left.items()):
-        show(f"  not corrected: {count} {LEFT[kind]}, the first in line {line}")
+    for kind, (count, line) in sorted(summary.unchanged.items()):
+        show(f"  not corrected: {count} {UNCHANGED[kind]}, the first in line {line}")
     if summary.uncorrected[0]:
         show(f"  WARNING: {summary.uncorrected[0]} cuts start uncorrected, the first in line {summary.uncorrected[1]}")
     if summary.outside[0]:
         count, line = summary.outside
-        show(f"  WARNING: {count} moves outside of what was measured, the first in line {line}: held at its edge")
+        show(f"  WARNING: {count} moves outside the measured range, the first in line {line}: corrected as at its edge")
     for note in found.notes:
         show(f"  note: {note}")
     for path in choice.page.files if choice.page is not None else ():
@@ -223,13 +223,3 @@ def _one_of(option: str, text: str, allowed: tuple[str, ...]) -> str:
     if text not in allowed:
         raise ProgramError(f"{option} {text}: expected one of {', '.join(allowed)}")
     return text
-
-
-def _quantity(option: str, text: str, kind: Any) -> float:
-    """Return a length or time with its unit in SI."""
-    try:
-        value: float = TypeAdapter(kind).validate_python(text)
-    except ValidationError as error:
-        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
-        raise DatasetError(f"{option} {text}: {reason}") from None
-    return value

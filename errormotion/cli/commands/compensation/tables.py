@@ -1,26 +1,23 @@
-"""``errormotion compensate``: tables of corrections for controllers."""
+"""``errormotion compensate table``: writes a compensation table for a control."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
-
-from pydantic import TypeAdapter, ValidationError
 
 from errormotion.cli.commands.compensation.model import errors_of
+from errormotion.cli.options import quantity
 from errormotion.cli.output import show, show_json
 from errormotion.cli.settings import read_settings
 from errormotion.compensation.tables import axis_table, export, get
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.units import Length, Time
-from errormotion.errors import DatasetError
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What of the errors a table is made of; texts as they were typed."""
+    """Options of the command; positions in m, quantities as text."""
 
     axis: str
     component: str
@@ -39,7 +36,8 @@ def table(errors: Path, form: str, choice: Choice, out: Path, assignments: list[
     PluginError
         No such format.
     DatasetError
-        The errors cannot be read or make no table, the control would refuse it, or a file exists. Nothing is written.
+        The errors cannot be read or do not determine a table, the table exceeds a limit of the control, or a file
+        exists already. Nothing is written.
     """
     chosen = get(form)
     settings = read_settings(chosen.Settings, None, assignments)
@@ -48,9 +46,9 @@ def table(errors: Path, form: str, choice: Choice, out: Path, assignments: list[
             errors_of(errors),
             choice.axis.upper(),
             component=choice.component.upper(),
-            step=_quantity("--step", choice.step, Length),
+            step=None if choice.step is None else quantity("--step", choice.step, Length),
             at=choice.at,
-            time=_quantity("--time", choice.time, Time),
+            time=None if choice.time is None else quantity("--time", choice.time, Time),
             functional_point=choice.functional_point,
             chain=choice.chain,
             run=errors.resolve().name,
@@ -74,15 +72,3 @@ def table(errors: Path, form: str, choice: Choice, out: Path, assignments: list[
     for remark in exported.remarks:
         show(f"  note: {remark}")
     show(f"  format from: {chosen.source}")
-
-
-def _quantity(option: str, text: str | None, kind: Any) -> float | None:
-    """Return a length or time with its unit in SI; None where it is not stated."""
-    if text is None:
-        return None
-    try:
-        value: float = TypeAdapter(kind).validate_python(text)
-    except ValidationError as error:
-        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
-        raise DatasetError(f"{option} {text}: {reason}") from None
-    return value

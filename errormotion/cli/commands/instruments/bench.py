@@ -1,4 +1,4 @@
-"""``errormotion bench probe``."""
+"""``errormotion bench probe``: reads every instrument of a bench once."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from errormotion.campaign.bench import OpenBench
+from errormotion.campaign.claims import claimed
 from errormotion.campaign.files import BenchPlan, load_bench
-from errormotion.campaign.turns import claimed
 from errormotion.cli.output import show, show_json, table
 
-MOST_NUMBERS = 12
-"""Readings with more numbers are printed as a summary."""
+MAX_NUMBERS = 12
+"""Largest number of values of a reading that are printed; a longer reading is summarized."""
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ def _probe(plan: BenchPlan, as_json: bool) -> bool:
             [
                 r["name"],
                 r["driver"],
-                _who(r["identity"]),
+                _name(r["identity"]),
                 f"FAILED: {r['error']}" if r["error"] else _short(r["reading"]),
             ]
             for r in found
@@ -59,7 +59,7 @@ def _probe(plan: BenchPlan, as_json: bool) -> bool:
     return good
 
 
-def _who(identity: dict[str, Any] | None) -> str:
+def _name(identity: dict[str, Any] | None) -> str:
     if identity is None:
         return "-"
     simulated = " (simulated)" if identity["simulated"] else ""
@@ -80,7 +80,7 @@ def _short(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{k} {_short(v)}" for k, v in value.items())
     if isinstance(value, list):
-        if len(value) > MOST_NUMBERS:
+        if len(value) > MAX_NUMBERS:
             return _summary(value)
         return ", ".join(_short(v) for v in value) or "none"
     return f"{value:.6g}" if isinstance(value, float) else str(value)

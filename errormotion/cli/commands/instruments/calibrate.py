@@ -1,4 +1,4 @@
-"""``errormotion calibrate``: readings become a calibration, by the plugin that owns their schema."""
+"""``errormotion calibrate``: makes a calibration from readings, by the plugin that owns their schema."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from errormotion import datasets, plugins
 from errormotion.cli.output import show, show_json
+from errormotion.cli.page import new_dataset
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.datasets.storage.disk import reading
@@ -20,14 +21,11 @@ def run(data: Path, out: Path, assignments: list[str], settings_file: Path | Non
     Raises
     ------
     DatasetError
-        The data cannot be read, no calibration is made from their schema, or the file exists already.
+        The data cannot be read or have no schema of a calibration, or the file exists already.
     MethodError
-        Wrong settings, or readings that do not determine a calibration.
+        The settings are invalid, or the readings do not determine a calibration.
     """
-    if out.suffix != ".nc":
-        raise DatasetError(f"{out}: expected a name that ends in .nc (NetCDF-4 file)")
-    if out.exists():
-        raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
+    new_dataset(out)
     with Bars(as_json) as bars, reading(data), datasets.load(data) as raw:
         calibration = _calibration_of(data, str(raw.attrs.get("schema", "none")))
         settings = read_settings(calibration.Settings, settings_file, assignments)
@@ -45,7 +43,7 @@ def run(data: Path, out: Path, assignments: list[str], settings_file: Path | Non
 
 
 def _calibration_of(data: Path, schema: str) -> Calibration:
-    """Return the calibration that is made from readings of a schema."""
+    """Return the calibration that evaluates readings of a schema."""
     owner = plugins.owner_of_schema(schema)
     found: Calibration | None = getattr(owner, "calibrations", {}).get(schema)
     if found is None:

@@ -1,4 +1,4 @@
-"""Arguments of the commands on benches and instruments. What a command needs is imported when it runs."""
+"""Arguments of the commands on benches and instruments; imports of a command are inside its function."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from errormotion.cli.guard import ERROR, INVALID, guarded
+from errormotion.cli import options
+from errormotion.cli.guard import ERROR, INVALID
 from errormotion.cli.output import show, show_json, table
-from errormotion.cli.root import Json, app, bench_app
+from errormotion.cli.root import app, bench_app
 
 
 @bench_app.command("validate")
-@guarded
-def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: Json = False) -> None:
+def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: options.Json = False) -> None:
     """Check a bench file; nothing is opened."""
     from errormotion.campaign.files import load_bench
     from errormotion.errors import BenchError
@@ -39,8 +39,7 @@ def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], 
 
 
 @bench_app.command("probe")
-@guarded
-def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: Json = False) -> None:
+def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: options.Json = False) -> None:
     """Open, identify and read every instrument once."""
     from errormotion.cli.commands.instruments import bench as command
 
@@ -49,13 +48,12 @@ def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], jso
 
 
 @app.command()
-@guarded
 def calibrate(
     data: Annotated[Path, typer.Argument(help="Readings of a sensor against a reference: NetCDF or CSV.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The calibration to write, .nc; it must not exist.")],
-    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting.")] = None,
-    settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
-    json_: Json = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File of the calibration (.nc); it must not exist.")],
+    set_: options.Set = None,
+    settings: options.SettingsFile = None,
+    json_: options.Json = False,
 ) -> None:
     """Make a calibration from readings."""
     from errormotion.cli.commands.instruments import calibrate as command
@@ -64,7 +62,6 @@ def calibrate(
 
 
 @app.command()
-@guarded
 def monitor(
     bench: Annotated[Path, typer.Argument(help="A bench file with thermometers, a controller, or both.")],
     runs: Annotated[Path, typer.Option(help="Folder for the run folder of the log.")] = Path("runs"),
@@ -79,26 +76,26 @@ def monitor(
 
 
 @app.command()
-@guarded
 def simulate(
     plugin: Annotated[str, typer.Argument(help="The id of an instrument or a compensator.")],
     port: Annotated[
         int | None,
-        typer.Option(min=0, max=65535, help="Port of the device, the next one for its next line; default: a free one."),
+        typer.Option(min=0, max=65535, help="Port; a second line uses the next one. Default: a free port."),
     ] = None,
     host: Annotated[
-        str | None, typer.Option(help="Address at which it listens; default: 127.0.0.1, this computer only.")
+        str | None, typer.Option(help="Address on which the device listens; default: 127.0.0.1, this computer only.")
     ] = None,
     fault: Annotated[str | None, typer.Option(help="A fault of the device, such as silence, split or late.")] = None,
-    bench: Annotated[Path | None, typer.Option(help="A bench file: its machine, and its device.")] = None,
+    bench: Annotated[Path | None, typer.Option(help="A bench file that states the machine and the device.")] = None,
     machine: Annotated[str | None, typer.Option(help="The virtual machine: cframe (default) or gantry.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Which individual of the machine.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the errors of the virtual machine.")] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter of the simulated device.")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="One parameter of the simulated device; may be repeated."),
     ] = None,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
-    """Start the simulated device of an instrument by itself, until Ctrl-C."""
+    """Start the simulated device of an instrument as a server, until Ctrl-C."""
     from errormotion.cli.commands.instruments import simulate as command
 
     command.run(
@@ -115,16 +112,13 @@ def simulate(
 
 
 @app.command()
-@guarded
 def record(
     bench: Annotated[Path, typer.Argument(help="A bench file.")],
     instrument: Annotated[str, typer.Argument(help="The name of one of its instruments.")],
     for_: Annotated[str, typer.Option("--for", metavar="TIME", help="Duration of the session.")] = "10 s",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The recording to write; default: INSTRUMENT-TIME.rec.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File; default: INSTRUMENT-TIME.rec.")] = None,
     mask_serial: Annotated[bool, typer.Option("--mask-serial", help="Mask the serial number.")] = False,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
     """Record a short session with one instrument: identity, readings, stream."""
     from errormotion.cli.commands.instruments import record as command
@@ -134,10 +128,9 @@ def record(
 
 
 @app.command()
-@guarded
 def replay(
-    recording: Annotated[Path, typer.Argument(help="A recording that 'errormotion record' has made.")],
-    json_: Json = False,
+    recording: Annotated[Path, typer.Argument(help="A recording made by 'errormotion record'.")],
+    json_: options.Json = False,
 ) -> None:
     """Run the driver on a recorded session, and report whether it was reproduced."""
     from errormotion.cli.commands.instruments import record as command

@@ -1,4 +1,4 @@
-"""``errormotion monitor``: temperatures and working parameters live in the terminal, and into a run folder."""
+"""``errormotion monitor``: shows temperatures and working parameters live, and logs them into a run folder."""
 
 from __future__ import annotations
 
@@ -14,68 +14,57 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from errormotion.campaign.claims import claimed
 from errormotion.campaign.files import load_bench
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
-from errormotion.campaign.turns import claimed
+from errormotion.cli import options
 from errormotion.cli.curves import bars
 from errormotion.cli.output import show
-from errormotion.datasets.units import TIME
-from errormotion.errors import BenchError
 
 TREND = 30
-"""Characters of the course of a temperature."""
+"""Points of the curve of a temperature."""
 
-LEAST_SPAN = 0.1
-"""Height of the course of a temperature at least, K: a tenth of a kelvin is no mountain."""
+MIN_SPAN = 0.1
+"""Smallest full scale of the curve of a temperature, K."""
 
 SPAN = 1800.0
-"""Time that the course and the rate of change look back, s."""
+"""Period of the curve and of the rate of change, s."""
 
 
 def run(file: Path, runs: Path, interval: str, duration: str | None, as_json: bool) -> None:
-    """Watch a bench until Ctrl-C, or for a time; print where the log is."""
-    step = _time("interval", interval)
-    length = math.inf if duration is None else _time("duration", duration)
+    """Monitor a bench until Ctrl-C or for a duration, and print the folder of the log."""
+    step = options.duration("--interval", interval)
+    length = math.inf if duration is None else options.duration("--duration", duration)
     monitor = Monitor(load_bench(file), runs, step)
     screen = Screen(monitor.sensors)
     console = Console(stderr=True, highlight=False)
     shown = sys.stderr.isatty() and not as_json
     last: Snapshot | None = None
-    place: Path | None = None
+    folder: Path | None = None
     try:
         with (
             claimed(monitor.plan.machine, "a monitor") as records,
             monitor,
             Live(console=console, auto_refresh=False, transient=True, screen=False) as live,
         ):
-            place = monitor.folder.path
-            records(place)
+            folder = monitor.folder.path
+            records(folder)
             for last in monitor.watch(length):
                 screen.take(last)
                 if as_json:
                     sys.stdout.write(json.dumps(_plain(last), ensure_ascii=False) + "\n")
                     sys.stdout.flush()
                 elif shown:
-                    live.update(screen.page(monitor.plan.machine, last, monitor.folder.path), refresh=True)
-    except KeyboardInterrupt:  # the way to end it
-        if place is None:  # before there was a log
+                    live.update(screen.page(monitor.plan.machine, last, folder), refresh=True)
+    except KeyboardInterrupt:  # Ctrl-C ends the command
+        if folder is None:  # before the log was created
             raise
     if not as_json:
         show(summary(last, monitor.folder.path))
 
 
-def _time(name: str, text: str) -> float:
-    try:
-        value = TIME.parse(text)
-    except ValueError as error:
-        raise BenchError(f"--{name}: {error}") from None
-    if not value > 0:
-        raise BenchError(f"--{name}: expected more than 0 s; found '{text}'")
-    return value
-
-
 class Screen:
-    """The live page: remembers as much of the past as it shows, and no more.
+    """The live view; its memory is bounded.
 
     Parameters
     ----------
@@ -89,7 +78,7 @@ class Screen:
         self._course: dict[str, deque[tuple[float, float]]] = {name: deque(maxlen=TREND) for name in sensors}
 
     def take(self, snapshot: Snapshot) -> None:
-        """Remember what the page needs of a snapshot."""
+        """Add the temperatures of a snapshot."""
         for name, value in snapshot.temperatures.items():
             course = self._course[name]
             if not course or snapshot.time - course[-1][0] >= SPAN / TREND:
@@ -101,7 +90,7 @@ class Screen:
             self._extremes[name] = min(low, value), max(high, value)
 
     def rate(self, name: str, snapshot: Snapshot) -> float:
-        """Return by how much a temperature rises, K/h; NaN while that cannot be said."""
+        """Return the rate of change of a temperature, K/h; NaN while it is unknown."""
         known = [(t, value) for t, value in self._course[name] if not math.isnan(value)]
         value = snapshot.temperatures[name]
         if not known or math.isnan(value) or snapshot.time <= known[0][0]:
@@ -109,7 +98,7 @@ class Screen:
         return (value - known[0][1]) / (snapshot.time - known[0][0]) * 3600
 
     def page(self, machine: str, snapshot: Snapshot, folder: Path) -> Group:
-        """Return what the terminal shows."""
+        """Return the live view of the terminal."""
         parts: list[Any] = [Text.assemble((machine, "bold"), f"  {clock(snapshot.time)}  {snapshot.logged} rows")]
         if snapshot.temperatures:
             parts.append(self._temperatures(snapshot))
@@ -139,7 +128,7 @@ class Screen:
                 _number(self.rate(name, snapshot), "+.2f"),
                 _number(low, ".2f"),
                 _number(high, ".2f"),
-                bars([value for _, value in self._course[name]], LEAST_SPAN),
+                bars([value for _, value in self._course[name]], MIN_SPAN),
             )
         return table
 
@@ -148,9 +137,9 @@ def _parameters(state: dict[str, Any] | Any) -> Table:
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column("", style="dim")
     table.add_column("")
-    place = state.get("position") or []
+    position = state.get("position") or []
     rows = [
-        ("position", "  ".join(f"{axis} {1e3 * x:.3f}" for axis, x in zip("XYZ", place, strict=False)) + " mm"),
+        ("position", "  ".join(f"{axis} {1e3 * x:.3f}" for axis, x in zip("XYZ", position, strict=False)) + " mm"),
         ("spindle", f"{_number(state.get('spindle_speed'), '.0f')} /min"),
         ("load", f"{_number(_times(100, state.get('spindle_load')), '.0f')} %"),
         ("feed", f"{_number(_times(60e3, state.get('feed')), '.0f')} mm/min"),
@@ -172,11 +161,13 @@ def clock(seconds: float) -> str:
 
 
 def summary(last: Snapshot | None, folder: Path) -> str:
-    """Return what a person reads when the monitor has ended."""
+    """Return the summary that is printed at the end."""
     if last is None:
         return f"Nothing was logged in {folder}."
     lines = [f"{last.logged} rows over {clock(last.time)} in {folder}."]
-    lines += [f"{name}: no answer in {count} of them, marked as gaps." for name, count in last.gaps.items()]
+    lines += [
+        f"{name}: no answer in {count} of the rows; they are marked as gaps." for name, count in last.gaps.items()
+    ]
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""``errormotion record`` and ``errormotion replay``: a short session with an instrument, and the driver on it again."""
+"""``errormotion record`` and ``errormotion replay``: record a session with an instrument, and replay it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pydantic import ValidationError
 
 from errormotion import __version__, plugins
 from errormotion.campaign.files import BenchInstrument, load_bench
+from errormotion.cli import options
 from errormotion.cli.output import show, show_json
-from errormotion.datasets.units import TIME
 from errormotion.errors import BenchError, InstrumentError, ReplayError
 from errormotion.instruments.sessions.masking import holds, mask, words_of
 from errormotion.instruments.sessions.session import Session, differences, live, repeated
@@ -21,28 +21,29 @@ from errormotion.instruments.simulators.virtual_world.described import describe
 from errormotion.instruments.transports.recording import add_note, parts_of, read_note, read_recording
 
 LONGEST = 3600.0
-"""Longest session, s."""
-MOST_BYTES = 50_000_000
-"""Size of the recording at which a session ends."""
-LARGEST_REPLAY = 10 * MOST_BYTES
+"""Longest duration of a session, s."""
+MAX_RECORDING = 50_000_000
+"""Size of a recording at which the session ends, bytes."""
+MAX_REPLAY = 10 * MAX_RECORDING
+"""Largest size of a recording that is replayed, bytes."""
 
 
 def record(bench: Path, name: str, duration: str, out: Path | None, mask_serial: bool, as_json: bool) -> bool:
-    """Record a session, print where, and return whether it went without an error."""
-    seconds = _seconds(duration)
+    """Record a session, print the files, and return whether it ended without an error."""
+    seconds = options.duration("--for", duration, LONGEST)
     instrument = _instrument(bench, name)
     path = out or Path(f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}.rec")
     if path.exists():
         raise InstrumentError(f"The recording {path} exists already; choose another file or remove it")
-    early: dict[Path, int] = {}  # frames until the identity was known
+    early: dict[Path, int] = {}  # number of frames before the identity was known
     session = live(
         instrument.driver(instrument.address, instrument.settings, record=path),
         seconds,
-        lambda: sum(each.stat().st_size for each in _files(path)) > MOST_BYTES,
+        lambda: sum(each.stat().st_size for each in _files(path)) > MAX_RECORDING,
         lambda: early.update({each: len(each.read_bytes().splitlines()) - 1 for each in _files(path)}),
     )
     if not path.is_file():
-        raise InstrumentError(session.message or f"The instrument '{name}' recorded nothing")
+        raise InstrumentError(session.message or f"Nothing was recorded from the instrument '{name}'")
     note = _note(instrument, session)
     add_note(path, note)
     if mask_serial:
@@ -62,11 +63,9 @@ def record(bench: Path, name: str, duration: str, out: Path | None, mask_serial:
 
 
 def replay(path: Path, as_json: bool) -> bool:
-    """Run the driver on a recording, print what it read, and return whether the session was reproduced."""
-    if (size := sum(part.stat().st_size for part in {path, *parts_of(path)})) > LARGEST_REPLAY:
-        raise ReplayError(
-            f"The recording {path} has {size / 1e6:.0f} MB; expected at most {LARGEST_REPLAY / 1e6:.0f} MB"
-        )
+    """Run the driver on a recording, print its readings, and return whether the session was reproduced."""
+    if (size := sum(part.stat().st_size for part in {path, *parts_of(path)})) > MAX_REPLAY:
+        raise ReplayError(f"The recording {path} has {size / 1e6:.0f} MB; expected at most {MAX_REPLAY / 1e6:.0f} MB")
     note, session, found = _played(path)
     frames = sum(len(read_recording(part)[1]) for part in parts_of(path))
     if as_json:
@@ -84,8 +83,8 @@ def replay(path: Path, as_json: bool) -> bool:
         )
         return not found
     identity = session.identity
-    who = " ".join(str(identity.get(key, "")) for key in ("manufacturer", "model", "serial_number", "firmware"))
-    show(f"{note['plugin']} {note.get('plugin_version', '')}: {who.strip() or 'no identity'}")
+    device = " ".join(str(identity.get(key, "")) for key in ("manufacturer", "model", "serial_number", "firmware"))
+    show(f"{note['plugin']} {note.get('plugin_version', '')}: {device.strip() or 'no identity'}")
     show(f"recorded with errormotion {note.get('errormotion', '?')}, {note.get('distribution', '?')}")
     for name, summary in (("reading", session.readings), ("block of the stream", session.stream)):
         if summary.count:
@@ -94,7 +93,7 @@ def replay(path: Path, as_json: bool) -> bool:
             )
             show(f"  first {_short(summary.first)}, last {_short(summary.last)}")
     if session.step and not found:
-        show(f"As in the recording, the session ends in the step '{session.step}' with an error: {session.message}")
+        show(f"As in the recording, the session ended in the step '{session.step}' with an error: {session.message}")
     show(f"{frames} frames: " + ("reproduced frame by frame" if not found else "NOT reproduced"))
     for difference in found:
         show(f"  - {difference}")
@@ -105,7 +104,7 @@ def _played(path: Path) -> tuple[dict[str, Any], Session, list[str]]:
     note = read_note(path)
     if note is None or "session" not in note or "plugin" not in note:
         raise ReplayError(
-            f"The recording {path} states no instrument: it was not made by 'errormotion record'. Open replay://{path} "
+            f"The recording {path} states no instrument; 'errormotion record' did not make it. Open replay://{path} "
             "with its driver instead"
         )
     cls = plugins.get("instruments", str(note["plugin"]))
@@ -136,24 +135,24 @@ def _note(instrument: BenchInstrument, session: Session) -> dict[str, Any]:
 
 
 def _mask(path: Path, session: Session, early: dict[Path, int]) -> None:
-    """Mask the serial number; remove the recording where that fails: it must not be sent by mistake."""
+    """Mask the serial number; if that fails, remove the recording, so that it cannot be sent by mistake."""
     try:
         if not session.identity:
-            raise InstrumentError("The instrument has stated no serial number")
+            raise InstrumentError("The instrument did not state a serial number")
         words = words_of(str(session.identity["serial_number"]))
         mask(path, words, early)
         add_note(path, (read_note(path) or {}) | {"masked": True})
         found = _played(path)[2]
         if found:
-            raise InstrumentError(f"The masked recording does not replay ({found[0]})")
+            raise InstrumentError(f"The masked recording cannot be replayed ({found[0]})")
         if holds(path, words):
-            raise InstrumentError("The serial number still stands in the masked recording")
+            raise InstrumentError("The masked recording still contains the serial number")
     except InstrumentError as error:
         for each in {path, *parts_of(path)}:
             each.unlink(missing_ok=True)
         raise InstrumentError(
-            f"{error}. The recording was removed. Record without --mask-serial, and send it only to whom may know the "
-            "serial number"
+            f"{error}. The recording was removed. Record without --mask-serial, and send the recording only to persons "
+            "who may know the serial number"
         ) from None
 
 
@@ -163,18 +162,8 @@ def _instrument(bench: Path, name: str) -> BenchInstrument:
     found = [each for each in plan.instruments if each.name == name]
     if not found:
         names = ", ".join(each.name for each in plan.instruments)
-        raise BenchError(f"{bench}: no instrument '{name}'; there are: {names}")
+        raise BenchError(f"{bench}: expected one of the instruments {names}; found '{name}'")
     return found[0]
-
-
-def _seconds(duration: str) -> float:
-    try:
-        value = TIME.parse(duration)
-    except ValueError as error:
-        raise BenchError(f"--for: {error}") from None
-    if not 0 < value <= LONGEST:
-        raise BenchError(f"--for: expected more than 0 s and at most {LONGEST:g} s; found '{duration}'")
-    return value
 
 
 def _files(path: Path) -> set[Path]:

@@ -1,4 +1,4 @@
-"""``errormotion simulate``: the simulated device of an instrument, or machine of a compensator, by itself."""
+"""``errormotion simulate``: starts the simulated device of an instrument or a compensator as a server."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from errormotion.instruments.transports import load_simulator, parse_address
 
 DEFAULT_MACHINE = "cframe"
 REAL_TIME = {"pace": "1", "clock": "1"}
-"""Other programs expect a device with the clock of this computer."""
+"""Parameters of a device that runs in real time, as other programs expect."""
 
 
 def run(
@@ -45,7 +45,7 @@ def run(
         _require_reachable(device.url)
         _print(plugin_id, address.url, device, as_json)
         _wait()
-    except KeyboardInterrupt:  # the way to end it
+    except KeyboardInterrupt:  # Ctrl-C ends the command
         pass
     finally:
         device.close()
@@ -64,7 +64,7 @@ def _simulator_of(plugin_id: str) -> str:
     choices = nearest(plugin_id, [name for name, simulator in simulated.items() if simulator])
     if plugin_id in found:
         group = found[plugin_id].group
-        plugins.get(group, plugin_id)  # states why it does not load
+        plugins.get(group, plugin_id)  # raises the reason if the plugin cannot be loaded
         raise PluginError(f"The {group.rstrip('s')} '{plugin_id}' has no simulator of its own. {choices}")
     raise PluginError(f"Expected an instrument or a compensator that can be simulated; found '{plugin_id}'. {choices}")
 
@@ -77,7 +77,7 @@ def _pairs(settings: list[str]) -> dict[str, str]:
 
 
 def _address(plugin_id: str, bench: Path | None, machine: str | None, params: dict[str, str]) -> str:
-    """Return the ``sim://`` address: that of the bench file for this instrument, with what was given instead."""
+    """Return the ``sim://`` address of the bench file for this instrument, changed by the options."""
     host, path, found = DEFAULT_MACHINE, "", dict[str, str]()
     if bench is not None:
         plan = load_bench(bench)
@@ -98,8 +98,8 @@ def _address(plugin_id: str, bench: Path | None, machine: str | None, params: di
 def _require_reachable(url: str) -> None:
     if url.startswith("can://virtual/"):
         raise InstrumentError(
-            f"The simulated device is on a CAN bus inside this process, {url}; put it on one that other processes "
-            "reach, such as --set bus=udp_multicast"
+            f"The simulated device uses a CAN bus inside this process, {url}; choose a bus that other processes reach, "
+            "such as --set bus=udp_multicast"
         )
 
 
@@ -116,12 +116,12 @@ def _print(plugin_id: str, simulator: str, device: Any, as_json: bool) -> None:
     for name, url in lines.items():
         show(f"{name}: {url}")
     for name, value in getattr(device, "driver_settings", {}).items():
-        show(f"{name} = {json.dumps(value)}")  # as a bench file has it
+        show(f"{name} = {json.dumps(value)}")  # as in a bench file
     show("Ctrl-C ends it.")
 
 
 def _driver_address(device: Any, lines: Mapping[str, str]) -> str:
-    """Return the address of the device in a bench file; empty where its lines have no common one."""
+    """Return the address of the device in a bench file; empty if its lines have no common address."""
     stated = getattr(device, "driver_url", None)
     if stated is not None:
         return str(stated)

@@ -1,1 +1,1 @@
-"""Plugins: those that are installed, and new ones."""
+"""Commands on plugins: list, show, check, and write new ones."""

@@ -1,4 +1,4 @@
-"""Arguments of the commands on plugins. What a command needs is imported when it runs."""
+"""Arguments of the commands on plugins; imports of a command are inside its function."""
 
 from __future__ import annotations
 
@@ -7,22 +7,21 @@ from typing import Annotated, Literal
 
 import typer
 
-from errormotion.cli.guard import INVALID, guarded
-from errormotion.cli.root import Json, plugins_app
+from errormotion.cli import options
+from errormotion.cli.guard import INVALID
+from errormotion.cli.root import plugins_app
 
 
 @plugins_app.command("list")
-@guarded
-def plugins_list(json_: Json = False) -> None:
-    """List all plugins, those that do not load included."""
+def plugins_list(json_: options.Json = False) -> None:
+    """List all plugins, including those that cannot be loaded."""
     from errormotion.cli.commands.plugins import listing as command
 
     command.list_plugins(json_)
 
 
 @plugins_app.command("show")
-@guarded
-def plugins_show(plugin: Annotated[str, typer.Argument(help="Its id.")], json_: Json = False) -> None:
+def plugins_show(plugin: Annotated[str, typer.Argument(help="Id of the plugin.")], json_: options.Json = False) -> None:
     """Show the description of a plugin and its settings."""
     from errormotion.cli.commands.plugins import listing as command
 
@@ -30,14 +29,13 @@ def plugins_show(plugin: Annotated[str, typer.Argument(help="Its id.")], json_: 
 
 
 @plugins_app.command("check")
-@guarded
 def plugins_check(
-    plugin: Annotated[str, typer.Argument(help="Its id.")],
+    plugin: Annotated[str, typer.Argument(help="Id of the plugin.")],
     address: Annotated[str | None, typer.Option(help="Address of a real instrument; default: its simulator.")] = None,
     mutants: Annotated[
-        int | None, typer.Option(min=0, help="Changed frames to try: default 300 in 6 s; of more, all.")
+        int | None, typer.Option(min=0, help="Number of changed frames to try; default: 300, in at most 6 s.")
     ] = None,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
     """Run the conformance kit on a plugin."""
     from errormotion.cli.commands.plugins import listing as command
@@ -47,14 +45,11 @@ def plugins_check(
 
 
 @plugins_app.command("new")
-@guarded
 def plugins_new(
-    what: Annotated[
-        Literal["instrument", "method", "compensator"], typer.Argument(help="instrument, method or compensator.")
-    ],
+    what: Annotated[Literal["instrument", "method", "compensator"], typer.Argument(help="Kind of plugin.")],
     name: Annotated[str, typer.Argument(help="Name of the plugin; its id is made from it.")],
     out: Annotated[Path | None, typer.Option(help="Folder to write; default: errormotion-NAME.")] = None,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
     """Write a new distribution with a plugin that passes the conformance kit."""
     from errormotion.cli.commands.plugins import new as command

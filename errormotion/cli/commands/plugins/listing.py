@@ -1,4 +1,4 @@
-"""``errormotion plugins list|show|check|new``."""
+"""``errormotion plugins list``, ``show`` and ``check``."""
 
 from __future__ import annotations
 
@@ -87,7 +87,9 @@ def group_of(plugin_id: str) -> plugins.Group:
     if len(found) == 1:
         return found[0]
     if found:
-        raise PluginError(f"'{plugin_id}' is a plugin of the groups {' and '.join(found)}; rename one of them")
+        raise PluginError(
+            f"'{plugin_id}' is the id of a plugin in each of the groups {' and '.join(found)}; rename one"
+        )
     from errormotion.datasets.files.tomlfile import nearest
 
     names = [plugin.id for group in plugins.GROUPS for plugin in plugins.available(group)]

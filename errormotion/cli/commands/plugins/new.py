@@ -1,4 +1,4 @@
-"""``errormotion plugins new``: a distribution with a plugin that passes the conformance kit as it stands."""
+"""``errormotion plugins new``: writes a distribution with a plugin that passes the conformance kit."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def new(what: str, name: str, out: Path | None, as_json: bool) -> None:
     what : str
         ``instrument``, ``method`` or ``compensator``.
     name : str
-        The id of the plugin, or words from which it is made: "LG7 gauge" becomes ``lg7_gauge``.
+        The id of the plugin, or words from which the id is made: "LG7 gauge" gives ``lg7_gauge``.
     out : Path, optional
-        The folder, which must not exist or be empty; default: the name of the distribution.
+        A folder that is empty or does not exist; default: the name of the distribution.
     as_json : bool
 
     Raises
     ------
     PluginError
-        The name cannot be an id or is taken, or the folder has files.
+        The name cannot be an id or is used already, or the folder is not empty.
     """
     plugin_id = id_of(name)
     words = {
@@ -57,16 +57,16 @@ def new(what: str, name: str, out: Path | None, as_json: bool) -> None:
 
 
 def id_of(name: str) -> str:
-    """Return the id that a name makes: lower case, words joined by underscores.
+    """Return the id of a name: lower case, words joined by underscores.
 
     Raises
     ------
     PluginError
-        The id would be no identifier, the name of a package of Python, or that of another plugin.
+        The id is not an identifier, or it is the name of a standard package of Python or of another plugin.
     """
     found = re.sub(r"[^a-z0-9]+", "_", name.strip().lower()).strip("_")
     if not found.isidentifier() or keyword.iskeyword(found) or len(found) > 40:
-        raise PluginError(f"'{name}': expected a name that begins with a letter, such as 'my sensor'; found '{found}'")
+        raise PluginError(f"'{name}': expected a name that starts with a letter, such as 'my sensor'; found '{found}'")
     taken = {plugin.id for group in plugins.GROUPS for plugin in plugins.available(group)}
     if found in taken or found in sys.stdlib_module_names or found == "errormotion":
         raise PluginError(f"'{found}' is the name of another plugin or package; choose another name")
@@ -81,8 +81,8 @@ def _templates(folder: Traversable, plugin_id: str) -> list[tuple[str, str]]:
             found += [(f"tests/test_{plugin_id}.py", (each / "test_plugin.py.j2").read_text(encoding="utf-8"))]
         elif each.name.endswith(".j2"):
             name = each.name.removesuffix(".j2").replace("package.py", "__init__.py")
-            place = name if not name.endswith(".py") else f"{plugin_id}/{name}"
-            found.append((place, each.read_text(encoding="utf-8")))
+            path = name if not name.endswith(".py") else f"{plugin_id}/{name}"
+            found.append((path, each.read_text(encoding="utf-8")))
     return found
 
 

@@ -1,1 +1,1 @@
-"""Results: identify, validate, compare, show, and hand on to a spreadsheet."""
+"""Commands on stored data: identify, validate, compare, report, and export."""

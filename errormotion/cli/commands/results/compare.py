@@ -1,4 +1,4 @@
-"""``errormotion compare``: whether several results of one machine agree, and what explains it where they do not."""
+"""``errormotion compare``: whether several results of one machine agree, and possible causes of differences."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.cli.output import show, show_json, table, working
-from errormotion.cli.page import Page
+from errormotion.cli.page import Page, new_files
 from errormotion.cli.results import load
 from errormotion.compare import compare as compared
 from errormotion.compare.repeats import labels
@@ -23,7 +23,7 @@ from errormotion.errors import DatasetError
 
 @dataclass(frozen=True)
 class Stated:
-    """What the command line states of the results: names, changes, origins of frames (m), chain, grouping, dims."""
+    """Options on the results: names, changes, origins of frames (m), chain, grouping, dims."""
 
     names: list[str]
     changes: list[str]
@@ -45,17 +45,14 @@ def compare(
     page: Page | None,
     as_json: bool,
 ) -> xr.Dataset:
-    """Compare error datasets, print the result, and write what was asked for.
+    """Compare error datasets, print the comparison, and write the requested files.
 
     Raises
     ------
     DatasetError
         The datasets cannot be read or compared, or a file exists already.
     """
-    files = [each for each in (out, *(page.files if page else ())) if each is not None]
-    for path in files:
-        if path.exists():
-            raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
+    files = new_files(page, out)
     results, left_out = load(paths, _named(stated.names), every=stated.by is not None)
     results = _completed(results, stated)
     results = {name: over_one(name, ds, stated) for name, ds in results.items()}
@@ -92,7 +89,7 @@ def _named(names: list[str]) -> dict[str, Path]:
 
 
 def _completed(results: dict[str, xr.Dataset], stated: Stated) -> dict[str, xr.Dataset]:
-    """Return the results with changes between them, and with what the command line states of them."""
+    """Return the results with the changes, frame origins and the chain of the command line."""
     found = dict(results)
     for each in stated.changes:
         name, _, paths = each.partition("=")
@@ -101,8 +98,8 @@ def _completed(results: dict[str, xr.Dataset], stated: Stated) -> dict[str, xr.D
             raise DatasetError(f"--change {each}: expected NAME=AFTER,BEFORE, as in --change volume=warm.nc,cold.nc")
         both, _ = load([], {"after": Path(parts[0]), "before": Path(parts[1])})
         found[name] = both["after"].em.change_from(both["before"])
-    if stray := [name for name in stated.origins if name not in found]:
-        raise DatasetError(f"--origin {stray[0]}: expected the name of a result: {', '.join(found)}")
+    if unmatched := [name for name in stated.origins if name not in found]:
+        raise DatasetError(f"--origin {unmatched[0]}: expected the name of a result: {', '.join(found)}")
     for name, origin in stated.origins.items():
         found[name] = found[name].assign_attrs(frame_origin=np.array(origin))
     if stated.chain is not None:
@@ -111,14 +108,14 @@ def _completed(results: dict[str, xr.Dataset], stated: Stated) -> dict[str, xr.D
 
 
 def over_one(name: str, ds: xr.Dataset, stated: Stated) -> xr.Dataset:
-    """Return a result at the selected element of each dimension but that of the comparison."""
+    """Return a result at the selected element of every dimension other than that of the comparison."""
     for each in stated.select:
         dim, _, index = each.partition("=")
         if not dim or not re.fullmatch("[0-9]{1,9}", index):
             raise DatasetError(f"--select {each}: expected DIM=NUMBER, as in --select position=3")
         if dim in ds["EX"].dims:
             if int(index) >= ds.sizes[dim]:
-                raise DatasetError(f"--select {each}: '{name}' has {dim} 0 to {ds.sizes[dim] - 1}")
+                raise DatasetError(f"--select {each}: '{name}' has the elements {dim}=0 to {dim}={ds.sizes[dim] - 1}")
             ds = ds.isel({dim: int(index)})
     others = map(str, ds["EX"].dims) if stated.over is not None and len(ds["EX"].dims) > 1 else ()
     for dim in others:
@@ -136,7 +133,7 @@ def _common(found: xr.Dataset) -> str:
 
 
 def _groups(results: dict[str, xr.Dataset], by: str | None) -> dict[str, str] | None:
-    """Return the group of each result; without ``by`` the repeats of a test, where there are any."""
+    """Return the group of each result; without ``by`` the repeats of each test, or None if there are none."""
     if by not in (None, "test"):
         return labels(results, str(by))
     tests = {name: re.sub(r" \(\d+\)$", "", name) for name in results}
@@ -144,7 +141,7 @@ def _groups(results: dict[str, xr.Dataset], by: str | None) -> dict[str, str] | 
 
 
 def text(ds: xr.Dataset) -> str:
-    """Return the result for a person."""
+    """Return the comparison as text."""
     names = [str(name) for name in ds["dof"].values]
     rows = []
     for j, pair in enumerate(ds["pair"].values):
@@ -160,7 +157,7 @@ def text(ds: xr.Dataset) -> str:
 
 
 def as_plain(ds: xr.Dataset) -> dict[str, Any]:
-    """Return the result for a program."""
+    """Return the comparison for JSON output."""
     pairs = []
     for j, pair in enumerate(ds["pair"].values):
         causes = [cause_text(ds, j, rank) for rank in range(ds.sizes["rank"])]

@@ -14,6 +14,7 @@ from errormotion import datasets, plugins
 from errormotion.campaign.storage.raw_paths import is_runs_folder, raw_of
 from errormotion.cli.guard import ERROR, INTERNAL, log_file
 from errormotion.cli.output import show, show_json, working
+from errormotion.cli.page import new_files
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.cli.summary import as_printed, figure_table, notes_of
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class Trials(NamedTuple):
-    """What ``--monte-carlo`` asks for; ``number`` is None for the adaptive procedure."""
+    """Options of ``--monte-carlo``; ``number`` is None for the adaptive procedure."""
 
     number: int | None
     digits: int
@@ -55,8 +56,8 @@ def identify(
     """Identify one raw dataset into a file, or several into a folder, and decide on tolerances."""
     limits = load_tolerances(tolerances) if tolerances is not None else None
     several = len(raws) > 1 or is_runs_folder(raws[0]) or (trials is None and (scheduler or workers))
-    if not several and out.exists():
-        raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
+    if not several:
+        new_files(None, out)
     method_id = method_id or _method_of(raws[0])
     settings = read_settings(plugins.get("methods", method_id).Settings, settings_file, assignments)
     if not several:
@@ -86,19 +87,19 @@ def _evaluated(
     workers: int | None,
     bars: Bars,
 ) -> dict[Path, xr.Dataset | str]:
-    """Return the Monte Carlo evaluation of each result, or why there is none; what exists already is kept."""
-    from errormotion.montecarlo.beside import evaluate_beside, file_beside
+    """Return the Monte Carlo evaluation of each result, or why it failed; existing evaluations are kept."""
+    from errormotion.montecarlo.saving import evaluate_and_save, evaluation_file
 
     found = dict[Path, Any]()
     for outcome in outcomes:
         if outcome.reason or outcome.errors is None:
             continue
-        file = file_beside(outcome.errors)
+        file = evaluation_file(outcome.errors)
         try:
             found[outcome.raw] = (
                 datasets.load(file)
                 if file.exists()
-                else evaluate_beside(
+                else evaluate_and_save(
                     raw_of(outcome.raw), method_id, settings, datasets.load(outcome.errors), outcome.errors,
                     trials=trials.number, digits=trials.digits, seed=trials.seed, scheduler=scheduler, workers=workers,
                     progress=bars,
@@ -120,7 +121,7 @@ def _method_of(raw: Path) -> str:
     if owner is None or not hasattr(owner, "identify"):
         raise DatasetError(f"{path}: expected a raw dataset of a method; found schema {schema}")
     if schema in getattr(owner, "calibrations", {}):
-        raise DatasetError(f"{path}: holds readings of a calibration; use 'errormotion calibrate'")
+        raise DatasetError(f"{path}: contains readings for a calibration; use 'errormotion calibrate'")
     return str(owner.info.id)
 
 
@@ -132,7 +133,7 @@ def _show_outcomes(
     as_json: bool,
     evaluations: Mapping[Path, xr.Dataset | str],
 ) -> None:
-    """Print the outcome of each run; the exit code is that of a failure if one failed, else of the tolerances."""
+    """Print the outcome of each run; the exit code is that of a failure if a run failed, else of the tolerances."""
     from errormotion.cli.commands.results import monte_carlo
 
     refused = [each for each in evaluations.values() if isinstance(each, str)]
@@ -162,11 +163,11 @@ def _show_outcomes(
                 show(f"  {raw}: {line}")
         for line in remarks(decisions):
             show(line)
-        for raw, made_of_it in evaluations.items():
-            if isinstance(made_of_it, str):
-                show(f"  failed: Monte Carlo evaluation of {raw}: {made_of_it}")
+        for raw, evaluated in evaluations.items():
+            if isinstance(evaluated, str):
+                show(f"  failed: Monte Carlo evaluation of {raw}: {evaluated}")
             else:
-                monte_carlo.show_evaluation(made_of_it, raw)
+                monte_carlo.show_evaluation(evaluated, raw)
     broken = any(outcome.traceback for outcome in failed)
     if broken:
         typer.echo(f"The tracebacks are in {log_file()}.", err=True)
@@ -189,7 +190,7 @@ def _identify_one(
     method, evaluation, file = plugins.get("methods", method_id), None, out
     if trials is not None:
         from errormotion.cli.commands.results import monte_carlo
-        from errormotion.montecarlo.beside import evaluate_beside
+        from errormotion.montecarlo.saving import evaluate_and_save
 
         file = monte_carlo.beside(out)
     with Bars(as_json) as bars:
@@ -199,7 +200,7 @@ def _identify_one(
                 errors = noted(method().identify(dataset, settings), dataset)
         datasets.validate(errors)
         if trials is not None:
-            evaluation = evaluate_beside(
+            evaluation = evaluate_and_save(
                 raw, method_id, settings, errors, out, trials=trials.number, digits=trials.digits, seed=trials.seed,
                 scheduler=scheduler or "threads", workers=workers, progress=bars,
             )  # fmt: skip
@@ -226,7 +227,7 @@ def _identify_one(
 
 
 def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
-    """Turn a log with columns into a raw dataset."""
+    """Convert a log with columns into a raw dataset."""
     from errormotion.datasets.importing import import_log as read_log
 
     with Bars(as_json) as bars:
@@ -255,7 +256,7 @@ def report(
     paper: str = "",
     also: tuple[str, ...] = (),
 ) -> None:
-    """Write the report of a run folder or of one file of errors, and decide on its tolerances."""
+    """Write the report of a run folder or of one file of errors, and decide on the tolerances."""
     from errormotion.campaign.folder import RunFolder
     from errormotion.report import Form, write_report, write_run_report
     from errormotion.report.write import belonging
@@ -309,7 +310,7 @@ def validate(file: Path) -> list[str]:
 
 
 def alike(mistakes: list[str]) -> list[str]:
-    """Return violations for a person: those that are alike in one line."""
+    """Return violations as text, similar ones on one line."""
     from errormotion.datasets.files.tomlfile import grouped
 
     return grouped(mistakes)
@@ -330,7 +331,7 @@ def _of_toml(file: Path) -> list[str]:
         else:
             return [
                 "schema: expected that of a bench, a campaign or tolerances, such as errormotion.bench/1; "
-                f"found {schema!r}. Another file is checked by the command that uses it."
+                f"found {schema!r}. Other files are checked by the command that reads them."
             ]
     except ErrormotionError as error:
         return _mistakes(str(error), file)
@@ -338,7 +339,7 @@ def _of_toml(file: Path) -> list[str]:
 
 
 def _mistakes(message: str, file: Path) -> list[str]:
-    """Return the single mistakes of a message; those of another file, such as the bench of a campaign, name it."""
+    """Return the mistakes of a message; those of another file, such as the bench of a campaign, state its name."""
     from errormotion.datasets.files.tomlfile import single
 
     found, source = list[str](), str(file)
@@ -368,5 +369,5 @@ def _of_run(path: Path) -> list[str]:
         found += [f"{part.relative_to(path)}: {violation}" for violation in validate(part)]
     found += events.read(path)[1]
     if folder.finished and folder.errors is None:
-        found.append(f"run.json: expected 'errors', because the run is finished; found {json.dumps(None)}")
+        found.append("run.json: expected 'errors', because the run is finished; found null")
     return found

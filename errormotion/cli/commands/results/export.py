@@ -24,8 +24,8 @@ from errormotion.errors import DatasetError
 from errormotion.report.exports import xlsx
 from errormotion.report.exports.tables import Entry, Sheet
 
-MOST_ROWS = 2**20 - 2
-"""Rows of one table of a workbook, by its format, less caption and head."""
+MAX_ROWS = 2**20 - 2
+"""Largest number of rows of a table in a workbook: the limit of the format, less caption and head."""
 
 FORMS = (".csv", ".xlsx", ".nc", ".zarr")
 
@@ -38,17 +38,17 @@ def export(
     k: float,
     as_json: bool,
 ) -> None:
-    """Write the errors of one result in the form that the ending of a file names.
+    """Write the errors of one result; the ending of the file states the format.
 
     Raises
     ------
     DatasetError
-        Not one result, another ending, an existing file, no such freedom.
+        The path is not exactly one result, the ending or a freedom is unknown, or the file exists already.
     """
     if out.suffix.lower() not in FORMS:
         raise DatasetError(f"{out}: expected a name that ends in {', '.join(FORMS)}")
     if out.exists():
-        raise DatasetError(f"{out}: exists already, and is not replaced; give another name to --out")
+        raise DatasetError(f"{out}: exists already, and is not replaced; give another name")
     found, _ = load([result], {})
     if len(found) != 1:
         names = ", ".join(found) or "none"
@@ -60,7 +60,7 @@ def export(
             errors = errors.em.at(at)
     if out.suffix.lower() in (".nc", ".zarr"):
         if freedoms is not None:
-            raise DatasetError(f"{out}: a dataset holds all freedoms; --freedoms is for .csv and .xlsx")
+            raise DatasetError(f"{out}: a dataset contains all freedoms; --freedoms is allowed for .csv and .xlsx only")
         datasets.save(errors, out)
         sheets = []
     else:
@@ -69,8 +69,8 @@ def export(
         if out.suffix.lower() == ".csv":
             with whole(out) as beside:
                 beside.write_bytes(_csv(sheets[0]))
-        elif rows > MOST_ROWS:
-            raise DatasetError(f"{out}: a workbook holds {MOST_ROWS} rows; found {rows}. Write .csv or .nc")
+        elif rows > MAX_ROWS:
+            raise DatasetError(f"{out}: a workbook has at most {MAX_ROWS} rows; found {rows}. Write .csv or .nc")
         else:
             xlsx.write(sheets, out)
     if as_json:
@@ -114,7 +114,7 @@ def _sheet(number: int, section: str, caption: str, head: list[str], rows: list[
 
 
 def _entry(value: Any) -> Entry:
-    """Return a cell: a number, a text, or nothing for what is not known."""
+    """Return a cell: a number, a text, or None for an unknown value."""
     if isinstance(value, (int, float, np.number)) and not isinstance(value, bool):
         return float(f"{value:.15g}") if np.isfinite(value) else None
     return None if value is None else str(value)
@@ -130,7 +130,7 @@ def _csv(sheet: Sheet) -> bytes:
 
 
 def _text(entry: Entry) -> str:
-    """Return a cell; a text that a spreadsheet would take as a formula begins with an apostrophe."""
+    """Return a cell; a text that a spreadsheet would take as a formula is preceded by an apostrophe."""
     if isinstance(entry, str):
         return f"'{entry}" if entry[:1] in ("=", "+", "-", "@", "\t", "\r") else entry
     return "" if entry is None else f"{entry:.12g}"

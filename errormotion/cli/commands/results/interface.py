@@ -1,4 +1,4 @@
-"""Arguments of the commands on stored data and results. What a command needs is imported when it runs."""
+"""Arguments of the commands on stored data and results; imports of a command are inside its function."""
 
 from __future__ import annotations
 
@@ -7,47 +7,41 @@ from typing import Annotated, Literal
 
 import typer
 
-from errormotion.cli.guard import INVALID, guarded
+from errormotion.cli import options
+from errormotion.cli.guard import INVALID
 from errormotion.cli.output import show, show_json
 from errormotion.cli.page import page_of
-from errormotion.cli.root import Json, Language, Limits, Paper, Pdf, Tolerances, app, millimetres
+from errormotion.cli.root import app
 
 
 @app.command()
-@guarded
 def identify(
     raw: Annotated[
         list[Path],
-        typer.Argument(help="Raw datasets: NetCDF, Zarr, CSV of readings, run folders, or a folder of those."),
+        typer.Argument(help="Raw datasets: NetCDF, Zarr, CSV of readings, run folders, or a folder of runs."),
     ],
-    out: Annotated[Path, typer.Option(help="The NetCDF file to write; it must not exist. For several runs: a folder.")],
-    method: Annotated[
-        str | None, typer.Option(help="The id of a method plugin; default: the method of the raw data.")
-    ] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting.")] = None,
-    settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
+    out: Annotated[Path, typer.Option(help="File of the errors (.nc); it must not exist. For several runs: a folder.")],
+    method: Annotated[str | None, typer.Option(help="Id of a method plugin; default: that of the raw data.")] = None,
+    set_: options.Set = None,
+    settings: options.SettingsFile = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(
-            help="For several runs or --monte-carlo: processes, threads, sync, or a Dask scheduler, tcp://host:port."
-        ),
+        typer.Option(help="For several runs or --monte-carlo: processes, threads, sync, or a Dask scheduler (tcp://)."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="How many processes or threads; default: one for each processor.")
+        int | None, typer.Option(min=1, help="Number of processes or threads; default: one for each processor.")
     ] = None,
-    tolerances: Limits = None,
+    tolerances: options.Limits = None,
     monte_carlo: Annotated[
         str | None,
         typer.Option(
             metavar="N|auto",
-            help="Evaluate the uncertainty by N trials (JCGM 101) as well, or by as many as the result needs.",
+            help="Evaluate the uncertainty by N Monte Carlo trials (JCGM 101) as well; auto: adaptive number.",
         ),
     ] = None,
-    digits: Annotated[
-        int, typer.Option(min=1, max=2, help="For --monte-carlo: meaningful digits of a standard uncertainty.")
-    ] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="For --monte-carlo: one seed gives one result.")] = 0,
-    json_: Json = False,
+    digits: Annotated[int, typer.Option(min=1, max=2, help="For --monte-carlo: digits of a standard uncertainty.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="For --monte-carlo: seed of the random numbers.")] = 0,
+    json_: options.Json = False,
 ) -> None:
     """Identify the errors of one raw dataset, or of many."""
     from errormotion.cli.commands.results import data
@@ -61,12 +55,11 @@ def identify(
 
 
 @app.command("import")
-@guarded
 def import_(
     log: Annotated[Path, typer.Argument(help="A log with columns: CSV or TSV.")],
     map_: Annotated[Path, typer.Option("--map", help="A TOML file that describes the columns.")],
-    out: Annotated[Path, typer.Option(help="The raw dataset to write: .nc or .zarr.")],
-    json_: Json = False,
+    out: Annotated[Path, typer.Option(help="File of the raw dataset: .nc or .zarr.")],
+    json_: options.Json = False,
 ) -> None:
     """Convert a log with columns into a raw dataset."""
     from errormotion.cli.commands.results import data
@@ -75,21 +68,20 @@ def import_(
 
 
 @app.command()
-@guarded
 def report(
     run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
-    out: Annotated[Path | None, typer.Option(help="The page to write; default: report.html in the run folder.")] = None,
-    tolerances: Tolerances = None,
-    pdf: Pdf = False,
+    out: Annotated[Path | None, typer.Option(help="File of the page; default: report.html in the run folder.")] = None,
+    tolerances: options.Tolerances = None,
+    pdf: options.Pdf = False,
     csv: Annotated[bool, typer.Option("--csv", help="Write every table as CSV into a folder beside the page.")] = False,
     xlsx: Annotated[bool, typer.Option("--xlsx", help="Write every table into a workbook beside the page.")] = False,
     paper: Annotated[
-        Literal["A4", "Letter"] | None, typer.Option(help="Paper; default: that of the campaign, else A4.")
+        Literal["A4", "Letter"] | None, typer.Option(help="Paper; default: of the campaign, or A4.")
     ] = None,
     language: Annotated[
-        Literal["en", "de"] | None, typer.Option(help="Language; default: that of the campaign, else en.")
+        Literal["en", "de"] | None, typer.Option(help="Language; default: of the campaign, or en.")
     ] = None,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
     """Write the report of a run."""
     from errormotion.cli.commands.results import data
@@ -99,10 +91,9 @@ def report(
 
 
 @app.command()
-@guarded
 def validate(
     file: Annotated[Path, typer.Argument(help="A dataset (.nc, .zarr), a run folder, a bench or a campaign file.")],
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
     """Check that a file follows its schema, and list every violation."""
     from errormotion.cli.commands.results import data
@@ -118,94 +109,81 @@ def validate(
 
 
 @app.command()
-@guarded
 def compare(
     results: Annotated[
         list[Path] | None,
         typer.Argument(help="Error datasets, run folders, or folders of runs (the newest result of each test)."),
     ] = None,
-    name: Annotated[list[str] | None, typer.Option(help="A further one with a name of its own: NAME=PATH.")] = None,
-    at: Annotated[
-        str | None, typer.Option(help="Functional point 'x,y,z', mm; default: that of the first dataset.")
-    ] = None,
-    over: Annotated[
-        str | None, typer.Option(metavar="DIM", help="What the errors are compared over: time, position or target.")
-    ] = None,
-    select: Annotated[
-        list[str] | None, typer.Option(help="One element of another dimension, counted from 0: position=3.")
-    ] = None,
-    freedoms: Annotated[str | None, typer.Option(help="Which are compared: EX,EZ; default: all known ones.")] = None,
+    name: Annotated[list[str] | None, typer.Option(metavar="NAME=PATH", help="A further result with its name.")] = None,
+    at: options.At = None,
+    over: options.Over = None,
+    select: options.Select = None,
+    freedoms: options.Freedoms = None,
     since: Annotated[
-        float | None, typer.Option(help="Common reference state, s after the start of the first dataset.")
+        float | None, typer.Option(help="Time of the common reference state, s after the start of the first dataset.")
     ] = None,
     same_start: Annotated[
-        bool, typer.Option("--same-start", help="Take time 0 of all datasets as one instant where none is stated.")
+        bool,
+        typer.Option("--same-start", help="Treat time 0 of all datasets as one instant if their start is not stated."),
     ] = False,
     change: Annotated[
         list[str] | None,
-        typer.Option(help="A further one, the change between two measurements of the same places: NAME=AFTER,BEFORE."),
+        typer.Option(help="A further result: the change between two measurements of the same places."),
     ] = None,
     origin: Annotated[
         list[str] | None,
-        typer.Option(help="Origin of the frame of one in machine coordinates, all axes at zero, mm: NAME=x,y,z."),
+        typer.Option(help="Origin of the frame of a result in machine coordinates with all axes at zero, mm."),
     ] = None,
-    chain: Annotated[
-        str | None, typer.Option(help="Kinematic chain of the machine, for results that state none.")
-    ] = None,
+    chain: Annotated[str | None, typer.Option(help="Kinematic chain, for results that do not state it.")] = None,
     by: Annotated[
         Literal["test", "operator", "instrument", "method"] | None,
-        typer.Option(help="Repeatability and reproducibility of groups; a folder of runs stands for all its results."),
+        typer.Option(
+            help="Group the results for repeatability and reproducibility; uses all results of a folder of runs."
+        ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the comparison as a dataset (.nc).")] = None,
-    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
-    pdf: Pdf = False,
-    paper: Paper = None,
-    language: Language = None,
-    json_: Json = False,
+    report: options.Report = None,
+    pdf: options.Pdf = False,
+    paper: options.Paper = None,
+    language: options.Language = None,
+    json_: options.Json = False,
 ) -> None:
-    """Compare results of one machine: whether they agree, and what explains it where they do not."""
+    """Compare results of one machine: whether they agree, and possible causes of differences."""
     from errormotion.cli.commands.results import compare as command
 
-    point = None if at is None else millimetres("--at", at)
     origins = {}
     for each in origin or []:
-        own, _, text = each.rpartition("=")
-        origins[own] = millimetres(f"--origin {own}", text)
-    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
+        result, _, text = each.rpartition("=")
+        origins[result] = options.point(f"--origin {result}", text)
     stated = command.Stated(name or [], change or [], origins, chain, by, over, select or [])
-    command.compare(
-        results or [], stated, point, chosen, since, same_start, out, page_of(report, pdf, paper, language), json_
-    )
+    point, page = options.optional_point("--at", at), page_of(report, pdf, paper, language)
+    command.compare(results or [], stated, point, options.parts(freedoms), since, same_start, out, page, json_)
 
 
 @app.command("open")
-@guarded
 def open_(
     place: Annotated[
         Path, typer.Argument(help="A run folder, a folder of runs (its newest run with a report), or a page.")
     ] = Path("runs"),
-    browser: Annotated[bool, typer.Option(help="Open the browser; without, print the path only.")] = True,
-    json_: Json = False,
+    browser: Annotated[bool, typer.Option(help="Open the browser; otherwise only print the path.")] = True,
+    json_: options.Json = False,
 ) -> None:
-    """Open the last report in the browser, and print its path."""
+    """Open the newest report in the browser, and print its path."""
     from errormotion.cli.commands.results import show as command
 
     command.open_report(place, browser=browser, as_json=json_)
 
 
 @app.command()
-@guarded
 def export(
     result: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
-    out: Annotated[Path, typer.Option(help="The file to write: .csv, .xlsx, .nc or .zarr; it must not exist.")],
-    freedoms: Annotated[str | None, typer.Option(help="Which are written: EX,EZ; default: all.")] = None,
+    out: Annotated[Path, typer.Option(help="File to write: .csv, .xlsx, .nc or .zarr; it must not exist.")],
+    freedoms: options.Freedoms = None,
     at: Annotated[str | None, typer.Option(help="Functional point, mm; default: that of the result.")] = None,
     k: Annotated[float, typer.Option("-k", min=0, max=10, help="Coverage factor of the uncertainties.")] = 2.0,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
-    """Write the tables of a result for a spreadsheet, in field units, or the dataset as NetCDF."""
+    """Write the tables of a result for a spreadsheet, in um and arcsec, or the dataset as NetCDF or Zarr."""
     from errormotion.cli.commands.results import export as command
 
-    point = None if at is None else millimetres("--at", at)
-    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else None
-    command.export(result, out, chosen, point, k, json_)
+    command.export(result, out, options.parts(freedoms) or None, options.optional_point("--at", at), k, json_)

@@ -8,10 +8,11 @@ from typing import Any
 import xarray as xr
 
 from errormotion.cli.output import show, table
+from errormotion.cli.page import new_files
 from errormotion.cli.summary import notes_of
 from errormotion.errors import DatasetError, MethodError
-from errormotion.montecarlo.beside import file_beside
 from errormotion.montecarlo.result import lines
+from errormotion.montecarlo.saving import evaluation_file
 
 
 def trials_of(text: str) -> int | None:
@@ -25,17 +26,16 @@ def trials_of(text: str) -> int | None:
 
 
 def beside(out: Path) -> Path:
-    """Return the file of the evaluation of a result; DatasetError where it exists or cannot be written."""
-    file = file_beside(out)
+    """Return the file of the evaluation of a result; DatasetError if it exists already or has no folder."""
+    file = evaluation_file(out)
     if not out.parent.is_dir():
-        raise DatasetError(f"{out.parent}: expected a folder for the result of --out; there is none")
-    if file.exists():
-        raise DatasetError(f"{file}: exists already, and a result is never overwritten; give another name to --out")
+        raise DatasetError(f"{out.parent}: no such folder, which --out states for the result")
+    new_files(None, file)
     return file
 
 
 def summary(found: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the verdicts for ``--json``, SI."""
+    """Return the verdicts for JSON output, SI."""
     return [
         {
             "freedom": line.name,
@@ -51,7 +51,7 @@ def summary(found: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def show_evaluation(found: xr.Dataset, file: Path) -> None:
-    """Print what the evaluation says of each freedom."""
+    """Print the evaluation of each freedom."""
     from errormotion.montecarlo.report import texts
 
     percent = 100 * float(found.attrs["probability"])

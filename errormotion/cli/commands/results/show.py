@@ -1,4 +1,4 @@
-"""``errormotion open``: the last report in the browser."""
+"""``errormotion open``: opens the newest report in the browser."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from errormotion.errors import RunError
 PAGE = "report.html"
 
 
-def open_report(place: Path, *, browser: bool, as_json: bool) -> None:
+def open_report(path: Path, *, browser: bool, as_json: bool) -> None:
     """Print the path of a report and open it in the browser.
 
     Parameters
     ----------
-    place : Path
+    path : Path
         A run folder, a folder of runs (its newest run with a report), or a page.
     browser : bool
-        False prints the path only.
+        False: only print the path.
 
     Raises
     ------
     RunError
-        No report there.
+        There is no report.
     """
-    page = _page(place).resolve()
+    page = _page(path).resolve()
     opened = browser and _opened(page.as_uri())
     if as_json:
         show_json({"ok": True, "report": str(page), "opened": opened})
         return
     show(str(page))
     if browser and not opened:
-        show("No browser was found on this computer: open the file above, or copy it; it needs no other file.")
+        show("No browser was found on this computer. Open the file above, or copy it; it needs no other files.")
 
 
 def _opened(address: str) -> bool:

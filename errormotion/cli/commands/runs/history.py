@@ -1,4 +1,4 @@
-"""``errormotion history``: one figure of one machine over months."""
+"""``errormotion history``: one figure of merit of one machine over time."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.cli.commands.runs.listing import note_lines, plain_note
 from errormotion.cli.output import show, show_json, table
-from errormotion.cli.page import Page
+from errormotion.cli.page import Page, new_files
 from errormotion.datasets.files.tomlfile import nearest
-from errormotion.errors import DatasetError, RunError
+from errormotion.errors import RunError
 from errormotion.record.history import history as followed
 from errormotion.record.runs.listing import list_runs
 from errormotion.record.text import date, field_of, sentences
@@ -31,7 +31,7 @@ def history(
     page: Page | None,
     as_json: bool,
 ) -> None:
-    """Print a figure of a machine over time, with its trend, steps and control limits, and write what was asked for.
+    """Print a figure of merit of a machine over time with trend, steps and control limits, and write files.
 
     Raises
     ------
@@ -40,13 +40,10 @@ def history(
     DatasetError
         A file exists already, or cannot be written.
     """
-    files = [each for each in (out, *(page.files if page else ())) if each is not None]
-    for path in files:
-        if path.exists():
-            raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
+    files = new_files(page, out)
     runs = list_runs(paths or [Path("runs")], machine=machine, method=method, test=test)
     if not runs.runs and machine.casefold() not in map(str.casefold, runs.machines):
-        message = f"--machine {machine}: no run of it; {nearest(machine, runs.machines)}"
+        message = f"--machine {machine}: no runs found; {nearest(machine, runs.machines)}"
         raise RunError("\n  - ".join([message, *(f"could not be read: {reason}" for reason in runs.skipped)]))
     found = followed(runs, machine, figure, at)
     if out is not None:
@@ -65,9 +62,9 @@ def history(
         show(line)
     for name in ("notes", "left_out"):
         for text in filter(None, found.attrs[name]):
-            show(f"left out: {text}" if name == "left_out" else text)
+            show(f"omitted: {text}" if name == "left_out" else text)
     if runs.waiting:
-        show(f"{runs.waiting} runs without figures: not yet read from the error datasets; repeat the command")
+        show(f"{runs.waiting} runs: figures of merit not read yet from the error datasets; repeat the command")
     for reason in runs.skipped:
         show(f"could not be read: {reason}")
     for path in files:
@@ -81,7 +78,7 @@ def _values(ds: xr.Dataset) -> str:
         value, U = rounded(
             factor * float(ds["value"][k]), factor * float(ds["expanded_uncertainty"][k]), signed=False, digits=2
         )
-        remarks = [word for name, word in (("outside", "outside"), ("departing", "departs alone")) if ds[name][k]]
+        remarks = [word for name, word in (("outside", "outside"), ("departing", "outlier")) if ds[name][k]]
         shown = [value.replace("−", "-"), U, unit, ", ".join(remarks), str(run)]
         rows.append([date(ds, float(ds["time"][k])), *shown])
     head = ["started (UTC)", "value", "U (k=2)", "unit", "limits", "run"]
@@ -89,7 +86,7 @@ def _values(ds: xr.Dataset) -> str:
 
 
 def as_plain(ds: xr.Dataset) -> dict[str, Any]:
-    """Return a history for a program, SI."""
+    """Return a history for JSON output, SI."""
     runs = ("time", "value", "expanded_uncertainty", "centre", "lower_limit", "upper_limit", "outside", "departing")
     steps = ("time", "low", "high", "size", "half_width", "p", "event")
     scalars = ("trend", "trend_low", "trend_high", "reproducibility", "reproducibility_of_ranges", "chi2", "chi2_p")

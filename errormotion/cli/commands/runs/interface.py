@@ -1,4 +1,4 @@
-"""Arguments of the commands on the record of a machine. What a command needs is imported when it runs."""
+"""Arguments of the commands on the record of a machine; imports of a command are inside its function."""
 
 from __future__ import annotations
 
@@ -7,24 +7,23 @@ from typing import Annotated
 
 import typer
 
-from errormotion.cli.guard import guarded
+from errormotion.cli import options
 from errormotion.cli.page import page_of
-from errormotion.cli.root import Json, Language, Paper, Pdf, app, millimetres
+from errormotion.cli.root import app
 
 
 @app.command()
-@guarded
 def runs(
     folders: Annotated[
         list[Path] | None, typer.Argument(help="Run folders, or folders of runs; default: runs.", show_default=False)
     ] = None,
     machine: Annotated[str | None, typer.Option(help="Only the runs of this machine.")] = None,
     method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
-    since: Annotated[str | None, typer.Option(metavar="DATE", help="Only runs from this date on, UTC.")] = None,
+    since: Annotated[str | None, typer.Option(metavar="DATE", help="Only the runs since this date, UTC.")] = None,
     tolerances: Annotated[
         Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the runs.")
     ] = None,
-    json_: Json = False,
+    json_: options.Json = False,
 ) -> None:
     """List the runs of folders, newest first, each with its figure of merit."""
     from errormotion.cli.commands.runs import listing as command
@@ -33,28 +32,24 @@ def runs(
 
 
 @app.command()
-@guarded
 def truth(
     run: Annotated[Path, typer.Argument(help="Run folder of a campaign with a [timeline] on a virtual machine.")],
     out: Annotated[Path, typer.Option(help="File of the error dataset (.nc).")],
 ) -> None:
-    """Write the true errors behind a run on a virtual machine, as an error dataset."""
+    """Write the true errors during a run on a virtual machine as an error dataset."""
     from errormotion.cli.commands.runs import truth as command
 
     command.truth(run, out)
 
 
 @app.command()
-@guarded
 def note(
-    folder: Annotated[Path, typer.Argument(help="A run folder; or a folder of runs, with --machine and --at.")],
+    folder: Annotated[Path, typer.Argument(help="A run folder, or a folder of runs with --machine and --at.")],
     text: Annotated[str, typer.Argument(help="What happened, on one line.")],
-    machine: Annotated[str | None, typer.Option(help="The machine, for a note without a run.")] = None,
-    at: Annotated[
-        str | None, typer.Option(metavar="DATE", help="When it happened, UTC; default: the time of the run.")
-    ] = None,
-    by: Annotated[str, typer.Option(metavar="NAME", help="Who notes it.")] = "",
-    json_: Json = False,
+    machine: Annotated[str | None, typer.Option(help="Name of the machine, for a note without a run.")] = None,
+    at: Annotated[str | None, typer.Option(metavar="DATE", help="Time of the event, UTC; default: of the run.")] = None,
+    by: Annotated[str, typer.Option(metavar="NAME", help="Author of the note.")] = "",
+    json_: options.Json = False,
 ) -> None:
     """Note an event of a machine, such as a collision or a repair."""
     from errormotion.cli.commands.runs import note as command
@@ -63,29 +58,22 @@ def note(
 
 
 @app.command()
-@guarded
 def history(
-    machine: Annotated[str, typer.Option(help="The machine.")],
-    figure: Annotated[
-        str, typer.Option(help="A figure of merit (* stands for any characters), or a freedom such as EZ.")
-    ],
-    folders: Annotated[
-        list[Path] | None, typer.Argument(help="Folders of runs; default: runs.", show_default=False)
-    ] = None,
-    at: Annotated[str | None, typer.Option(help="Place of the freedom 'x,y,z', mm.")] = None,
+    machine: Annotated[str, typer.Option(help="Name of the machine.")],
+    figure: Annotated[str, typer.Option(help="A figure of merit (* replaces any characters), or a freedom.")],
+    folders: Annotated[list[Path] | None, typer.Argument(help="Folders; default: runs.", show_default=False)] = None,
+    at: Annotated[str | None, typer.Option(help="Functional point of the freedom 'x,y,z', mm.")] = None,
     method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
     test: Annotated[str | None, typer.Option(help="Only the runs of this test.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the history as a dataset (.nc).")] = None,
-    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
-    pdf: Pdf = False,
-    paper: Paper = None,
-    language: Language = None,
-    json_: Json = False,
+    report: options.Report = None,
+    pdf: options.Pdf = False,
+    paper: options.Paper = None,
+    language: options.Language = None,
+    json_: options.Json = False,
 ) -> None:
-    """Show a figure of a machine over time: trend, steps, control limits, notes."""
+    """Show a figure of merit of a machine over time: trend, steps, control limits, notes."""
     from errormotion.cli.commands.runs import history as command
 
-    point = None if at is None else millimetres("--at", at)
-    command.history(
-        folders or [], machine, figure, point, method, test, out, page_of(report, pdf, paper, language), json_
-    )
+    page = page_of(report, pdf, paper, language)
+    command.history(folders or [], machine, figure, options.optional_point("--at", at), method, test, out, page, json_)

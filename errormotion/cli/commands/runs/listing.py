@@ -1,16 +1,13 @@
-"""``errormotion runs``: every run found, newest first, with its figure of merit."""
+"""``errormotion runs``: lists runs, newest first, each with its figure of merit."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import typer
-
-from errormotion.cli.guard import USAGE
+from errormotion.cli.options import date
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.summary import as_printed, digits_of
 from errormotion.cli.tolerances import end_with, remarks
@@ -29,7 +26,7 @@ def runs(
     tolerances: Path | None,
     as_json: bool,
 ) -> None:
-    """Print the runs of folders; with a file of tolerances, decide on each and end with the exit code.
+    """Print the runs of folders; with a file of tolerances, decide on each run and end with the exit code.
 
     Raises
     ------
@@ -37,7 +34,7 @@ def runs(
         A folder does not exist.
     """
     limits = load_tolerances(tolerances) if tolerances is not None else None
-    found = list_runs(paths or [Path("runs")], machine=machine, method=method, since=_time(since))
+    found = list_runs(paths or [Path("runs")], machine=machine, method=method, since=date("--since", since))
     decisions = judge_runs(found.runs, limits) if limits is not None else []
     if decisions:
         judged = zip(found.runs, decisions, strict=True)
@@ -74,23 +71,13 @@ def runs(
     end_with(conformities)
 
 
-def _time(text: str | None) -> datetime | None:
-    if text is None:
-        return None
-    try:
-        return datetime.fromisoformat(text)
-    except ValueError:
-        typer.echo(f"--since {text}: expected a date, as in 2026-03-31 or 2026-03-31T08:00+01:00", err=True)
-        raise typer.Exit(USAGE) from None
-
-
 def plain_note(note: Note) -> dict[str, Any]:
-    """Return a note for a JSON document."""
+    """Return a note for JSON output."""
     return {**asdict(note), "time": note.time.isoformat() if note.time is not None else None}
 
 
 def note_lines(notes: Sequence[Note]) -> list[str]:
-    """Return a table of notes, the oldest first; nothing where there are none."""
+    """Return a table of notes, the oldest first; empty without notes."""
     if not notes:
         return []
     rows = [
@@ -118,7 +105,7 @@ def _plain(path: Path, entry: Entry) -> dict[str, Any]:
 
 
 def _shown(path: Path) -> str:
-    """Return a path relative to the present folder where it is inside."""
+    """Return a path, relative to the current folder if it is inside."""
     here = Path.cwd()
     return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
 
@@ -130,9 +117,9 @@ def _remarks(found: Listing, machine: str | None, method: str | None) -> list[st
             if wanted is not None and wanted.casefold() not in map(str.casefold, known):
                 lines.append(f"{option} {wanted}: not found; {nearest(wanted, known)}")
     if found.undated:
-        lines.append(f"{found.undated} without a known time, not compared with --since")
+        lines.append(f"runs without a known time, not compared with --since: {found.undated}")
     if found.waiting:
-        lines.append(f"{found.waiting} without figures: not yet read from the error datasets; repeat the command")
+        lines.append(f"runs whose figures are not read yet from the errors: {found.waiting}; repeat the command")
     if found.skipped:
-        lines += [f"{len(found.skipped)} could not be read:", *(f"  {reason}" for reason in found.skipped)]
+        lines += [f"unreadable runs: {len(found.skipped)}", *(f"  {reason}" for reason in found.skipped)]
     return lines

@@ -1,4 +1,4 @@
-"""``errormotion truth``: the true errors behind a run on a virtual machine."""
+"""``errormotion truth``: writes the true errors during a run on a virtual machine."""
 
 from __future__ import annotations
 
@@ -8,20 +8,19 @@ from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.truth import truth_of
 from errormotion.cli.output import show
-from errormotion.errors import DatasetError
+from errormotion.cli.page import new_files
 
 
 def truth(run: Path, out: Path) -> None:
-    """Write the truth behind a run as an error dataset.
+    """Write the true errors during a run as an error dataset.
 
     Raises
     ------
     RunError
-        The run states no truth.
+        The run was not made on a virtual machine, so that the truth is unknown.
     DatasetError
         The file exists already.
     """
-    if out.exists():
-        raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name")
+    new_files(None, out)
     datasets.save(truth_of(RunFolder.open(run)), out)
     show(f"written: {out}")

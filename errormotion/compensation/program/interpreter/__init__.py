@@ -1,1 +1,1 @@
-"""LinuxCNC's own interpreter: expansion of what the plain reader does not know, and agreement with it."""
+"""LinuxCNC's interpreter: expansion of programs that the plain reader does not support, and comparison with it."""

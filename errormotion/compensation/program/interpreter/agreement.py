@@ -1,4 +1,4 @@
-"""Whether LinuxCNC's interpreter moves along the path that the plain reader reads."""
+"""Comparison of the moves of the plain reader with those of LinuxCNC's interpreter."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from contextlib import closing
 
 from errormotion.compensation.program.interpreter.canonical import Command, commands
 from errormotion.compensation.program.reading.arcs import SMALL
-from errormotion.compensation.program.reading.items import COUNTERCLOCKWISE, LINE, PLANES, RAPID, Left, Move
+from errormotion.compensation.program.reading.items import COUNTERCLOCKWISE, LINE, PLANES, RAPID, Move, Unchanged
 from errormotion.compensation.program.reading.offsets import Offsets
 from errormotion.compensation.program.reading.reader import Reader
 from errormotion.errors import ProgramError
 
 DIGIT = 1.02e-4
-"""Largest difference, in units of the program: the interpreter prints four digits, ours may have been cut."""
+"""Largest difference, in units of the program: the interpreter prints four digits, ours may be truncated."""
 
 _MOTIONS = {"STRAIGHT_TRAVERSE", "STRAIGHT_FEED", "ARC_FEED"}
 
 
 def check(source: Sequence[str], offsets: Offsets, reader: Reader) -> int:
-    """Return how many moves the interpreter and the reader agree on.
+    """Return the number of moves, which agree between the interpreter and the reader.
 
     Parameters
     ----------
@@ -28,12 +28,12 @@ def check(source: Sequence[str], offsets: Offsets, reader: Reader) -> int:
         Lines of a program.
     offsets : Offsets
     reader : Reader
-        A fresh one with these offsets.
+        A new reader with these offsets.
 
     Raises
     ------
     ProgramError
-        The interpreter refuses a line, or moves elsewhere; with the line.
+        The interpreter reports an error in a line, or its move differs.
     """
     left: set[int] = set()
     moves = _moves(reader, source, left)
@@ -45,11 +45,11 @@ def check(source: Sequence[str], offsets: Offsets, reader: Reader) -> int:
                 continue
             if command.line in left:
                 continue
-            move = move or next(moves, None)  # reading on fills what is left
+            move = move or next(moves, None)  # this also collects the unchanged moves
             if command.line in left:
                 continue
             if move is None:
-                raise ProgramError(f"line {command.line}: LinuxCNC's interpreter moves, and the reader does not")
+                raise ProgramError(f"line {command.line}: LinuxCNC's interpreter moves, but the reader does not")
             if move.block.line != command.line:
                 raise ProgramError(
                     f"line {move.block.line}: the reader moves; LinuxCNC's interpreter moves at line {command.line}"
@@ -59,13 +59,13 @@ def check(source: Sequence[str], offsets: Offsets, reader: Reader) -> int:
             count += 1
     rest = move or next(moves, None)
     if rest is not None:
-        raise ProgramError(f"line {rest.block.line}: the reader moves, and LinuxCNC's interpreter does not")
+        raise ProgramError(f"line {rest.block.line}: the reader moves, but LinuxCNC's interpreter does not")
     return count
 
 
 def _moves(reader: Reader, source: Iterable[str], left: set[int]) -> Iterator[Move]:
     for number, item in enumerate(reader.items(source), 1):
-        if isinstance(item, Left):
+        if isinstance(item, Unchanged):
             left.add(number)
         elif isinstance(item, Move):
             yield item
@@ -78,7 +78,7 @@ def _same(move: Move, command: Command) -> None:
         if move.kind <= LINE:
             raise _differ(move, command)
         a, b, c = PLANES[move.plane]
-        # Where an arc ends within rounding of the angle below which it is a full circle, both numbers are right.
+        # If an arc ends within rounding of the angle below which it is a full circle, both numbers are correct.
         counts = {math.ceil((abs(move.sweep) - part * SMALL) / (2 * math.pi)) for part in (0.99, 1.01)}
         sense = 1 if move.kind == COUNTERCLOCKWISE else -1
         turns = int(numbers[4]) if abs(int(numbers[4])) in counts and numbers[4] * sense > 0 else sense * max(counts)

@@ -1,7 +1,7 @@
-"""LinuxCNC's own interpreter (``rs274``), and the canonical commands that it prints.
+"""LinuxCNC's interpreter (``rs274``), and the canonical commands that it prints.
 
 It runs in an empty folder on a copy of the program in which every block is numbered with its line, so that each command
-names the line that it comes from. It prints four digits after the point.
+states its line. It prints four digits after the decimal point.
 """
 
 from __future__ import annotations
@@ -20,17 +20,14 @@ from pathlib import Path
 import numpy as np
 
 from errormotion.compensation.program.reading.offsets import UNITS, Offsets
-from errormotion.compensation.program.reading.words import lines_of
+from errormotion.compensation.program.reading.words import MAX_BLOCK, lines_of
 from errormotion.errors import ProgramError
 
-MOST_COMMANDS = 5_000_000
-"""Commands of one program; loops that do not end are ended here."""
+MAX_COMMANDS = 5_000_000
+"""Maximum number of commands of one program; it ends endless loops."""
 
 TIME_LIMIT = 300.0
-"""Of the interpreter, s."""
-
-LONGEST_BLOCK = 250
-"""Characters of a block that the interpreter reads."""
+"""Maximum duration of the interpreter, s."""
 
 _NUMBERED = re.compile(r"^(\s*/?)\s*(?:[nN]\s*(\d+)\s*)?")
 _COMMAND = re.compile(r"^\s*\d+ N(\d+|\.+)\s*([A-Z_0-9]+)\((.*)\)$")
@@ -44,10 +41,10 @@ class Command:
     Attributes
     ----------
     line : int
-        Line of the program that it comes from; 0: of none.
+        Line of the program that causes it; 0: none.
     name : str
     text : str
-        What stands in its parentheses.
+        Arguments in its parentheses.
     """
 
     line: int
@@ -55,12 +52,12 @@ class Command:
     text: str
 
     def numbers(self) -> list[float]:
-        """Return its arguments."""
+        """Return the arguments as numbers."""
         return [float(word) for word in self.text.replace(",", " ").split()]
 
 
 def interpreter() -> str | None:
-    """Return the interpreter of LinuxCNC; None where it is not installed."""
+    """Return the path of LinuxCNC's interpreter; None if it is not installed."""
     return shutil.which("rs274")
 
 
@@ -71,14 +68,14 @@ def commands(source: Iterable[str], offsets: Offsets, *, deleted: bool | None = 
     ----------
     source : iterable of str
     offsets : Offsets
-        What is not known is 0 for the interpreter.
+        Unknown values are 0 for the interpreter.
     deleted : bool, optional
-        Whether blocks that start with ``/`` are skipped; without it they are refused.
+        Whether blocks that start with ``/`` are skipped; None: they raise an error.
 
     Raises
     ------
     ProgramError
-        The interpreter is not installed, or refuses a line.
+        The interpreter is not installed, or reports an error in a line.
     """
     program = interpreter()
     if program is None:
@@ -95,7 +92,7 @@ def commands(source: Iterable[str], offsets: Offsets, *, deleted: bool | None = 
             process = subprocess.Popen(
                 [*arguments, "program.ngc"],
                 cwd=folder,
-                env={**os.environ, "HOME": name},  # its tools are in a file there, which running controls share
+                env={**os.environ, "HOME": name},  # avoids the tool file that running controls share
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=errors,
@@ -120,7 +117,7 @@ def commands(source: Iterable[str], offsets: Offsets, *, deleted: bool | None = 
             if process.stdout is not None:
                 process.stdout.close()
         if expired.is_set():
-            raise ProgramError(f"LinuxCNC's interpreter did not end within {TIME_LIMIT:g} s: a loop may not end")
+            raise ProgramError(f"LinuxCNC's interpreter did not end within {TIME_LIMIT:g} s: possibly an endless loop")
         if code != 0:
             raise _refused(folder, code)
 
@@ -128,8 +125,8 @@ def commands(source: Iterable[str], offsets: Offsets, *, deleted: bool | None = 
 def _commands(process: subprocess.Popen[bytes]) -> Iterator[Command]:
     assert process.stdout is not None
     for count, raw in enumerate(process.stdout):
-        if count > MOST_COMMANDS:
-            raise ProgramError(f"the program runs for more than {MOST_COMMANDS} commands: a loop may not end")
+        if count > MAX_COMMANDS:
+            raise ProgramError(f"the program has more than {MAX_COMMANDS} commands: possibly an endless loop")
         line = raw.decode("latin-1").rstrip("\n")
         found = _COMMAND.match(line)
         if found is None:
@@ -142,10 +139,12 @@ def _commands(process: subprocess.Popen[bytes]) -> Iterator[Command]:
 
 def _refused(folder: Path, code: int) -> ProgramError:
     with (folder / "errors").open("rb") as file:
-        said = [line for line in file.read(4096).decode("latin-1").splitlines() if line.strip() and line != "executing"]
+        messages = [
+            line for line in file.read(4096).decode("latin-1").splitlines() if line.strip() and line != "executing"
+        ]
     if code < 0:
         return ProgramError(f"LinuxCNC's interpreter was ended by signal {-code}")
-    why, where = said[0] if said else f"exit code {code}", said[1] if len(said) > 1 else ""
+    why, where = messages[0] if messages else f"exit code {code}", messages[1] if len(messages) > 1 else ""
     number = _NUMBERED.match(where)
     if number is not None and number[2]:
         return ProgramError(f"line {number[2]} '{where[number.end() :].strip()[:60]}': {why} (LinuxCNC's interpreter)")
@@ -160,7 +159,7 @@ def _line_of(path: Path, text: str) -> str:
 
 
 def own_number(text: str) -> tuple[str, str]:
-    """Return the number (N) that a line carries, or nothing, and the rest of the line."""
+    """Return the number (N) of a line, or an empty string, and the rest of the line."""
     found = _NUMBERED.match(text)
     assert found is not None
     return found[2] or "", found[1].strip() + text[found.end() :]
@@ -171,13 +170,13 @@ def _write_program(source: Iterable[str], path: Path, deleted: bool | None) -> N
         for number, text in lines_of(source):
             _, rest = own_number(text)
             if rest.startswith("/") and deleted is None:
-                raise ProgramError(f"line {number}: '/' (block delete): state whether such blocks are skipped")
+                raise ProgramError(f"line {number}: '/' (block delete): state whether these blocks are skipped")
             plain = rest.lstrip("/ \t")
             if plain and plain[0] not in "oO%":
                 mark = "/" if rest.startswith("/") else ""
                 text = f"{mark}N{number} {plain}"
-            if len(text) > LONGEST_BLOCK:
-                raise ProgramError(f"line {number}: LinuxCNC's interpreter reads {LONGEST_BLOCK} characters of a line")
+            if len(text) > MAX_BLOCK:
+                raise ProgramError(f"line {number}: LinuxCNC's interpreter reads {MAX_BLOCK} characters of a line")
             file.write(text + "\n")
 
 

@@ -1,8 +1,8 @@
-"""A program without variables, loops, subroutines and cycles: LinuxCNC's interpreter has run them.
+"""Expansion of a program to one without variables, loops, subroutines and cycles, by LinuxCNC's interpreter.
 
-Each of its canonical commands becomes a block that the plain reader understands; one that has no such block is refused
-with its line. Comments, messages, switches and tool changes stay where they were; line numbers stay on the first block
-of their line.
+Each canonical command becomes a block of the plain reader; a command without such a block raises an error with its
+line. Comments, messages, switches and tool changes keep their order; line numbers remain on the first block of their
+line.
 """
 
 from __future__ import annotations
@@ -67,16 +67,16 @@ _RESET = {
 
 
 class Expansion:
-    """Makes plain code of canonical commands.
+    """Converts canonical commands to plain code.
 
     Parameters
     ----------
     source : sequence of str
         Lines of the program, without their ends.
     offsets : Offsets
-        With which the interpreter ran.
+        Offsets of the interpreter.
     tolerance : float
-        m; in inches the interpreter's last digit is larger than most tolerances.
+        m; checked for inches, whose last digit printed by the interpreter is larger than most tolerances.
     """
 
     def __init__(self, source: Sequence[str], offsets: Offsets, tolerance: float) -> None:
@@ -131,7 +131,7 @@ class Expansion:
         Raises
         ------
         ProgramError
-            A command that has no block.
+            A command without a block.
         """
         yield "%"
         yield "G21 G90 G17 G94 G40 G49 G91.1"
@@ -166,7 +166,7 @@ class Expansion:
             return ["M60" if re.search(r"M\s*60(?![.\d])", self._text(command)) else "M0"]
         handler = self._handlers.get(name)
         if handler is None:
-            raise self._refusal(command, f"{name} has no plain code")
+            raise self._refusal(command, f"{name} cannot be expanded")
         return handler(command)
 
     def _text(self, command: Command) -> str:
@@ -215,7 +215,7 @@ class Expansion:
             if not stated or abs(value - old / scale) <= 1.5 * _DIGIT:
                 continue
             if re.search(r"L\s*20", text) and not self._known[axis]:
-                raise self._refusal(command, "an origin at a position that is not known before the program runs")
+                raise self._refusal(command, "an origin at a position that is unknown before the program runs")
             words += f" {'XYZ'[axis]}{value:.4f}"
             known[axis] = value * scale
         blocks = [f"G10 L2 P{k + 1}{words}"] if words else []
@@ -248,7 +248,7 @@ class Expansion:
             return ["G92 " + " ".join(f"{'XYZ'[k]}{self._at[k]:.4f}" for k in axes)]
         if same:
             return []
-        raise self._refusal(command, "an offset (G92) outside of the program's own lines")
+        raise self._refusal(command, "an offset (G92) that no line of the program states")
 
     def _tool(self, command: Command) -> list[str]:
         x, y, z = self._three(command, command.numbers())
@@ -315,10 +315,10 @@ class Expansion:
         return [] if text.startswith("interpreter:") else [f"({text})"]
 
     def _place(self, command: Command, new: Triple) -> str:
-        """Return the words of a position: axes that move, and those that a line states whose position is not known.
+        """Return the words of a position: axes that move, and axes at an unknown position that the line states.
 
-        The interpreter starts at zero, and takes a probing move as reaching its end: until an axis is moved to a
-        stated position it is not known where it is.
+        The interpreter starts at zero, and assumes that a probing move reaches its end: the position of an axis is
+        unknown until it is moved to a stated position.
         """
         text = "" if all(self._known) else _IN_ORDER.sub(" ", self._text(command))
         words = []
@@ -328,11 +328,11 @@ class Expansion:
                     words.append(f"{axis}{new[k]:.4f}")
             elif axis in text:
                 if self._incremental:
-                    raise self._refusal(command, f"an increment of {axis}, whose position is not known")
+                    raise self._refusal(command, f"an increment of {axis} from an unknown position")
                 self._known[k] = True
                 words.append(f"{axis}{new[k]:.4f}")
             elif abs(new[k] - self._at[k]) > _DIGIT:
-                raise self._refusal(command, f"{axis} moves from a position that is not known")
+                raise self._refusal(command, f"{axis} moves from an unknown position")
         self._at = new
         return " ".join(words)
 
@@ -345,11 +345,11 @@ class Expansion:
         return [f"{code} {words}"] if words else []
 
     def _in_machine(self, command: Command, new: Triple, code: str) -> list[str]:
-        """G53, G28 and G30 lead to positions of the machine."""
+        """Return the block of G53, G28 or G30, a move to a position in machine coordinates."""
         if code != "53" and any(v != v for v in self._offsets.homes[0 if code == "28" else 1]):
-            raise self._refusal(command, f"the position of G{code} is not known: give --parameters")
+            raise self._refusal(command, f"the position of G{code} is unknown: state --parameters")
         if any(v != v for v in self._systems[self._system]) or self._frame.rotation:
-            raise self._refusal(command, "a position of the machine, and the work offset is not known or is rotated")
+            raise self._refusal(command, "a position in machine coordinates with an unknown or rotated work offset")
         text = _IN_ORDER.sub(" ", self._text(command))
         axes = [k for k in range(3) if "XYZ"[k] in text] or [0, 1, 2]
         place = self._frame.machine(new)
@@ -361,7 +361,7 @@ class Expansion:
     def _probe(self, command: Command) -> list[str]:
         found = _PROBE.search(self._text(command))
         if found is None:
-            raise self._refusal(command, "a probing move outside of the program's own lines")
+            raise self._refusal(command, "a probing move that no line of the program states")
         words = self._place(command, self._three(command, command.numbers()))
         for word in words.split():
             self._known["XYZ".index(word[0])] = False
@@ -375,7 +375,7 @@ class Expansion:
         place[a], place[b], place[c] = first, second, third
         at = self._at
         if not (self._known[a] and self._known[b]):
-            raise self._refusal(command, "an arc from a position that is not known")
+            raise self._refusal(command, "an arc from an unknown position")
         words = self._place(command, _triple(place))
         words += f" {'IJK'[a]}{x - at[a]:.4f} {'IJK'[b]}{y - at[b]:.4f}"
         words += f" P{abs(turns):.0f}" if abs(turns) > 1 else ""

@@ -1,6 +1,6 @@
-"""What an expansion would lose: codes whose effect the interpreter does not print, and values of the running machine.
+"""Detection of codes whose effect the interpreter does not print, and of values of the running machine.
 
-Every code that is not among those whose commands have plain code is refused with its line, whether it runs or not.
+Every other code than those with plain code raises an error with its line, whether it is executed or not.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ _PROBE = re.compile(r"G\s*38", re.IGNORECASE)
 
 
 def screen(source: Iterable[str]) -> None:
-    """Refuse a program whose expansion would not do what it does.
+    """Raise an error for a program whose expansion would differ in its effect.
 
     Raises
     ------
     ProgramError
-        With the number of the line.
+        The message contains the number of the line.
     """
     probing = False
     indirect: tuple[int, str] | None = None
     for line, text in enumerate(source, 1):
         for comment in _COMMENT.finditer(text):
             if comment[1] and _LOST.match(comment[1]):
-                raise refusal(line, text, "prints or logs values, which are only known while the program runs")
+                raise refusal(line, text, "prints or logs values, which are unknown before the program runs")
         plain = _COMMENT.sub(" ", text)
         if _OF_MACHINE.search(plain):
             raise refusal(line, text, "a parameter that the running machine sets (position, probe, input)")
@@ -65,6 +65,6 @@ def _codes(line: int, text: str, plain: str) -> None:
             raise refusal(line, text, f"a computed code ({letter})")
         value = float(number)
         if value not in (_G if letter == "G" else _M):
-            raise refusal(line, text, f"{letter}{value:g} has no plain code")
+            raise refusal(line, text, f"{letter}{value:g} cannot be expanded")
         if value == 10 and letter == "G" and not re.search(r"L\s*0*(2|20)(?![\d.])", found):
             raise refusal(line, text, "expected G10 L2 or L20")

@@ -1,1 +1,1 @@
-"""Reading of RS-274 (ISO 6983) code: words, modal state, offsets, and the moves that follow."""
+"""Reading of RS-274 (ISO 6983) code: words, modal state, offsets, and the resulting moves."""

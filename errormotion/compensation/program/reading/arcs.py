@@ -8,12 +8,12 @@ from errormotion.compensation.program.reading.frames import Triple
 from errormotion.compensation.program.reading.words import Block, refusal
 
 SPIRAL = 1e-3
-"""Largest difference of the radii at start and end, relative; LinuxCNC refuses larger ones too."""
+"""Largest relative difference of the radii at start and end; LinuxCNC rejects larger ones too."""
 
 SMALL = 1e-6
-"""Angle below which start and end are taken as one point: a full circle, rad."""
+"""Angle below which start and end are the same point, so that the arc is a full circle, rad."""
 
-MOST_TURNS = 1000
+MAX_TURNS = 1000
 
 
 def arc(
@@ -30,13 +30,13 @@ def arc(
     Raises
     ------
     ProgramError
-        The words determine no arc.
+        The words do not determine an arc.
     """
     a, b, _ = axes
     s, e = (start[a], start[b]), (end[a], end[b])
     sense = 1.0 if motion == 3 else -1.0
     if values.keys() & {"IJK"[axes[2]]}:
-        raise refusal(block.line, block.text, "the centre of an arc lies in its plane")
+        raise refusal(block.line, block.text, "expected the centre of an arc in its plane")
     offsets = "IJK"[a], "IJK"[b]
     if "R" in values:
         if values.keys() & set(offsets):
@@ -61,8 +61,8 @@ def arc(
     if angle > 2 * math.pi + SMALL:
         angle -= 2 * math.pi
     turns = float(values.get("P", 1.0))
-    if turns != int(turns) or not 1 <= turns <= MOST_TURNS:
-        raise refusal(block.line, block.text, f"expected turns P from 1 to {MOST_TURNS}")
+    if turns != int(turns) or not 1 <= turns <= MAX_TURNS:
+        raise refusal(block.line, block.text, f"expected turns P from 1 to {MAX_TURNS}")
     return centre, sense * (angle + 2 * math.pi * (turns - 1))
 
 

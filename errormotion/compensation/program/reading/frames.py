@@ -1,4 +1,4 @@
-"""From coordinates of a program to positions of the machine's axes."""
+"""Transformation between coordinates of a program and positions of the machine axes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Machine = R (scale program + g92) + origin + tool, as LinuxCNC adds them; R turns about Z.
+    """Machine = R (scale program + g92) + origin + tool, as in LinuxCNC; R rotates about Z.
 
     Attributes
     ----------
@@ -21,7 +21,7 @@ class Frame:
     g92, origin, tool : (x, y, z)
         Offset of G92, origin of the coordinate system, offset of the tool, m.
     known : bool
-        Whether all of them are.
+        Whether all offsets are known.
     """
 
     scale: float
@@ -44,22 +44,22 @@ class Frame:
         return math.cos(angle), math.sin(angle)
 
     def vector(self, v: Triple) -> Triple:
-        """Return a difference of program coordinates in the machine's axes, m."""
+        """Return a difference of program coordinates in machine axes, m."""
         return self._turned((v[0] * self.scale, v[1] * self.scale, v[2] * self.scale), 1.0)
 
     def own(self, v: Triple) -> Triple:
-        """Return a vector of the machine's axes, m, in program coordinates."""
+        """Return a vector of machine axes, m, in program coordinates."""
         x, y, z = self._turned(v, -1.0)
         return x / self.scale, y / self.scale, z / self.scale
 
     def machine(self, p: Triple) -> Triple:
-        """Return the position of the machine's axes, m."""
+        """Return the position of the machine axes, m."""
         x, y, z = self._turned(tuple(a * self.scale + b for a, b in zip(p, self.g92, strict=True)), 1.0)  # type: ignore[arg-type]
         o, t = self.origin, self.tool
         return x + o[0] + t[0], y + o[1] + t[1], z + o[2] + t[2]
 
     def program(self, q: Triple) -> Triple:
-        """Return program coordinates of a position of the machine's axes, m."""
+        """Return program coordinates of a position of the machine axes, m."""
         o, t = self.origin, self.tool
         x, y, z = self._turned((q[0] - o[0] - t[0], q[1] - o[1] - t[1], q[2] - o[2] - t[2]), -1.0)
         return tuple((a - b) / self.scale for a, b in zip((x, y, z), self.g92, strict=True))  # type: ignore[return-value]

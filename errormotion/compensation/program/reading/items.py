@@ -1,4 +1,4 @@
-"""What the reader makes of the lines of a program, in their order."""
+"""Items that the reader returns for the lines of a program, in their order."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ RAPID, LINE, CLOCKWISE, COUNTERCLOCKWISE = 0, 1, 2, 3
 PLANES = ((0, 1, 2), (2, 0, 1), (1, 2, 0))
 """Of G17, G18, G19: the two axes of the plane, right-handed with the third."""
 
-LEFT = {
+UNCHANGED = {
     "machine": "positions in machine coordinates (G53, G28, G30)",
     "probe": "probing moves (G38)",
-    "unknown": "rapid moves while the position of an axis is not known",
+    "unknown": "rapid moves while the position of an axis is unknown",
 }
-"""Moves that stay as they are."""
+"""Kinds of moves that are not corrected."""
 
 
 @dataclass(slots=True)
 class Text:
-    """A line that stays as it is and moves nothing.
+    """An unchanged line without a move.
 
     Attributes
     ----------
     text : str
     motion : int, optional
-        Motion that it states for the moves that follow.
+        Motion that it states for the following moves.
     dwell : float
         s.
     """
@@ -39,16 +39,16 @@ class Text:
 
 
 @dataclass(slots=True)
-class Left:
-    """A move that stays as it is: in machine coordinates, to an unknown position, or of a probe.
+class Unchanged:
+    """A move that is not corrected: in machine coordinates, to an unknown position, or of a probe.
 
     Attributes
     ----------
     text : str
     axes : tuple of int
-        Axes that it leads to a commanded position: no correction acts on them from here on.
+        Axes that it moves to a commanded position: from then on without correction.
     motion : int
-        Of the moves that follow without a word of their own; -1: none.
+        Motion of following moves that do not state one; -1: none.
     explicit : bool
         Whether its line has the word of the motion.
     kind : str
@@ -65,7 +65,7 @@ class Left:
 
 @dataclass(slots=True)
 class Setting:
-    """G92 or G10 L20: the axes are set to values where they stand; the correction that acts there is added to them."""
+    """G92 or G10 L20: values of the axes at their present position, to which the present correction is added."""
 
     block: Block
     frame: Frame
@@ -95,9 +95,9 @@ class Move:
     feed_mode : int
         93, 94 or 95.
     feed : float
-        F in units of the program; NaN where no F came yet.
+        F in units of the program; NaN before the first F.
     speed : float
-        S, 1/min; NaN where none came.
+        S, 1/min; NaN before the first S.
     """
 
     block: Block
@@ -116,4 +116,4 @@ class Move:
     speed: float
 
 
-Item = Text | Left | Setting | Move
+Item = Text | Unchanged | Setting | Move

@@ -1,6 +1,6 @@
 """Work offsets, tools and reference positions of a control: LinuxCNC parameter files (.var) and tool tables (.tbl).
 
-What is not known is NaN; a cut that depends on it is refused.
+Unknown values are NaN; a cut that depends on them raises an error.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ SYSTEMS = ("G54", "G55", "G56", "G57", "G58", "G59", "G59.1", "G59.2", "G59.3")
 UNITS = {"mm": 1e-3, "inch": 25.4e-3}
 """Lengths of the units of programs, m."""
 
-LARGEST_FILE = 1 << 20
-"""Of a parameter file or tool table, bytes."""
+MAX_FILE = 1 << 20
+"""Maximum size of a parameter file or tool table, bytes."""
 
-_FIRST = 5221  # X of G54; the other systems follow at intervals of 20, the rotation stands 9 behind
+_FIRST = 5221  # X of G54; the other systems follow at intervals of 20, the rotation follows 9 after
 _TOOL = re.compile(r"([TPXYZABCUVWDIJQ])\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """What a control knows before a program starts.
+    """Offsets of a control before a program starts.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Offsets:
     tools : mapping of int to array (3,)
         Offset of each tool, m; X, Y, Z.
     system : int
-        The active one, 0 for G54.
+        Index of the active system, 0 for G54.
     """
 
     systems: Array = field(default_factory=lambda: np.full((9, 3), math.nan))
@@ -71,7 +71,7 @@ def read_parameters(path: Path, unit: str = "mm") -> Offsets:
     path : Path
         Numbers and values in two columns.
     unit : str
-        ``mm`` or ``inch``: the unit of the machine, in which the file is kept.
+        ``mm`` or ``inch``: the unit of the machine and of the file.
 
     Raises
     ------
@@ -133,8 +133,8 @@ def read_tools(path: Path, unit: str = "mm") -> dict[int, Array]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        if require_regular(path).st_size > LARGEST_FILE:
-            raise ProgramError(f"{path}: expected a file of at most {LARGEST_FILE} bytes")
+        if require_regular(path).st_size > MAX_FILE:
+            raise ProgramError(f"{path}: expected a file of at most {MAX_FILE} bytes")
         return path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise ProgramError(f"{path} cannot be read: {error.strerror}") from None

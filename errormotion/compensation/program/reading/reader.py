@@ -1,6 +1,6 @@
-"""The plain reader: the subset of RS-274 (ISO 6983) in which every line does one thing, once.
+"""The plain reader of the subset of RS-274 (ISO 6983) in which every line is executed exactly once.
 
-It knows the modal state of a control and refuses, with the number of the line, whatever it does not know. Meaning and
+It tracks the modal state of a control; unsupported words raise an error with the number of the line. Meaning and
 order of words are those of LinuxCNC (G code reference, "order of execution").
 """
 
@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from errormotion.compensation.program.reading import arcs
 from errormotion.compensation.program.reading.frames import Frame, Triple
-from errormotion.compensation.program.reading.items import LINE, PLANES, RAPID, Item, Left, Move, Setting, Text
+from errormotion.compensation.program.reading.items import LINE, PLANES, RAPID, Item, Move, Setting, Text, Unchanged
 from errormotion.compensation.program.reading.offsets import SYSTEMS, UNITS, Offsets
 from errormotion.compensation.program.reading.words import Block, lines_of, refusal, split
 
@@ -40,13 +40,13 @@ class Reader:
     Parameters
     ----------
     offsets : Offsets
-        What the control knows before the program starts.
+        Offsets of the control before the program starts.
     unit : str
         ``mm`` or ``inch``: of the program before its first G20 or G21.
     start : (x, y, z), optional
-        Position of the machine's axes before the program starts, m.
+        Position of the machine axes before the program starts, m.
     deleted : bool, optional
-        Whether blocks that start with ``/`` are skipped. Without it they are refused.
+        Whether blocks that start with ``/`` are skipped; None: they raise an error.
     """
 
     def __init__(
@@ -67,17 +67,17 @@ class Reader:
             UNITS[unit], float(self._rotations[self._system]), self._stored, self._origin(), (0.0, 0.0, 0.0)
         )
         self._at: Triple = self._frame.program(start) if start is not None else UNKNOWN
-        self._why = "no position was commanded yet, and none is given with --start"
+        self._why = "no position was commanded yet, and none is stated by --start"
         self._measured: set[int] = set()
         self.ended = False
 
     def items(self, source: Iterable[str]) -> Iterator[Item]:
-        """Yield what each line of a program does.
+        """Yield the item of each line of a program.
 
         Raises
         ------
         ProgramError
-            A line is not understood, or what it does is not determined.
+            A line is not supported, or its effect is not determined.
         """
         begun = False
         for number, text in lines_of(source):
@@ -96,7 +96,7 @@ class Reader:
     def _item(self, block: Block) -> Item:
         if block.skippable:
             if self.deleted is None:
-                raise refusal(block.line, block.text, "'/' (block delete): state whether such blocks are skipped")
+                raise refusal(block.line, block.text, "'/' (block delete): state whether these blocks are skipped")
             if self.deleted:
                 return Text(block.text)
             block = split(block.line, block.text.replace("/", "", 1))
@@ -109,7 +109,7 @@ class Reader:
             elif letter == "M":
                 switches.append(int(_whole(block, letter, number)))
             elif letter in values:
-                raise refusal(block.line, block.text, f"the word {letter} stands twice")
+                raise refusal(block.line, block.text, f"the word {letter} is repeated")
             else:
                 values[letter] = number
         if codes or switches or "S" in values or "T" in values:
@@ -119,11 +119,11 @@ class Reader:
         if "X" in values or "Y" in values or "Z" in values or "I" in values or "J" in values or "K" in values:
             return self._move(block, values, explicit=False, machine=False)
         if values.keys() - {"N", "F"}:
-            raise refusal(block.line, block.text, f"the word {min(values.keys() - {'N', 'F'})} has no use here")
+            raise refusal(block.line, block.text, f"the word {min(values.keys() - {'N', 'F'})} is not allowed here")
         return Text(block.text)
 
     def _full(self, block: Block, codes: list[int], switches: list[int], values: dict[str, str]) -> Item:
-        """Do a block with codes, in the order of execution."""
+        """Process a block with codes, in the order of execution."""
         consumer = motion = None
         machine = False
         later: list[int] = []
@@ -165,7 +165,7 @@ class Reader:
             if item_is_arc(item) and switches and (("P" in values and _WITH_P & {*switches}) or 19 in switches):
                 raise refusal(block.line, block.text, "an arc and a switch that share a word (P or R)")
             if more := values.keys() - allowed:
-                raise refusal(block.line, block.text, f"the word {min(more)} has no use here")
+                raise refusal(block.line, block.text, f"the word {min(more)} is not allowed here")
         else:
             if machine:
                 raise refusal(block.line, block.text, "G53 without a position")
@@ -173,7 +173,7 @@ class Reader:
             known |= {"P", "Q"} if 640 in later else set()
             known |= {"D"} if 960 in later else set()
             if more := values.keys() - known:
-                raise refusal(block.line, block.text, f"the word {min(more)} has no use here")
+                raise refusal(block.line, block.text, f"the word {min(more)} is not allowed here")
             item = Text(block.text, motion)
         if any(code in _ENDS for code in switches):
             self.ended = True
@@ -187,7 +187,7 @@ class Reader:
         elif code == 61:
             self._tool = int(_whole(block, "Q", values.get("Q", "")))
         elif code not in _SWITCHES and code not in _STOPS and code not in _ENDS:
-            raise refusal(block.line, block.text, f"M{code} is not known to the plain reader")
+            raise refusal(block.line, block.text, f"M{code} is not supported by the plain reader")
 
     def _modal(self, block: Block, code: int, values: dict[str, str]) -> None:
         """Change the modal state."""
@@ -209,16 +209,16 @@ class Reader:
         elif code == 490:
             self._change(replace(self._frame, tool=(0.0, 0.0, 0.0)))
         elif code in _CYCLES:
-            raise refusal(block.line, block.text, f"G{code // 10} is a canned cycle, which the plain reader has not")
+            raise refusal(block.line, block.text, f"G{code // 10} is a canned cycle, not supported by the plain reader")
         elif code in (410, 411, 420, 421):
-            raise refusal(block.line, block.text, f"G{code / 10:g} (cutter compensation) moves along another path")
+            raise refusal(block.line, block.text, f"G{code / 10:g} (cutter compensation) changes the path")
         elif code not in _HARMLESS and code not in _PATH:
-            raise refusal(block.line, block.text, f"G{code / 10:g} is not known to the plain reader")
+            raise refusal(block.line, block.text, f"G{code / 10:g} is not supported by the plain reader")
         if code == 800:
             self._motion = None
 
     def _consume(self, block: Block, code: int, values: dict[str, str]) -> Item:
-        """Do a block whose axis words are not those of a motion."""
+        """Process a block whose axis words do not belong to a motion."""
         allowed = set("NFST")
         if code == 40:
             allowed |= {"P"}
@@ -231,7 +231,7 @@ class Reader:
             allowed |= set(_AXES)
             item = self._home(block, 0 if code == 280 else 1, values)
         elif code in (281, 301):
-            raise refusal(block.line, block.text, "stores a position that is not known before the program runs")
+            raise refusal(block.line, block.text, "stores a position that is unknown before the program runs")
         elif code == 431:
             allowed |= set(_AXES)
             tool = list(self._frame.tool)
@@ -245,9 +245,9 @@ class Reader:
             axes = _axes(values)
             if not axes:
                 raise refusal(block.line, block.text, "a probing move without a position")
-            self._forget(axes, f"the probing move of line {block.line} ends where it touches")
+            self._forget(axes, f"the probing move of line {block.line} ends at the contact")
             self._motion = None
-            item = Left(block.text, block.line, axes, -1, True, "probe")
+            item = Unchanged(block.text, block.line, axes, -1, True, "probe")
         elif code == 920:
             allowed |= set(_AXES)
             frame = self._frame
@@ -261,7 +261,7 @@ class Reader:
                 at[k] = value
             self._stored = _triple(g92)
             if any(map(math.isnan, g92)):
-                self._why = f"line {block.line} sets an offset at a position that is not known before the program runs"
+                self._why = f"line {block.line} sets an offset at a position that is unknown before the program runs"
             self._frame, self._at = replace(frame, g92=self._stored), _triple(at)
             item = Setting(block, frame)
         else:
@@ -270,7 +270,7 @@ class Reader:
             self._change(replace(self._frame, g92=self._stored if code == 923 else (0.0, 0.0, 0.0)))
             item = Text(block.text)
         if more := values.keys() - allowed:
-            raise refusal(block.line, block.text, f"the word {min(more)} has no use here")
+            raise refusal(block.line, block.text, f"the word {min(more)} is not allowed here")
         return item
 
     def _set_system(self, block: Block, values: dict[str, str]) -> Item:
@@ -288,7 +288,7 @@ class Reader:
                 value if kind == "2" else self._at[k] * scale + self._systems[self._system, k] - value
             )
         if kind == "20" and any(math.isnan(self._systems[index, k]) for k in _axes(values)):
-            self._why = f"line {block.line} sets an origin at a position that is not known before the program runs"
+            self._why = f"line {block.line} sets an origin at a position that is unknown before the program runs"
             self._measured.add(index)
         if "R" in values:
             self._rotations[index] = _number(block, "R", values["R"])
@@ -304,13 +304,13 @@ class Reader:
         for k in axes:
             machine[k] = float(home[k])
         new = self._frame.program(_triple(machine))
-        if not self._frame.rotation:  # the other axes stay, known or not
+        if not self._frame.rotation:  # the other axes do not move, known or not
             new = _triple([new[k] if k in axes else at[k] for k in range(3)])
         self._at = new
-        self._why = f"the position that line {block.line} leads to is not known; it stands in the parameter file"
+        self._why = f"the target position of line {block.line} is unknown; it is stated in the parameter file"
         moved = axes if not self._frame.rotation else (0, 1, 2)
         motion = -1 if self._motion is None else self._motion
-        return Left(block.text, block.line, moved, motion, True, "machine")
+        return Unchanged(block.text, block.line, moved, motion, True, "machine")
 
     def _move(self, block: Block, values: dict[str, str], *, explicit: bool, machine: bool) -> Item:
         motion = self._motion
@@ -337,10 +337,10 @@ class Reader:
             axes = _axes(values) if self._absolute else ()
             if not self._absolute:
                 self._why = f"line {block.line} moves by an increment from an unknown position"
-            return Left(block.text, block.line, axes, motion, explicit, "unknown")
+            return Unchanged(block.text, block.line, axes, motion, explicit, "unknown")
         if not known or not _known(at):
             if known and motion == RAPID:
-                at = new  # from anywhere: only the end counts
+                at = new  # from an unknown position: only the end is relevant
             else:
                 raise refusal(block.line, block.text, f"a cut from or to an unknown position: {self._unknown()}")
         if motion == LINE and self._feed_mode == 93 and "F" not in values:
@@ -366,9 +366,9 @@ class Reader:
         )
 
     def _in_machine(self, block: Block, values: dict[str, str], motion: int, explicit: bool) -> Item:
-        """G53: a rapid move to a position of the machine stays as it is."""
+        """Return the unchanged rapid move of G53 to a position in machine coordinates."""
         if motion != RAPID or not self._absolute:
-            raise refusal(block.line, block.text, "G53 is understood with G0 and G90 only")
+            raise refusal(block.line, block.text, "G53 is supported with G0 and G90 only")
         machine = list(self._frame.machine(self._at))
         axes = _axes(values)
         for k in axes:
@@ -379,7 +379,7 @@ class Reader:
         elif not {0, 1} <= set(axes) and axes != (2,):
             raise refusal(block.line, block.text, "G53 in a rotated coordinate system: expected both X and Y, or Z")
         self._at = new
-        return Left(block.text, block.line, axes, motion, explicit, "machine")
+        return Unchanged(block.text, block.line, axes, motion, explicit, "machine")
 
     def _tool_offset(self, block: Block, values: dict[str, str]) -> Triple:
         number = int(_whole(block, "H", values["H"])) if "H" in values else self._tool
@@ -387,7 +387,7 @@ class Reader:
             return 0.0, 0.0, 0.0
         if number is None or number not in self._offsets.tools:
             which = "the tool in the spindle" if number is None else f"tool {number}"
-            raise refusal(block.line, block.text, f"the length of {which} is not known: give --tools with a tool table")
+            raise refusal(block.line, block.text, f"the length of {which} is unknown: state a tool table with --tools")
         return _triple(self._offsets.tools[number])
 
     def _origin(self) -> Triple:
@@ -397,7 +397,7 @@ class Reader:
         self._change(replace(self._frame, origin=self._origin(), rotation=float(self._rotations[self._system])))
 
     def _change(self, frame: Frame) -> None:
-        """Take another frame; the machine stays where it is."""
+        """Change the frame without a motion of the machine."""
         old, at = self._frame, self._at
         if frame == old:
             return
@@ -415,7 +415,7 @@ class Reader:
     def _unknown(self) -> str:
         name = SYSTEMS[self._system]
         if any(map(math.isnan, self._frame.origin)) and self._system not in self._measured:
-            return f"the origin of {name} is not known; give --parameters FILE.var or --offset {name}=X,Y,Z"
+            return f"the origin of {name} is unknown; state --parameters FILE.var or --offset {name}=X,Y,Z"
         return self._why
 
 
@@ -434,7 +434,7 @@ def _code(block: Block, number: str) -> int:
         value = 10 * float(number)
         found = round(value)
         if abs(value - found) > 1e-6 or not 0 <= found < 1000:
-            raise refusal(block.line, block.text, f"G{number} is no code")
+            raise refusal(block.line, block.text, f"G{number} is not a code")
         if len(_CODES) < 1000:
             _CODES[number] = found
     return found

@@ -1,7 +1,7 @@
-"""The words of a block of RS-274 (ISO 6983) code, and their texts, which are kept as they are until one changes.
+"""The words of a block of RS-274 (ISO 6983) code, and their original texts.
 
-A line is split into text that stands between words, letters, numbers and comments. Joined, the parts give the line.
-Expressions, variables and control words (``O``) are no words: the line is refused with its number.
+A line is split into text between words, letters, numbers and comments. The joined parts are the line. Expressions,
+variables and control words (``O``) are no words and raise an error with the number of the line.
 """
 
 from __future__ import annotations
@@ -12,17 +12,20 @@ from dataclasses import dataclass
 
 from errormotion.errors import ProgramError
 
-LONGEST_LINE = 1024
-"""Longest line that is read, characters."""
+MAX_BLOCK = 250
+"""Maximum length of a line that LinuxCNC reads, characters."""
 
-MOST_LINES = 5_000_000
-"""Most lines of one program."""
+MAX_LINE = 1024
+"""Maximum length of a line, characters."""
+
+MAX_LINES = 5_000_000
+"""Maximum number of lines of one program."""
 
 _PARTS = re.compile(r"(?:([A-Za-z])[ \t]*([-+]?(?:\d{1,15}\.?\d{0,15}|\.\d{1,15})))|(\([^()]*\)|;.*)")
 _CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
 _OTHER = re.compile(r"#|\[|<")
 STRIDE = 4
-"""Parts of a line come in fours: text between, letter, number, comment."""
+"""Number of parts that repeat along a line: text between, letter, number, comment."""
 
 
 @dataclass(slots=True)
@@ -32,13 +35,13 @@ class Block:
     Attributes
     ----------
     line : int
-        Its number in the file, from 1.
+        Number of the line in the file, from 1.
     text : str
-        Without its end.
+        Text without line end.
     parts : list of str or None
-        Text between, letter, number, comment, and again; ends with text.
+        Text between, letter, number, comment, repeated; ends with text.
     words : list of (str, str, int)
-        Letter (upper case), number as it was written, and the index of the number in ``parts``.
+        Letter (upper case), number as written, and the index of the number in ``parts``.
     skippable : bool
         Whether it starts with ``/`` (block delete).
     """
@@ -56,7 +59,7 @@ def split(line: int, text: str) -> Block:
     Raises
     ------
     ProgramError
-        The line has something else than words, comments and spaces.
+        The line has other content than words, comments and spaces.
     """
     parts: list[str | None] = _PARTS.split(text)
     between = "".join([part for part in parts[::STRIDE] if part]).strip()
@@ -74,14 +77,14 @@ def split(line: int, text: str) -> Block:
 
 
 def unknown(line: int, text: str, what: str) -> ProgramError:
-    """Return the refusal of a line that is not understood."""
+    """Return the error of a line that is not supported."""
     if _OTHER.search(what) or text.lstrip().lower().startswith("o"):
-        return refusal(line, text, "an expression, a variable or a control word (O), which the plain reader has not")
+        return refusal(line, text, "an expression, a variable or a control word (O), not supported by the plain reader")
     return refusal(line, text, f"expected words (letter and number) and comments; found '{what[:20]}'")
 
 
 def refusal(line: int, text: str, why: str) -> ProgramError:
-    """Return the error of a line that is refused."""
+    """Return the error of a line."""
     return ProgramError(f"line {line} '{text.strip()[:60]}': {why}")
 
 
@@ -91,14 +94,14 @@ def lines_of(source: Iterable[str]) -> Iterator[tuple[int, str]]:
     Raises
     ------
     ProgramError
-        Too many lines, a line that is too long, or one with control characters.
+        Too many lines, a line that is too long, or control characters in a line.
     """
     for number, line in enumerate(source, 1):
-        if number > MOST_LINES:
-            raise ProgramError(f"expected a program of at most {MOST_LINES} lines")
+        if number > MAX_LINES:
+            raise ProgramError(f"expected a program of at most {MAX_LINES} lines")
         text = line.rstrip("\r\n")
-        if len(text) > LONGEST_LINE:
-            raise ProgramError(f"line {number}: expected at most {LONGEST_LINE} characters; found {len(text)}")
+        if len(text) > MAX_LINE:
+            raise ProgramError(f"line {number}: expected at most {MAX_LINE} characters; found {len(text)}")
         if not text.isprintable() and _CONTROL.search(text):
-            raise ProgramError(f"line {number}: has control characters; expected text")
+            raise ProgramError(f"line {number}: expected text; found control characters")
         yield number, text

@@ -1,1 +1,1 @@
-"""Correction and division of moves, and the lines of the new program."""
+"""Correction and division of moves, and output of the new program."""

@@ -1,8 +1,8 @@
-"""Where moves are divided, so that straight lines and arcs between corrected points follow the corrected path.
+"""Division of moves, so that straight lines and arcs between corrected points follow the corrected path.
 
-A line between corrected ends follows the corrected path where the correction changes linearly along it; an arc through
-three corrected points follows it where the correction turns the arc into another arc. The deviation from that is
-examined at points that are at most one sampling interval apart.
+A line between corrected ends follows the corrected path if the correction changes linearly along it; an arc through
+three corrected points follows it if the correction transforms the arc into another arc. The deviation is examined at
+points that are at most one sampling interval apart.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from errormotion.compensation.program.writing.path import Indices, Path
 from errormotion.compiling import Compiler
 from errormotion.errors import ProgramError
 
-MOST_PIECES = 10_000
-"""Of one move."""
+MAX_PIECES = 10_000
+"""Maximum number of pieces of one move."""
 
 _POINTS = 200_000  # evaluated at a time
 _compiled = Compiler("the division of lines", seconds=2)
@@ -32,20 +32,20 @@ class Values(Protocol):
 
     @property
     def offset(self) -> Array:
-        """Translations that the commands are changed by (n, 3), m."""
+        """Translations added to the commands (n, 3), m."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Whether the correction is known there (n,)."""
+        """Whether the correction is known at the points (n,)."""
 
 
 Correcting = Callable[[Array, Array], Values]
-"""Corrections of positions of the machine's axes (n, 3), m, of tools with offsets (n, 3), m."""
+"""Corrections of positions of the machine axes (n, 3), m, of tools with offsets (n, 3), m."""
 
 
 @dataclass
 class Division:
-    """Pieces of moves: those of move k are ``first[k]`` to ``first[k + 1]``.
+    """Pieces of moves; move k has the pieces ``first[k]`` to ``first[k + 1] - 1``.
 
     Attributes
     ----------
@@ -55,11 +55,11 @@ class Division:
     offset : array (piece, 3)
         Correction at the end of each piece, in units of the program.
     start : array (move, 3)
-        Correction at the start of each move that is divided or an arc; NaN for others.
+        Correction at the start of each divided move and of each arc; NaN for others.
     middle : array (piece, 3)
         Correction in the middle of each piece of an arc; NaN for lines.
     shifted : array (move,)
-        Arcs whose correction is the same everywhere.
+        Whether the correction of an arc is constant.
     valid : array (move,)
         Whether the correction is known at all points of the move.
     """
@@ -92,7 +92,7 @@ class _Field:
             if not values.valid.all():
                 self.valid[k[~values.valid]] = False
         if not np.isfinite(found).all():
-            raise ProgramError("the correction is not known at every position of the program")
+            raise ProgramError("the correction is unknown at some positions of the program")
         return found
 
 
@@ -106,21 +106,21 @@ def divide(path: Path, correcting: Correcting, tolerance: float, step: float, di
     tolerance : float
         Largest distance of the result from the corrected path, m.
     step : float
-        Largest distance of two points at which it is examined, m.
+        Largest distance between two points at which it is examined, m.
     digits : array (move,)
         Last printed digit of each move, in units of the program.
 
     Raises
     ------
     ProgramError
-        More than `MOST_PIECES` for one move, or a correction that is not known.
+        More than `MAX_PIECES` for one move, or an unknown correction.
     """
     field = _Field(path, correcting)
     counts = np.ones(len(path), np.intp)
     lines = np.flatnonzero(path.kind <= LINE)
     cuts = lines[path.kind[lines] == LINE]
     counts[cuts] = np.maximum(1, np.ceil(path.length[cuts] / step)).astype(np.intp)
-    _bounded(counts, 100 * MOST_PIECES)
+    _bounded(counts, 100 * MAX_PIECES)
     start: Array = np.full((len(path), 3), np.nan)
     nodes: list[tuple[Indices, Array, Array, Array]] = []
     simple = lines[counts[lines] == 1]
@@ -142,8 +142,8 @@ def divide(path: Path, correcting: Correcting, tolerance: float, step: float, di
 def _bounded(counts: Indices, most: int) -> None:
     if counts.size and counts.max() > most:
         raise ProgramError(
-            f"a move would be examined or divided at {counts.max()} points; at most {most} are allowed: "
-            "raise the tolerance or the sampling interval"
+            f"a move requires {counts.max()} points, of which at most {most} are allowed: "
+            "increase the tolerance or the sampling interval"
         )
 
 
@@ -171,13 +171,13 @@ def _lines(field: _Field, moves: Indices, counts: Indices, start: Array, toleran
 
 @_compiled()
 def _greedy(offset: Any, first: Any, direction: Any, tolerance: float) -> Any:
-    """Return which samples are ends of pieces: each piece is as long as the tolerance allows."""
+    """Return which samples are ends of pieces; each piece has the maximum length within the tolerance."""
     kept = np.zeros(offset.shape[0], np.bool_)
     for k in range(first.size - 1):
         anchor, last = first[k], first[k + 1] - 1
         while anchor < last:
             good = anchor + 1
-            step = last - anchor  # the whole rest first, then by halves: what is smooth ends soon
+            step = last - anchor  # try the rest first, then halves: smooth corrections need few steps
             while step > 0:
                 end = min(good + step, last)
                 fits = end > good
@@ -212,9 +212,9 @@ def _arcs(
     pieces = np.ceil(turns / np.pi - 1e-9).astype(np.intp)
     first = True
     while moves.size:
-        _bounded(pieces, MOST_PIECES)
+        _bounded(pieces, MAX_PIECES)
         points = np.ceil(path.length[moves] / pieces / step).astype(np.intp)
-        points = 2 * np.maximum(2, np.minimum((points + 1) // 2, MOST_PIECES))
+        points = 2 * np.maximum(2, np.minimum((points + 1) // 2, MAX_PIECES))
         fits = np.zeros(moves.size, bool)
         rest = np.arange(moves.size)
         total = np.cumsum(pieces * points + 1) // _POINTS
@@ -241,7 +241,7 @@ def _pieces(
     digits: Array,
     first_time: bool,
 ) -> tuple[NDArray[np.bool_], tuple[Indices, Array, Array, Array]]:
-    """Return which arcs follow the corrected path with so many pieces, and the pieces of those.
+    """Return which arcs follow the corrected path with ``pieces`` pieces, and their pieces.
 
     Each piece is examined at ``points`` intervals, an even number.
     """

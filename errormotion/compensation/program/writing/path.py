@@ -1,4 +1,4 @@
-"""Moves as arrays: points on them, in the program and on the machine."""
+"""Moves as arrays: their points in coordinates of the program and of the machine."""
 
 from __future__ import annotations
 
@@ -97,15 +97,15 @@ class Path:
         return found
 
     def machine(self, index: Indices, points: Array) -> Array:
-        """Return the positions of the machine's axes (n, 3) at points of the program, m."""
+        """Return the positions of the machine axes (n, 3) at points of the program, m."""
         return self._rotated(index, points * self.scale[index, None], 1.0) + self._shift[index]
 
     def vector(self, index: Indices, vectors: Array) -> Array:
-        """Return vectors (n, 3) of the program in the machine's axes, m."""
+        """Return vectors (n, 3) of the program in machine axes, m."""
         return self._rotated(index, vectors * self.scale[index, None], 1.0)
 
     def own(self, index: Indices, vectors: Array) -> Array:
-        """Return vectors (n, 3) of the machine's axes, m, in coordinates of the program."""
+        """Return vectors (n, 3) of machine axes, m, in coordinates of the program."""
         return self._rotated(index, vectors, -1.0) / self.scale[index, None]
 
     def _rotated(self, index: Indices, v: Array, sense: float) -> Array:

@@ -1,4 +1,4 @@
-"""A program, read, corrected and written as it goes: a part of it is in memory at a time."""
+"""Reading, correction and output of a program in parts, so that memory is limited."""
 
 from __future__ import annotations
 
@@ -9,21 +9,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.compensation.program.reading.items import LINE, RAPID, Item, Left, Move, Setting, Text
+from errormotion.compensation.program.reading.items import LINE, RAPID, Item, Move, Setting, Text, Unchanged
 from errormotion.compensation.program.reading.reader import Reader
+from errormotion.compensation.program.reading.words import MAX_BLOCK
 from errormotion.compensation.program.writing.dividing import Correcting, Division, divide
 from errormotion.compensation.program.writing.path import Indices, Path
 from errormotion.compensation.program.writing.writer import DECIMALS, Writer
 from errormotion.errors import ProgramError
 
-MOST_WRITTEN = 20_000_000
-"""Most lines of the new program."""
-
-LONGEST_BLOCK = 250
-"""Characters of a line that LinuxCNC reads; a shorter line does not become a longer one."""
+MAX_WRITTEN = 20_000_000
+"""Maximum number of lines of the new program."""
 
 SHOWN = 4000
-"""Most points of the path that are kept for the page."""
+"""Maximum number of points of the path for the page."""
 
 _MOVES = 10_000  # in memory at a time
 _ITEMS = 100_000
@@ -32,37 +30,37 @@ _ANGLE = 0.2  # between points of arcs for the page, rad
 
 @dataclass
 class Summary:
-    """What was done to a program.
+    """Summary of the correction of a program.
 
     Attributes
     ----------
     read, written : int
         Lines.
     cuts, rapids : int
-        Moves that were corrected.
+        Corrected moves.
     divided : int
-        Cuts that were divided.
-    left : dict of str to (int, int)
-        Moves that stay as they are: of each kind the number, and the line of the first.
+        Divided cuts.
+    unchanged : dict of str to (int, int)
+        Moves without correction: number of each kind, and line of the first.
     uncorrected : (int, int)
-        Cuts that start where no correction acts yet: number, and the line of the first.
+        Cuts that start at a position without correction: number, and line of the first.
     outside : (int, int)
-        Moves outside of what was measured: number, and the line of the first. The correction is held at its edge.
+        Moves outside the measured range, with the correction at its limit: number, and line of the first.
     largest : float
-        Of the corrections, m.
+        Largest correction, m.
     largest_line : int
     length : float
-        Of all cuts, m.
+        Length of all cuts, m.
     seconds : float
-        Of all cuts and dwells, at the programmed feed, s.
+        Duration of all cuts and dwells at the programmed feed, s.
     unfed : int
-        Cuts whose feed is not known: they are not in ``seconds``.
-    places, offsets : array (n, 3)
-        Points on the path, positions of the machine's axes and corrections there, m: at most `SHOWN`.
+        Cuts with unknown feed, which ``seconds`` does not include.
+    positions, offsets : array (n, 3)
+        Positions of the machine axes on the path, and corrections there, m; at most `SHOWN`.
     tools : array (n, 3)
-        Offset of the tool at each of them, m.
+        Offset of the tool at each position, m.
     lines : array (n,)
-        Lines of the program at them; 0 where a rapid move ends.
+        Line of the program at each position; 0 for the end of a rapid move.
     """
 
     read: int = 0
@@ -70,7 +68,7 @@ class Summary:
     cuts: int = 0
     rapids: int = 0
     divided: int = 0
-    left: dict[str, tuple[int, int]] = field(default_factory=dict)
+    unchanged: dict[str, tuple[int, int]] = field(default_factory=dict)
     uncorrected: tuple[int, int] = (0, 0)
     outside: tuple[int, int] = (0, 0)
     largest: float = 0.0
@@ -78,23 +76,23 @@ class Summary:
     length: float = 0.0
     seconds: float = 0.0
     unfed: int = 0
-    places: Array = field(default_factory=lambda: np.empty((0, 3)))
+    positions: Array = field(default_factory=lambda: np.empty((0, 3)))
     offsets: Array = field(default_factory=lambda: np.empty((0, 3)))
     tools: Array = field(default_factory=lambda: np.empty((0, 3)))
     lines: Array = field(default_factory=lambda: np.empty(0))
 
 
 class Rewriting:
-    """The rewriting of one program.
+    """Correction of one program.
 
     Parameters
     ----------
     reader : Reader
     correcting : callable
     tolerance : float
-        Largest distance of the new cuts from the corrected path, beside the last printed digit, m.
+         Largest distance of the new cuts from the corrected path, in addition to the last printed digit, m.
     step : float
-        Largest distance of two points at which that is examined, m.
+        Largest distance between two points at which it is examined, m.
     """
 
     def __init__(self, reader: Reader, correcting: Correcting, *, tolerance: float = 1e-6, step: float = 2e-3) -> None:
@@ -115,7 +113,7 @@ class Rewriting:
         Raises
         ------
         ProgramError
-            A line is not understood, or what it does is not determined.
+            A line is not supported, or its effect is not determined.
         """
         items: list[Item] = []
         moves: list[Move] = []
@@ -151,13 +149,11 @@ class Rewriting:
                 )
                 number += 1
                 summary.written += len(made)
-                if summary.written > MOST_WRITTEN:
+                if summary.written > MAX_WRITTEN:
+                    raise ProgramError(f"the new program would exceed {MAX_WRITTEN} lines: increase the tolerance")
+                if max(map(len, made)) > MAX_BLOCK >= len(item.block.text):
                     raise ProgramError(
-                        f"the new program would have more than {MOST_WRITTEN} lines: raise the tolerance"
-                    )
-                if max(map(len, made)) > LONGEST_BLOCK >= len(item.block.text):
-                    raise ProgramError(
-                        f"line {item.block.line} would get longer than the {LONGEST_BLOCK} characters of a control"
+                        f"line {item.block.line} would exceed {MAX_BLOCK} characters, which controls do not read"
                     )
                 yield from made
                 continue
@@ -165,10 +161,10 @@ class Rewriting:
             if isinstance(item, Text):
                 summary.seconds += item.dwell
                 yield writer.text(item)
-            elif isinstance(item, Left):
-                count, line = summary.left.get(item.kind, (0, item.line))
-                summary.left[item.kind] = count + 1, line
-                yield writer.left(item)
+            elif isinstance(item, Unchanged):
+                count, line = summary.unchanged.get(item.kind, (0, item.line))
+                summary.unchanged[item.kind] = count + 1, line
+                yield writer.unchanged(item)
             elif isinstance(item, Setting):
                 yield writer.setting(item)
 
@@ -200,7 +196,7 @@ class Rewriting:
         self._show(moves, path, division)
 
     def _show(self, moves: list[Move], path: Path, division: Division) -> None:
-        """Keep points of the path for the page, ever fewer of them: ends of pieces of lines, and points on arcs."""
+        """Keep points of the path for the page, thinned out: ends of pieces of lines, and points on arcs."""
         pieces = np.diff(division.first)
         counts = np.where(path.kind > LINE, np.ceil(np.abs(path.sweep) / _ANGLE - 1e-9), pieces).astype(np.intp)
         ends = np.cumsum(counts)
@@ -209,10 +205,10 @@ class Rewriting:
         k = np.searchsorted(ends, chosen, side="right")
         number = chosen - (ends - counts)[k]
         u = np.where(path.kind[k] > LINE, (number + 1) / counts[k], division.u[division.first[k] + number % pieces[k]])
-        places = path.machine(k, path.points(k, u))
+        positions = path.machine(k, path.points(k, u))
         offset = path.vector(k, _between(division, k, u))
         lines = np.where(path.kind[k] == RAPID, 0, np.array([move.block.line for move in moves])[k])
-        self._shown.append(np.hstack([places, offset, path.tool[k], lines[:, None]]))
+        self._shown.append(np.hstack([positions, offset, path.tool[k], lines[:, None]]))
         while sum(map(len, self._shown)) > SHOWN:
             self._shown = [np.concatenate(self._shown)[::2]]
             self._every *= 2
@@ -223,15 +219,15 @@ class Rewriting:
         summary.uncorrected = writer.uncorrected, writer.first_uncorrected
         if self._shown:
             rows = np.concatenate(self._shown)
-            summary.places, summary.offsets, summary.tools = rows[:, :3], rows[:, 3:6], rows[:, 6:9]
+            summary.positions, summary.offsets, summary.tools = rows[:, :3], rows[:, 3:6], rows[:, 6:9]
             summary.lines = rows[:, 9]
 
 
 def _between(division: Division, k: Indices, u: Array) -> Array:
-    """Return corrections at fractions of moves, between those at ends and middles of their pieces."""
+    """Return corrections at fractions of moves, interpolated between ends and middles of their pieces."""
     size = np.diff(division.first)
     index = np.repeat(np.arange(len(size)), size)
-    inside = np.isfinite(division.start[:, 0])  # of moves that are not divided the end alone is known
+    inside = np.isfinite(division.start[:, 0])  # for undivided moves only the end is known
     before = np.concatenate([[0.0], division.u[:-1]])
     before[division.first[:-1]] = 0.0
     arcs = np.isfinite(division.middle[:, 0])

@@ -1,6 +1,6 @@
-"""Lines of the new program: words of the old ones with other numbers, and further blocks where a move is divided.
+"""Lines of the new program: words of the old ones with other numbers, and further blocks for divided moves.
 
-A number whose correction is below the last printed digit stays as it was written.
+A number whose correction is below the last printed digit is not changed.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import re
 from collections.abc import Sequence
 
 from errormotion.compensation.program.reading.frames import Frame, Triple
-from errormotion.compensation.program.reading.items import LINE, PLANES, RAPID, Left, Move, Setting, Text
+from errormotion.compensation.program.reading.items import LINE, PLANES, RAPID, Move, Setting, Text, Unchanged
 from errormotion.compensation.program.reading.offsets import UNITS
 from errormotion.compensation.program.reading.words import STRIDE
 
 DECIMALS = {UNITS["mm"]: 4, UNITS["inch"]: 5}
-"""Printed digits after the point for each unit of programs."""
+"""Printed digits after the decimal point for each unit of programs."""
 
 _STOPS = {0.0, 1.0, 2.0, 30.0, 60.0}
 _NUMBER = re.compile(r"^\s*(?:[nN]\s*\d+\s*)?")
@@ -25,17 +25,16 @@ _OFFSETS = "IJK"
 
 
 class Writer:
-    """Writes moves in their order; it knows what correction acts on each axis.
+    """Writes moves in their order, and tracks the present correction of each axis.
 
     Attributes
     ----------
     added : int
-        Lines that were added.
+        Added lines.
     divided : int
-        Moves that were divided.
+        Divided moves.
     uncorrected : int
-        Cuts that start where the correction does not act yet, after a position in machine coordinates or a probing
-        move.
+        Cuts that start at a position without correction, after a position in machine coordinates or a probing move.
     first_uncorrected : int
         Line of the first of them.
     """
@@ -47,13 +46,13 @@ class Writer:
         self._motion = -1
 
     def text(self, item: Text) -> str:
-        """Return the line that moves nothing."""
+        """Return a line without a move."""
         if item.motion is not None:
             self._motion = item.motion
         return item.text
 
-    def left(self, item: Left) -> str:
-        """Return the line of a move that stays as it is."""
+    def unchanged(self, item: Unchanged) -> str:
+        """Return the line of a move without correction."""
         for k in item.axes:
             self._applied[k] = 0.0
         text = item.text
@@ -63,7 +62,7 @@ class Writer:
         return text
 
     def setting(self, item: Setting) -> str:
-        """Return the line that sets the axes to values where they stand, with the correction that acts there."""
+        """Return the line that sets the axes to values, including their present correction."""
         self._in(item.frame)
         new: dict[int, str] = {}
         decimals = DECIMALS[item.frame.scale]
@@ -92,11 +91,11 @@ class Writer:
         u : sequence of float
             Ends of its pieces, fractions.
         offset, middle : sequences of (3,)
-            Corrections there, and in the middle of the pieces of an arc; units of the program.
+            Corrections at the ends, and in the middle of the pieces of an arc; units of the program.
         start : (3,)
-            Correction at the start, where it was examined.
+            Correction at the start; NaN if unknown.
         shifted : bool
-            Whether the correction of an arc is the same everywhere.
+            Whether the correction of an arc is constant.
         tolerance : float
             m; a cut that starts farther from its corrected start is counted.
         """
@@ -121,7 +120,7 @@ class Writer:
         return lines
 
     def _in(self, frame: Frame) -> None:
-        """Express the correction that acts in another frame."""
+        """Express the present correction in another frame."""
         if self._frame is not None and frame is not self._frame:
             old = self._frame
             if frame.scale != old.scale or frame.rotation != old.rotation:
@@ -129,7 +128,7 @@ class Writer:
         self._frame = frame
 
     def _modal(self, kind: int) -> str:
-        """Return the word of a motion, where the control does another one."""
+        """Return the word of a motion; empty if the control is already in this mode."""
         before, self._motion = self._motion, kind
         return "" if before in (kind, -1) else f"G{kind} "
 
@@ -177,7 +176,7 @@ class Writer:
         u: Sequence[float],
         decimals: int,
     ) -> list[str]:
-        """Return one block for each piece: the first with all words of the old one, except stops, which come last."""
+        """Return one block for each piece: the first with all words of the old one, except stops, which follow."""
         here = [round(move.start[k] + self._applied[k], decimals) for k in range(3)]
         whole = [move.end[k] - move.start[k] + points[-1][k] - move.end[k] - self._applied[k] for k in range(3)]
         done = [0.0, 0.0, 0.0]
@@ -190,7 +189,7 @@ class Writer:
             axes = ""
             for k in range(3):
                 step = place[k] - here[k]
-                if last and not move.absolute:  # the increments add up to what they were
+                if last and not move.absolute:  # the sum of the increments does not change
                     step = whole[k] - done[k]
                 step = round(step, decimals)
                 if step:
@@ -230,7 +229,7 @@ class Writer:
         return text
 
     def _shifted(self, move: Move, change: Sequence[float], decimals: int) -> str:
-        """Return an arc whose correction is the same everywhere."""
+        """Return an arc with a constant correction."""
         half = 10.0**-decimals / 4
         centre = {_OFFSETS[axis]: axis for axis in PLANES[move.plane][:2]} if move.centre_absolute else {}
         new: dict[int, str] = {}
@@ -304,7 +303,7 @@ class Writer:
 def _centre(
     s: tuple[float, float], m: tuple[float, float], e: tuple[float, float], kind: int, digit: float
 ) -> tuple[float, float] | None:
-    """Return the centre of the arc through three points; None where a straight line is the same to the last digit."""
+    """Return the centre of the arc through three points; None if a straight line is equal to the last digit."""
     dx, dy = e[0] - s[0], e[1] - s[1]
     length = math.hypot(dx, dy)
     if length < 10 * digit:
@@ -336,12 +335,12 @@ def _text(value: float, decimals: int) -> str:
 
 
 def _ahead(word: str, text: str) -> str:
-    """Return a line with a word before all others but its number."""
+    """Return a line with a word before all others except its number."""
     return _NUMBER.sub(lambda found: found[0] + word, text, count=1) if word else text
 
 
 def _joined(parts: Sequence[str | None], new: dict[int, str], tail: str = "") -> str:
-    """Return a line with other numbers, an empty one for no word; ``tail`` follows its last word of a position."""
+    """Return a line with other numbers; an empty one deletes the word. ``tail`` follows its last word of a position."""
     found = [part or "" for part in parts]
     end = axis = -1
     for index in range(2, len(found), STRIDE):

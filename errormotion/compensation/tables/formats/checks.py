@@ -1,4 +1,4 @@
-"""Checks that several formats need."""
+"""Checks of several formats."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ import numpy as np
 from errormotion.compensation.tables.table import AxisTable
 from errormotion.errors import DatasetError
 
-CHECK_SIGN = "Check the sign with one value before the table is used: it is from memory (inverted = true turns it)."
-"""Remark of formats whose sign no document of the maker states."""
+CHECK_SIGN = "Check the sign with one value before use: it is from memory (inverted = true reverses it)."
+"""Remark of formats whose sign is not stated by a document of the maker."""
 
 
 def check_points(table: AxisTable, most: int, control: str) -> None:
-    """Refuse more points than a control takes."""
+    """Raise an error for more points than a control accepts."""
     if table.positions.size > most:
         raise DatasetError(
-            f"{control} takes at most {most} points; this table has {table.positions.size}. State a larger "
+            f"{control} accepts at most {most} points; this table has {table.positions.size}. State a larger "
             "step (--step)"
         )
 
 
 def check_even(table: AxisTable, control: str) -> None:
-    """Refuse points at unequal distances."""
+    """Raise an error for points at unequal distances."""
     if np.isnan(table.step):
-        raise DatasetError(f"{control} needs points at equal distances; state the distance (--step)")
+        raise DatasetError(f"{control} requires points at equal distances; state the distance (--step)")
 
 
 def one_direction(table: AxisTable, control: str) -> tuple[str, ...]:
-    """Return the remark on the directions where a control knows one only."""
+    """Return the remark of controls that do not distinguish directions."""
     if table.reversal < 1e-9:
         return ()
     return (
-        f"{control} knows one direction: the table has the mean of both. Half of the reversal, up to "
+        f"{control} does not distinguish directions: it has the mean of both. Half of the reversal, up to "
         f"{0.5e6 * table.reversal:.2f} um, remains for the backlash compensation of the control.",
     )

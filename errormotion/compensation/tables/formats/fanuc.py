@@ -1,9 +1,9 @@
-"""FANUC: stored pitch error compensation, as the text that the control reads in.
+"""FANUC: stored pitch error compensation, as the text file that the control reads.
 
 Parameters 3620 to 3624 of the axis state number of the reference point, first and last number, magnification and
 distance. Value k is the change of the compensation from point k - 1 to point k, seen from the negative direction, a
 whole number of detection units times the magnification. The compensation is 0 at the reference point: a constant
-cannot be held. Between two points the control outputs the whole value at one position.
+cannot be stored. Between two points the control outputs the whole value at one position.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class FanucTable:
         ------
         DatasetError
             No table of this axis; points at unequal distances; the reference point (position 0) is none of them; more
-            points or larger values than the control holds.
+            points or larger values than the control accepts.
         """
         if table.component != table.axis:
             raise DatasetError(
@@ -77,14 +77,14 @@ class FanucTable:
         count = table.positions.size
         if count - 1 > settings.most_points or settings.first_number + count > NUMBERS:
             raise DatasetError(
-                f"This FANUC takes at most {settings.most_points} points an axis (setting most_points), numbers up to "
-                f"{NUMBERS - 1}; this table has {count - 1} from {settings.first_number + 1} on. State a larger step "
-                "(--step)"
+                f"This FANUC control accepts at most {settings.most_points} points per axis (setting most_points), "
+                f"numbers up to {NUMBERS - 1}; this table has {count - 1} from {settings.first_number + 1}. State "
+                "a larger step (--step)"
             )
         wanted = table.mean - table.mean[zero]
         units = wanted / settings.detection_unit
         magnification = _magnification(units, settings)
-        levels = np.round(units / magnification).astype(int)  # of the sums, so that rounding does not add up
+        levels = np.round(units / magnification).astype(int)  # of the sums, so that rounding errors do not accumulate
         values = np.diff(levels) * (-1 if settings.inverted else 1)
         held = levels * magnification * settings.detection_unit
         reference = settings.first_number + zero
@@ -103,17 +103,17 @@ class FanucTable:
             *table.comments,
             f"sign: value = {sign}change of the correction from the point before, added to the command (from memory)",
             f"unit: {1e6 * settings.detection_unit:g} um times {magnification}; 3624 in um",
-            "The data end above: what follows the second per cent sign is not read.",
+            "The data end above: text after the second per cent sign is not read.",
         ]
         text = "\n".join(["%", *lines, "%", *(f"({_plain(line)})" for line in comments)]) + "\n"
         removed = float(table.mean[zero])
         remarks = (
             CHECK_SIGN,
-            f"Compare parameters 3620 to 3624 with the control's manual (3624 is {parameters[3624]} um here), then "
-            "switch off and on and return to the reference point.",
+            f"Compare parameters 3620 to 3624 with the manual of the control (3624 is {parameters[3624]} um here), "
+            "then switch it off and on and return to the reference point.",
             *one_direction(table, "This table"),
             *(
-                [f"The correction at position 0, {1e6 * removed:.2f} um, is left out: the table is 0 there."]
+                [f"The correction at position 0, {1e6 * removed:.2f} um, is omitted: the table is 0 there."]
                 if abs(removed) >= 1e-9
                 else []
             ),
@@ -122,13 +122,13 @@ class FanucTable:
 
 
 def _magnification(units: Array, settings: FanucSettings) -> int:
-    """Return the smallest magnification with which every value is small enough."""
+    """Return the smallest magnification with which no value exceeds the largest one."""
     for magnification in range(1, MAGNIFICATION + 1):
         if np.abs(np.diff(np.round(units / magnification))).max() <= settings.largest_value:
             return magnification
     worst = np.abs(np.diff(units)).max() * settings.detection_unit
     raise DatasetError(
-        f"The correction changes by {1e6 * worst:.1f} um between two points; FANUC holds at most "
+        f"The correction changes by {1e6 * worst:.1f} um between two points; FANUC accepts at most "
         f"{1e6 * settings.largest_value * MAGNIFICATION * settings.detection_unit:.0f} um. State a smaller step "
         "(--step)"
     )

@@ -1,4 +1,4 @@
-"""CSV and NetCDF, for every control that has no format of its own."""
+"""CSV and NetCDF, for controls without a specific format."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """HEIDENHAIN: a compensation value table (.COM), and the assignment of tables to axes (.CMA).
 
 The columns are those of the newer controls: AXISPOS, BACKLASH, and the key of the axis that is corrected. A value is
-the error with its own sign, the actual less the nominal position, which the control takes off: so the manuals of the
-TNC 306, 360 and 407 call it, and so a published converter from laser measurements writes it. No manual of a newer
-control that states the sign was found. The first line of the text (``BEGIN``) is that of the same converter; the last
+the error with its own sign, the actual less the nominal position, which the control subtracts, according to the manuals
+of the TNC 306, 360 and 407 and to a published converter from laser measurements. No manual of a newer control that
+states the sign was found. The first line of the text (``BEGIN``) is that of the same converter; the last
 (``[END]``) is from memory.
 """
 
@@ -32,7 +32,7 @@ class HeidenhainSettings(TableSettings):
         default="", pattern="^[A-Za-z0-9_]{0,12}$", description="key of the axis in CfgAxes/axisList; default: letter"
     )
     component_key: str = Field(
-        default="", pattern="^[A-Za-z0-9_]{0,12}$", description="key of the axis that is corrected; default: its letter"
+        default="", pattern="^[A-Za-z0-9_]{0,12}$", description="key of the corrected axis; default: its letter"
     )
     most_points: int = Field(default=256, ge=2, description="points of one table; 256 on TNC 407 to 425")
     inverted: bool = Field(default=False, description="write the values with opposite sign")
@@ -56,12 +56,12 @@ class HeidenhainTable:
         Raises
         ------
         DatasetError
-            More points than the control takes, or points closer than its resolution.
+            More points than the control accepts, or points closer than its resolution.
         """
         check_points(table, settings.most_points, "This HEIDENHAIN control (setting most_points)")
         position = np.round(1e3 * table.positions, DECIMALS)
         if (np.diff(position) <= 0).any():
-            raise DatasetError("HEIDENHAIN needs positions that increase; state a larger step (--step)")
+            raise DatasetError("HEIDENHAIN requires increasing positions; state a larger step (--step)")
         turn = 1.0 if settings.inverted else -1.0
         values = [np.round(1e3 * offset, DECIMALS) + 0.0 for offset in (table.forward, table.backward)]
         axis, corrected = settings.axis_key or table.axis, settings.component_key or table.component
@@ -80,7 +80,7 @@ class HeidenhainTable:
         }
         remarks = (
             CHECK_SIGN,
-            "Only one .CMA table is active: enter the line into the one of the control where it has others.",
+            "Only one .CMA table is active: if the control already has one, add the line to it.",
         )
         return Written(tables, values[0] / 1e3, values[1] / 1e3, remarks=remarks)
 

@@ -6,7 +6,7 @@
   setpoint of the output axis: a positive one moves it in the positive direction (from memory; a comment of the example
   in the manual of 802D sl agrees).
 
-Values are in mm in double precision, at equal steps, linear in between, held outside of the table.
+Values are in mm in double precision, at equal steps, linear in between, constant outside the table.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from errormotion.compensation.tables.table import AxisTable
 DECIMALS = 6
 """Of a value in mm."""
 
-MOST_CHARACTERS = 24
-"""Of the name of a program (from memory)."""
+MAX_CHARACTERS = 24
+"""Maximum length of the name of a program (from memory)."""
 
 
 class SiemensSettings(TableSettings):
@@ -36,7 +36,7 @@ class SiemensSettings(TableSettings):
         default="", pattern="^[A-Z]*[0-9]*$", description="name of the machine axis; default: letter and 1, such as Y1"
     )
     output_axis: str = Field(
-        default="", pattern="^[A-Z]*[0-9]*$", description="name of the axis that a sag table corrects; default likewise"
+        default="", pattern="^[A-Z]*[0-9]*$", description="name of the axis corrected by a sag table; default likewise"
     )
     encoder: int = Field(default=0, ge=0, le=1, description="measuring system of the leadscrew table")
     table: int = Field(default=0, ge=0, le=62, description="index of the (first) sag table")
@@ -64,7 +64,7 @@ class SiemensTable:
         Raises
         ------
         DatasetError
-            Points at unequal distances, or more than the control holds.
+            Points at unequal distances, or more than the control accepts.
         """
         check_even(table, "SINUMERIK")
         check_points(table, settings.most_points, "This SINUMERIK (setting most_points)")
@@ -89,7 +89,7 @@ def _leadscrew(table: AxisTable, settings: SiemensSettings, axis: str) -> Writte
     remarks = (
         f"Load with MD32700 ENC_COMP_ENABLE[{settings.encoder}] = 0, then set it to 1 and reference {axis}; MD38000 "
         f"MM_ENC_COMP_MAX_POINTS[{settings.encoder}] must be at least {values.size}.",
-        "The value at the reference point should be 0, so that the axis does not jump when the table acts.",
+        "The value at the reference point should be 0, so that the axis does not jump when the table takes effect.",
         *one_direction(table, "This table"),
     )
     return Written(_file("AX_EEC_INI", table, sign, lines, settings.program), held, held, remarks=remarks)
@@ -130,7 +130,7 @@ def _sag(table: AxisTable, settings: SiemensSettings, base: str, output: str) ->
 def _file(name: str, table: AxisTable, sign: str, lines: list[str], program: bool) -> dict[str, FileText]:
     file, head, end = f"{table.name}.INI", [f"%_N_{name}", "CHANDATA(1)"], "M17"
     if program:
-        own = re.sub("[^A-Z0-9_]", "_", table.name.upper())[:MOST_CHARACTERS]
+        own = re.sub("[^A-Z0-9_]", "_", table.name.upper())[:MAX_CHARACTERS]
         file, head, end = f"{own}.MPF", [f"%_N_{own}_MPF", ";$PATH=/_N_MPF_DIR"], "M30"
     comments = [*table.comments, sign, "unit: mm"]
     return {file: "\n".join([*head, *(f"; {text}" for text in comments), *lines, end]) + "\n"}

@@ -17,21 +17,21 @@ from errormotion.datasets.units import ANGLE, LENGTH
 from errormotion.kinematics.chains import parse_chain
 
 Ask = Callable[[str, str], str]
-"""``ask(question, default)`` returns the answer of a person."""
+"""``ask(question, default)`` returns the answer of the user."""
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 
 
 def complete(answers: Answers, ask: Ask) -> None:
-    """Ask for what is not stated yet."""
+    """Ask for everything that is not stated yet."""
     if not answers.machine:
         while not answers.machine:
             answers.machine = ask("Name of the machine", "").strip()
-        question = "Its kinematic chain, such as workpiece-X-Y-bed-Z-spindle-tool; empty: unknown"
+        question = "Kinematic chain, such as workpiece-X-Y-bed-Z-spindle-tool (empty: unknown)"
         answers.chain = _checked(question, ask, _chain)
     for axis in parse_chain(answers.chain) if answers.chain and not _chain(answers.chain) else ():
         if axis not in answers.travel:
-            question = f"Travel of {axis}, lowest and highest position, such as -300 mm, 300 mm"
+            question = f"Travel of {axis} (lowest and highest position, such as -300 mm, 300 mm)"
             answers.travel[axis] = span_of(_checked(question, ask, _span))
     if not answers.instruments:
         _instruments(answers, ask)
@@ -51,16 +51,17 @@ def _instruments(answers: Answers, ask: Ask) -> None:
     if ports := _ports():
         show(f"Serial ports of this computer: {', '.join(ports)}")
     while True:
-        driver = _checked("Instrument (its id; empty: no more)", ask, lambda text: _known(text, drivers))
+        driver = _checked("Id of an instrument (empty: no more)", ask, lambda text: _known(text, drivers))
         if not driver:
             return
         kind = drivers[driver].kind
-        name = _checked(f"Its name on the bench [{kind}]", ask, lambda text: _new(text, answers.instruments)) or kind
+        name = (
+            _checked(f"Name of the instrument on the bench [{kind}]", ask, lambda text: _new(text, answers.instruments))
+            or kind
+        )
         if name in answers.instruments:
             name = f"{name}_{len(answers.instruments) + 1}"
-        question = (
-            "Its address, such as serial:///dev/ttyUSB0?baudrate=115200, tcp://192.168.0.2:23 or sim://cframe?seed=1"
-        )
+        question = "Address, such as serial:///dev/ttyUSB0?baudrate=115200, tcp://192.168.0.2:23 or sim://cframe?seed=1"
         answers.instruments[name] = Instrument(driver, ask(question, "").strip())
 
 
@@ -68,12 +69,12 @@ def _tests(answers: Answers, ask: Ask) -> None:
     kinds = {plugins.get("instruments", each.driver).info.kind for each in answers.instruments.values()}
     methods = {cls.info.id: cls for cls in plugins.loaded("methods")}
     possible = {identity: cls for identity, cls in methods.items() if set(cls.needs.instruments) <= kinds}
-    show("\nMethods for these instruments:" if possible else "\nNo method works with these instruments alone:")
+    show("\nMethods for these instruments:" if possible else "\nNo method works with these instruments only:")
     for identity, cls in sorted((possible or methods).items()):
         needs = "" if possible else f" (needs {', '.join(cls.needs.instruments)})"
         show(f"  {identity:<20} {cls.info.summary}{needs}")
     while possible:
-        method = _checked("Method (its id; empty: no more)", ask, lambda text: _known(text, possible))
+        method = _checked("Id of a method (empty: no more)", ask, lambda text: _known(text, possible))
         if not method:
             return
         name = _checked(f"Name of the test [{method}]", ask, lambda text: _new(text, answers.tests)) or method
@@ -82,7 +83,7 @@ def _tests(answers: Answers, ask: Ask) -> None:
         answers.tests[name] = Test(method)
 
 
-def _required(place: str, model: Any, stated: dict[str, Any], ask: Ask) -> None:
+def _required(owner: str, model: Any, stated: dict[str, Any], ask: Ask) -> None:
     """Ask for the settings of a plugin that have no default."""
     for name, field in model.model_fields.items():
         if not field.is_required() or name in stated:
@@ -90,15 +91,15 @@ def _required(place: str, model: Any, stated: dict[str, Any], ask: Ask) -> None:
 
         def check(text: str, name: str = name) -> str:
             if not text:
-                return f"{name}: a value is needed"
+                return f"{name}: expected a value"
             mistakes = tomlfile.check({**stated, name: value_of(text)}, model)[1]
             return next((each for each in mistakes if re.match(rf"{re.escape(name)}(?![\w-])", each)), "")
 
-        stated[name] = value_of(_checked(f"{place}: {name} ({field.description or 'value'})", ask, check))
+        stated[name] = value_of(_checked(f"{owner}: {name} ({field.description or 'value'})", ask, check))
 
 
 def _checked(question: str, ask: Ask, check: Callable[[str], str]) -> str:
-    """Ask until the answer passes a check, which returns what is wrong with it."""
+    """Ask until the answer is valid; ``check`` returns the mistake of an answer, or an empty text."""
     while True:
         answer = ask(question, "").strip()
         wrong = check(answer)
@@ -114,11 +115,11 @@ def _known(text: str, known: Any) -> str:
 def _new(text: str, taken: Any) -> str:
     if text and not _NAME.fullmatch(text):
         return f"expected a name of letters, digits, - and _; found '{text}'"
-    return f"'{text}' is taken; give another name" if text in taken else ""
+    return f"the name '{text}' is used already; give another name" if text in taken else ""
 
 
 def span_of(text: str) -> list[str]:
-    """Return the two ends of a travel as they are written."""
+    """Return the two ends of a travel as texts."""
     return [part.strip() for part in text.split(",")]
 
 
@@ -127,7 +128,7 @@ def _span(text: str) -> str:
     try:
         low, high = (LENGTH.parse(end) if not end.endswith("deg") else ANGLE.parse(end) for end in ends)
     except ValueError:
-        return f"expected two positions with their units, such as -300 mm, 300 mm; found '{text}'"
+        return f"expected two positions with units, such as -300 mm, 300 mm; found '{text}'"
     return "" if low < high else f"expected the lowest position first; found '{text}'"
 
 

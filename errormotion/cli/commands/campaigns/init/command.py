@@ -1,4 +1,4 @@
-"""``errormotion init``: answers from options and questions, checked, and written as two files."""
+"""``errormotion init``: writes a bench and a campaign file from options and answers."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def init(
     as_json: bool,
     ask: asking.Ask | None = None,
 ) -> None:
-    """Write a bench and a campaign.
+    """Write a bench and a campaign file.
 
     Parameters
     ----------
     travel : sequence of str
-        ``AXIS=LOW,HIGH``, with units.
+        Travels of axes, ``AXIS=LOW,HIGH``, with units.
     instruments : sequence of str
         ``NAME=ID@ADDRESS``.
     tests : sequence of str
@@ -48,23 +48,23 @@ def init(
     assignments : sequence of str
         ``NAME.KEY=VALUE``: one setting of an instrument or a test.
     ask : callable, optional
-        Asks a person for what is not stated; default: on a terminal.
+        Asks the user for what is not stated; default: a prompt on a terminal.
 
     Raises
     ------
     BenchError
-        Mistakes, as those of the files; an existing file without ``force``. Nothing is written then.
+        The files would be invalid, or one exists and ``force`` is false. Nothing is written.
     """
     answers = _stated(machine, chain, travel, instruments, tests, assignments)
     targets = [folder / BENCH, folder / CAMPAIGN]
     if not force and (there := [str(path) for path in targets if path.exists()]):
-        raise BenchError(f"{' and '.join(there)}: exists already. Give another folder, or --force to replace it")
+        raise BenchError(f"{' and '.join(there)}: exists already; give another folder, or --force to replace it")
     if ask is None and sys.stdin.isatty() and sys.stderr.isatty() and not as_json:
         ask = _prompt
     if ask is not None:
         asking.complete(answers, ask)
     elif not answers.machine or not answers.instruments:
-        typer.echo("Expected --machine and at least one --instrument: there is no terminal to ask at.", err=True)
+        typer.echo("Expected --machine and at least one --instrument, as there is no terminal for questions.", err=True)
         raise typer.Exit(USAGE)
     try:
         texts = _checked(answers, folder)
@@ -83,7 +83,7 @@ def init(
     steps += [f"errormotion plan {files[1]}", f"errormotion run {files[1]}"] if len(files) > 1 else []
     show("\nNext:\n  " + "\n  ".join(steps))
     if len(files) == 1:
-        show(f"No test was chosen, so there is no {CAMPAIGN}; 'errormotion plugins list' shows the methods.")
+        show(f"No test was chosen, so that no {CAMPAIGN} was written; 'errormotion plugins list' shows the methods.")
 
 
 def _stated(
@@ -102,19 +102,19 @@ def _stated(
         name, _, rest = text.partition("=")
         driver, _, address = rest.partition("@")
         if not name.strip() or not driver.strip():
-            raise BenchError(f"--instrument {text}: expected NAME=ID@ADDRESS, ID of an instrument plugin")
+            raise BenchError(f"--instrument {text}: expected NAME=ID@ADDRESS with the id of an instrument plugin")
         plugins.get("instruments", driver.strip())
         answers.instruments[name.strip()] = Instrument(driver.strip(), address.strip())
     for text in tests:
         name, _, method = text.partition("=")
         if not name.strip() or not method.strip():
-            raise BenchError(f"--test {text}: expected NAME=ID, ID of a method plugin")
+            raise BenchError(f"--test {text}: expected NAME=ID with the id of a method plugin")
         plugins.get("methods", method.strip())
         answers.tests[name.strip()] = Test(method.strip())
     owners: dict[str, Any] = {**answers.instruments, **answers.tests}
     for text in assignments:
-        place, sign, content = text.partition("=")
-        owner, _, key = place.strip().partition(".")
+        name, sign, content = text.partition("=")
+        owner, _, key = name.strip().partition(".")
         if not sign or owner not in owners or not key:
             known = ", ".join(owners) or "none"
             raise BenchError(
@@ -125,7 +125,7 @@ def _stated(
 
 
 def _checked(answers: Answers, folder: Path) -> dict[Path, str]:
-    """Return the texts of the files by their paths, as their reader accepts them."""
+    """Return the texts of the files by path, checked by the readers of the files."""
     drivers = {name: plugins.get("instruments", each.driver).Settings for name, each in answers.instruments.items()}
     methods = {name: plugins.get("methods", each.method).Settings for name, each in answers.tests.items()}
     texts = {folder / BENCH: bench_text(answers, drivers)}
@@ -138,7 +138,7 @@ def _checked(answers: Answers, folder: Path) -> dict[Path, str]:
 
 def _write(path: Path, text: str, force: bool) -> None:
     if not force:
-        with path.open("x", encoding="utf-8") as file:  # refuses a file that has come meanwhile
+        with path.open("x", encoding="utf-8") as file:  # fails if the file was created meanwhile
             file.write(text)
         return
     part = path.with_name(f".{path.name}.part")

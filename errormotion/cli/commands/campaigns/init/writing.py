@@ -1,4 +1,4 @@
-"""The text of a bench and of a campaign file, from answers."""
+"""The texts of a bench and a campaign file from answers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Test:
 
 @dataclass
 class Answers:
-    """What bench and campaign state."""
+    """The contents of a bench and a campaign."""
 
     machine: str = ""
     chain: str = ""
@@ -65,8 +65,8 @@ def bench_text(answers: Answers, settings: Mapping[str, type[PluginSettings]]) -
 def campaign_text(answers: Answers, bench: str, settings: Mapping[str, type[PluginSettings]]) -> str:
     """Return a campaign file; ``settings`` are the models of the methods by the name of the test."""
     lines = [
-        "# The tests that are made one after the other. Nothing moves before 'errormotion run' announces it:",
-        "# 'errormotion run --dry-run' shows path and duration, 'errormotion plan' the uncertainty to expect.",
+        "# The tests of the campaign, in order. Nothing moves before 'errormotion run' announces it:",
+        "# 'errormotion run --dry-run' shows path and duration, 'errormotion plan' the expected uncertainty.",
         'schema = "errormotion.campaign/1"',
         f"name = {value(f'Tests of {answers.machine}')}",
         f"bench = {value(bench)}",

@@ -1,4 +1,4 @@
-"""Runs that are at work in a terminal or another program: their folders are locked."""
+"""Runs that a terminal or another program executes: their folders are locked."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from errormotion.datasets.files.containers import LARGEST_METADATA
 from errormotion.datasets.files.reading import parse_json, read_bytes
 from errormotion.errors import ErrormotionError
 
-MOST = 1000
-"""Run folders that are looked at, the newest."""
+MAX_FOLDERS = 1000
+"""Number of run folders that are examined, from the newest on."""
 
 
-def measuring_elsewhere(runs: Path, known: Collection[str]) -> list[Background]:
-    """Return the runs of campaigns that a process works on and that are not ``known``, by the names of their folders.
+def runs_of_other_processes(runs: Path, known: Collection[str]) -> list[Background]:
+    """Return the running campaigns whose run folders are not among the names ``known``.
 
-    Each is shown like a process of its own; whoever started it stops it.
+    Each is described like a background process; only the program that started it can stop it.
     """
     return [] if not runs.is_dir() else list(_found(runs, known))
 
 
 def _found(runs: Path, known: Collection[str]) -> Iterator[Background]:
     folders = sorted((path for path in runs.iterdir() if not path.name.startswith(".")), key=lambda path: path.name)
-    for path in reversed(folders[-MOST:]):
-        if path.name in known or not path.is_dir() or not _works(path):
+    for path in reversed(folders[-MAX_FOLDERS:]):
+        if path.name in known or not path.is_dir() or not _is_running(path):
             continue
         try:
             folder = RunFolder.open(path)
             if folder.data.get("status") == "running" and "campaign" in folder.data:
                 yield _described(folder)
         except (ErrormotionError, LookupError, TypeError, AttributeError, ValueError):
-            continue  # half a folder, or none of a campaign
+            continue  # an incomplete folder, or not one of a campaign
 
 
-def _works(path: Path) -> bool:
+def _is_running(path: Path) -> bool:
     try:
         return is_locked(path)
     except ImportError:  # Windows: no lock
@@ -70,7 +70,7 @@ def _described(folder: RunFolder) -> Background:
 
 
 def _progress(folder: RunFolder) -> tuple[float, float]:
-    """Return the part of a measurement that is on disk, and its whole: s of evenly spaced samples, else items."""
+    """Return the length of a measurement on disk and its expected length: s for evenly spaced samples, else items."""
     test = next(each for each in stored_plan(folder).tests if each.name == folder.data["test"])
     method = test.method()
     expected = float(method.progress(test.settings))

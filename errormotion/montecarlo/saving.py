@@ -1,4 +1,4 @@
-"""The evaluation of a result in a file beside that of its errors."""
+"""Monte Carlo evaluation of a result in a file beside its errors."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from errormotion.montecarlo.evaluation import Progress, evaluate
 from errormotion.montecarlo.store import Store
 
 
-def file_beside(errors: Path) -> Path:
-    """Return the file of the evaluation of a file of errors."""
+def evaluation_file(errors: Path) -> Path:
+    """Return the file of the evaluation for a file of errors."""
     return errors.with_suffix(".monte_carlo.nc")
 
 
-def evaluate_beside(
+def evaluate_and_save(
     raw: Path,
     method_id: str,
     settings: Any,
@@ -31,17 +31,17 @@ def evaluate_beside(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> xr.Dataset:
-    """Evaluate a result by the Monte Carlo method, and store it beside its ``file``.
+    """Evaluate a result by the Monte Carlo method, and save the evaluation beside its ``file``.
 
-    The trials are in a folder beside it while the evaluation is in work; one that was interrupted is continued. The
-    other arguments are those of `errormotion.montecarlo.evaluate`.
+    During the evaluation the trials are in a folder beside the file, from which an interrupted evaluation is continued.
+    The other arguments are those of `errormotion.montecarlo.evaluate`.
 
     Raises
     ------
     MethodError, RunError, DatasetError
-        As `errormotion.montecarlo.evaluate`; the file of the evaluation exists.
+        As for `errormotion.montecarlo.evaluate`; or the file of the evaluation exists already.
     KeyboardInterrupt
-        The operator stopped it; the message states where the trials are.
+        The operator stopped the evaluation; the message states the folder of the trials.
     """
     folder = file.with_suffix(".trials")
     try:
@@ -51,6 +51,6 @@ def evaluate_beside(
         )  # fmt: skip
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(f"The trials are kept in {folder}; repeat the command to continue.") from error
-    datasets.save(found, file_beside(file))
+    datasets.save(found, evaluation_file(file))
     Store(folder, {}).remove()
     return found

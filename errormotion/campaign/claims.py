@@ -1,8 +1,8 @@
-"""Who has the instruments of a machine: many of them answer one program at a time.
+"""Exclusive use of the instruments of a machine: many instruments accept one connection only.
 
-A program that measures or compensates claims them before it opens them, and states where it records. Whoever only
-watches a machine closes them then, and reads the record instead. Claims are locked files in the user's state folder,
-by the name of the machine: a claim ends with its process, however that ends.
+A program that measures or compensates claims the instruments before it opens them, and states its run folder. A
+program that only displays readings then closes the instruments, and reads the run folder instead. A claim is a locked
+file in the user's state folder, named after the machine; the operating system releases it when its process ends.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from errormotion.datasets.files.reading import read_bytes
 
 try:
     import fcntl
-except ImportError:  # Windows: no lock, and no turns
+except ImportError:  # Windows: no locks, and no claims
     fcntl = None  # type: ignore[assignment]
 
 RELEASE_TIMEOUT = 15.0
-"""Longest time for which a claim waits until those who watch have closed the instruments, s."""
+"""Longest time for which a claim waits until programs that display readings have closed the instruments, s."""
 POLL_INTERVAL = 0.05
-LARGEST_CLAIM = 1 << 14
-"""Bytes."""
+MAX_CLAIM = 1 << 14
+"""Largest size of a claim, bytes."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Claim:
-    """Who has the instruments: ``what`` it does, and its run folder once it has one."""
+    """The program that uses the instruments: ``what`` it does, and its run folder as soon as it has one."""
 
     what: str
     run: Path | None = None
@@ -46,19 +46,19 @@ class Claim:
 
 @contextmanager
 def claimed(machine: str, what: str) -> Iterator[Callable[[Path], None]]:
-    """Claim the instruments of a machine; wait until nobody who only watches has them.
+    """Claim the instruments of a machine, and wait until programs that display readings have closed them.
 
     Parameters
     ----------
     machine : str
         Name of the machine of the bench.
     what : str
-        What the program does, such as ``a run``.
+        Activity of the program, such as ``a run``.
 
     Yields
     ------
     callable
-        States the run folder into which the program records.
+        States the run folder of the program.
     """
     descriptor, path = -1, _folder() / f"{_key(machine)}-{uuid4().hex}.claim"
     if fcntl is not None:
@@ -66,7 +66,7 @@ def claimed(machine: str, what: str) -> Iterator[Callable[[Path], None]]:
             path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-        except OSError as error:  # a claim is a courtesy: a measurement does not depend on it
+        except OSError as error:  # a measurement does not depend on a claim
             log.warning("%s: the instruments are not claimed: %s", path, error)
 
     def state(run: Path | None) -> None:
@@ -88,7 +88,7 @@ def claimed(machine: str, what: str) -> Iterator[Callable[[Path], None]]:
 
 
 def holder(machine: str) -> Claim | None:
-    """Return who has claimed the instruments of a machine, the newest claim; None where nobody has."""
+    """Return the newest claim of the instruments of a machine, or None."""
     if fcntl is None:
         return None
     found = []
@@ -96,14 +96,14 @@ def holder(machine: str) -> Claim | None:
         with suppress(OSError):
             if is_locked(path):
                 found.append((path.stat().st_mtime_ns, _read(path)))
-            elif time.time() - path.stat().st_mtime > 1.0:  # of a process that was killed, and not one just made
+            elif time.time() - path.stat().st_mtime > 1.0:  # of a killed process, not one that is being created
                 path.unlink(missing_ok=True)
     return max(found, key=lambda each: each[0])[1] if found else None
 
 
 @contextmanager
 def watching(machine: str) -> Iterator[bool]:
-    """Have the instruments of a machine only to watch them; the context states whether nobody has claimed them."""
+    """Register a program that displays readings; the context returns whether the instruments are free of claims."""
     if fcntl is None:
         yield True
         return
@@ -117,7 +117,7 @@ def watching(machine: str) -> Iterator[bool]:
         return
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH)
-        yield holder(machine) is None  # asked under the lock: a claim made meanwhile waits for its end
+        yield holder(machine) is None  # tested under the lock: a later claim waits until the lock is released
     finally:
         os.close(descriptor)
 
@@ -147,9 +147,9 @@ def _watched(machine: str) -> bool:
 
 def _read(path: Path) -> Claim:
     try:
-        content: Any = json.loads(read_bytes(path, LARGEST_CLAIM))
+        content: Any = json.loads(read_bytes(path, MAX_CLAIM))
         return Claim(str(content["what"]), Path(content["run"]) if content["run"] else None)
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):  # being written
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):  # it is being written
         return Claim("another program")
 
 

@@ -1,11 +1,11 @@
-"""Corrections from errors over time and place together, and from targets that fill no volume."""
+"""Corrections of errors over time and position together, and of targets that span no volume."""
 
 import numpy as np
 import pytest
 import xarray as xr
 
 from errormotion.compensation.correction import correction
-from errormotion.compensation.correction.places import Grid, Scattered, of_targets
+from errormotion.compensation.correction.nodes import Grid, Scattered, of_targets
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import DatasetError
 from errormotion.twin import VirtualMachine
@@ -15,7 +15,7 @@ PLACES = np.linspace(-0.2, 0.2, 5)
 
 
 def warming() -> xr.Dataset:
-    """Return errors of Y over time and position: EY = 1e-9 t y / 0.2 and EA = 1e-8 t, with one source and own noise."""
+    """Return errors of Y over time and position: EY = 1e-9 t y / 0.2 and EA = 1e-8 t, with one source and noise."""
     t, y = np.meshgrid(TIMES, PLACES, indexing="ij")
     E = np.zeros((*t.shape, 6))
     E[..., 1], E[..., 3] = 1e-9 * t * y / 0.2, 1e-8 * t
@@ -60,27 +60,27 @@ def test_the_lever_of_an_axis_at_the_tool_is_that_of_the_chain() -> None:
     assert found[1] == pytest.approx(-1e-9 * 1800 * 0.5 + 1e-8 * 1800 * 0.3, rel=1e-4)
     alone = warming()
     del alone.attrs["chain"]
-    assert any("no chain" in note for note in correction(alone).notes)
+    assert any("the chain of the machine is unknown" in note for note in correction(alone).notes)
 
 
-def test_places_that_no_instant_knows_are_left_out() -> None:
+def test_positions_without_errors_at_any_time_are_omitted() -> None:
     errors = warming()
     lost = (errors["position_index"] == 2) | (errors["time_index"] == 1)
     gone = errors.assign({name: errors[name].where(~lost) for name in ("EX", "EY", "EZ", "EA", "EB", "EC")})
     made = correction(gone)
     assert [note.split(": ")[1] for note in made.notes] == [
-        "1 of 3 times have no errors and are bridged by their neighbours.",
-        "1 of 5 places lack errors and are bridged by their neighbours.",
+        "1 of 3 times have no errors; interpolated from their neighbours.",
+        "1 of 5 positions lack errors; interpolated from their neighbours.",
     ]
     here = np.array([[0.0, 0.02, 0.0]])
     assert np.abs(made.at(here, 700.0).offset - correction(errors).at(here, 700.0).offset).max() < 1e-9
     never = errors.assign(EY=errors["EY"].where((errors["position_index"] + errors["time_index"]) % 2 == 0))
-    with pytest.raises(DatasetError, match="no place has known errors at all times"):
+    with pytest.raises(DatasetError, match="no position has known errors at all times"):
         correction(never)
 
 
 def linear(p: np.ndarray) -> np.ndarray:
-    """Return errors that are linear in the place, (n, 6): every interpolation has them exactly."""
+    """Return errors that are linear in position, (n, 6): every interpolation is exact."""
     gradient = 1e-5 * np.arange(1, 19).reshape(3, 6)
     return np.asarray(2e-6 + p @ gradient)
 
@@ -94,7 +94,7 @@ def linear(p: np.ndarray) -> np.ndarray:
     ],
     ids=["line", "plane", "volume"],
 )
-def test_scattered_places_of_any_dimension(basis: list[list[float]], count: int) -> None:
+def test_scattered_nodes_of_any_dimension(basis: list[list[float]], count: int) -> None:
     rng = np.random.default_rng(1)
     directions = np.asarray(basis)
     nodes = [0.1, 0.2, 0.3] + rng.uniform(-0.4, 0.4, (count, len(directions))) @ directions
@@ -111,7 +111,7 @@ def test_scattered_places_of_any_dimension(basis: list[list[float]], count: int)
     assert added.max() < 1e-18  # a linear function has no curvature
 
 
-def test_one_target_stands_for_itself() -> None:
+def test_one_target_is_valid_at_its_position_only() -> None:
     machine = VirtualMachine("cframe", 3)
     made = correction(machine.volumetric_truth(np.array([[0.1, 0.1, 0.1]])))
     found = made.at(np.array([[0.1, 0.1, 0.1], [0.1, 0.1, 0.2]]))
@@ -119,11 +119,11 @@ def test_one_target_stands_for_itself() -> None:
     assert np.ptp(found.offset, axis=0).max() == 0
 
 
-def test_a_grid_is_recognised_in_any_order_and_with_gaps_it_is_none() -> None:
+def test_a_grid_is_recognised_in_any_order_but_not_with_gaps() -> None:
     x = np.stack(np.meshgrid([0.0, 0.3, 0.4], [0.0, 1.0], [2.0], indexing="ij"), axis=-1).reshape(-1, 3)
     mixed = x[np.random.default_rng(2).permutation(len(x))] + 1e-12
-    places, order = of_targets(mixed)
-    assert isinstance(places, Grid)
+    found, order = of_targets(mixed)
+    assert isinstance(found, Grid)
     assert np.abs(mixed[order] - x).max() < 1e-9
     assert isinstance(of_targets(mixed[1:])[0], Scattered)
     assert isinstance(of_targets(np.concatenate([mixed[:-1], mixed[:1]]))[0], Scattered)  # one target twice

@@ -1,7 +1,7 @@
-"""Interpolation: which measured places make up the value at a point, with which weights, and what that adds.
+"""Interpolation between the measured positions: weights of the nodes at a point, and the added variance.
 
-Outside of what was measured a point is moved to the edge: to the nearest value of a line or a grid, and of scattered
-places to where the straight line to their mean leaves their convex hull. The value at the edge is continuous.
+Outside the measured range a point is moved to its limit: to the nearest value of a line or a grid, or, for scattered
+positions, to the intersection of their convex hull with the line to their mean. The value is continuous there.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from errormotion.arrays import Array
 from errormotion.datasets.results.interpolation import intensity
 
 _EDGE = 1e-6
-"""Distance from the hull that is still on it, relative to the distance from the mean of the nodes."""
+"""Maximum distance from the hull of a point on it, relative to the distance from the mean of the nodes."""
 
 NEIGHBOURS = 8
-"""Neighbours from which a scattered place is predicted, to estimate the curvature of the errors."""
+"""Neighbours from which a scattered node is predicted, to estimate the curvature of the errors."""
 
 SAME = 1e-7
-"""Distance within which two coordinates are one, m or s."""
+"""Distance within which two coordinates are equal, m or s."""
 
 _JITTER = 1e-7
-"""Displacement of the nodes for triangulation, relative to their range: places on a grid have no unique one."""
+"""Displacement of the nodes for triangulation, relative to their range: that of a grid is not unique."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """How points are made of nodes.
+    """Weights of the nodes for the values at points.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Weights:
     weight : (k, n)
         Their weights; the sum is 1.
     inside : (n,) of bool
-        Whether the point lies within what was measured.
+        Whether the point lies within the measured range.
     """
 
     node: NDArray[np.intp]
@@ -62,14 +62,14 @@ class Weights:
         return Weights(self.node, self.weight**2, self.inside).of(values)
 
     def times(self, other: Weights, size: int) -> Weights:
-        """Return the weights on the product of these nodes and ``size`` others, which count fastest."""
+        """Return the weights on the product of these nodes and ``size`` others, which vary fastest."""
         node = (self.node[:, None] * size + other.node[None]).reshape(-1, other.node.shape[1])
         weight = (self.weight[:, None] * other.weight[None]).reshape(-1, other.node.shape[1])
         return Weights(node, weight, self.inside & other.inside)
 
 
-class Places(Protocol):
-    """Places at which errors were measured.
+class Nodes(Protocol):
+    """Positions or times at which errors were measured.
 
     Attributes
     ----------
@@ -85,16 +85,16 @@ class Places(Protocol):
         """Return the weights of points, (n, coordinate)."""
 
     def added(self, points: Array, values: Array, own: Array) -> Array:
-        """Return the variance that interpolation adds at points, (n, 6); NaN where it cannot be estimated.
+        """Return the variance of the interpolation at points, (n, 6); NaN where it cannot be estimated.
 
-        ``values`` (node, 6) and ``own`` (node, 6, 6) are the errors at the nodes, and the covariance that is drawn
-        anew at each.
+        ``values`` (node, 6) and ``own`` (node, 6, 6) are the errors at the nodes, and the covariance that is
+        independent between them.
         """
 
 
 @dataclass(frozen=True)
 class Line:
-    """Increasing positions or instants."""
+    """Increasing positions or times."""
 
     nodes: Array
 
@@ -113,7 +113,7 @@ class Line:
     def added(self, points: Array, values: Array, own: Array) -> Array:
         """Return the variance of an integrated Wiener process between two nodes; see `datasets.results.interpolation`.
 
-        Errors (node, ..., 6) that are known on several lines have one intensity.
+        Errors (node, ..., 6) on several lines have one common intensity.
         """
         if self.size == 1:
             return np.zeros((len(points), 6))
@@ -165,7 +165,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Scattered:
-    """Places in a volume, a plane or on a line, (node, 3), that are no grid: linear within a triangulation."""
+    """Positions in a volume, a plane or on a line, (node, 3), that are no grid: linear within a triangulation."""
 
     nodes: Array
 
@@ -252,10 +252,10 @@ class Scattered:
         return np.asarray(excess / (lever**2).sum())
 
 
-def of_targets(nodes: Array) -> tuple[Places, NDArray[np.intp]]:
-    """Return the places of targets, (node, 3), and the order of the targets in them.
+def of_targets(nodes: Array) -> tuple[Nodes, NDArray[np.intp]]:
+    """Return the nodes of targets, (node, 3), and the order of the targets in them.
 
-    A grid where the targets are all combinations of some coordinates, each once; else scattered places.
+    A grid if the targets are all combinations of some coordinates, each once; else scattered nodes.
     """
     counts = np.round(nodes / SAME).astype(np.int64)
     steps, first, number = zip(
@@ -271,13 +271,13 @@ def of_targets(nodes: Array) -> tuple[Places, NDArray[np.intp]]:
 
 
 def _parts(points: Array) -> Iterator[Array]:
-    """Yield some thousand points at a time, so that what is computed of them stays in the cache."""
+    """Yield 4096 points at a time, so that their intermediate results fit into the processor cache."""
     for k in range(0, len(points), 4096):
         yield points[k : k + 4096]
 
 
-class Anywhere:
-    """One measurement that stands for every place."""
+class Constant:
+    """One measurement for all positions."""
 
     size = 1
 

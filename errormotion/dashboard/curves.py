@@ -1,4 +1,4 @@
-"""A result as curves: values with U (k = 2) in field units at a functional point, reduced to what a screen shows."""
+"""A result as curves: values with U (k = 2) at a functional point, reduced to the resolution of a screen."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from errormotion.arrays import Array
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
-MOST_POINTS = 2000
-"""Points of a reduced curve: about two for each pixel of a wide screen."""
+MAX_POINTS = 2000
+"""Number of points of a reduced curve: about two for each pixel of a wide screen."""
 FIELD = {"m": ("um", "µm"), "rad": ("arcsec", "arcsec")}
-"""Field unit of an error by its SI unit: for the conversion, and as it is shown."""
+"""Printed unit of an error by SI unit: name for the conversion, and text."""
 _SCALES = {"time": ("s", "min", "time"), "position": ("m", "mm", "position")}
 
 
@@ -34,7 +34,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Course:
+class CurveSet:
     """The errors of one result over one dimension.
 
     Attributes
@@ -44,12 +44,12 @@ class Course:
     places : ndarray, (n,)
         Abscissa.
     names : tuple of str
-        Names of the places where they are no scale; else empty.
+        Names of the places if they have no scale; else empty.
     curves : tuple of Curve
     point : ndarray, (3,)
         Functional point, m.
     others : mapping of str to int
-        Length of the further dimensions, of which one index is shown.
+        Lengths of the further dimensions, of which one index is shown.
     """
 
     label: str
@@ -60,7 +60,9 @@ class Course:
     others: Mapping[str, int]
 
 
-def course(ds: xr.Dataset, point: Sequence[float] | None = None, select: Mapping[str, int] | None = None) -> Course:
+def curves_of(
+    ds: xr.Dataset, point: Sequence[float] | None = None, select: Mapping[str, int] | None = None
+) -> CurveSet:
     """Return the curves of an error dataset.
 
     Parameters
@@ -70,12 +72,12 @@ def course(ds: xr.Dataset, point: Sequence[float] | None = None, select: Mapping
     point : sequence of float, optional
         Another functional point, m; values and covariance are recomputed.
     select : mapping of str to int, optional
-        Index along each dimension but the first one shown; default 0.
+        Index along each dimension other than the abscissa; default 0.
 
     Raises
     ------
     DatasetError
-        No error dataset, an index beyond its dimension, or a point that the errors cannot be moved to.
+        The dataset is no error dataset, an index is beyond its dimension, or the functional point cannot be changed.
     """
     moved = ds if point is None else ds.em.at(point)
     dims = moved.em.dims
@@ -99,22 +101,22 @@ def course(ds: xr.Dataset, point: Sequence[float] | None = None, select: Mapping
             curves.append(Curve(freedom, names[freedom], written, values, bands))
     label, places, texts = _abscissa(moved, shown)
     here = np.asarray(moved.attrs.get("functional_point", (np.nan,) * 3), dtype=float)
-    return Course(label, places, texts, tuple(curves), here, others)
+    return CurveSet(label, places, texts, tuple(curves), here, others)
 
 
-def thin(values: Array, most: int = MOST_POINTS) -> NDArray[np.intp]:
-    """Return the indices of a reduced curve: the first and last value, and of each interval the extremes and a gap.
+def thin(values: Array, most: int = MAX_POINTS) -> NDArray[np.intp]:
+    """Return the indices of a reduced curve: first and last value, and the extremes and a gap of each interval.
 
     Parameters
     ----------
     values : ndarray, (n,)
     most : int
-        Indices at most, about; every minimum, maximum and gap of an interval is among them.
+        Approximate largest number of indices; minimum, maximum and a gap of every interval are included.
 
     Returns
     -------
     ndarray of int
-        Increasing.
+        Indices in ascending order.
     """
     n, bins = len(values), max(1, (most - 2) // 3)
     if n <= most:
@@ -134,8 +136,8 @@ def thin(values: Array, most: int = MOST_POINTS) -> NDArray[np.intp]:
     return indices[indices < n]
 
 
-def as_csv(found: Course) -> str:
-    """Return all values of a course as comma-separated text; unknown values are empty."""
+def as_csv(found: CurveSet) -> str:
+    """Return all values of a set of curves as comma-separated text; unknown values are empty."""
     out = io.StringIO()
     table = csv.writer(out)
     heads = [f"{each.name} / {each.unit}" for each in found.curves]
@@ -148,12 +150,12 @@ def as_csv(found: Course) -> str:
 
 
 def _cell(text: str) -> str:
-    """Return a text that no spreadsheet takes for a formula."""
+    """Return a text that a spreadsheet does not interpret as a formula."""
     return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text
 
 
 def _abscissa(ds: xr.Dataset, dim: str) -> tuple[str, Array, tuple[str, ...]]:
-    """Return label and places of a dimension, and their names where they are no scale."""
+    """Return label and places of a dimension, and their names if they have no scale."""
     if not dim:
         return "", np.zeros(1), (str(ds.attrs.get("component", "")),)
     if dim in _SCALES:

@@ -1,4 +1,4 @@
-"""Results of work that takes time, kept for the next client that asks for the same."""
+"""Caches of results of slow functions, shared by all clients."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 
-class Kept(Generic[T]):
-    """The last few results by their keys; one is made at a time.
+class Cache(Generic[T]):
+    """The results used last, by key; one result is computed at a time.
 
     Parameters
     ----------
     most : int
-        Results that are kept.
+        Number of results that are kept.
     """
 
     def __init__(self, most: int) -> None:
@@ -27,7 +27,7 @@ class Kept(Generic[T]):
         self._kept: OrderedDict[Hashable, T] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Return the result of a key, made now if it is not known."""
+        """Return the result of a key; it is computed if it is not in the cache."""
         with self._lock:
             if key not in self._kept:
                 self._kept[key] = make()
@@ -37,15 +37,15 @@ class Kept(Generic[T]):
             return self._kept[key]
 
 
-class Lately(Generic[T]):
-    """The last result of each key, made anew when it is old: at most a fifth of the time is work.
+class TimedCache(Generic[T]):
+    """The last result of each key, computed again when it is outdated; computing takes at most a fifth of the time.
 
     Parameters
     ----------
     interval : float
-        Shortest time after which a result is old, s; more where it took long.
+        Shortest time after which a result is outdated, s; longer if computing takes long.
     most : int
-        Results that are kept.
+        Number of results that are kept.
     """
 
     def __init__(self, interval: float, most: int = 8) -> None:
@@ -54,23 +54,23 @@ class Lately(Generic[T]):
         self._kept: dict[Hashable, tuple[float, T]] = {}
 
     def get(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Return the result of a key; while it is being made for another client, the one before, if there is one."""
+        """Return the result of a key; while it is computed for another client, the previous one if there is one."""
         known = self._kept.get(key)
         if known is not None and (time.monotonic() < known[0] or self._lock.locked()):
             return known[1]
         with self._lock:
-            begin = time.monotonic()
+            start = time.monotonic()
             known = self._kept.get(key)
-            if known is None or begin >= known[0]:
+            if known is None or start >= known[0]:
                 result, end = make(), time.monotonic()
                 self._kept.pop(key, None)
-                self._kept[key] = known = (end + max(self._interval, 4.0 * (end - begin)), result)
+                self._kept[key] = known = (end + max(self._interval, 4.0 * (end - start)), result)
                 while len(self._kept) > self._most:
                     del self._kept[next(iter(self._kept))]
             return known[1]
 
 
 def stamp(path: Path) -> tuple[str, int, int]:
-    """Return what changes with the content of a file: its path, time of change and size."""
+    """Return path, modification time and size of a file, which identify its content."""
     state = path.stat()
     return str(path), state.st_mtime_ns, state.st_size
