@@ -185,8 +185,8 @@ def test_a_program_within_the_limits_is_accepted(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("G90 G94 G21\nG1 X100.1 F100\n", "line 2 .*X would go to 100.1 mm"),
-        ("G90 G94 G21\nG1 X-1 F100\n", "X would go to -1 mm"),
+        ("G90 G94 G21\nG1 X100.1 F100\n", "line 2 .*X would move to 100.1 mm"),
+        ("G90 G94 G21\nG1 X-1 F100\n", "X would move to -1 mm"),
         ("G90 G94 G21\nG1 X1 F1201\n", "feed would be 1201 mm/min"),
         ("G90 G94 G21\nG1 X1 F0\n", "finite feed above 0"),
         ("G90 G94 G21\nG1 X1\n", "a move before a feed"),
@@ -234,7 +234,7 @@ def test_the_first_order_is_stated_before_it_is_sent(caplog: pytest.LogCaptureFi
     here.admit(True, "move to X 2")
     (record,) = caplog.records
     assert "test at here is armed (X 0 to 100 mm, feed up to 1200 mm/min, spindle up to 1000 /min)" in record.message
-    assert "its first order: move to X 1" in record.message
+    assert "its first command: move to X 1" in record.message
 
 
 def test_a_capability_that_changes_a_machine_is_seen_without_an_id() -> None:

@@ -72,8 +72,8 @@ def test_a_channel_has_its_own_range(controller: ScriptedController) -> None:
 @pytest.mark.parametrize(
     ("answers", "settings", "message"),
     [
-        ({}, {"channel": 3}, "expected a sensor at channel 3; it is not there"),
-        ({"CHS": "1"}, {"channel": 2}, "not there"),
+        ({}, {"channel": 3}, "expected a sensor at channel 3; found none"),
+        ({"CHS": "1"}, {"channel": 2}, "found none"),
         ({"CHS": "2,1"}, {}, "mathematical function"),
         ({}, {"measuring_range": 0.2e-3}, "states 2 mm"),
         ({"CHI1": ":NAMx,RNG5,UNTinch"}, {}, "range in 'inch'"),

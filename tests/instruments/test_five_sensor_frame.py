@@ -85,7 +85,7 @@ def test_one_stream_at_a_time() -> None:
     with FiveSensorFrame(ADDRESS, settings()) as frame:
         stream = frame.stream()
         next(stream)
-        with pytest.raises(InstrumentError, match="streaming already"):
+        with pytest.raises(InstrumentError, match="already streaming"):
             frame.stream()
         stream.close()
         assert len(take(frame, 1)) == 1
@@ -207,8 +207,11 @@ def test_settings_from_a_bench_file_have_units() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"bar_radius": 5.0}, "found 5000 mm. From Python, lengths are in m"),
-        ({"direction": {**dict.fromkeys(CHANNELS, (0.0, 0.0, 1.0)), "X2": (1.0, 1.0, 0.0)}}, "X2 must be a unit"),
+        ({"bar_radius": 5.0}, "found 5000 mm. In Python, lengths are in m"),
+        (
+            {"direction": {**dict.fromkeys(CHANNELS, (0.0, 0.0, 1.0)), "X2": (1.0, 1.0, 0.0)}},
+            "unit vector as the direction of X2",
+        ),
         ({"addresses": {"X1": "tcp://a:1"}}, "missing: X2, Y1, Y2, Z"),
         ({"origin": {**dict.fromkeys(CHANNELS, (0.0, 0.0, 0.0)), "X3": (0.0, 0.0, 0.0)}}, "unknown: X3"),
     ],

@@ -235,7 +235,7 @@ def test_settings_that_the_sensor_does_not_have_are_refused(wrong: dict[str, obj
 
 
 def test_a_rate_that_the_line_of_the_address_does_not_carry_is_refused_before_it_is_opened() -> None:
-    with pytest.raises(InstrumentError, match=r"do not fit through 9600 baud"):
+    with pytest.raises(InstrumentError, match=r"exceed 9600 baud"):
         KeyenceLK("serial:///dev/ttyUSB0?baudrate=9600").open()
 
 

@@ -85,7 +85,7 @@ _READING = ("identify", "state")
 class ControllerSettings(ArmedSettings):
     """Settings of the virtual controller."""
 
-    timeout: Time = Field(default=2.0, description="time limit of an answer", gt=0)
+    timeout: Time = Field(default=2.0, description="time limit for an answer", gt=0)
 
 
 class VirtualController(Driver):

@@ -60,7 +60,7 @@ class TrackerTable:
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         from errormotion.instruments.laser_tracker.table_conformance import length_table
 
         return InstrumentSubject(cls, str(length_table()))

@@ -66,7 +66,7 @@ class CanSettings(ThermometerSettings):
     start: bool = Field(
         default=False, description="send the node to OPERATIONAL when it is opened, and after a boot-up"
     )
-    timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit for an answer", gt=0)
     retry: Time = Field(default=1.0, description="least interval between two attempts to open a lost bus", ge=0)
 
     @model_validator(mode="after")
@@ -110,7 +110,7 @@ class CanTemperature(Thermometer):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         return InstrumentSubject(cls, "sim://cframe?seed=3")
 
     @property

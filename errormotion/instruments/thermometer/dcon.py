@@ -122,7 +122,7 @@ class DconSettings(ThermometerSettings):
     unit: int = Field(default=1, description="address of the module on its line", ge=0, le=255)
     checksum: bool = Field(default=False, description="whether the module is set to use checksums")
     baudrate: int = Field(default=9600, description="of a serial line", gt=0)
-    timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit for an answer", gt=0)
     retry: Time = Field(default=1.0, description="least interval between two attempts to connect again", ge=0)
 
 

@@ -70,7 +70,7 @@ class ModbusSettings(ThermometerSettings):
     lowest: Temperature = Field(default=-273.15, description="temperatures below are out of range")
     highest: Temperature = Field(default=2500.0, description="temperatures above are out of range")
     baudrate: int = Field(default=9600, description="of a serial line, where its URL has none", gt=0)
-    timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit for an answer", gt=0)
     retry: Time = Field(default=1.0, description="least interval between two attempts to connect again", ge=0)
     retries: int = Field(default=1, description="number of repeated requests after a damaged answer", ge=0, le=10)
 

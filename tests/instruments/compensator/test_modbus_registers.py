@@ -202,7 +202,7 @@ def test_the_heartbeat_is_written_with_the_last_register() -> None:
 
 def test_a_limit_that_the_registers_cannot_hold_is_refused() -> None:
     with connected("clock=0&type=i16&scale=1e-9") as (_, compensator):
-        with pytest.raises(InstrumentError, match=r"hold offsets from 0.001 um to 32.767 um; the limit is 50 um"):
+        with pytest.raises(InstrumentError, match=r"represent offsets from 0.001 um to 32.767 um; the limit is 50 um"):
             compensator.arm(50e-6)
         with pytest.raises(InstrumentError, match="is not armed"):
             compensator.write((0.0, 0.0, 0.0))

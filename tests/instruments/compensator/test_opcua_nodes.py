@@ -166,7 +166,9 @@ def test_whole_numbers_are_rounded_within_the_limit(control: Control) -> None:
         assert [control.value(node).Value.Value for node in nodes] == [28, -28, 1]
     with (
         made(control, offset=nodes, scale=1e-9) as compensator,
-        pytest.raises(InstrumentError, match=r"\(Int16\) holds offsets from 0.001 um to 32.767 um; the limit is 50 um"),
+        pytest.raises(
+            InstrumentError, match=r"\(Int16\) represents offsets from 0.001 um to 32.767 um; the limit is 50 um"
+        ),
     ):
         compensator.arm(LIMIT)
 
@@ -200,7 +202,7 @@ def test_what_is_not_known_is_not_zero(control: Control) -> None:
         control.spoil(STOP)
         control.spoil(Y)
         found = compensator.read()
-        assert found.fault == "stop is not known: ns=2;s=Stop has the status BadNoCommunication"
+        assert found.fault == "stop is unknown: ns=2;s=Stop has the status BadNoCommunication"
         assert (found.offset[0], found.offset[2]) == (0.0, 0.0)
         assert math.isnan(found.offset[1])
 
@@ -209,7 +211,7 @@ def test_a_node_that_is_not_taken_is_named(control: Control) -> None:
     with made(control) as compensator:
         compensator.arm(LIMIT)
         compensator._types[0] = "Float"  # the server wants a Double
-        with pytest.raises(InstrumentError, match=r"did not take the offset: ns=2;s=Offset.X: BadTypeMismatch$"):
+        with pytest.raises(InstrumentError, match=r"did not accept the offset: ns=2;s=Offset.X: BadTypeMismatch$"):
             compensator.write(OFFSET)
 
 
@@ -264,7 +266,7 @@ def test_whatever_is_answered_only_typed_errors_come_out(
     [
         ({"offset": (X, X, Z)}, "Offset.X' is named twice"),
         ({"stop": BEAT}, "Beat' is named twice"),
-        ({"heartbeat": ""}, "found an empty text"),
+        ({"heartbeat": ""}, "found an empty string"),
         ({"scale": 0.0}, "greater than 0"),
         ({"offset": (X, Y)}, "Field required"),
     ],

@@ -83,7 +83,7 @@ class MTConnect(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         # Faults of observations do not affect the state, in which an alarm is a word.
         harmless = ("split", "overrun", "jump", "restart", "alarm")
         return InstrumentSubject(cls, "sim://cframe/mtconnect", harmless=harmless)

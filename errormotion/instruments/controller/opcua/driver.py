@@ -41,7 +41,7 @@ class OpcUa(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         return InstrumentSubject(cls, "sim://cframe/opcua", {"timeout": 1.5})
 
     def __init__(self, address: str, settings: OpcUaSettings | None = None, *, record: Path | None = None) -> None:

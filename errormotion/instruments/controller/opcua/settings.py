@@ -49,7 +49,7 @@ class OpcUaSettings(PluginSettings):
     )
     user: str = Field(default="", description="name of the user; empty: anonymous")
     password_file: str = Field(default="", description="file whose first line is the user's password")
-    timeout: Time = Field(default=4.0, description="time limit of one request", gt=0)
+    timeout: Time = Field(default=4.0, description="time limit for one request", gt=0)
 
     @field_validator("nodes")
     @classmethod

@@ -78,7 +78,7 @@ class Shdr(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         return InstrumentSubject(
             cls, "sim://cframe/shdr?style=vmc", settings={"timeout": 0.7}, harmless=("split", "alarm", "late")
         )

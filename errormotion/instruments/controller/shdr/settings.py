@@ -73,7 +73,7 @@ class ShdrSettings(PluginSettings):
     lenient: bool = Field(
         default=False, description="ignore and count lines that are not of the protocol, rather than refuse them"
     )
-    timeout: Time = Field(default=2.0, description="time limit of an answer", gt=0)
+    timeout: Time = Field(default=2.0, description="time limit for an answer", gt=0)
     silence: Time = Field(
         default=600.0, description="time limit without data from an adapter that has no heartbeat", gt=0
     )

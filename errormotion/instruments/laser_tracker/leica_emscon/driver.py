@@ -48,7 +48,7 @@ class LeicaEmScon(EmSconSession):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines; a tracker whose reflector rests gives a lost reading once more."""
+        """Return the subject of the conformance kit; a tracker whose reflector rests gives a lost reading once more."""
         return InstrumentSubject(cls, "sim://cframe?seed=3", vary=simulators.in_steps(seed=3))
 
     # ------------------------------------------------------------------ identity and state

@@ -47,10 +47,10 @@ class EmSconSettings(PluginSettings):
     )
     reacquire: int = Field(default=1, description="number of searches for the reflector after a broken beam", ge=0)
     noise: Length = Field(default=0.5e-6, description="standard deviation of a single distance", ge=0)
-    timeout: Time = Field(default=3.0, description="time limit of an answer", gt=0)
-    motion_timeout: Time = Field(default=30.0, description="time limit of a motion or a search", gt=0)
-    initialise_timeout: Time = Field(default=180.0, description="time limit of the initialisation", gt=0)
-    busy_timeout: Time = Field(default=5.0, description="time limit of retries with a busy tracker", ge=0)
+    timeout: Time = Field(default=3.0, description="time limit for an answer", gt=0)
+    motion_timeout: Time = Field(default=30.0, description="time limit for a motion or a search", gt=0)
+    initialise_timeout: Time = Field(default=180.0, description="time limit for the initialisation", gt=0)
+    busy_timeout: Time = Field(default=5.0, description="time limit for retries while the tracker is busy", ge=0)
 
     @property
     def interval(self) -> int:

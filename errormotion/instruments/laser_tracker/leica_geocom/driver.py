@@ -57,7 +57,7 @@ class LeicaGeoCom(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines; a station whose reflector rests gives a lost reading once more."""
+        """Return the subject of the conformance kit; a station whose reflector rests gives a lost reading once more."""
         return InstrumentSubject(cls, "sim://cframe?seed=3", vary=simulators.in_steps(seed=3))
 
     _transaction = 0

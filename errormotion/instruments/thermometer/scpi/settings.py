@@ -57,7 +57,7 @@ class ScpiSettings(ThermometerSettings):
     )
     models: tuple[str, ...] = Field(default=MODELS, description="models that are accepted", min_length=1)
     baudrate: int = Field(default=9600, description="of a serial line, where its URL has none", gt=0)
-    timeout: Time = Field(default=5.0, description="time limit of an answer, in which a scan must end", gt=0)
+    timeout: Time = Field(default=5.0, description="time limit for an answer, in which a scan must end", gt=0)
     retry: Time = Field(default=1.0, description="least interval between two attempts to connect again", ge=0)
 
     @model_validator(mode="after")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from errormotion.errors import ProtocolError
 
 LONGEST_LINE = 256
-"""Longest line, bytes; three positions, a time and a label have some 80."""
+"""Longest line, bytes; three positions, a time and a label have about 80."""
 _NUMBER = r"[-+]?+\s*+(?:\d++\.?+\d*+|\.\d++)"
 PATTERN = (
     r"(?:N\s*+(?P<number>\d++)\s*+|[A-MO-W]\w*+\s++)?"
@@ -23,8 +23,8 @@ PATTERN = (
 )
 """Default pattern of a line: number of the touch or a label, position, time.
 
-No part of it is matched in a second way (possessive quantifiers), so that the time grows with the length of the line.
-The two optional groups are not possessive: Python before 3.11.5 accepts parts of such a group.
+Its possessive quantifiers prevent backtracking, so that the time grows with the length of the line. The two optional
+groups are not possessive: Python before 3.11.5 accepts parts of such a group.
 """
 
 _CONTROL = bytes(range(32)) + b"\x7f%"  # characters of POPEN and PCLOS around the lines
