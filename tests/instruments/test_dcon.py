@@ -82,9 +82,9 @@ def test_a_disabled_channel_is_none() -> None:
 @pytest.mark.parametrize(
     ("configuration", "message"),
     [
-        ("100601", "writes per cent of the range"),
-        ("0F0682", r"writes hexadecimal \(data format 82\)"),
-        ("200603", "writes ohms"),
+        ("100601", "reports per cent of the range"),
+        ("0F0682", r"reports hexadecimal \(data format 82\)"),
+        ("200603", "reports ohms"),
         ("050600", "input range 05, a voltage or current"),
     ],
 )

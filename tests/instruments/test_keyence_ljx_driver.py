@@ -125,7 +125,7 @@ def test_program_and_x_pitch_are_set_and_asked_for() -> None:
         (block,) = take(profiler, 1, 2)
         assert np.diff(block.x) == pytest.approx(25e-6, rel=1e-9)
         assert block.x.shape == (80,)
-        with pytest.raises(InstrumentError, match="numbers 0 to 15; found 16"):
+        with pytest.raises(InstrumentError, match="number of a program, 0 to 15; found 16"):
             profiler.change_program(16)
         profiler.change_program(0)
         assert profiler.program() == 0
@@ -391,7 +391,7 @@ def test_nothing_to_see_is_nan_with_its_reason() -> None:
 
 
 def test_checksums_that_are_never_right_end_in_a_protocol_error() -> None:
-    with pytest.raises(ProtocolError, match="No profile of 57 words with a right checksum"):
+    with pytest.raises(ProtocolError, match="No profile of 57 words with a valid checksum"):
         session(SMALL + "&fault=checksum&fault_at=8&fault_every=1")
 
 

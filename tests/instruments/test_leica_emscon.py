@@ -247,7 +247,7 @@ def test_after_silence_or_stray_bytes_the_connection_is_of_no_use() -> None:
 
 
 def test_settings_refuse_what_does_not_go_together() -> None:
-    with pytest.raises(ValueError, match="whole ms"):
+    with pytest.raises(ValueError, match="multiple of 1 ms"):
         EmSconSettings(rate=300.0)
     with pytest.raises(ValueError, match="meteo = read or manual"):
         EmSconSettings(refraction_index=1.00027)

@@ -228,7 +228,7 @@ def test_another_unit_does_not_answer() -> None:
         ("modbus+rtu://", "Expected modbus.rtu:///dev/NAME"),
         ("modbus+tcp://127.0.0.1:9?unit=300", "'unit' .* from 0 to 255; found 300"),
         ("modbus+tcp://127.0.0.1:9", "No connection to modbus.tcp://127.0.0.1:9"),
-        (f"{LOGGER}&wire=pty&framing=tcp", "on a pty 'rtu' only"),
+        (f"{LOGGER}&wire=pty&framing=tcp", "'rtu' on a pty"),
         (f"{LOGGER}&sensors=coffee", "found coffee"),
         (f"{LOGGER}&open=7", "inputs from 0 to 4; found '7'"),
         (f"{LOGGER}&type=f64", "register map .* cannot be"),

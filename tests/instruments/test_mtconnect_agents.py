@@ -220,7 +220,7 @@ def test_observations_of_the_package_mtconnect_come_once(monkeypatch: pytest.Mon
 def test_a_device_that_the_address_does_not_name_is_refused() -> None:
     two = b"<Device id='a' name='A'/><Device id='b' name='B'/>"
     probe = b"<MTConnectDevices>%s/><Devices>%s</Devices></MTConnectDevices>" % (HEADER.encode(), two)
-    with agent(probe) as there, pytest.raises(InstrumentError, match="the devices A, B; name one in the address"):
+    with agent(probe) as there, pytest.raises(InstrumentError, match="the devices A, B; state one in the address"):
         MTConnect(there.url).open()
 
 

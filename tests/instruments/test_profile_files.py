@@ -240,7 +240,7 @@ def test_a_cloud_that_is_no_height_map_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("address", "message"),
-    [("none.ply", "no file 'none.ply'"), ("tcp://127.0.0.1:9", "Expected a file"), ("*.nc", "there is no file")],
+    [("none.ply", "no file 'none.ply'"), ("tcp://127.0.0.1:9", "Expected a file"), ("*.nc", "found no file")],
 )
 def test_an_address_without_files_is_refused(address: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):

@@ -90,7 +90,7 @@ def test_units_are_those_of_the_title(tmp_path: Path, title: str, value: str, me
 
 def test_a_line_that_comes_again_is_refused_unless_settings_say_which_counts(tmp_path: Path) -> None:
     address = write(tmp_path, "S1,1,1500,20,1013,40", "S1,2,1510,20,1013,40", "S1,1,1502,22,1013,40")
-    assert "line 4: station 'S1', target '1': expected one line; line 2 is another one" in refusal(address)
+    assert "line 4: station 'S1', target '1': expected one line; line 2 is another" in refusal(address)
     for repeats, expected in (("last", 1.502), ("mean", 1.501)):
         with TrackerTable(address, TrackerTableSettings(repeats=repeats)) as table:
             assert table.read()[0, 0] == pytest.approx(expected, rel=1e-15)
@@ -110,7 +110,7 @@ def test_a_station_without_lines_is_nan(tmp_path: Path) -> None:
 
 def test_millimetres_called_metres_are_found(tmp_path: Path) -> None:
     message = refusal(write(tmp_path, "S1,1,1500.5", head="station,target,length [m]"))
-    assert "expected -160 to 160; found 1500.5. Is its unit really m?" in message
+    assert "expected -160 to 160; found 1500.5. Check its unit, m" in message
 
 
 def test_metres_called_millimetres_are_found(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
     [
         ((), "expected lines of measurements"),
         (("S1,1,,20,1013,40",), "expected lengths; found none"),
-        (("S1,1,1500,20,1013,40", "", "S1,2,1500,20,1013,40"), "found the start of a second one"),
+        (("S1,1,1500,20,1013,40", "", "S1,2,1500,20,1013,40"), "found the start of a second table"),
     ],
 )
 def test_tables_without_lengths_or_in_two_parts_are_refused(tmp_path: Path, lines: tuple[str, ...], words: str) -> None:

@@ -1,4 +1,4 @@
-"""A table of lengths for the conformance kit."""
+"""Table of lengths for the conformance kit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def own_folder() -> Path:
-    """Return a new folder that lasts as long as this process."""
+    """Return a new folder that is deleted at the end of this process."""
     folder = Path(tempfile.mkdtemp(prefix="errormotion-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder

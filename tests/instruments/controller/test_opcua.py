@@ -232,7 +232,7 @@ def test_the_encoder_of_the_motor_is_read_where_the_settings_say_so(shared):
 
 def test_several_spindles_need_a_name(shared):
     url = shared(two_spindles).url
-    with pytest.raises(InstrumentError, match="several: spindle S1, S2; name one"):
+    with pytest.raises(InstrumentError, match="several: spindle S1, S2; state one"):
         OpcUa(url).open()
     with OpcUa(url, OpcUaSettings(spindle="S2")) as cnc:
         assert cnc.state()["spindle_speed"] == pytest.approx(12000)
@@ -241,7 +241,7 @@ def test_several_spindles_need_a_name(shared):
 
 
 def test_a_server_without_the_model_needs_nodes(shared):
-    with pytest.raises(InstrumentError, match=r"no object CncInterface .* name its nodes"):
+    with pytest.raises(InstrumentError, match=r"no object CncInterface .* state nodes"):
         OpcUa(shared(plain_nodes).url).open()
 
 

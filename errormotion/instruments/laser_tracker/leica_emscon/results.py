@@ -13,7 +13,7 @@ MILLIBAR = 100.0  # Pa
 
 
 def environment(values: Mapping[str, Any]) -> Environment:
-    """Return the state of the air."""
+    """Return the conditions of the air."""
     return Environment(float(values["temperature"]), MILLIBAR * float(values["pressure"]), float(values["humidity"]))
 
 

@@ -1,4 +1,4 @@
-"""Settings of a tracker behind an emScon server."""
+"""Settings of a tracker with an emScon server."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class EmSconSettings(PluginSettings):
         description="AT901: LT or AT901, with an interferometer; AT4xx: absolute distances, point by point",
     )
     reflector: str | None = Field(
-        default=None, description="name of the reflector at the tracker; default: the one that is set"
+        default=None, description="name of the reflector, as defined in the tracker; default: unchanged"
     )
     initialise: Literal["if_needed", "always", "never"] = Field(
-        default="if_needed", description="whether the tracker is initialised when it is opened: it moves, for a minute"
+        default="if_needed", description="when to initialise the tracker on opening; it moves for a minute"
     )
     meteo: Literal["refraction", "read", "manual"] = Field(
         default="refraction",
-        description="weather station: sets the refraction index, is read only, or is absent and the values are given",
+        description="weather station: sets the refraction index, is only read, or is absent and the values are given",
     )
     temperature: Temperature = Field(
         default=20.0, description="temperature of the air, with meteo = manual", ge=0, le=50
@@ -36,7 +36,7 @@ class EmSconSettings(PluginSettings):
     humidity: float = Field(default=50.0, description="relative humidity in %, with meteo = manual", ge=0, le=100)
     refraction_index: float | None = Field(
         default=None,
-        description="refraction index that the tracker uses; default: its own. 1: distances in vacuum",
+        description="refraction index that the tracker uses; default: that of the tracker; 1: distances in vacuum",
         ge=1.0,
         le=1.0005,
     )
@@ -54,19 +54,19 @@ class EmSconSettings(PluginSettings):
 
     @property
     def interval(self) -> int:
-        """Time between the points of a stream, ms."""
+        """Interval between the points of a stream, ms."""
         return round(1000.0 / self.rate)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if abs(self.interval * self.rate / 1000.0 - 1.0) > 1e-6:
             raise ValueError(
-                f"the tracker counts the time between two points in whole ms; {self.rate:g} points/s are "
+                f"expected a rate whose interval is a multiple of 1 ms; {self.rate:g} points/s are "
                 f"{1000.0 / self.rate:g} ms apart. Choose 1000, 500, 250, 200, 125, 100, 50, ... points/s"
             )
         if self.refraction_index is not None and self.meteo == "refraction":
             raise ValueError(
-                "with meteo = refraction the tracker sets its refraction index itself; give meteo = read or manual "
-                "beside refraction_index"
+                "with meteo = refraction the tracker sets its refraction index itself; expected meteo = read or manual "
+                "with refraction_index"
             )
         return self

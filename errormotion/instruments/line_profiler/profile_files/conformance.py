@@ -1,4 +1,4 @@
-"""A scan as a file for the conformance kit."""
+"""File of a scan for the conformance kit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import xarray as xr
 
 
 def own_folder() -> Path:
-    """Return a new folder that lasts as long as this process."""
+    """Return a new folder that is deleted at the end of this process."""
     folder = Path(tempfile.mkdtemp(prefix="errormotion-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
@@ -21,7 +21,7 @@ def own_folder() -> Path:
 
 @cache
 def scan_file() -> Path:
-    """Return a scan of 350 profiles as a file that lasts as long as this process; three heights are unknown."""
+    """Return a temporary file with a scan of 350 profiles; three heights are unknown."""
     folder = own_folder()
     x, y = 12.5e-6 * np.arange(60), 25e-6 * np.arange(350)
     heights = 1e-3 * np.sin(np.add.outer(700.0 * y, 5000.0 * x))

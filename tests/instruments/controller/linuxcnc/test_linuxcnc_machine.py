@@ -289,7 +289,7 @@ def test_without_arm_it_reads_and_may_stop_the_machine(machine: LinuxCNC) -> Non
         stopper.join()
         with pytest.raises(InstrumentError, match=r"only reads.*home.*arm = true"):
             reader.home()
-        answer = reader._order  # past the driver's own check: the bridge refuses as well
+        answer = reader._send  # past the driver's own check: the bridge refuses as well
         with pytest.raises(InstrumentError, match="this client only reads"):
             answer("move_to", position=THERE, feed=None)
 
@@ -336,7 +336,7 @@ def test_a_lost_connection_stops_the_move_which_is_not_repeated() -> None:
         machine.state()  # after identity and state the wire breaks at the next answer, that of the stop
         ordered = threading.Thread(target=lambda: (wait_until_moving(witness), witness.stop()))
         ordered.start()
-        with pytest.raises(InstrumentError, match="during the order 'move to'"):
+        with pytest.raises(InstrumentError, match="during the command 'move to'"):
             machine.move_to(THERE, 0.05)
         ordered.join()
         place = witness.state()["position"]
