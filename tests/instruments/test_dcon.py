@@ -218,7 +218,7 @@ def test_a_bad_checksum_is_a_protocol_error_and_splitting_none() -> None:
         read_often(thermometer, 3)
     with DconTemperature(f"{ADDRESS}&checksum=1&fault=split", settings) as thermometer:
         assert all(math.isfinite(value) for value in thermometer.read().values())
-    with pytest.raises(InstrumentError, match="no such fault"):
+    with pytest.raises(InstrumentError, match="does not have this fault"):
         DconTemperature(f"{ADDRESS}&fault=checksum").open()
 
 

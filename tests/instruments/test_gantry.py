@@ -270,7 +270,7 @@ def test_the_clock_and_the_position_are_those_of_the_last_profile_that_was_read(
         for _ in range(5):
             block = next(stream)
             assert controller.state()["position"][1] == pytest.approx(block.encoder[-1] * 1e-6, abs=1e-12)
-            with pytest.raises(InstrumentError, match="let time pass while profiler stream"):
+            with pytest.raises(InstrumentError, match="advance the time while profiler stream"):
                 controller.elapse(1.0)
         seen = controller.state()["time"]
         stream.close()
@@ -403,7 +403,7 @@ def test_a_refused_program_moves_nothing() -> None:
         for text, message in [
             ("G1 Y100 F1500\nG1 Y901\nM30", r"refuses: Line 2 'G1 Y901': Y travels from -900 to 900 mm; found 901"),
             ("%\nG91\nM30", r"refuses: Line 2 'G91'"),
-            ("G1 Y100 F1500", "is it whole"),
+            ("G1 Y100 F1500", "check that it is complete"),
         ]:
             with pytest.raises(InstrumentError, match=message):
                 controller.run_program(text)

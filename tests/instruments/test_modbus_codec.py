@@ -165,7 +165,7 @@ def test_blocks_take_what_lies_between_even_channels_only() -> None:
         ({"map": "adam-6018", "channels": tuple("abcdefghi")}, "has 8 channels; found 9"),
         ({"registers": (1, 2)}, "one for each of the 5 channels; found 2"),
         ({"scale": (1.0, 2.0)}, "one, or one for each of the 5 channels"),
-        ({"type": "f32", "stride": 1}, "a f32 fills 2 registers"),
+        ({"type": "f32", "stride": 1}, "a f32 needs 2 registers"),
         ({"first": 65533}, "registers up to 65535"),
         ({"channels": ("a", "a")}, "has a twice"),
         ({"places": {"bed": (0, 0, 0)}}, "'places' has bed"),

@@ -276,7 +276,7 @@ def test_a_broken_connection_is_an_instrument_error_and_can_be_opened_again() ->
 
 
 @pytest.mark.parametrize(
-    ("fault", "message"), [("checksum", "no such fault"), ("fire", "unknown fault"), ("silenc", "choose from silence")]
+    ("fault", "message"), [("checksum", "does not have this fault"), ("fire", "unknown fault"), ("silenc", "expected one of silence")]
 )
 def test_a_fault_that_is_not_on_the_menu_is_refused(fault: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):

@@ -368,11 +368,11 @@ def test_a_program_warms_the_spindle_and_stops_it_to_probe(controller: VirtualCo
     [
         ("M3 S1000\nG31 X100 F100", r"Line 2 .*: the spindle turns at 1000 /min; M5 first"),
         ("M3 S99999", r"Line 1 .*: The spindle turns at 0 to"),
-        ("DPRNT[Y#5062[53]]", "no skip move, G31, has ended yet"),
-        ("G31 X1 F100\nDPRNT[Y#100[53]]", "#100 is not understood; printed are #5061, #5062, #5063"),
-        ("G31 X100", "a move with G31, but no feed"),
+        ("DPRNT[Y#5062[53]]", "expected a skip move, G31, before its position is printed"),
+        ("G31 X1 F100\nDPRNT[Y#100[53]]", "#100 is not supported; supported are #5061, #5062, #5063"),
+        ("G31 X100", "a move with G31 before a feed"),
         ("G31 X1 F100\nG1 X400 Y-720 Z120", "the probe would trip on this path"),
-        ("M3 S1000\nG1 X1", "a move with G1, but no feed"),
+        ("M3 S1000\nG1 X1", "a move with G1 before a feed"),
     ],
 )
 def test_a_program_that_cannot_run_orders_nothing(

@@ -115,7 +115,7 @@ def test_the_servo_thread_bounds_what_did_not_pass_the_bridge(machine: Machine) 
 
 @one_route
 def test_a_jump_is_refused(compensator: LinuxCNCOffset) -> None:
-    with pytest.raises(InstrumentError, match="is a jump of 15 um; the slew limit allows 11 um"):
+    with pytest.raises(InstrumentError, match="is a change of 15 um; the slew limit permits 11 um"):
         compensator.write([15e-6, 0.0, 0.0])
 
 

@@ -251,7 +251,7 @@ def test_silence_and_drop_concern_lines():
 
 def test_an_illegal_block_stops_the_program_ahead_of_its_start():
     with port() as (line, here):
-        with pytest.raises(InstrumentError, match=r"Line 2 .*expected 1 to 8 places in all; found 9"):
+        with pytest.raises(InstrumentError, match=r"Line 2 .*expected 1 to 8 digits in all; found 9"):
             here.run_program("POPEN\nDPRNT[T#3001[81]]\nPCLOS\nM30")
         here.elapse(10.0)
         assert received(line) == b""

@@ -170,12 +170,12 @@ def test_a_token_that_others_can_read_is_not_used(start: Start, tmp_path: Path) 
 
 def test_without_a_token_the_message_says_what_to_do(start: Start, tmp_path: Path) -> None:
     port = start("--port", "0")["port"]
-    with pytest.raises(InstrumentError, match=r"expected the token.*Copy that file.*'token_file'"):
+    with pytest.raises(InstrumentError, match=r"expected the token.*Copy this file.*'token_file'"):
         LinuxCNC(f"tcp://127.0.0.1:{port}", LinuxCNCSettings(token_file=tmp_path / "none")).open()
     wrong = tmp_path / "wrong"
     wrong.write_text("x" * 64)
     wrong.chmod(0o600)
-    with pytest.raises(InstrumentError, match=r"the token is not that of this bridge.*Copy that file"):
+    with pytest.raises(InstrumentError, match=r"the token is not valid for this bridge.*Copy this file"):
         LinuxCNC(f"tcp://127.0.0.1:{port}", LinuxCNCSettings(token_file=wrong)).open()
 
 

@@ -652,7 +652,7 @@ def test_probing_is_in_the_work_frame_and_its_result_is_not(play: Callable[[Test
         ({"task_state": FakeLinuxCNC.STATE_OFF}, "is off"),
         ({"homed": (1, 0, 1)}, "not homed"),
         ({"joints": 0}, "not homed"),
-        ({"interp_state": FakeLinuxCNC.INTERP_READING}, "this bridge has not ordered"),
+        ({"interp_state": FakeLinuxCNC.INTERP_READING}, "this bridge has not started"),
         ({"probe_val": 1}, "tripped before it moves"),
         ({"spindle": ({"speed": 9.0, "direction": 1},)}, "spindle turns"),
     ],
@@ -695,7 +695,7 @@ def test_the_e_stop_that_stays_pressed_is_reported(play: Callable[[Test], None])
         fake.values.task_state = fake.STATE_ESTOP
         assert "check the buttons" in await wire.ask("reset")
         fake.values.task_state = fake.STATE_OFF
-        assert "stays off" in await wire.ask("enable")
+        assert "remains off" in await wire.ask("enable")
 
     play(test)
 
