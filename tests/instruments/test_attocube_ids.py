@@ -15,7 +15,7 @@ ONE = IdsSettings(timeout=0.7)
 
 
 class TestKit(InstrumentConformance):
-    """Three beams and an angle; nobody at a port."""
+    """Three beams and an angle; a port without a server."""
 
     subject = InstrumentSubject(
         AttocubeIds,
@@ -56,7 +56,7 @@ def test_two_parallel_beams_give_an_angle() -> None:
     assert ids.channels["yaw"] == "rad"
 
 
-def test_an_idle_device_is_started_and_one_that_is_aligned_is_left_alone() -> None:
+def test_an_idle_device_is_started_and_an_aligned_one_is_unchanged() -> None:
     with AttocubeIds("sim://cframe/ids?seed=3&init=0.05", ONE) as ids:
         assert math.isfinite(ids.read()["axis1"])
     with pytest.raises(InstrumentError, match="set 'start = true'"):
@@ -103,7 +103,7 @@ def test_no_zero_while_a_beam_is_broken() -> None:
         ids.zero()
 
 
-def test_a_broken_beam_that_is_not_used_does_no_harm() -> None:
+def test_a_broken_beam_that_is_not_used_has_no_effect() -> None:
     with AttocubeIds(f"{QUIET}&fault=beam_broken&broken=3", ONE) as ids:
         assert math.isfinite(ids.read()["axis1"])
 

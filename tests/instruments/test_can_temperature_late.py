@@ -1,4 +1,4 @@
-"""CANopen thermometers: answers that come late, or belong to another request."""
+"""CANopen thermometers: late answers, and answers to another request."""
 
 import struct
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from errormotion.instruments.thermometer.can_temperature import CanTemperature
 
 
 def test_late_answers_are_not_taken_for_later_ones() -> None:
-    """Every value is the number of its request; one answer comes after the time limit."""
+    """Every value is the number of its request; one answer arrives after the time limit."""
     late, asked, after = 1.0, 0, []
 
     def answers(number: int, index: int, subindex: int) -> Iterator[tuple[float, bytes]]:

@@ -1,4 +1,4 @@
-"""The NC programs that the virtual control understands, and how it refuses the others."""
+"""NC programs that the virtual control accepts, and refusals of others."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def run(*lines: str, start: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Pat
     return interpret("\n".join(lines), start, TRAVEL, RAPID)
 
 
-def test_a_measuring_pass_takes_its_way_over_its_feed() -> None:
+def test_the_duration_of_a_measuring_pass_is_path_divided_by_feed() -> None:
     path = run(
         "%",
         "(cold pass; eight artefacts)",
@@ -32,19 +32,19 @@ def test_a_measuring_pass_takes_its_way_over_its_feed() -> None:
     assert path.rapid.tolist() == [False, False, False, True]
 
 
-def test_words_stand_close_or_apart_in_either_case_with_leading_zeros() -> None:
+def test_words_may_have_spaces_either_case_and_leading_zeros() -> None:
     path = run("g01x100.y+20Z.5f600", "G04 P.5", "G 00 X 0", "m02")
     assert path.places[-2].tolist() == [0.1, 0.02, 0.0005]
     assert path.times[1] == pytest.approx(np.linalg.norm([0.1, 0.02, 0.0005]) / 0.01)
 
 
-def test_a_program_begins_where_the_machine_is() -> None:
+def test_a_program_starts_at_the_present_position() -> None:
     path = run("G1 Y200 F1200", "M30", start=(1.0, 0.1, 0.5))
     assert path.places.tolist() == [[1.0, 0.1, 0.5], [1.0, 0.2, 0.5]]
     assert path.duration == pytest.approx(5.0)
 
 
-def test_moves_that_go_nowhere_take_no_time_and_nothing_is_read_behind_the_end() -> None:
+def test_moves_without_travel_take_no_time_and_nothing_is_read_after_the_end() -> None:
     path = run("G1 Y0 F100", "G4 P0", "G0 Z0", "M30 (over)", "what stands here is not read")
     assert path.duration == 0
     assert path.places.shape == (1, 3)
@@ -84,7 +84,7 @@ def test_moves_that_go_nowhere_take_no_time_and_nothing_is_read_behind_the_end()
         ("G1 Y10 P5", "only with a dwell"),
     ],
 )
-def test_what_is_not_understood_is_refused_with_its_line(line: str, why: str) -> None:
+def test_unknown_text_is_refused_with_its_line(line: str, why: str) -> None:
     with pytest.raises(InstrumentError, match=rf"^Line 3 '.*': .*{why}"):
         run("%", "G1 Y100 F1500", line, "M30")
 

@@ -1,4 +1,4 @@
-"""A recorded session plays back as it was, and in no other way."""
+"""A recorded session is replayed exactly, and deviations are errors."""
 
 import threading
 from pathlib import Path
@@ -13,7 +13,7 @@ from errormotion.instruments.transports.recording import Recorder, read_index, r
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """Two questions and their answers, recorded from a real connection."""
+    """Two requests and their answers, recorded from a real connection."""
     path = tmp_path / "session.rec"
     server = make_server("tcp", "echo", lambda data: server.send(data.upper()))
     server.start()
@@ -65,7 +65,7 @@ def test_a_changed_byte_in_a_write_is_an_error(recording: Path) -> None:
         line.close()
 
 
-def test_a_write_too_many_is_an_error(recording: Path) -> None:
+def test_an_excess_write_is_an_error(recording: Path) -> None:
     line = play(recording)
     line.write(b"abc;de;")
     with pytest.raises(ReplayError, match="no further write"):
@@ -75,7 +75,7 @@ def test_a_write_too_many_is_an_error(recording: Path) -> None:
         line.close()
 
 
-def test_a_read_too_many_is_an_error(recording: Path) -> None:
+def test_an_excess_read_is_an_error(recording: Path) -> None:
     line = play(recording)
     line.write(b"abc;de;")
     line.read_until(b"DE;")
@@ -84,7 +84,7 @@ def test_a_read_too_many_is_an_error(recording: Path) -> None:
     line.close()
 
 
-def test_an_answer_does_not_come_before_its_question(recording: Path) -> None:
+def test_an_answer_does_not_precede_its_request(recording: Path) -> None:
     line = play(recording)
     with pytest.raises(InstrumentTimeoutError, match=r"before the driver has written b'abc;'"):
         line.read()

@@ -92,13 +92,7 @@ class SimulatedDevice:
             return
         if fault.hits("garbage", number):
             data = stray_bytes(self._rng) + data
-        if fault.kind == "late" and number == fault.at:
-            self._late.hold(self._server, data, self.fault.delay)
-            return
-        with self._server.lock:
-            self._late.release(self._server)
-            for piece in fault.pieces(data):
-                self._server.send(piece)
+        self._late.send(self._server, fault, number, data)
 
     def _silent(self) -> bool:
         return self._answers > self.fault.at

@@ -10,7 +10,7 @@
 * ``drop``: samples, or answers, are missing
 * ``disconnect``: the connection is lost; it can be opened again
 * ``late``: one answer, number ``fault_at``, is delayed by ``late_by`` s, at most until the next answer, which it
-precedes (without ``late_by``: until then); it is lost with its connection
+  precedes (without ``late_by``: until then); it is lost with its connection
 
 ``fault_at`` is the first sample (of a stream) or answer (of others) with the fault; default 0. ``silence`` without
 ``fault_at`` starts before the first answer. ``fault_every`` is the period of ``garbage`` and ``drop``, ``fault_for``
@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -63,6 +64,14 @@ class Fault:
         if kind != self.kind or number < self.at:
             return False
         return (number - self.at) % self.every == 0
+
+    def affects(self, kind: str, number: Any) -> Any:
+        """Whether a sample or answer, or each of an array, is among the ``length`` ones with this fault."""
+        return (kind == self.kind) & (number >= self.at) & ((self.length == 0) | (number < self.at + self.length))
+
+    def suppresses(self, number: int) -> bool:
+        """Whether an answer with this number is not sent: silence, or a missing answer."""
+        return (self.kind == "silence" and number >= self.at) or self.hits("drop", number)
 
     def pieces(self, data: bytes) -> Iterator[bytes]:
         """Yield the pieces to be sent: all data, or with ``split`` first pieces of 1 to 7 bytes, later of 1009 bytes.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 
+from errormotion.instruments.simulators.faults import Fault
 from errormotion.instruments.transports.loopback.serving import Server
 
 
@@ -22,6 +23,16 @@ class LateAnswer:
             self._timer = threading.Timer(delay, self.release, (server,))
             self._timer.daemon = True
             self._timer.start()
+
+    def send(self, server: Server, fault: Fault, number: int, data: bytes) -> None:
+        """Send the answer with a number, in the pieces of the fault; delay it if it is the late one."""
+        if fault.kind == "late" and number == fault.at:
+            self.hold(server, data, fault.delay)
+            return
+        with server.lock:
+            self.release(server)
+            for piece in fault.pieces(data):
+                server.send(piece)
 
     def release(self, server: Server) -> None:
         """Send the delayed answer, if its connection is still open."""

@@ -1,4 +1,4 @@
-"""The simulated confocalDT 24x1 at the wire: what the manual prints, what it refuses, and the blocks that it sends."""
+"""The simulated confocalDT 24x1 on its lines: dialogues of the manual, refusals, and blocks."""
 
 import socket
 import struct
@@ -19,7 +19,7 @@ NO_PEAK = 0x7FFFFFFB
 
 
 class Client:
-    """Two sockets, as a program of the maker's would open them."""
+    """Two sockets, as opened by a program of the maker."""
 
     def __init__(self, device: SimulatedConfocal) -> None:
         self.device = device
@@ -31,7 +31,7 @@ class Client:
         self.commands.sendall(text.encode("latin-1"))
 
     def answer(self) -> str:
-        """Return what comes before the next prompt."""
+        """Return the text before the next prompt."""
         data = b""
         while not data.endswith(b"\r\n->"):
             data += self.commands.recv(1)
@@ -65,7 +65,7 @@ class Client:
         return data
 
     def quiet(self) -> bool:
-        """Read until no values arrive; return whether none came at all."""
+        """Read until no values arrive; return whether there were none."""
         assert self.data is not None
         self.data.settimeout(0.3)
         came, self.rest = bool(self.rest), b""
@@ -127,7 +127,7 @@ def streaming(parameters: str = "", left: str = "ECHO OFF") -> Iterator[Client]:
         ("", ""),
     ],
 )
-def test_what_the_manual_has_is_answered(command: str, answer: str) -> None:
+def test_commands_of_the_manual_are_answered(command: str, answer: str) -> None:
     with simulated("&range=3") as client:
         assert client.ask(command) == answer
 
@@ -165,7 +165,7 @@ def test_what_the_manual_has_is_answered(command: str, answer: str) -> None:
         (300 * "X", "E11"),
     ],
 )
-def test_what_the_manual_does_not_have_is_refused(command: str, error: str) -> None:
+def test_commands_that_are_not_in_the_manual_are_refused(command: str, error: str) -> None:
     with simulated("&range=3") as client:
         assert client.ask(command).startswith(error + " ")
         assert client.ask("OUTPUT") == "OUTPUT NONE"
@@ -219,7 +219,7 @@ def test_values_are_those_of_the_virtual_machine() -> None:
     np.testing.assert_allclose(frames[:, 0] * 1e-9, truth, rtol=0, atol=0.501e-9)
 
 
-def test_further_values_have_the_places_of_the_manual() -> None:
+def test_further_values_have_the_positions_of_the_manual() -> None:
     chosen = "OUTADD_ETH STATE INTENSITY TIMESTAMP COUNTER ENC1 MEASRATE SHUTTER;OUTSTATISTIC_ETH MAX MIN"
     with streaming(left=f"ECHO OFF;MEASRATE 2.5;{chosen}") as client:
         counter, (first, second), frames = client.block()
@@ -272,7 +272,7 @@ def test_averages_smooth() -> None:
     assert max(spreads[kind] for kind in spreads if kind != "NONE") < spreads["NONE"] / 2
 
 
-def test_reduction_leaves_values_out() -> None:
+def test_reduction_omits_values() -> None:
     with streaming(left="ECHO OFF;OUTADD_ETH COUNTER;OUTREDUCE 10") as client:
         frames = np.concatenate([client.block()[2] for _ in range(3)])
     assert (np.diff(frames[:, 0]) == 10).all()
@@ -297,7 +297,7 @@ def test_missing_frames_show_in_the_counter() -> None:
     assert blocks[1][0] == blocks[0][0] + 101
 
 
-def test_nothing_to_measure_is_no_peak() -> None:
+def test_a_missing_target_is_no_peak() -> None:
     with streaming("&fault=out_of_range&fault_at=10&fault_for=5", "ECHO OFF;OUTADD_ETH STATE") as client:
         frames = client.block()[2]
     assert np.flatnonzero(frames[:, 0] == NO_PEAK).tolist() == [10, 11, 12, 13, 14]

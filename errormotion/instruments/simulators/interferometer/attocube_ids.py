@@ -171,7 +171,7 @@ class SimulatedIds(SimulatedDevice):
         return _line({"jsonrpc": "2.0", "id": number, "result": result})
 
     def _result(self, function: Callable[..., Sequence[Any]], params: Any) -> list[Any]:
-        if self.fault.kind == "refuse" and self._due(self._answers):
+        if self.fault.affects("refuse", self._answers):
             return [self._code]
         try:
             values = function(*params) if isinstance(params, list) else function(**params)
@@ -180,10 +180,6 @@ class SimulatedIds(SimulatedDevice):
             return [refused.code, *refused.values]
         except TypeError:
             return [BAD_VALUE]
-
-    def _due(self, number: int) -> bool:
-        fault = self.fault
-        return number >= fault.at and (fault.length == 0 or number < fault.at + fault.length)
 
     def _function(self, method: str) -> Callable[..., Sequence[Any]] | None:
         """Return the function for a method, such as ``_system_resetAxes`` for com.attocube.ids.system.resetAxes."""
@@ -297,7 +293,7 @@ class SimulatedIds(SimulatedDevice):
         return self._beams[int(axis)]
 
     def _broken_now(self) -> set[int]:
-        return self._breaks if self.fault.kind == "beam_broken" and self._due(self._readings) else set()
+        return self._breaks if self.fault.affects("beam_broken", self._readings) else set()
 
     def _counts(self) -> list[int]:
         """Return the displacements, pm."""

@@ -110,20 +110,14 @@ class SimulatedPrinter(SimulatedDevice):
     def _print(self, line: bytes) -> None:
         number, fault = self._lines, self.fault
         self._lines += 1
-        if (fault.kind == "silence" and number >= fault.at) or fault.hits("drop", number):
+        if fault.suppresses(number):
             return
         if fault.kind == "disconnect" and number >= fault.at:
             self._server.disconnect()
             return
         if fault.hits("garbage", number):
             line = b"\xff" + stray_bytes(self._rng) + line
-        if fault.kind == "late" and number == fault.at:
-            self._late.hold(self._server, line, self.fault.delay)
-            return
-        with self._server.lock:
-            self._late.release(self._server)
-            for piece in fault.pieces(line * (2 if fault.hits("duplicate", number) else 1)):
-                self._server.send(piece)
+        self._late.send(self._server, fault, number, line * (2 if fault.hits("duplicate", number) else 1))
 
 
 def _choice(address: Address, key: str, choices: tuple[str, ...]) -> str:
