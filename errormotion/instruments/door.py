@@ -91,7 +91,7 @@ class Door:
                 )
 
     def coordinate(self, axis: str, x: float) -> None:
-        """Raise InstrumentError where the coordinate of an axis, m, is outside the limits."""
+        """Raise InstrumentError if the coordinate of an axis, m, is outside the limits."""
         span = self.limits.spans.get(axis)
         if not math.isfinite(x) or (span is not None and not span[0] - _ROUNDING <= x <= span[1] + _ROUNDING):
             low, high = (1e3 * each for each in span or (-math.inf, math.inf))

@@ -196,7 +196,7 @@ class Reader:
     def finish(self, quiet: float, timeout: float) -> InstrumentError | None:
         """Discard further samples until the stream ends or no data have arrived for ``quiet`` s; end the thread.
 
-        Returns the error that ended the thread, None where the device stopped sending.
+        Returns the error that ended the thread, None if the device stopped sending.
 
         Raises
         ------

@@ -445,7 +445,7 @@ def test_a_new_schedule_stops_a_program_where_the_machine_is() -> None:
     ("params", "message"),
     [
         ("&disturbances=some", "expected one of none, white, full"),
-        ("&artefacts=0.1,here", "expected positions in m, joined by commas"),
+        ("&artefacts=0.1,here", "expected positions in m, separated by commas"),
         ("&artefacts=0.1,0.13", "66 mm or more apart along Y"),
         ("&artefacts=0.1,1.3", r"Y travels from -0\.9 to 0\.9 m; found 1\.3 m"),
         ("&pocket=0.1", "56 mm or more apart along Y; .* circular pocket"),

@@ -33,7 +33,7 @@ class OffsetFileSettings(PluginSettings):
 
     valid: Time = Field(default=5.0, gt=0, le=60.0, description="time after which the reader must ramp to zero")
     state: str = Field(
-        default="", description="file that the reader writes, with the offset in effect; default: what was written"
+        default="", description="file that the reader writes, with the offset in effect; default: the written offset"
     )
 
 

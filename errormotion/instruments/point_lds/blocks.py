@@ -1,6 +1,6 @@
 """Blocks of counted values on a data port: a header with a preamble, then frames of 32-bit values.
 
-Some manuals state the preamble ``MEAS``; drivers by others read it as a little-endian word, ``SAEM``. Both are
+Some manuals state the preamble ``MEAS``; other drivers read it as a little-endian word, ``SAEM``. Both are
 accepted.
 """
 

@@ -43,7 +43,7 @@ class Probe:
         return self._map
 
     def configure(self, settings: Any) -> None:
-        """Use other settings from now on; those of the connection take effect when it is next opened."""
+        """Use other settings from now on; those of the connection take effect at the next opening."""
         self._map = settings.pretravel_map()
         self.settings = settings
 

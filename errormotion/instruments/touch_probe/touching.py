@@ -190,7 +190,7 @@ class Toucher:
         return along
 
     def _probe(self, target: Array, feed: float) -> dict[str, Any] | None:
-        """Move until the probe trips; wait for a stuck one; None where it does not trip."""
+        """Move until the probe trips; wait for a stuck one; None if it does not trip."""
         for attempt in range(1 + self._how.attempts):
             try:
                 found = self._control.probe(target.tolist(), feed)

@@ -1,13 +1,11 @@
 """The simulated capaNCDT 6200 on its lines: dialogues of the manuals, refusals, and blocks."""
 
-import socket
 import struct
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from data_port_client import DataPortClient
 from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError
@@ -19,24 +17,13 @@ FULL_SCALE = 0xFFFFFF
 HEADER = struct.Struct("<4sIIQIHHI")
 
 
-class Client:
-    """Two sockets, as opened by a program of the maker."""
-
+class Client(DataPortClient):
     def __init__(self, device: SimulatedCapaNCDT) -> None:
-        self.device = device
-        self.commands = connect(device.url)
+        super().__init__(device)
         self.greeting = self.line()
-        self.data: socket.socket | None = None
-        self.rest = b""
-
-    def send(self, text: str) -> None:
-        self.commands.sendall(text.encode("latin-1"))
 
     def line(self) -> str:
-        line = b""
-        while not line.endswith(b"\r\n"):
-            line += self.commands.recv(1)
-        return line.decode("latin-1").removesuffix("\r\n")
+        return self.text(b"\r\n")
 
     def ask(self, command: str) -> str:
         """Send a command without its dollar; return the text after its echo."""
@@ -48,49 +35,16 @@ class Client:
     def block(self) -> tuple[int, list[int], np.ndarray]:
         """Return counter, channels and frames of the next block."""
         if self.data is None:
-            self.data = connect(self.device.urls["data"])
+            self.open_data()
         preamble, _, serial, field, status, width, count, counter = HEADER.unpack(self.exactly(HEADER.size))
         assert (preamble, serial, status) == (b"SAEM", self.device.serial, 0)
         channels = [channel + 1 for channel in range(32) if field >> 2 * channel & 3 == 1]
         assert width == 4 * len(channels)
         return counter, channels, np.frombuffer(self.exactly(width * count), "<i4").reshape(count, -1)
 
-    def exactly(self, size: int) -> bytes:
-        assert self.data is not None
-        while len(self.rest) < size:
-            self.rest += self.data.recv(65536)
-        data, self.rest = self.rest[:size], self.rest[size:]
-        return data
 
-    def quiet(self) -> bool:
-        """Read until no values arrive; return whether there were none."""
-        assert self.data is not None
-        self.data.settimeout(0.3)
-        came, self.rest = bool(self.rest), b""
-        try:
-            while self.data.recv(1 << 20):
-                came = True
-        except TimeoutError:
-            self.data.settimeout(5.0)
-        return not came
-
-
-def connect(url: str) -> socket.socket:
-    host, port = url.removeprefix("tcp://").split(":")
-    return socket.create_connection((host, int(port)), timeout=5.0)
-
-
-@contextmanager
-def simulated(parameters: str = "", name: str = "X1") -> Iterator[Client]:
-    device = SimulatedCapaNCDT(parse_address(f"sim://cframe/{name}?seed=3{parameters}"))
-    client = Client(device)
-    try:
-        yield client
-    finally:
-        client.commands.close()
-        if client.data is not None:
-            client.data.close()
-        device.close()
+def simulated(parameters: str = "", name: str = "X1") -> Client:
+    return Client(SimulatedCapaNCDT(parse_address(f"sim://cframe/{name}?seed=3{parameters}")))
 
 
 # ---------------------------------------------------------------------- commands
@@ -222,7 +176,7 @@ def test_a_mathematical_function_replaces_its_channel_and_may_be_negative() -> N
 
 def test_in_the_trigger_modes_one_frame_is_sent_for_each_request() -> None:
     with simulated("&beams=X1,Y1&left=TRG1") as client:
-        client.data = connect(client.device.urls["data"])
+        client.open_data()
         assert client.quiet()
         counters = []
         for _ in range(3):

@@ -1,6 +1,5 @@
 """The simulated confocalDT 24x1 on its lines: dialogues of the manual, refusals, and blocks."""
 
-import socket
 import struct
 import time
 from collections.abc import Iterator
@@ -8,6 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from data_port_client import DataPortClient
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators import world
@@ -18,81 +18,25 @@ HEADER = struct.Struct("<4sIIIIHHI")
 NO_PEAK = 0x7FFFFFFB
 
 
-class Client:
-    """Two sockets, as opened by a program of the maker."""
-
-    def __init__(self, device: SimulatedConfocal) -> None:
-        self.device = device
-        self.commands = connect(device.url)
-        self.data: socket.socket | None = None
-        self.rest = b""
-
-    def send(self, text: str) -> None:
-        self.commands.sendall(text.encode("latin-1"))
-
+class Client(DataPortClient):
     def answer(self) -> str:
         """Return the text before the next prompt."""
-        data = b""
-        while not data.endswith(b"\r\n->"):
-            data += self.commands.recv(1)
-        return data.decode("latin-1").removesuffix("\r\n->")
+        return self.text(b"\r\n->")
 
     def ask(self, command: str) -> str:
         self.send(command + "\n")
         return self.answer()
 
-    def open_data(self) -> None:
-        if self.data is not None:
-            self.data.close()
-            self.rest = b""
-        self.data = connect(self.device.urls["data"])
-
     def block(self) -> tuple[int, tuple[int, int], np.ndarray]:
         """Return counter, flags and frames of the next block."""
-        assert self.data is not None
         preamble, article, serial, first, second, width, count, counter = HEADER.unpack(self.exactly(HEADER.size))
         assert (preamble, article, serial) == (b"SAEM", 2418004, self.device.serial)
         return counter, (first, second), np.frombuffer(self.exactly(width * count), "<i4").reshape(count, -1)
 
-    def exactly(self, size: int) -> bytes:
-        assert self.data is not None
-        while len(self.rest) < size:
-            piece = self.data.recv(65536)
-            if not piece:
-                raise ConnectionError("closed")
-            self.rest += piece
-        data, self.rest = self.rest[:size], self.rest[size:]
-        return data
 
-    def quiet(self) -> bool:
-        """Read until no values arrive; return whether there were none."""
-        assert self.data is not None
-        self.data.settimeout(0.3)
-        came, self.rest = bool(self.rest), b""
-        try:
-            while self.data.recv(1 << 20):
-                came = True
-        except TimeoutError:
-            self.data.settimeout(5.0)
-        return not came
-
-
-def connect(url: str) -> socket.socket:
-    host, port = url.removeprefix("tcp://").split(":")
-    return socket.create_connection((host, int(port)), timeout=5.0)
-
-
-@contextmanager
-def simulated(parameters: str = "", left: str = "ECHO OFF") -> Iterator[Client]:
-    device = SimulatedConfocal(parse_address(f"sim://cframe/X1?seed=3&left={left.replace(' ', '%20')}{parameters}"))
-    client = Client(device)
-    try:
-        yield client
-    finally:
-        client.commands.close()
-        if client.data is not None:
-            client.data.close()
-        device.close()
+def simulated(parameters: str = "", left: str = "ECHO OFF") -> Client:
+    left = left.replace(" ", "%20")
+    return Client(SimulatedConfocal(parse_address(f"sim://cframe/X1?seed=3&left={left}{parameters}")))
 
 
 @contextmanager

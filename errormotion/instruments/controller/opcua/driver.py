@@ -202,7 +202,7 @@ def _is_child(each: Any) -> bool:
 
 
 def _seconds(time: Any) -> float:
-    """Return a time as s since 1970; NaN if it is none."""
+    """Return a time as s since 1970; NaN if it is invalid."""
     try:
         return datetime.fromisoformat(time).timestamp()
     except (TypeError, ValueError, OverflowError):

@@ -139,7 +139,7 @@ class Shdr(Driver):
         InstrumentTimeoutError
             No answer to ``* PING`` within the time limit.
         ProtocolError
-            A line that is not of the protocol (unless ``lenient``), or a value that is no number.
+            A line that is not of the protocol (unless ``lenient``), or a value that is not a number.
         InstrumentError
             The connection is lost.
         """
@@ -227,7 +227,7 @@ class Shdr(Driver):
                 answered = self._command(found) or answered
             else:
                 for observed in filter(None, map(self._of_device, found)):
-                    self._memory.note(observed)
+                    self._memory.store(observed)
         if wrong and not self.settings.lenient:
             raise ProtocolError(f"{self.address}: {wrong}; set 'lenient' to ignore and count such lines")
         if wrong:
@@ -278,7 +278,7 @@ class Shdr(Driver):
 
     def _forget(self, reason: str) -> None:
         self._lines.clear()
-        self._memory.forget()
+        self._memory.clear()
         self._fresh = True
         if isinstance(self._transport, ReconnectingTransport):
             self._transport.drop(f"The connection to {self.address} was closed: {reason}")
@@ -326,7 +326,7 @@ class Shdr(Driver):
 
     def _start_session(self) -> None:
         self._lines.clear()
-        self._memory.forget()  # of an earlier session
+        self._memory.clear()  # of an earlier session
         self._fresh, self.heartbeat = True, math.inf
         self._update()
 

@@ -30,12 +30,12 @@ class Memory:
         self.conditions: dict[tuple[str, str], Observed] = {}
         self.started = self.newest = math.nan
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Discard values and conditions; the clock continues."""
         self.values.clear()
         self.conditions.clear()
 
-    def note(self, observed: Observed) -> None:
+    def store(self, observed: Observed) -> None:
         """Store a value or condition.
 
         Raises

@@ -45,11 +45,11 @@ class Reply:
     refusal: str = ""
 
     def length(self, index: int) -> float:
-        """Return a value in picometres as m; ProtocolError where there is none."""
+        """Return a value in picometres as m; ProtocolError if it is invalid."""
         return self.quantity(index) * PICOMETRE
 
     def quantity(self, index: int) -> float:
-        """Return a finite number; ProtocolError where there is none."""
+        """Return a finite number; ProtocolError if it is invalid."""
         value = self._value(index)
         if isinstance(value, int | float) and not isinstance(value, bool):
             try:
@@ -61,14 +61,14 @@ class Reply:
         raise ProtocolError(f"Value {index + 1} of a reply: expected a number; found {str(value)[:40]!r}")
 
     def flag(self, index: int) -> bool:
-        """Return true or false; ProtocolError where there is neither."""
+        """Return true or false; ProtocolError if it is neither."""
         value = self._value(index)
         if not isinstance(value, bool):
             raise ProtocolError(f"Value {index + 1} of a reply: expected true or false; found {str(value)[:40]!r}")
         return value
 
     def text(self, index: int) -> str:
-        """Return a text of at most 200 printable characters; ProtocolError where there is none."""
+        """Return a text of at most 200 printable characters; ProtocolError if it is invalid."""
         value = self._value(index)
         if not isinstance(value, str) or len(value) > 200 or not value.isprintable():
             raise ProtocolError(f"Value {index + 1} of a reply: expected a short text; found {str(value)[:40]!r}")

@@ -48,5 +48,5 @@ def is_near(found: Measurement, goal: tuple[float, float, float], radius: float)
 
 
 def reason(status: int) -> str:
-    """Return why there is no measurement."""
+    """Return the reason of a missing measurement."""
     return f"status {status}: {statuses.result_text(status)}"

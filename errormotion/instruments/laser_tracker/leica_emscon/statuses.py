@@ -81,7 +81,7 @@ RESULTS: Mapping[int, str] = {
     10021: "the target recognition has a fault",
 }
 
-#: Statuses without a distance that are no fault of the tracker.
+#: Statuses without a distance that are not faults of the tracker.
 NO_TARGET = frozenset({NO_DISTANCE, NOT_READY, NO_RESULT, SYSTEM_NOT_READY})
 
 #: Messages of a server about itself that were not requested.

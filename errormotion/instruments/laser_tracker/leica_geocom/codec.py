@@ -46,7 +46,7 @@ class Reply:
     values: tuple[str, ...] = ()
 
     def number(self, index: int) -> float:
-        """Return a finite value; ProtocolError if it is none."""
+        """Return a finite value; ProtocolError if it is invalid."""
         text = self._value(index)
         if _HEX.fullmatch(text):
             return float(int(text, 16))
@@ -56,7 +56,7 @@ class Reply:
         return value
 
     def whole(self, index: int) -> int:
-        """Return an integer, also of a byte or in hexadecimal; ProtocolError if it is none."""
+        """Return an integer, also of a byte or in hexadecimal; ProtocolError if it is invalid."""
         text = self._value(index)
         if byte := _BYTE.fullmatch(text):
             return int(byte[1], 16)
@@ -67,7 +67,7 @@ class Reply:
         return int(text)
 
     def text(self, index: int) -> str:
-        """Return a string without its quotation marks; ProtocolError if it is none."""
+        """Return a string without its quotation marks; ProtocolError if it is invalid."""
         text = self._value(index)
         if len(text) < 2 or text[0] != '"' or text[-1] != '"':
             raise ProtocolError(f"Value {index + 1} of a GeoCOM reply: expected a string; found {text[:40]!r}")

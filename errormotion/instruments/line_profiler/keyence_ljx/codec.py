@@ -77,7 +77,7 @@ def request(opcode: int, arguments: bytes = b"", *, generation: str = "LJ-X8000"
 
 
 def parse_request(frame: bytes) -> tuple[int, bytes, str]:
-    """Return opcode, arguments and generation of a request; ProtocolError if it is none."""
+    """Return opcode, arguments and generation of a request; ProtocolError if it is invalid."""
     if len(frame) < REQUEST_HEAD + 4:
         raise ProtocolError(f"A request has at least {REQUEST_HEAD + 4} bytes; found {frame.hex(' ')}")
     length, variant, _, size = struct.unpack_from("<I4sII", frame)

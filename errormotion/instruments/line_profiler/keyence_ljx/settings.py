@@ -12,7 +12,7 @@ from errormotion.plugins import PluginSettings
 
 
 class LJXSettings(PluginSettings):
-    """Settings of one profiler. What is not given remains unchanged in the active program."""
+    """Settings of one profiler. Settings without a value are not changed in the active program."""
 
     program: int | None = Field(default=None, description="program to activate", ge=0, lt=PROGRAMS)
     x_pitch: Length | None = Field(default=None, description="distance between points on the line", gt=0)

@@ -11,7 +11,7 @@ from errormotion.plugins import PluginSettings
 
 
 class ProfileFileSettings(PluginSettings):
-    """Settings of scans in files, for what the files do not state."""
+    """Settings of scans in files: values that the files do not state."""
 
     unit: Literal["m", "mm", "um", "inch"] | None = Field(
         default=None, description="unit of lengths in the files; required, except for NetCDF files, which state it"

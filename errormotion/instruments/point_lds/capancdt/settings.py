@@ -14,7 +14,7 @@ Averaging = Literal["none", "moving", "arithmetic", "median", "dynamic noise rej
 
 
 class CapaSettings(PluginSettings):
-    """Settings of one channel. What is not given remains unchanged in the controller."""
+    """Settings of one channel. Settings without a value are not changed in the controller."""
 
     channel: int = Field(
         default=1, description="channel of the controller to which the sensor is connected", ge=1, le=4

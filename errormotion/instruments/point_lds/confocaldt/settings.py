@@ -10,7 +10,7 @@ from errormotion.plugins import PluginSettings
 
 
 class ConfocalSettings(PluginSettings):
-    """Settings of one controller. What is not given remains unchanged in the controller."""
+    """Settings of one controller. Settings without a value are not changed in the controller."""
 
     measuring_range: Length | None = Field(
         default=None,

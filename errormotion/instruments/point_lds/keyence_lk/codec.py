@@ -6,7 +6,7 @@ eight characters: a sign and seven digits with a decimal point, or one of three 
 not state whether it is in mm or um: this depends on a setting of the controller, its smallest displayed unit.
 
 Formats, modes and errors of the LK-G3000 are from the maker's manual (LK-G-M-NO5-E, pages 5-5 and 5-6), errors of the
-LK-G5000 from clients by others. Facts marked (m) are from memory; each is a single line to correct.
+LK-G5000 from other clients. Facts marked (m) are from memory; each is a single line to correct.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _MEANINGS = (
     (("88",), "timeout in the controller; retry"),
     (("99",), "another error; see the display of the controller"),
 )
-#: Meanings of errors. Codes of the LK-G3000 start at 00 (its manual), of the LK-G5000 at 50 (clients by others).
+#: Meanings of errors. Codes of the LK-G3000 start at 00 (its manual), of the LK-G5000 at 50 (other clients).
 ERRORS: Mapping[str, str] = {code: meaning for codes, meaning in _MEANINGS for code in codes}
 
 
@@ -177,7 +177,7 @@ def parse_answer(request: str, text: str, header: str | None = None) -> str:
 
 
 def error_code(request: str, text: str) -> str | None:
-    """Return the code of an error that answers a request; None if it is no error, or answers another request.
+    """Return the code of an error that answers a request; None if it is not an error, or answers another request.
 
     The error repeats the first word of the request, or the name of the setting after it.
     """

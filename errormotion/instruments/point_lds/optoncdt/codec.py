@@ -1,6 +1,6 @@
 """Values of the optoNCDT on RS422: bytes to values and back.
 
-A value has 18 bits and travels as three bytes, tagged in their upper bits: ``L = 00 D5..D0``, ``M = 01 D11..D6``, ``H =
+A value has 18 bits and is sent as three bytes, tagged in their upper bits: ``L = 00 D5..D0``, ``M = 01 D11..D6``, ``H =
 10 D17..D12`` (1420 p. 84). If a sample has several values, those after the first have ``H = 11 D17..D12``. Distances
 use 16 bits; error values are higher. Answers to commands are ASCII text between the values and end with ``->``. No
 character of a text has the top bit, which every ``H`` has, so that the two can always be distinguished.

@@ -33,7 +33,7 @@ MM, MILLISECONDS = 1e-3, 1e-3
 
 @dataclass(frozen=True)
 class Line:
-    """One printed line: position (m), number of the touch (None where not printed), time (s; NaN where not printed)."""
+    """One printed line: position (m), number of the touch (None if not printed), time (s; NaN if not printed)."""
 
     position: tuple[float, float, float]
     number: int | None = None
@@ -54,7 +54,7 @@ def from_iso_code(raw: bytes) -> bytes:
 
 
 def text_of(raw: bytes) -> str:
-    """Return a line as text, without control characters; empty where nothing is left.
+    """Return a line as text, without control characters; empty if nothing is left.
 
     Raises
     ------

@@ -20,7 +20,7 @@ class DprntSettings(ProbeSettings):
     )
     length_unit: Literal["mm", "in"] = Field(default="mm", description="unit of printed positions")
     time_unit: Literal["ms", "s"] = Field(default="ms", description="unit of printed times")
-    first_number: int = Field(default=1, description="number of the first touch, where touches are numbered", ge=0)
+    first_number: int = Field(default=1, description="number of the first touch, if touches are numbered", ge=0)
     margin: Length = Field(default=1e-3, description="largest distance of a position from the path of its touch", gt=0)
     free: Length = Field(default=0.2e-3, description="first part of a path, in which a trip counts as false", ge=0)
     at_target: Length = Field(

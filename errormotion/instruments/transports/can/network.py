@@ -97,7 +97,7 @@ class Network:
             self._note_sent(MARK)
 
     def close(self) -> None:
-        """Leave the bus; idempotent."""
+        """Close the connection to the bus; idempotent."""
         self._stopped.set()
         self._thread.join()
         self._end()

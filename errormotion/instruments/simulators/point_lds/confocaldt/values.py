@@ -45,7 +45,7 @@ def raw_values(distances: Array, measuring_range: float, offset: float = 0.0) ->
 
 
 def states(distances: Array, measuring_range: float) -> Array:
-    """Return error states: bit 2 no peak, 5 before, 6 behind the range."""
+    """Return error states: bit 2 no peak, 5 before, 6 beyond the range."""
     missing = np.isnan(distances).astype(np.int64)
     before = (distances < 0.0).astype(np.int64)
     behind = (distances > measuring_range).astype(np.int64)

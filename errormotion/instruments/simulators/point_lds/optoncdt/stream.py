@@ -114,7 +114,7 @@ class SensorStream:
     sync : str
         NONE, MASTER or SLAVE.
     output : Output
-        What is sent.
+        Of the stream.
     counters : Counters
         Of the sensor.
     """
