@@ -1,4 +1,4 @@
-"""The last check of an order before it reaches a machine: armed, finite, within the limits of the bench."""
+"""The last check of a command to a machine: the driver is armed, the numbers are finite and within the limits."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class ArmedSettings(PluginSettings):
     """Settings of an instrument that can move or change a machine."""
 
     arm: bool = Field(
-        default=False, description="whether the driver may move and change the machine; without it, it only reads"
+        default=False, description="whether the driver may move and change the machine; if not, it only reads"
     )
 
 
 class Door:
-    """Checks each order of a driver.
+    """Checks each command of a driver.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class Door:
     Attributes
     ----------
     limits : MachineLimits
-        Those of the bench; none at first.
+        The limits of the bench; initially none.
     """
 
     def __init__(self, name: str, address: str) -> None:
@@ -45,56 +45,58 @@ class Door:
         self.limits = MachineLimits()
 
     def admit(self, arm: bool, what: str) -> None:
-        """Refuse an order unless the driver is armed; log the first one.
+        """Refuse a command unless the driver is armed; log the first one.
 
         Raises
         ------
         InstrumentError
-            It is not armed, or nothing may move.
+            The driver is not armed, or the bench forbids motion.
         """
         what = " ".join(what.split())[:200]
         if not arm:
             raise InstrumentError(
-                f"{self._where} only reads, and this order changes the machine: {what}. Nothing was sent. Set "
-                "arm = true for the instrument in the bench file (arm=True in its settings) if it may"
+                f"{self._where} only reads, and this command changes the machine: {what}. Nothing was sent. To permit "
+                "it, set arm = true for the instrument in the bench file (arm=True in its settings)"
             )
         if self.limits.forbidden:
             raise InstrumentError(f"{self._where}: {what}: refused, since {self.limits.forbidden}. Nothing was sent")
         if not self._announced:
             self._announced = True
-            log.info("%s is armed (%s); its first order: %s", self._where, self.limits, what)
+            log.info("%s is armed (%s); its first command: %s", self._where, self.limits, what)
 
-    def position(self, place: Sequence[float], what: str = "position") -> list[float]:
+    def position(self, point: Sequence[float], what: str = "position") -> list[float]:
         """Return X, Y, Z, m; InstrumentError unless they are finite and within the limits."""
         try:
-            found = [float(x) for x in place]
+            found = [float(x) for x in point]
         except (TypeError, ValueError, OverflowError):
             found = []
         if len(found) != 3 or not all(map(math.isfinite, found)):
-            raise InstrumentError(f"{self._where}: expected a {what} of three finite numbers X, Y, Z; found {place!r}")
+            raise InstrumentError(f"{self._where}: expected a {what} of three finite numbers X, Y, Z; found {point!r}")
         for axis, x in zip("XYZ", found, strict=True):
             self.coordinate(axis, x)
         return found
 
-    def extent(self, way: Sequence[float], what: str) -> None:
-        """Raise InstrumentError unless a way, (3,) m, is finite and no longer than the distance of the limits."""
-        if len(way) != 3 or not all(map(math.isfinite, way)):
-            raise InstrumentError(f"{self._where}: expected {what} of three finite numbers X, Y, Z; found {way!r}")
-        for axis, x in zip("XYZ", way, strict=True):
+    def extent(self, displacement: Sequence[float], what: str) -> None:
+        """Raise InstrumentError unless a displacement, (3,) m, is finite and fits between the limits of each axis."""
+        if len(displacement) != 3 or not all(map(math.isfinite, displacement)):
+            raise InstrumentError(
+                f"{self._where}: expected {what} of three finite numbers X, Y, Z; found {displacement!r}"
+            )
+        for axis, x in zip("XYZ", displacement, strict=True):
             span = self.limits.spans.get(axis)
             if span is not None and abs(x) > span[1] - span[0] + _ROUNDING:
                 raise InstrumentError(
-                    f"{self._where}: {axis} would go {1e3 * abs(x):.6g} mm; the limits of the bench are "
+                    f"{self._where}: {axis} would move by {1e3 * abs(x):.6g} mm; the limits of the bench are "
                     f"{1e3 * (span[1] - span[0]):.6g} mm apart. Nothing was sent"
                 )
 
     def coordinate(self, axis: str, x: float) -> None:
-        """Raise InstrumentError where the coordinate of an axis, m, is outside of the limits."""
+        """Raise InstrumentError if the coordinate of an axis, m, is outside the limits."""
         span = self.limits.spans.get(axis)
         if not math.isfinite(x) or (span is not None and not span[0] - _ROUNDING <= x <= span[1] + _ROUNDING):
             low, high = (1e3 * each for each in span or (-math.inf, math.inf))
             raise InstrumentError(
-                f"{self._where}: {axis} would go to {1e3 * x:.6g} mm; the limits of the bench are {low:.6g} and "
+                f"{self._where}: {axis} would move to {1e3 * x:.6g} mm; the limits of the bench are {low:.6g} and "
                 f"{high:.6g} mm. Nothing was sent"
             )
 

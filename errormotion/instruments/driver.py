@@ -1,4 +1,4 @@
-"""Base of drivers: settings, opening and closing, an error for use before opening, requests and their answers."""
+"""Bases of drivers: opening and closing, settings, requests and their answers."""
 
 from __future__ import annotations
 
@@ -15,12 +15,36 @@ from errormotion.instruments.transports.quiet import await_quiet, discard_input
 from errormotion.plugins import InstrumentInfo, PluginSettings
 
 
-class Driver:
+class Openable:
+    """Base of what is opened and closed, also by a ``with`` block."""
+
+    def open(self) -> None:
+        """Open; idempotent."""
+
+    def close(self) -> None:
+        """Close; idempotent."""
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+            return
+        with suppress(InstrumentError):  # the first error states the cause
+            self.close()
+
+
+class Driver(Openable):
     """Base of drivers with one transport.
 
     A subclass has ``info`` and ``Settings``, starts the device in ``_start_session``, stops it in ``_end_session``, and
     sends each request, and reads its answer, within ``with self.exchange() as line:``. A driver of a device that sends
-    without requests uses ``self.transport``. Settings called ``timeout`` (s) and ``baudrate`` apply to the transport.
+    data without requests uses ``self.transport``. Settings called ``timeout`` (s) and ``baudrate`` apply to the
+    transport.
 
     Parameters
     ----------
@@ -80,27 +104,14 @@ class Driver:
             transport, self._transport = self._transport, None
             transport.close()
 
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.close()
-            return
-        with suppress(InstrumentError):  # the first error states the cause
-            self.close()
-
     @contextmanager
     def exchange(self) -> Iterator[Transport]:
-        """Give the transport for one request and its answer: the first bytes that are read belong to this request.
+        """Yield the transport for one request and its answer: the first bytes that are read belong to this request.
 
-        Unread bytes are discarded ahead of the request. If the previous exchange ended with an error, its answer may
-        still arrive, or its rest: `resynchronise` is called first. An answer is therefore checked and decoded within
-        the block, so that a wrong one is known as an error of this exchange. A refusal is an answer as well: its error
-        is raised after the block, and the next request need not wait.
+        Unread bytes are discarded before the request. If the previous exchange ended with an error, its answer or a
+        part of it may still arrive: `resynchronise` is called first. Check and decode an answer within the block, so
+        that a wrong answer counts as an error of this exchange. A refusal is a complete answer: raise its error after
+        the block, so that the next request is sent without a wait.
 
         Raises
         ------
@@ -120,14 +131,14 @@ class Driver:
         self._failed_at = None
 
     def resynchronise(self) -> None:
-        """Make sure, after a failed exchange, that no answer to an earlier request is read as the next one.
+        """Ensure, after a failed exchange, that no answer to an earlier request is read as the next one.
 
-        Everything is discarded until nothing has arrived for a time limit since the failure. If an answer was missing
+        All input is discarded until nothing has arrived for one time limit since the failure. If an answer was missing
         and has not arrived by then, a TCP connection is opened again: the answer is lost with the old one.
 
-        An answer that is later still, on a serial line or through a serial server, would be read as the next one. A
-        driver whose answers have no number overrides this method where the protocol has a request with an answer of
-        its own form: it calls ``super().resynchronise()``, sends this request, and reads until its answer.
+        On a serial line or through a serial server, an answer that arrives even later would be read as the next one. A
+        driver whose answers have no number overrides this method if the protocol has a request whose answer has a
+        unique form: it calls ``super().resynchronise()``, sends this request, and reads until its answer.
 
         Raises
         ------

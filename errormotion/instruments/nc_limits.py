@@ -1,10 +1,10 @@
-"""Limits of an NC program (ISO 6983), read line by line; a block that may leave them is refused.
+"""Check of an NC program (ISO 6983) against the limits, line by line; a block that may exceed them is refused.
 
-Understood are straight moves in absolute machine coordinates and mm: G0, G1, G31, G38.2 to G38.5 with X, Y, Z and F,
-G4 on a line of its own, G17, G21, G40, G49, G53, G80, G90, G94, M0 to M9, M30, S, T, comments, and the printing of
-positions. A program states its units, G1 and its feed before it depends on them; what a control keeps from before is
-unknown. Arcs, incremental moves, inches, offsets, variables, macros and subprograms are not understood: where they lead
-is known to the control.
+The check understands straight moves in absolute machine coordinates and mm: G0, G1, G31, G38.2 to G38.5 with X, Y, Z
+and F, G4 alone on a line, G17, G21, G40, G49, G53, G80, G90, G94, M0 to M9, M30, S, T, comments, and the printing of
+positions. A program must state its units, G1 and its feed before it depends on them; the modes that a control keeps
+from earlier programs are unknown. Arcs, incremental moves, inches, offsets, variables, macros and subprograms are
+refused: only the control knows their path.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _MM, _MM_MIN = 1e-3, 1e-3 / 60  # m, m/s
 
 
 def check_program(text: str, door: Door) -> None:
-    """Hold a program to the limits of a door.
+    """Check that a program stays within the limits of the bench.
 
     Raises
     ------
     InstrumentError
-        A line leaves the limits, or it is unknown where it leads; with its number. Without limits only the length is
+        A line exceeds the limits, or its path is unknown; the message has its number. Without limits only the length is
         checked.
     """
     if len(text) > MOST_CHARACTERS:
@@ -68,12 +68,12 @@ def _check_line(plain: str, door: Door, stated: set[str]) -> None:
             raise _unknown(code)
         if letter not in "GMNXYZFSTP" or (letter == "P" and not dwell):
             raise _unknown(f"{letter}{value}")
-    if dwell:  # a control may move as well where other words stand beside a dwell
+    if dwell:  # a control may also move if a dwell has other words beside it
         if sorted(letter for letter, _ in words if letter != "N") not in (["G", "P"], ["G", "X"]):
-            raise InstrumentError("a dwell with other words beside it; write G4 P on a line of its own")
+            raise InstrumentError("a dwell with other words beside it; write G4 P alone on a line")
         return
     if door.limits.feed is not None and "G0" in codes:
-        raise InstrumentError("a rapid move, whose feed is that of the machine; write G1 with a feed within the limit")
+        raise InstrumentError("a rapid move at the feed of the machine; write G1 with a feed within the limit")
     if door.limits.feed is not None and any(letter == "F" for letter, _ in words) and not {"G21", "G94"} <= stated:
         raise InstrumentError("a feed F before a line with G21 and G94; whether it is within the limit is unknown")
     stated |= {letter for letter, _ in words if letter in "FS"} | {code for code in codes if code[0] == "G"}
@@ -84,7 +84,7 @@ def _check_line(plain: str, door: Door, stated: set[str]) -> None:
             if not {"G21", "G90"} <= stated:
                 raise InstrumentError("a position before G21 and G90; whether it is within the limits is unknown")
             if not _STRAIGHT & codes and not {"G0", "G1"} & stated:
-                raise InstrumentError("a position before G0 or G1; along which line the machine moves is unknown")
+                raise InstrumentError("a position before G0 or G1; the path of the machine is unknown")
             if door.limits.feed is not None and "F" not in stated:
                 raise InstrumentError("a move before a feed F; whether it is within the limit is unknown")
             door.coordinate(letter, float(value) * _MM)

@@ -49,7 +49,7 @@ class Chunk:
 
 
 class Decoder(Protocol):
-    """Turns bytes, however they are split, into gapless samples."""
+    """Converts bytes, however they are split, to samples without gaps."""
 
     def __call__(self, data: bytes) -> Chunk:
         """Return the samples that the next bytes complete."""
@@ -96,7 +96,7 @@ class Reader:
         self._text = b""
         self._reply: bytes | None = None
         self._listening = False
-        self._final = False  # the next answer is the last thing to be read
+        self._final = False  # nothing is read after the next answer
         self._error: InstrumentError | None = None
         self._draining = False
         self._ended = False
@@ -196,7 +196,7 @@ class Reader:
     def finish(self, quiet: float, timeout: float) -> InstrumentError | None:
         """Discard further samples until the stream ends or no data have arrived for ``quiet`` s; end the thread.
 
-        Returns the error that ended the thread, None where the device stopped sending.
+        Returns the error that ended the thread, None if the device stopped sending.
 
         Raises
         ------

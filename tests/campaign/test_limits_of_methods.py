@@ -201,7 +201,7 @@ def test_a_motion_that_the_method_did_not_state_is_prevented(write: Write, tmp_p
     path = write(METHOD + WRONG, limited(BENCH))
     with plugins.get("instruments", "virtual_controller")("sim://cframe/c?seed=77") as watching:
         before = watching.state()["position"]
-        with pytest.raises(RunError, match=r"X would go to 100 mm; the limits of the bench are 0.4 and 1.4 mm"):
+        with pytest.raises(RunError, match=r"X would move to 100 mm; the limits of the bench are 0.4 and 1.4 mm"):
             runner.run(load_campaign(path), runs=tmp_path / "runs")
         assert watching.state()["position"] == before
 

@@ -187,7 +187,7 @@ def test_a_note_replaces_an_earlier_one(folder: Path) -> None:
         (["record", "bench.toml", "sensor"], "expected one of the instruments air, dead"),
         (["record", "bench.toml", "air", "--for", "2 h"], "at most 3600 s"),
         (["record", "bench.toml", "air", "--for", "soon"], "--for"),
-        (["record", "bench.toml", "air", "--out", "bench.toml"], "exists already"),
+        (["record", "bench.toml", "air", "--out", "bench.toml"], "exists"),
         (["replay", "bench.toml"], "states no instrument"),
         (["replay", "none.rec"], "cannot be read"),
     ],

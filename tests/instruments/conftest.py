@@ -1,4 +1,4 @@
-"""Every test leaves as it came: no simulated world, no thread, no socket."""
+"""Every test leaves no simulated world, no thread and no socket open."""
 
 import os
 import threading

@@ -1,6 +1,6 @@
-"""Every driver that can move or change a machine: it only reads unless it is armed, and holds limits for each order.
+"""Every driver that can move or change a machine: it only reads unless armed, and checks limits for each command.
 
-The drivers follow from the contracts of their kinds: one that is added is tried here without a line of its own.
+The drivers follow from the contracts of their kinds; a new one is tested here automatically.
 """
 
 import inspect
@@ -54,7 +54,7 @@ class Wire:
 
 
 def driver_of(plugin_id: str, **settings: Any) -> Any:
-    """Return a driver that thinks it is open."""
+    """Return a driver that is marked as open."""
     cls = plugins.get("instruments", plugin_id)
     driver = cls("sim://cframe/x", cls.Settings(**settings))
     for name in ("_transport", "_control"):
@@ -64,7 +64,7 @@ def driver_of(plugin_id: str, **settings: Any) -> Any:
 
 
 def orders(driver: Any) -> list[str]:
-    """Return the public methods of a driver that may send an order."""
+    """Return the public methods of a driver that may send a command."""
     return [
         name
         for name, _ in inspect.getmembers(type(driver), inspect.isfunction)
@@ -85,7 +85,7 @@ def call(driver: Any, name: str, **changed: Any) -> None:
 
 
 def test_these_drivers_can_change_a_machine() -> None:
-    """A new driver appears here by what it can do."""
+    """A new driver is listed here by its capabilities."""
     assert sorted(DRIVERS) == ["controller_probe", "linuxcnc", "virtual_controller"]
     assert kind_changes_machine("controller")
     assert not kind_changes_machine("thermometer")
@@ -102,15 +102,15 @@ def test_by_default_it_only_reads(plugin_id: str) -> None:
 
 
 @pytest.mark.parametrize("plugin_id", DRIVERS)
-def test_it_sends_an_order_once_armed(plugin_id: str) -> None:
-    """The other half of the test above: there it is the setting that holds the orders back."""
+def test_it_sends_a_command_once_armed(plugin_id: str) -> None:
+    """Counterpart of the test above: only the setting prevents the commands."""
     for name in orders(driver_of(plugin_id)):
         with pytest.raises(AssertionError, match="something was sent"):
             call(driver_of(plugin_id, arm=True), name)
 
 
 @pytest.mark.parametrize("plugin_id", DRIVERS)
-def test_its_methods_are_those_of_its_kind_or_orders(plugin_id: str) -> None:
+def test_its_methods_are_those_of_its_kind_or_commands(plugin_id: str) -> None:
     driver = driver_of(plugin_id)
     assert not deviations(driver, kind(driver.info.kind))
     known = {*orders(driver), *READING, *ALWAYS}
@@ -128,7 +128,7 @@ MOVES = ("move_to", "probe", "spindle", "run_program", "run_steps", "start", "fo
     ("plugin_id", "name"),
     [(each, name) for each in DRIVERS for name in MOVES if hasattr(plugins.get("instruments", each), name)],
 )
-def test_each_order_is_held_to_the_limits(plugin_id: str, name: str) -> None:
+def test_each_command_is_checked_against_the_limits(plugin_id: str, name: str) -> None:
     driver = driver_of(plugin_id, arm=True)
     driver.bound(TIGHT)
     with pytest.raises(InstrumentError, match="limit"):
@@ -137,7 +137,7 @@ def test_each_order_is_held_to_the_limits(plugin_id: str, name: str) -> None:
 
 @pytest.mark.parametrize("plugin_id", sorted(set(DRIVERS) - {"controller_probe"}))
 @pytest.mark.parametrize("value", WRONG, ids=str)
-def test_numbers_that_are_none_are_refused_without_limits_as_well(plugin_id: str, value: Any) -> None:
+def test_nan_and_infinity_are_refused_without_limits_as_well(plugin_id: str, value: Any) -> None:
     driver = driver_of(plugin_id, arm=True)
     refused = [("move_to", {"position": [0.0, 0.0, value]}), ("move_to", {"feed": value}), ("probe", {"feed": value})]
     refused += [("probe", {"target": [value, 0.0, 0.0]}), ("spindle", {"speed": value})]
@@ -185,8 +185,8 @@ def test_a_program_within_the_limits_is_accepted(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("G90 G94 G21\nG1 X100.1 F100\n", "line 2 .*X would go to 100.1 mm"),
-        ("G90 G94 G21\nG1 X-1 F100\n", "X would go to -1 mm"),
+        ("G90 G94 G21\nG1 X100.1 F100\n", "line 2 .*X would move to 100.1 mm"),
+        ("G90 G94 G21\nG1 X-1 F100\n", "X would move to -1 mm"),
         ("G90 G94 G21\nG1 X1 F1201\n", "feed would be 1201 mm/min"),
         ("G90 G94 G21\nG1 X1 F0\n", "finite feed above 0"),
         ("G90 G94 G21\nG1 X1\n", "a move before a feed"),
@@ -221,23 +221,23 @@ def test_a_program_within_the_limits_is_accepted(text: str) -> None:
         ("G90 G94 G21\nG1 A1 F100\n", "'A1'"),
     ],
 )
-def test_a_program_that_leaves_them_or_cannot_be_told_is_refused(text: str, said: str) -> None:
+def test_a_program_outside_the_limits_or_of_unknown_path_is_refused(text: str, said: str) -> None:
     with pytest.raises(InstrumentError, match=said):
         check_program(text, door())
     check_program(text, door(MachineLimits()))  # without limits the control decides
 
 
-def test_the_first_order_is_stated_before_it_is_sent(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_first_command_is_stated_before_it_is_sent(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     here = door()
     here.admit(True, "move to X 1")
     here.admit(True, "move to X 2")
     (record,) = caplog.records
     assert "test at here is armed (X 0 to 100 mm, feed up to 1200 mm/min, spindle up to 1000 /min)" in record.message
-    assert "its first order: move to X 1" in record.message
+    assert "its first command: move to X 1" in record.message
 
 
-def test_a_capability_that_changes_a_machine_is_seen_without_an_id() -> None:
+def test_a_capability_that_changes_a_machine_is_detected_without_an_id() -> None:
     class Foreign:
         info = InstrumentInfo("foreign", "controller", "a control", "simulated_only")
         Settings = PluginSettings

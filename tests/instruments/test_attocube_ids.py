@@ -15,7 +15,7 @@ ONE = IdsSettings(timeout=0.7)
 
 
 class TestKit(InstrumentConformance):
-    """Three beams and an angle; nobody at a port."""
+    """Three beams and an angle; a port without a server."""
 
     subject = InstrumentSubject(
         AttocubeIds,
@@ -56,7 +56,7 @@ def test_two_parallel_beams_give_an_angle() -> None:
     assert ids.channels["yaw"] == "rad"
 
 
-def test_an_idle_device_is_started_and_one_that_is_aligned_is_left_alone() -> None:
+def test_an_idle_device_is_started_and_an_aligned_one_is_unchanged() -> None:
     with AttocubeIds("sim://cframe/ids?seed=3&init=0.05", ONE) as ids:
         assert math.isfinite(ids.read()["axis1"])
     with pytest.raises(InstrumentError, match="set 'start = true'"):
@@ -72,7 +72,7 @@ def test_an_idle_device_is_started_and_one_that_is_aligned_is_left_alone() -> No
 def test_another_pass_mode_is_refused() -> None:
     with AttocubeIds(f"{QUIET}&passes=2", ONE.model_copy(update={"passes": "dual"})) as ids:
         assert ids.identify().details["passes"] == "dual"
-    with pytest.raises(InstrumentError, match="expected a device that is set to single pass"):
+    with pytest.raises(InstrumentError, match="expected a device in single pass mode"):
         AttocubeIds(f"{QUIET}&passes=2", ONE.model_copy(update={"passes": "single"})).open()
 
 
@@ -98,12 +98,12 @@ def test_a_broken_beam_has_no_value_until_the_next_zero(after_break: str) -> Non
 def test_no_zero_while_a_beam_is_broken() -> None:
     with (
         AttocubeIds(f"{QUIET}&fault=beam_broken", ONE.model_copy(update={"after_break": "clear"})) as ids,
-        pytest.raises(InstrumentError, match="no zero while a beam is broken: axis1"),
+        pytest.raises(InstrumentError, match="zero cannot be set while a beam is broken: axis1"),
     ):
         ids.zero()
 
 
-def test_a_broken_beam_that_is_not_used_does_no_harm() -> None:
+def test_a_broken_beam_that_is_not_used_has_no_effect() -> None:
     with AttocubeIds(f"{QUIET}&fault=beam_broken&broken=3", ONE) as ids:
         assert math.isfinite(ids.read()["axis1"])
 
@@ -136,7 +136,10 @@ def test_an_interface_without_error_numbers_is_named() -> None:
         ({"axes": (0,)}, "from 1 to 3"),
         ({"axes": (1, 1)}, "each once"),
         ({"axes": (1,), "angles": {"yaw": {"plus": 1, "minus": 2, "base": 0.1}}}, "expected two of the axes 1"),
-        ({"axes": (1, 2), "angles": {"axis1": {"plus": 1, "minus": 2, "base": 0.1}}}, "name of an axis"),
+        (
+            {"axes": (1, 2), "angles": {"axis1": {"plus": 1, "minus": 2, "base": 0.1}}},
+            "another name than that of an axis",
+        ),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(wrong: dict[str, object], text: str) -> None:

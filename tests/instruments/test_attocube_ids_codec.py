@@ -58,7 +58,7 @@ def test_the_maker_takes_null_for_no_error() -> None:
         b'{"jsonrpc":"2.0","id":1,"result":[0]}{"jsonrpc":"2.0","id":2,"result":[0]}',
     ],
 )
-def test_what_is_no_reply_is_an_error(line: bytes) -> None:
+def test_invalid_replies_are_an_error(line: bytes) -> None:
     with pytest.raises(ProtocolError):
         codec.reply(line)
 

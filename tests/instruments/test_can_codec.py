@@ -1,4 +1,4 @@
-"""SDO and PDO frames, values, units and states of CANopen thermometers: documents' bytes, and any bytes."""
+"""SDO and PDO frames, values, units and states of CANopen thermometers: documented bytes, and any bytes."""
 
 import math
 import struct
@@ -86,12 +86,12 @@ def test_mappings_of_documents(vector: Vector) -> None:
 
 
 @given(st.floats(width=32, allow_nan=False))
-def test_floats_come_back(value: float) -> None:
+def test_floats_round_trip(value: float) -> None:
     assert NUMBERS["float"].decode(struct.pack("<f", value)) == value
 
 
 @given(st.integers(-(2**31), 2**31 - 1), st.integers(0, MOST_DIGITS))
-def test_whole_numbers_come_back_with_their_digits(value: int, digits: int) -> None:
+def test_integers_round_trip_with_their_digits(value: int, digits: int) -> None:
     number = NUMBERS["integer 32"].decode(struct.pack("<i", value))
     assert scale_of(CELSIUS, digits).celsius(number) == float(f"{value}e-{digits}")
 

@@ -47,7 +47,7 @@ def test_reads_a_node_in_its_own_units(status: bool) -> None:
         assert thermometer.flags == {"air": "", "bed": ""}
 
 
-def test_a_long_name_comes_in_segments() -> None:
+def test_a_long_name_is_received_in_segments() -> None:
     name = "Thermometer with four inputs, CiA 404"
     entries = two_inputs() | {(0x1008, 0): (datatypes.VISIBLE_STRING, name)}
     with a_node(entries) as (address, _), CanTemperature(address, TWO) as thermometer:
@@ -95,7 +95,7 @@ def test_a_status_without_subindices_is_that_of_all_inputs(status: int, flag: st
         assert thermometer.flags == {"air": flag, "bed": flag}
 
 
-def test_the_number_of_states_is_no_status() -> None:
+def test_the_number_of_states_is_not_a_status() -> None:
     entries = {key: value for key, value in two_inputs().items() if key != (0x6150, 2)} | {(0x6150, 0): (U8, 1)}
     with a_node(entries) as (address, _), CanTemperature(address, TWO) as thermometer:
         thermometer.read()
@@ -103,7 +103,7 @@ def test_the_number_of_states_is_no_status() -> None:
 
 
 @pytest.mark.parametrize(("index", "kind"), [(0x7130, I16), (0x9130, I32)])
-def test_whole_numbers_have_their_decimal_digits(index: int, kind: int) -> None:
+def test_integers_have_their_decimal_digits(index: int, kind: int) -> None:
     entries = a_device() | {
         (0x6131, 1): (U32, CELSIUS),
         (0x6131, 2): (U32, CELSIUS),
@@ -116,7 +116,7 @@ def test_whole_numbers_have_their_decimal_digits(index: int, kind: int) -> None:
         assert thermometer.read() == {"air": 20.31, "bed": -5.7}
 
 
-def test_whole_numbers_without_digits_need_them_in_the_settings() -> None:
+def test_integers_without_digits_need_them_in_the_settings() -> None:
     entries = a_device() | {(0x6131, 1): (U32, CELSIUS), (0x7130, 1): (I16, 2031)}
     with a_node(entries) as (address, _):
         with pytest.raises(
@@ -138,7 +138,7 @@ def test_objects_without_subindices_are_the_first_input() -> None:
         assert thermometer.read() == {"air": 20.31}
 
 
-def test_the_form_of_the_values_can_be_chosen() -> None:
+def test_the_form_of_the_values_can_be_set() -> None:
     entries = two_inputs() | {(0x9130, i): (I32, 200 + i) for i in (1, 2)} | {(0x6132, i): (U8, 1) for i in (1, 2)}
     with a_node(entries) as (address, _):
         with CanTemperature(address, TWO) as thermometer:
@@ -149,7 +149,7 @@ def test_the_form_of_the_values_can_be_chosen() -> None:
             CanTemperature(address, TWO.model_copy(update={"number": "integer 16"})).open()
 
 
-def test_an_input_without_a_value_is_nan_and_the_others_go_on() -> None:
+def test_an_input_without_a_value_is_nan_and_the_others_continue() -> None:
     with (
         a_node(two_inputs(second=SdoAbortedError(0x06060000))) as (address, _),
         CanTemperature(address, TWO) as thermometer,
@@ -213,7 +213,7 @@ def test_an_emergency_message_is_kept_until_it_is_over() -> None:
         await_that(lambda: thermometer.emergency == 0)
 
 
-def test_a_node_that_boots_is_read_and_started_anew() -> None:
+def test_a_node_that_boots_is_read_and_started_again() -> None:
     entries = two_inputs()
     settings = TWO.model_copy(update={"start": True})
     with a_node(entries) as (address, local), CanTemperature(address, settings) as thermometer:
@@ -239,7 +239,7 @@ def test_a_node_that_boots_is_read_and_started_anew() -> None:
         (f"{ADDRESS}&sensors=coffee", "found coffee"),
     ],
 )
-def test_a_wrong_address_says_what_is_expected(address: str, message: str) -> None:
+def test_the_message_for_a_wrong_address_states_the_expected_form(address: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):
         CanTemperature(address, QUICK).open()
 
@@ -325,7 +325,7 @@ PLAIN = f"{ADDRESS}&pdo=none"
 
 @pytest.fixture(scope="module")
 def before(tmp_path_factory: pytest.TempPathFactory) -> int:
-    """Return the number of SDO answers until the first reading is over."""
+    """Return the number of SDO answers up to the end of the first reading."""
     path = tmp_path_factory.mktemp("can") / "first.rec"
     with CanTemperature(f"{PLAIN}&heartbeat=0", QUICK, record=path) as thermometer:
         thermometer.read()
@@ -348,7 +348,7 @@ def before(tmp_path_factory: pytest.TempPathFactory) -> int:
         ("abort&code=0x08000000", SdoRefusal, "0x6130:1 is refused: Code 0x08000000, General error"),
     ],
 )
-def test_each_fault_is_a_state_of_its_own(fault: str, error: type[InstrumentError], message: str, before: int) -> None:
+def test_each_fault_has_its_own_state(fault: str, error: type[InstrumentError], message: str, before: int) -> None:
     at = f"&fault={fault}&fault_at={before}&heartbeat=0.02"
     with CanTemperature(PLAIN + at, QUICK) as thermometer:
         await_state(thermometer, "OPERATIONAL")
@@ -371,7 +371,7 @@ def test_a_stopped_node_reports_it_in_its_heartbeat(before: int) -> None:
 
 
 @pytest.mark.parametrize("fault", ["unplugged", "bus_off"])
-def test_a_node_that_was_away_is_read_again_by_itself(fault: str, before: int) -> None:
+def test_an_absent_node_is_read_again_automatically(fault: str, before: int) -> None:
     at = f"&fault={fault}&fault_at={before}&unplugged_for=1.6"
     with CanTemperature(PLAIN + at, QUICK) as thermometer:
         first = thermometer.read()
@@ -388,7 +388,7 @@ def test_a_node_that_was_away_is_read_again_by_itself(fault: str, before: int) -
         assert set(thermometer.flags.values()) == {""}
 
 
-def test_a_controller_that_is_bus_off_is_tried_again_at_a_limited_rate(before: int) -> None:
+def test_a_controller_that_is_bus_off_is_retried_at_a_limited_rate(before: int) -> None:
     settings = QUICK.model_copy(update={"retry": 60.0})
     with CanTemperature(f"{PLAIN}&fault=bus_off&fault_at={before}", settings) as thermometer:
         thermometer.read()
@@ -414,7 +414,7 @@ def test_a_recorded_session_plays_back(tmp_path: Path) -> None:
         assert thermometer.node.node == 5
 
 
-def test_a_recorded_session_that_goes_on_is_an_error(tmp_path: Path) -> None:
+def test_a_recorded_session_with_excess_data_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "can.rec"
     with CanTemperature(ADDRESS, QUICK, record=path) as thermometer:
         thermometer.read()

@@ -44,7 +44,7 @@ def test_pdos_of_a_timer_are_received() -> None:
         assert asked == []
 
 
-def test_pdos_at_sync_are_asked_for_where_that_is_set() -> None:
+def test_pdos_at_sync_are_requested_if_so_set() -> None:
     entries = two_inputs(second_status=1)
     sent(entries, 0, [0x61300120, 0x61500108], transmission=1)
     sent(entries, 1, [0x61500208, 0x61300220], transmission=3)
@@ -79,7 +79,7 @@ def test_sync_of_another_participant_is_waited_for() -> None:
         master.shutdown()
 
 
-def test_what_is_not_sent_is_read_by_sdo() -> None:
+def test_values_without_a_pdo_are_read_by_sdo() -> None:
     entries = two_inputs(second_status=2)
     sent(entries, 0, [0x61300120], transmission=1)
     sent(entries, 1, [0x61300220], transmission=255)  # by event alone
@@ -176,7 +176,7 @@ def test_pdos_need_a_node_that_is_operational() -> None:
 
 
 class TestNodeThatSends(InstrumentConformance):
-    """The conformance kit on values by PDO; nobody on the bus."""
+    """The conformance kit on values by PDO; a bus without a device."""
 
     subject = InstrumentSubject(
         CanTemperature,

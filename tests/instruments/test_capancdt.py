@@ -1,4 +1,4 @@
-"""The driver of the capaNCDT 6200 at the wire, with a controller that answers from a table."""
+"""The driver of the capaNCDT 6200, with a scripted controller."""
 
 import itertools
 import math
@@ -35,7 +35,7 @@ def sensor(controller: ScriptedController, **settings: Any) -> CapaNCDT:
     return CapaNCDT(controller.address, CapaSettings(**{"timeout": 1.5, **settings}))
 
 
-def test_opening_asks_for_what_the_controller_has(controller: ScriptedController) -> None:
+def test_opening_queries_the_configuration_of_the_controller(controller: ScriptedController) -> None:
     with sensor(controller) as capa:
         assert capa.measuring_range == pytest.approx((0.0, 2e-3))
         assert capa.mid_range == pytest.approx(1e-3)
@@ -72,8 +72,8 @@ def test_a_channel_has_its_own_range(controller: ScriptedController) -> None:
 @pytest.mark.parametrize(
     ("answers", "settings", "message"),
     [
-        ({}, {"channel": 3}, "expected a sensor at channel 3; it is not there"),
-        ({"CHS": "1"}, {"channel": 2}, "not there"),
+        ({}, {"channel": 3}, "expected a sensor at channel 3; found none"),
+        ({"CHS": "1"}, {"channel": 2}, "found none"),
         ({"CHS": "2,1"}, {}, "mathematical function"),
         ({}, {"measuring_range": 0.2e-3}, "states 2 mm"),
         ({"CHI1": ":NAMx,RNG5,UNTinch"}, {}, "range in 'inch'"),
@@ -81,7 +81,7 @@ def test_a_channel_has_its_own_range(controller: ScriptedController) -> None:
         ({"TRG?": ""}, {}, "expected a number"),
     ],
 )
-def test_what_does_not_fit_is_refused(
+def test_invalid_values_are_refused(
     controllers: list[ScriptedController], answers: dict[str, str], settings: dict[str, Any], message: str
 ) -> None:
     controllers.append(ScriptedController(**answers))
@@ -137,7 +137,7 @@ def test_a_stream_starts_and_ends_with_the_trigger_mode(controller: ScriptedCont
     controller.readings = [block(99, (4194304, 0))]
     with sensor(controller) as capa:
         first, second = itertools.islice(capa.stream(block=15), 2)
-        assert capa.read() == pytest.approx(0.5e-3, abs=1e-9)  # not a value that the stream left
+        assert capa.read() == pytest.approx(0.5e-3, abs=1e-9)  # not a value from the previous stream
     assert (first.first, second.first, first.rate) == (0, 15, capa.rate)
     raws = np.concatenate([first.values, second.values], axis=1) / 2e-3 * 0xFFFFFF
     np.testing.assert_allclose(raws, MIDDLE + np.arange(30)[np.newaxis], atol=0.01)
@@ -190,7 +190,7 @@ def test_an_older_controller_reports_a_version_only(controller: ScriptedControll
     assert (identity.model, identity.serial_number, identity.firmware) == ("DT6220", "0815", "V1.0")
 
 
-def test_two_uses_at_a_time_are_refused(controller: ScriptedController) -> None:
+def test_two_simultaneous_uses_are_refused(controller: ScriptedController) -> None:
     controller.blocks = [block(n, (5, 5)) for n in range(50)]
     with sensor(controller) as capa:
         stream = capa.stream(block=5)

@@ -1,4 +1,4 @@
-"""Commands, answers and blocks of a capaNCDT 6200, against what documents and independent drivers show."""
+"""Commands, answers and blocks of a capaNCDT 6200, against documents and independent drivers."""
 
 import numpy as np
 import pytest
@@ -62,13 +62,13 @@ def test_the_sample_time_is_the_actual_one() -> None:
 @pytest.mark.parametrize(
     "line", [b"Welcome to the capaNCDT 6200\r\n", b"\r\n", b"$TRG?0OK\r\n", b"$AVT?1OK\r\n", b"TRG1OK\r\n"]
 )
-def test_lines_without_the_echo_are_no_answer(line: bytes) -> None:
+def test_lines_without_the_echo_are_not_an_answer(line: bytes) -> None:
     assert not codec.echoes("TRG1", line)
     with pytest.raises(ProtocolError):
         codec.answer_to("TRG1", line)
 
 
-def test_an_echo_ahead_of_the_answer_is_no_part_of_it() -> None:
+def test_an_echo_before_the_answer_is_not_part_of_it() -> None:
     assert codec.answer_to("CHS", b"$CHS\r$CHS1,0OK\r\n") == "1,0"
 
 
@@ -92,7 +92,7 @@ def test_a_channel_without_a_usable_range_is_an_error(text: str) -> None:
 
 
 @given(st.binary(max_size=600))
-def test_any_line_gives_an_answer_or_an_error_of_ours(line: bytes) -> None:
+def test_any_line_gives_an_answer_or_an_error_of_the_project(line: bytes) -> None:
     try:
         codec.echoes("CHI1", line)
         codec.parse_channel(1, codec.answer_to("CHI1", line))
@@ -133,7 +133,7 @@ def test_values(vector: Vector) -> None:
         assert codes[0] == blocks.VALID
 
 
-def test_values_at_and_beyond_the_ends_of_the_scale_are_no_readings() -> None:
+def test_values_at_and_beyond_the_ends_of_the_scale_are_not_readings() -> None:
     raws = np.array([-1, 0, 1, 0xFFFFFE, 0xFFFFFF, 0x1000000])
     values, codes = blocks.scale(raws, 1e-4, 1e-3)
     assert [blocks.REASONS[code] for code in codes] == [

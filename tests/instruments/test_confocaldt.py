@@ -75,7 +75,7 @@ def test_a_rate_has_one_decimal_place_of_a_kilohertz(rate: float, command: str) 
 
 
 @pytest.mark.parametrize("answer", [[], ["MEASRATE"], ["MEASRATE fast"], ["MEASRATE -1"], ["MEASRATE 0"], ["9" * 300]])
-def test_a_rate_that_is_none_is_an_error(answer: list[str]) -> None:
+def test_an_invalid_rate_is_an_error(answer: list[str]) -> None:
     with pytest.raises(ProtocolError):
         codec.rate_of(answer)
 
@@ -107,7 +107,7 @@ def ended() -> Iterator[None]:
 ADDRESS = "sim://cframe/X1?seed=3"
 
 
-def test_reads_the_distance_that_the_machine_has() -> None:
+def test_reads_the_distance_of_the_machine() -> None:
     with ConfocalDT(ADDRESS) as sensor:
         world = simulators.world("cframe", 3)
         low, high = sensor.measuring_range
@@ -134,10 +134,10 @@ def test_writes_the_rate_and_states_it() -> None:
         assert samples.rate == 2500.0
 
 
-def test_restores_the_outputs_that_it_found() -> None:
+def test_restores_the_previous_outputs() -> None:
     with ConfocalDT(ADDRESS) as sensor:
         dialogue = sensor._commands()
-        dialogue._before.clear()  # as another client that leaves its choice behind
+        dialogue._before.clear()  # as after another client
         dialogue.command("OUTADD_ETH COUNTER INTENSITY")
         dialogue.command("OUTREDUCE 10 ETHERNET")
         sensor._start_session()
@@ -149,7 +149,7 @@ def test_restores_the_outputs_that_it_found() -> None:
         assert codec.reduction_of(opened.command("OUTREDUCE")) == 10
 
 
-def test_values_that_an_earlier_output_left_are_not_read() -> None:
+def test_values_of_an_earlier_output_are_not_read() -> None:
     with ConfocalDT(ADDRESS) as sensor:
         stream = sensor.stream(block=50)
         next(stream)
@@ -164,7 +164,7 @@ def test_refuses_a_master_value() -> None:
 
 
 @pytest.mark.parametrize("left", ["ECHO+OFF", "OUTADD_ETH+COUNTER+INTENSITY", "OUTPUT+ETHERNET", "OUTREDUCE+10"])
-def test_reads_whatever_another_client_left(left: str) -> None:
+def test_reads_with_any_settings_of_another_client(left: str) -> None:
     with ConfocalDT(ADDRESS) as sensor:
         expected = sensor.read()
     simulators.reset()

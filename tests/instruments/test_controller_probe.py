@@ -1,4 +1,4 @@
-"""Probing through a controller: contacts, wrong triggers, and that nothing moves on after an error."""
+"""Probing through a controller: contacts, false triggers, and no motion after an error."""
 
 import math
 import re
@@ -24,7 +24,7 @@ NORMALS = ((1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0), (0, 0, 1))
 
 
 def touches(items: Sequence[int] = (0,), normals: Sequence[Sequence[float]] = NORMALS) -> list[Touch]:
-    """Return touches of balls of the machine, from where a person believes them to be."""
+    """Return touches of balls of the machine at their estimated positions."""
     machine = world("cframe", 3).machine
     reach = machine.balls.nominal_radius + machine.probe.nominal_tip_radius
     return [
@@ -45,7 +45,7 @@ def gathered(probe: ControllerProbe, items: Sequence[int] = (0,)) -> tuple[list[
     return contacts, None
 
 
-def test_contacts_are_where_the_twin_says() -> None:
+def test_contacts_agree_with_the_twin() -> None:
     with ControllerProbe(ADDRESS, PROBE) as probe:
         machine = world("cframe", 3).machine
         orders = touches((0, 1))
@@ -75,7 +75,7 @@ def test_more_repeats_scatter_less() -> None:
     assert spread[1] < 0.6 * spread[0]
 
 
-def test_the_probe_says_who_and_what_it_is() -> None:
+def test_the_probe_states_its_identity_and_type() -> None:
     settings = ControllerProbeSettings(arm=True, tip_radius=2e-3, noise=0.3e-6)
     with ControllerProbe(ADDRESS, settings) as probe:
         assert probe.identify().model == "cframe touch probe"
@@ -125,7 +125,7 @@ def test_a_map_without_a_serial_number_is_used_with_a_note(tmp_path: Path, caplo
     assert "states no serial number" in caplog.text
 
 
-def test_a_map_takes_contacts_to_where_the_tip_met_the_surface(tmp_path: Path) -> None:
+def test_a_map_corrects_contacts_to_the_position_of_the_tip(tmp_path: Path) -> None:
     made = lobed(1e-6)
     path = made.save(tmp_path / "probe.nc")
     results = []
@@ -136,7 +136,7 @@ def test_a_map_takes_contacts_to_where_the_tip_met_the_surface(tmp_path: Path) -
     np.testing.assert_allclose(results[1] - results[0], value[:, None] * np.array(NORMALS), atol=1e-15)
 
 
-def test_touches_beyond_the_map_are_refused_before_anything_moves(tmp_path: Path) -> None:
+def test_touches_beyond_the_map_are_refused_without_motion(tmp_path: Path) -> None:
     path = lobed(0.0, NORMALS[:4]).save(tmp_path / "probe.nc")
     with ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, pretravel=str(path))) as probe:
         with pytest.raises(InstrumentError, match=r"direction of touch 5 \(item 0\); it does not cover 1 of 5 touches"):
@@ -144,12 +144,12 @@ def test_touches_beyond_the_map_are_refused_before_anything_moves(tmp_path: Path
         assert world("cframe", 3).time == 0.0
 
 
-def test_a_map_that_is_not_there_is_reported_on_opening() -> None:
+def test_a_missing_map_is_reported_on_opening() -> None:
     with pytest.raises(DatasetError, match=r"nowhere\.nc.*no such file"):
         ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, pretravel="nowhere.nc")).open()
 
 
-# ---------------------------------------------------------------------- what goes wrong
+# ---------------------------------------------------------------------- faults
 
 
 @pytest.mark.parametrize(
@@ -174,10 +174,10 @@ def test_a_fault_in_the_middle_ends_the_cycle_and_keeps_the_contacts(
         assert [contact.flag for contact in contacts] == ["", ""]
         rests = here.position()
         here.elapse(10.0)
-        assert here.position() == rests  # nothing moves on
+        assert here.position() == rests  # no further motion
 
 
-def test_nothing_begins_in_alarm_or_emergency_stop() -> None:
+def test_nothing_starts_in_alarm_or_emergency_stop() -> None:
     with ControllerProbe(ADDRESS, PROBE) as probe, VirtualController(ADDRESS, CONTROLLER) as control:
         control.press_estop()
         with pytest.raises(InstrumentError, match="in emergency stop; nothing was moved"):
@@ -198,7 +198,7 @@ def test_a_probe_that_never_trips_is_found_at_the_second_ball() -> None:
         assert world("cframe", 3).position() == pytest.approx(rests, abs=1e-12)  # back at the start of its touch
 
 
-def test_a_ball_that_is_not_there_costs_its_own_touches_only() -> None:
+def test_a_missing_ball_only_costs_its_own_touches() -> None:
     orders = [Touch(tuple(np.add(t.start, (0, 0, 0.1))), tuple(np.add(t.target, (0, 0, 0.1))), 0) for t in touches()]
     with ControllerProbe(ADDRESS, PROBE) as probe:
         contacts = list(probe.measure([*orders, *touches((1,))]))
@@ -212,15 +212,15 @@ def test_a_stuck_probe_gives_its_flag_and_then_an_error() -> None:
     assert "Touch 3 of 5 (item 0): the probe is tripped before it moves, and remains so" in str(raised)
 
 
-def test_a_probe_that_sticks_for_a_moment_is_waited_for() -> None:
+def test_the_driver_waits_for_a_probe_that_sticks_briefly() -> None:
     with ControllerProbe(f"{ADDRESS}&fault=tripped&fault_at=30&fault_for=1", PROBE) as probe:
         contacts, raised = gathered(probe)
     assert raised is None
     assert [contact.flag for contact in contacts] == [""] * 5
 
 
-def test_something_in_the_way_stops_the_machine_there() -> None:
-    """Without clearance the straight way from one side of the ball to the other goes through it."""
+def test_an_obstacle_stops_the_machine() -> None:
+    """Without clearance the straight path between two sides of the ball passes through it."""
     settings = ControllerProbeSettings(arm=True, clearance=0.0)
     with ControllerProbe(ADDRESS, settings) as probe:
         source = probe.measure([touches()[0], touches()[2]])
@@ -239,7 +239,7 @@ def test_a_turning_spindle_is_refused() -> None:
             next(probe.measure(touches()))
 
 
-def test_a_caller_who_stops_leaves_the_probe_at_the_start_of_a_touch() -> None:
+def test_a_cycle_that_the_caller_stops_leaves_the_probe_at_the_start_of_a_touch() -> None:
     with ControllerProbe(ADDRESS, PROBE) as probe:
         source = probe.measure(touches())
         next(source)
@@ -285,7 +285,8 @@ def test_a_recorded_cycle_plays_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("off", [-0.4e-6, 0.4e-6])
 def test_no_probing_move_is_shorter_than_controllers_accept(monkeypatch: pytest.MonkeyPatch, off: float) -> None:
-    """A machine rests a fraction of a micrometre beside its goal: LinuxCNC's bridge refuses to probe so short a way."""
+    """A machine stops a fraction of a micrometre from its target; LinuxCNC's bridge refuses to probe such a short
+    distance."""
     with ControllerProbe(ADDRESS, PROBE) as probe:
         control, moves = probe.control, []
         state, move = control.state, control.probe
@@ -303,15 +304,15 @@ def test_no_probing_move_is_shorter_than_controllers_accept(monkeypatch: pytest.
         monkeypatch.setattr(control, "state", beside)
         monkeypatch.setattr(control, "probe", noted)
         list(probe.measure(touches()))
-        list(probe.measure(touches()))  # from where it has risen to
+        list(probe.measure(touches()))  # from its raised position
     assert min(moves) > 1e-6
 
 
-# ---------------------------------------------------------------------- one touch, on a controller that misbehaves
+# ---------------------------------------------------------------------- one touch with controller faults
 
 
 class Controller:
-    """A controller whose probe trips where a test states: along X, m."""
+    """A controller whose probe trips at stated positions along X, m."""
 
     def __init__(self, trips: Callable[[int, float, float], float | None]) -> None:
         self.trips = trips
@@ -355,7 +356,7 @@ def test_a_false_trip_on_the_way_is_not_taken_for_a_contact() -> None:
     assert control.place.tolist() == [0.0, 0.0, 0.0]
 
 
-def test_a_false_trip_at_the_start_is_tried_again() -> None:
+def test_a_move_with_a_false_trip_at_the_start_is_repeated() -> None:
     contact, control = touch(lambda n, begin, target: 0.1e-3 if n == 0 else surface(begin, target))
     assert contact.flag == ""
     assert control.probings == 4
@@ -371,7 +372,7 @@ def test_false_trips_without_end_are_no_contact() -> None:
 
 
 @pytest.mark.parametrize(("difference", "flag"), [(2.9e-6, ""), (3.1e-6, "repeat differs")])
-def test_repeats_have_to_agree(difference: float, flag: str) -> None:
+def test_repeats_must_agree(difference: float, flag: str) -> None:
     places = [SURFACE, SURFACE - difference, SURFACE]
     contact, _ = touch(lambda n, begin, target: places[n], agreement=3e-6)
     assert contact.flag == flag
@@ -386,7 +387,7 @@ def test_slow_contacts_far_before_the_fast_one_differ() -> None:
     assert contact.flag == "repeat differs"
 
 
-def test_a_place_off_the_way_is_an_error() -> None:
+def test_a_position_off_the_path_is_an_error() -> None:
     control = Controller(lambda n, begin, target: surface(begin, target))
     control.aside = 0.2e-3
     with pytest.raises(InstrumentError, match=r"2\.000 mm along it and 0\.200 mm aside"):

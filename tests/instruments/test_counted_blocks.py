@@ -1,4 +1,4 @@
-"""Blocks of counted values, and readings in the order of their counter: for every controller that sends them."""
+"""Blocks of counted values, and readings in the order of their counter, for all controllers that send them."""
 
 import random
 import time
@@ -21,7 +21,7 @@ from errormotion.instruments.point_lds.counted import CountedReadings
 
 @dataclass(frozen=True)
 class Controller:
-    """What the tests need of one controller."""
+    """Test data of one controller."""
 
     name: str
     header: Callable[[int, int], bytes]
@@ -96,7 +96,7 @@ def test_stray_bytes_are_discarded_and_the_block_before_them_is_not_trusted(of: 
 
 
 @every
-def test_bytes_within_a_block_spoil_this_block_only(of: Controller) -> None:
+def test_bytes_within_a_block_only_damage_this_block(of: Controller) -> None:
     data = bytearray(of.block(1, *range(50)) + of.block(51, 7) + of.block(52, 8))
     data[100:100] = b"\x55\x66"
     found = of.decoder().feed(bytes(data), last=True)
@@ -104,17 +104,17 @@ def test_bytes_within_a_block_spoil_this_block_only(of: Controller) -> None:
 
 
 @every
-def test_a_preamble_in_what_is_no_header_hides_no_block(of: Controller) -> None:
+def test_a_preamble_outside_a_header_hides_no_block(of: Controller) -> None:
     for stray in (b"SAEM", b"SAEMSAEM", b"MEAS" + bytes(5), bytes(1) + b"SAE", b"SAEM" + bytes(20)):
         found = of.decoder().feed(stray + of.block(1, 5, 6) + of.block(3, 7), last=True)
         assert [(each.counter, each.count) for each in found] == [(1, 2), (3, 1)]
 
 
 @every
-def test_a_header_that_states_more_than_a_packet_is_none(of: Controller) -> None:
+def test_a_header_that_states_more_than_a_packet_is_invalid(of: Controller) -> None:
     longest = (MAX_BLOCK_BYTES - of.header_bytes) // 4
     data = of.header(0, longest) + of.block(9, 1) + of.block(10, 1)
-    assert of.decoder().feed(data, last=True) == []  # the rest of it may come
+    assert of.decoder().feed(data, last=True) == []  # the rest may follow
     data = of.header(0, longest + 1) + of.block(9, 1) + of.block(10, 1)
     try:
         found = of.decoder().feed(data, last=True)

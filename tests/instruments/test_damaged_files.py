@@ -94,7 +94,7 @@ def test_netcdf_height_maps_that_were_cut_off(tmp_path: Path) -> None:
         with ProfileFiles(str(path)) as files:
             list(files.scans())
 
-    # Cuts only: changed bytes are the matter of the HDF5 library, which does not bound its time on them.
+    # Cuts only: the HDF5 library reads changed bytes, and does not limit its time.
     refused = mutants.check(read, path.read_bytes(), seed=3, number=mutants.count(60), changes=(mutants.cut,))
     assert refused > 50
 

@@ -1,4 +1,4 @@
-"""DCON thermometers: codec, driver, wire."""
+"""DCON thermometers: codec, driver, line."""
 
 import math
 import time
@@ -36,19 +36,19 @@ def test_vectors() -> None:
 
 
 @pytest.mark.parametrize("vector", vectors("dcon_temperature", "reading"), ids=str)
-def test_readings_that_makers_print(vector: Vector) -> None:
+def test_readings_in_makers_documents(vector: Vector) -> None:
     found = parse_temperatures(decode(vector.data))
     assert found == pytest.approx(vector.expected["values"], abs=1e-12, nan_ok=True)
 
 
 @pytest.mark.parametrize("vector", vectors("dcon_temperature", "checked line"), ids=str)
-def test_lines_with_checksum_that_makers_print(vector: Vector) -> None:
+def test_lines_with_checksum_in_makers_documents(vector: Vector) -> None:
     assert decode(vector.data, with_checksum=True) == vector.expected["text"]
     assert encode(vector.expected["text"], with_checksum=True) == vector.data
 
 
 @pytest.mark.parametrize("vector", vectors("dcon_temperature", "line"), ids=str)
-def test_lines_that_makers_print(vector: Vector) -> None:
+def test_lines_in_makers_documents(vector: Vector) -> None:
     assert decode(vector.data) == vector.expected["text"]
     assert encode(vector.expected["text"]) == vector.data
 
@@ -62,7 +62,7 @@ def test_checksum_is_the_sum_of_the_characters() -> None:
 
 
 @given(st.lists(st.floats(-200, 1370).map(lambda t: round(t, 2)), min_size=1, max_size=10))
-def test_temperatures_come_back(temperatures: list[float]) -> None:
+def test_temperatures_round_trip(temperatures: list[float]) -> None:
     answer = ">" + "".join(f"{t:+07.2f}" for t in temperatures)
     assert parse_temperatures(answer) == pytest.approx(temperatures, abs=1e-9)
 
@@ -82,9 +82,9 @@ def test_a_disabled_channel_is_none() -> None:
 @pytest.mark.parametrize(
     ("configuration", "message"),
     [
-        ("100601", "writes per cent of the range"),
-        ("0F0682", r"writes hexadecimal \(data format 82\)"),
-        ("200603", "writes ohms"),
+        ("100601", "reports per cent of the range"),
+        ("0F0682", r"reports hexadecimal \(data format 82\)"),
+        ("200603", "reports ohms"),
         ("050600", "input range 05, a voltage or current"),
     ],
 )
@@ -99,7 +99,7 @@ def test_engineering_units_of_thermocouples_and_resistors_are_read(configuration
 
 
 @pytest.mark.parametrize("configuration", ["", "10060", "1006000", "1g0600"])
-def test_another_answer_is_no_configuration(configuration: str) -> None:
+def test_another_answer_is_not_a_configuration(configuration: str) -> None:
     with pytest.raises(ProtocolError, match="such as '100600'"):
         check_configuration(configuration)
 
@@ -120,7 +120,7 @@ def test_modules_of_both_makers_are_read(model: str, type_code: int) -> None:
     assert reading["frame"] == pytest.approx(20.0, abs=1.0)
 
 
-def test_zero_degrees_is_no_open_sensor() -> None:
+def test_zero_degrees_is_not_an_open_sensor() -> None:
     assert parse_temperatures(">+000.00-000.00") == [0.0, 0.0]
 
 
@@ -189,7 +189,7 @@ def test_a_refused_request_and_a_missing_module_are_errors() -> None:
 
 
 def test_a_sensor_that_the_machine_does_not_have_is_refused() -> None:
-    with pytest.raises(InstrumentError, match=r"has the sensors .* found coffee"):
+    with pytest.raises(InstrumentError, match=r"sensors of the machine, .*found coffee"):
         DconTemperature(f"{ADDRESS}&sensors=coffee").open()
 
 
@@ -218,7 +218,7 @@ def test_a_bad_checksum_is_a_protocol_error_and_splitting_none() -> None:
         read_often(thermometer, 3)
     with DconTemperature(f"{ADDRESS}&checksum=1&fault=split", settings) as thermometer:
         assert all(math.isfinite(value) for value in thermometer.read().values())
-    with pytest.raises(InstrumentError, match="no such fault"):
+    with pytest.raises(InstrumentError, match="does not have this fault"):
         DconTemperature(f"{ADDRESS}&fault=checksum").open()
 
 
@@ -236,7 +236,7 @@ def test_a_recorded_session_plays_back(tmp_path: Path) -> None:
         assert [thermometer.read() for _ in range(3)] == readings
 
 
-def test_flags_and_places_tell_what_and_where_a_sensor_is() -> None:
+def test_flags_and_positions_state_type_and_location_of_a_sensor() -> None:
     settings = DconSettings.model_validate({"places": {"frame": ("0.1 m", "20 mm", 0.0)}})
     with DconTemperature(f"{ADDRESS}&open=1,3", settings) as thermometer:
         assert set(thermometer.flags.values()) == {"not read"}
@@ -247,7 +247,7 @@ def test_flags_and_places_tell_what_and_where_a_sensor_is() -> None:
 
 
 @pytest.mark.parametrize("wire", ["tcp", "pty"])
-def test_a_module_that_was_unplugged_is_heard_again_by_itself(wire: str) -> None:
+def test_an_unplugged_module_is_received_again_automatically(wire: str) -> None:
     settings = DconSettings(timeout=0.7, retry=0.05)
     address = f"{ADDRESS}&wire={wire}&fault=unplugged&fault_at=4&unplugged_for=1.6"
     with DconTemperature(address, settings) as thermometer:

@@ -1,4 +1,4 @@
-"""Contacts that the machine prints: lines, which touch they belong to, and every way to lose one."""
+"""Contacts that the machine prints: lines, assignment to touches, and all kinds of loss."""
 
 import math
 import re
@@ -74,7 +74,7 @@ def test_lines_after_the_manual_of_haas(vector: Vector) -> None:
     st.none() | st.integers(0, 99999),
     st.none() | st.integers(0, 10**8),
 )
-def test_lines_come_back(micrometres: tuple[int, int, int], number: int | None, ms: int | None) -> None:
+def test_lines_round_trip(micrometres: tuple[int, int, int], number: int | None, ms: int | None) -> None:
     x, y, z = (value * 1e-6 for value in micrometres)
     line = Line((x, y, z), number, math.nan if ms is None else ms * 1e-3)
     found = parse_line(format_line(line), COMPILED)
@@ -92,7 +92,7 @@ def test_anything_else_is_a_protocol_error(text: str) -> None:
 
 
 @given(st.text(max_size=60))
-def test_no_text_does_anything_but_a_protocol_error(text: str) -> None:
+def test_any_invalid_text_is_a_protocol_error(text: str) -> None:
     try:
         parse_line(text, COMPILED)
     except ProtocolError:
@@ -107,7 +107,7 @@ def test_control_characters_around_lines_are_no_part_of_them() -> None:
         text_of(b"X1\xff Y2\r\n")
 
 
-def test_a_pattern_of_ones_own_has_to_name_the_places() -> None:
+def test_a_custom_pattern_must_name_the_coordinates() -> None:
     pattern = r"P(?P<number>\d+);(?P<x>[-\d.]+);(?P<y>[-\d.]+);(?P<z>[-\d.]+)"
     line = parse_line("P3;1;-2;3", re.compile(DprntSettings(pattern=pattern).pattern), length=25.4e-3)
     assert line.position == pytest.approx((25.4e-3, -50.8e-3, 76.2e-3))
@@ -118,7 +118,7 @@ def test_a_pattern_of_ones_own_has_to_name_the_places() -> None:
         DprntSettings(pattern="(?P<x>")
 
 
-# ---------------------------------------------------------------------- which touch
+# ---------------------------------------------------------------------- assignment to touches
 
 
 def belongs(text: str, due: int, last: str = "") -> int:
@@ -126,7 +126,7 @@ def belongs(text: str, due: int, last: str = "") -> int:
     return touch_of(parse_line(text, COMPILED), TOUCHES, due, before, 1, 1e-3)
 
 
-def test_without_numbers_the_place_decides() -> None:
+def test_without_numbers_the_position_decides() -> None:
     assert belongs(printed(0), 0) == 0
     assert belongs(printed(3), 1, printed(0)) == 3  # two lines are missing
     assert belongs(printed(0), 1, printed(0)) == REPEATED
@@ -135,7 +135,7 @@ def test_without_numbers_the_place_decides() -> None:
         belongs(printed(5).replace("50.", "55."), 0)
 
 
-def test_numbers_decide_and_go_on_or_begin_anew_from_cycle_to_cycle() -> None:
+def test_numbers_decide_and_continue_or_restart_between_cycles() -> None:
     assert belongs(printed(2, number=3), 0) == 2
     assert belongs(printed(2, number=13), 0) == 2
     assert belongs(printed(0, number=1), 1, printed(0, number=1)) == REPEATED
@@ -146,13 +146,13 @@ def test_numbers_decide_and_go_on_or_begin_anew_from_cycle_to_cycle() -> None:
 @pytest.mark.parametrize(
     ("x", "flag"), [(2.0, ""), (3.0, "no trip"), (2.997, "no trip"), (0.0, "tripped at the start"), (0.3, "")]
 )
-def test_the_place_says_what_came_of_the_touch(x: float, flag: str) -> None:
+def test_the_position_shows_the_result_of_the_touch(x: float, flag: str) -> None:
     contact = contact_of(parse_line(printed(0, x), COMPILED), TOUCHES[0], 0.2e-3, 5e-6)
     assert contact.flag == flag
     assert math.isnan(contact.position[0]) == bool(flag)
 
 
-# ---------------------------------------------------------------------- a machine that sends what a test states
+# ---------------------------------------------------------------------- a scripted machine
 
 
 class Machine:
@@ -175,7 +175,7 @@ def machine() -> Iterator[Machine]:
 
 
 @pytest.mark.parametrize(("line_end", "end"), [("cr", b"\r"), ("lf", b"\n"), ("lf", b"\r\n"), ("lf", b"\n\r\r")])
-def test_lines_end_as_the_settings_say(machine: Machine, line_end: str, end: bytes) -> None:
+def test_lines_end_as_set(machine: Machine, line_end: str, end: bytes) -> None:
     settings = DprntSettings(timeout=2.0, start_timeout=2.0, line_end=line_end)
     with Dprnt(machine.server.url, settings) as probe:
         machine.say(*(printed(k).encode() + end for k in range(2)))
@@ -193,7 +193,7 @@ def flags(contacts: Sequence[Contact]) -> list[str]:
     return [contact.flag for contact in contacts]
 
 
-def test_contacts_come_in_the_order_of_the_touches(machine: Machine, probe: Dprnt) -> None:
+def test_contacts_are_in_the_order_of_the_touches(machine: Machine, probe: Dprnt) -> None:
     machine.say(b"\x12%\r\n", *(printed(k, 2.0 + 0.001 * k) + f" T{1000 * k}" for k in range(5)), b"%\x14")
     contacts = list(probe.measure(TOUCHES))
     np.testing.assert_allclose([contact.position[0] for contact in contacts], 2e-3 + 1e-6 * np.arange(5))
@@ -203,7 +203,7 @@ def test_contacts_come_in_the_order_of_the_touches(machine: Machine, probe: Dprn
 
 
 @pytest.mark.parametrize("numbered", [False, True])
-def test_lost_and_repeated_lines_cost_only_their_own_touches(machine: Machine, probe: Dprnt, numbered: bool) -> None:
+def test_lost_and_repeated_lines_only_cost_their_own_touches(machine: Machine, probe: Dprnt, numbered: bool) -> None:
     lines = [printed(k, number=k + 1 if numbered else None) for k in (0, 0, 1, 3, 4)]
     machine.say(*lines)
     contacts = list(probe.measure(TOUCHES))
@@ -213,7 +213,7 @@ def test_lost_and_repeated_lines_cost_only_their_own_touches(machine: Machine, p
 
 
 @pytest.mark.parametrize("numbered", [False, True])
-def test_a_cycle_whose_end_was_lost_ends_where_the_next_one_begins(
+def test_a_cycle_whose_end_was_lost_ends_at_the_start_of_the_next_one(
     machine: Machine, probe: Dprnt, numbered: bool
 ) -> None:
     first = [printed(k, number=k + 1 if numbered else None) for k in range(3)]
@@ -225,7 +225,7 @@ def test_a_cycle_whose_end_was_lost_ends_where_the_next_one_begins(
     assert contacts[0].position[0] == pytest.approx(2.5e-3)
 
 
-def test_lines_that_cannot_be_read_are_counted_and_passed_over(machine: Machine, probe: Dprnt) -> None:
+def test_unreadable_lines_are_counted_and_skipped(machine: Machine, probe: Dprnt) -> None:
     machine.say(
         printed(0), b"\xfe\xff X\r\n", "ALARM 401", printed(1), b"X2.0" + printed(2).encode() + b"\r\n", printed(3)
     )
@@ -234,7 +234,7 @@ def test_lines_that_cannot_be_read_are_counted_and_passed_over(machine: Machine,
     assert probe.unreadable == 3
 
 
-def test_nothing_but_unreadable_lines_is_an_error(machine: Machine, probe: Dprnt) -> None:
+def test_only_unreadable_lines_are_an_error(machine: Machine, probe: Dprnt) -> None:
     machine.say(printed(0), *[b"\xfe\xff\n"] * 11)
     source = probe.measure(TOUCHES)
     assert next(source).flag == ""
@@ -242,7 +242,7 @@ def test_nothing_but_unreadable_lines_is_an_error(machine: Machine, probe: Dprnt
         next(source)
 
 
-def test_silence_names_the_touch_and_keeps_what_came(machine: Machine, probe: Dprnt) -> None:
+def test_silence_names_the_touch_and_keeps_the_contacts(machine: Machine, probe: Dprnt) -> None:
     machine.say(printed(0), printed(1))
     source = probe.measure(TOUCHES)
     assert flags([next(source), next(source)]) == ["", ""]
@@ -292,7 +292,7 @@ def program(touches: Sequence[Touch]) -> str:
 def run(
     address: str, settings: DprntSettings = QUICK, fault: str = ""
 ) -> tuple[Dprnt, list[Contact], Exception | None]:
-    """Let the machine run a program, and return what the listening driver makes of it."""
+    """Run a program on the machine; return the result of the listening driver."""
     contacts: list[Contact] = []
     raised = None
     with (
@@ -352,7 +352,7 @@ def test_iso_code_shows_damaged_characters() -> None:
 
 
 @pytest.mark.parametrize("late", [2, 4])
-def test_lines_of_a_cycle_that_came_too_late_are_no_touches_of_the_next_one(late: int) -> None:
+def test_late_lines_of_a_cycle_are_not_touches_of_the_next_one(late: int) -> None:
     touches = ball_touches()
     address = f"{ADDRESS}&fault=late&fault_at={late}&late_by=0.5"
     with Dprnt(address, QUICK) as probe, VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
@@ -399,7 +399,7 @@ def test_faults_of_the_line_that_cost_a_touch_at_most(
         ("disconnect", "tcp", InstrumentError),
     ],
 )
-def test_a_line_that_goes_silent_keeps_the_contacts(fault: str, wire: str, error: type[InstrumentError]) -> None:
+def test_silence_of_a_line_keeps_the_contacts(fault: str, wire: str, error: type[InstrumentError]) -> None:
     _, contacts, raised = run(f"{ADDRESS}&wire={wire}&fault={fault}&fault_at=3")
     assert isinstance(raised, error)
     assert "Touch 4 of 5 (item 0)" in str(raised)
@@ -426,7 +426,7 @@ def test_a_recorded_session_plays_back(tmp_path: Path) -> None:
         assert list(probe.measure(orders)) == contacts
 
 
-def test_lines_from_before_the_driver_listened_are_gone() -> None:
+def test_lines_sent_before_the_driver_opened_are_lost() -> None:
     with VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
         begun = control.run_program(program(ball_touches()))
         control.elapse(begun["duration"] + begun["longest_lead_in"])

@@ -50,7 +50,7 @@ def test_sample_0_is_the_same_instant_for_all_channels_and_so_are_the_others() -
 
 
 @pytest.mark.parametrize("wire", ["tcp", "pty"])
-def test_a_turning_spindle_is_seen_from_time_0_on(wire: str) -> None:
+def test_a_turning_spindle_is_measured_from_time_0_on(wire: str) -> None:
     with FiveSensorFrame(f"{ADDRESS}&wire={wire}", settings()) as frame:
         frame.read()
         world("cframe", 3).start([Event(0.0, spindle_speed=15000.0)])
@@ -59,7 +59,7 @@ def test_a_turning_spindle_is_seen_from_time_0_on(wire: str) -> None:
     np.testing.assert_allclose(values(blocks), truth, rtol=0, atol=HALF_A_STEP)
 
 
-def test_some_channels_may_stream_alone_and_in_any_order() -> None:
+def test_some_channels_may_stream_separately_and_in_any_order() -> None:
     with FiveSensorFrame(ADDRESS, settings()) as frame:
         single = values(take(frame, 2, channels=["Z"]))
         pair = values(take(frame, 2, channels=["Y1", "X1"], block=500))
@@ -76,7 +76,7 @@ def test_a_reading_is_one_distance_of_each_channel() -> None:
 
 
 @pytest.mark.parametrize("channels", [["X3"], ["X1", "X1"], []])
-def test_channels_that_are_not_there_are_refused(channels: list[str]) -> None:
+def test_missing_channels_are_refused(channels: list[str]) -> None:
     with FiveSensorFrame(ADDRESS, settings()) as frame, pytest.raises(InstrumentError, match="X1, X2, Y1, Y2, Z"):
         frame.stream(channels)
 
@@ -85,13 +85,13 @@ def test_one_stream_at_a_time() -> None:
     with FiveSensorFrame(ADDRESS, settings()) as frame:
         stream = frame.stream()
         next(stream)
-        with pytest.raises(InstrumentError, match="streaming already"):
+        with pytest.raises(InstrumentError, match="already streaming"):
             frame.stream()
         stream.close()
         assert len(take(frame, 1)) == 1
 
 
-# ---------------------------------------------------------------------- what goes wrong
+# ---------------------------------------------------------------------- faults
 
 
 @pytest.mark.parametrize("channel", ["X1", "Y2", "Z"])
@@ -101,7 +101,7 @@ def test_a_stalled_channel_is_named(channel: str) -> None:
         take(frame, 100)
 
 
-def test_a_channel_that_is_not_there_is_named() -> None:
+def test_a_missing_channel_is_named() -> None:
     with pytest.raises(InstrumentTimeoutError, match=r"^Channel Y1: .* received nothing"):
         FiveSensorFrame(settings=with_fault("Y1", "silence", timeout=0.5)).open()
 
@@ -123,7 +123,7 @@ def test_a_sensor_out_of_range_for_minutes_is_only_nan_and_counted() -> None:
     assert not any(block.dropped for block in blocks)
 
 
-def test_lost_samples_of_one_channel_leave_the_others_where_they_are() -> None:
+def test_lost_samples_of_one_channel_do_not_shift_the_others() -> None:
     with FiveSensorFrame(settings=with_fault("X2", "drop&fault_every=10")) as frame:
         blocks = take(frame, 4)
         truth = world("cframe", 3).machine.distances(0, 3000, 1500.0)
@@ -146,7 +146,7 @@ def test_the_identity_names_all_sensors_and_is_json() -> None:
     assert json.loads(json.dumps(asdict(identity)))["details"]["address"] == ADDRESS
 
 
-def test_sensors_that_report_no_operating_time_are_taken_as_cold() -> None:
+def test_sensors_without_an_operating_time_are_treated_as_cold() -> None:
     with FiveSensorFrame(ADDRESS, settings()) as frame:
         assert not frame.warm
     late = datetime.now(UTC) - timedelta(hours=1)
@@ -161,7 +161,7 @@ def test_sensors_that_report_their_operating_time_are_warm_after_two_hours(monke
             assert frame.warm == warm
 
 
-def test_a_person_may_say_when_the_sensors_were_switched_on() -> None:
+def test_a_setting_may_state_when_the_sensors_were_switched_on() -> None:
     early = datetime.now(UTC) - timedelta(hours=3)
     with FiveSensorFrame(f"{ADDRESS}&warm=0", settings(powered_since=early)) as frame:
         assert frame.warm
@@ -207,13 +207,16 @@ def test_settings_from_a_bench_file_have_units() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"bar_radius": 5.0}, "found 5000 mm. From Python, lengths are in m"),
-        ({"direction": {**dict.fromkeys(CHANNELS, (0.0, 0.0, 1.0)), "X2": (1.0, 1.0, 0.0)}}, "X2 must be a unit"),
+        ({"bar_radius": 5.0}, "found 5000 mm. In Python, lengths are in m"),
+        (
+            {"direction": {**dict.fromkeys(CHANNELS, (0.0, 0.0, 1.0)), "X2": (1.0, 1.0, 0.0)}},
+            "unit vector as the direction of X2",
+        ),
         ({"addresses": {"X1": "tcp://a:1"}}, "missing: X2, Y1, Y2, Z"),
         ({"origin": {**dict.fromkeys(CHANNELS, (0.0, 0.0, 0.0)), "X3": (0.0, 0.0, 0.0)}}, "unknown: X3"),
     ],
 )
-def test_a_geometry_that_cannot_be_is_refused(wrong: dict[str, object], message: str) -> None:
+def test_an_invalid_geometry_is_refused(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         settings(**wrong)
 

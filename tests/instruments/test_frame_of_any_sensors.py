@@ -22,7 +22,7 @@ RATE = 200.0
 
 
 def lk(channel: int, **more: object) -> dict[str, object]:
-    """A sensor that reads 0.1 mm for each channel before it, and nothing every third time on Z."""
+    """A sensor that reads 0.1 mm times the number of preceding channels; every third reading of Z is missing."""
     readings = "0.4,0.4,nan" if channel == 4 else f"{0.1 * channel}"
     return {"driver": "keyence_lk", "address": f"sim://cframe/lk{channel}?seed=3&readings={readings}", **more}
 
@@ -33,7 +33,7 @@ def settings(**changes: object) -> FrameSettings:
 
 
 class Sensor:
-    """Counts its readings; takes some time for each."""
+    """A sensor that counts its readings; each takes some time."""
 
     def __init__(self, seconds: float = 0.0, fails: int = -1) -> None:
         self.seconds, self.fails, self.readings = seconds, fails, 0
@@ -65,7 +65,7 @@ def test_sensors_without_synchronisation_are_read_together() -> None:
     assert identity.details["synchronised"] is False
 
 
-def test_readings_are_taken_in_the_rhythm_of_the_rate() -> None:
+def test_readings_are_taken_at_the_rate() -> None:
     sensors = {name: Sensor() for name in CHANNELS}
     start = time.monotonic()
     (block,) = itertools.islice(sampling.polled(sensors, 20, RATE), 1)
@@ -73,7 +73,7 @@ def test_readings_are_taken_in_the_rhythm_of_the_rate() -> None:
     assert (block.rate, block.first) == (RATE, 0)
 
 
-def test_an_instant_that_passes_during_a_reading_is_lost_in_all_channels_and_counted() -> None:
+def test_an_instant_during_a_reading_is_lost_in_all_channels_and_counted() -> None:
     sensors = {"X1": Sensor(), "Z": Sensor(2.5 / RATE)}
     (block,) = itertools.islice(sampling.polled(sensors, 30, RATE), 1)
     missing = np.isnan(block.values)
@@ -93,7 +93,7 @@ def test_a_sensor_that_fails_is_named_and_leaves_no_thread() -> None:
     assert set(threading.enumerate()) == before
 
 
-def test_a_frame_that_is_left_in_a_stream_leaves_nothing_open() -> None:
+def test_leaving_a_frame_during_a_stream_closes_everything() -> None:
     before = open_things()
     with FiveSensorFrame(settings=settings()) as frame:
         stream: Iterator[object] = frame.stream()
@@ -114,7 +114,7 @@ def test_a_recorded_frame_of_any_sensors_plays_back(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.read(), reading)
 
 
-def test_synchronised_sensors_by_their_own_tables_sample_like_those_of_the_frame() -> None:
+def test_synchronised_sensors_with_their_own_tables_sample_like_those_of_the_frame() -> None:
     shared = {"rate": 1500.0, "timeout": 10.0}
     table = {name: {"driver": "optoncdt", "address": f"sim://cframe/{name}?seed=3", **shared} for name in CHANNELS}
     found = []
@@ -146,7 +146,7 @@ def bench(**changed: str) -> str:
     return BENCH + "".join(f"sensors.{name} = {{ {text} }}\n" for name, text in {**lines, **changed}.items())
 
 
-def test_a_bench_file_gives_each_sensor_a_driver_an_address_and_settings() -> None:
+def test_a_bench_file_states_driver_address_and_settings_of_each_sensor() -> None:
     text = bench(Z='driver = "keyence_lk", address = "serial:///dev/ttyZ", noise = "0.2 um"')
     (frame,) = parse_bench(text, Path("bench.toml")).instruments
     stored = FrameSettings.model_validate_json(frame.settings.model_dump_json())
@@ -176,7 +176,7 @@ def test_a_bench_file_gives_each_sensor_a_driver_an_address_and_settings() -> No
         ({"Z": 'driver = "keyence_lk", address = "com1"'}, "Z.address: Expected an address such as"),
     ],
 )
-def test_a_mistake_in_a_sensors_table_is_reported_with_its_key(changed: dict[str, str], message: str) -> None:
+def test_an_error_in_the_table_of_a_sensor_is_reported_with_its_key(changed: dict[str, str], message: str) -> None:
     with pytest.raises(BenchError, match=rf"(?s)bench\.toml.*instruments\.frame\.sensors: .*{message}"):
         parse_bench(bench(**changed), Path("bench.toml"))
 

@@ -52,7 +52,7 @@ def test_a_row_depends_on_the_code_of_its_kind_of_instrument_and_on_its_reader(p
     assert len(set(codes.values())) > len(CODECS) // 2
 
 
-def test_failures_of_a_row_are_forgotten_when_it_is_tried_again(programme: ModuleType, tmp_path: Path) -> None:
+def test_failures_of_a_row_are_deleted_when_it_is_repeated(programme: ModuleType, tmp_path: Path) -> None:
     page, codec = tmp_path / "page.md", CODECS[0]
     programme.write(page, programme.TITLE, [(codec, Found(frames=5, failures=["mutant 7: too slow"]))])
     assert "mutant 7" in body(programme, page)

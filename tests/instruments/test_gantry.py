@@ -1,4 +1,4 @@
-"""A measurement on the virtual gantry at the wire: programs at the control, profiles at the profiler, and heat."""
+"""A measurement on the virtual gantry: programs of the control, profiles of the profiler, and heat."""
 
 import itertools
 import time
@@ -32,7 +32,7 @@ FEED = 25e-3  # m/s
 
 
 def forwards(start: float, end: float) -> str:
-    """A pass in +Y, in mm, without the way back."""
+    """A pass in +Y, in mm, without the return."""
     return f"%\nG90 G94 G21\nG1 Y{start} F1500\nG4 P2.0\nG1 Y{end}\nM30\n%"
 
 
@@ -82,7 +82,7 @@ def finish(controller: VirtualController) -> None:
 
 
 def scan(controller: VirtualController, profiler: KeyenceLJX, start: float, end: float, lines: int) -> Pass:
-    """A pass from the start in mm; on the way there nobody listens."""
+    """A pass from the start in mm; without a client on the way to the start."""
     controller.run_program(f"G0 Y{start}\nM30")
     finish(controller)
     controller.run_program(forwards(start, end))
@@ -95,17 +95,17 @@ def one_scan(address: str, start: float, end: float, lines: int) -> Pass:
 
 
 def same(heights: np.ndarray, expected: np.ndarray, most: float) -> bool:
-    """Whether heights agree but for points at an outline, which rounding may put on either side."""
+    """Whether heights agree except for points at an outline, which rounding may assign to either side."""
     both = np.isfinite(heights) & np.isfinite(expected)
     assert (np.isfinite(heights) != np.isfinite(expected)).mean() < 1e-3
     return bool(np.abs(heights - expected)[both].max() <= most)
 
 
-# ------------------------------------------------------------------ what the profiler sees
+# ------------------------------------------------------------------ profiles
 
 
-def test_a_pass_shows_what_the_twin_computes_for_the_same_lines() -> None:
-    """Two artefacts, cold: heights to half a Z unit, counts at the absolute multiples, nothing beside them."""
+def test_a_pass_agrees_with_the_twin_for_the_same_lines() -> None:
+    """Two artefacts, cold: heights to half a Z unit, counts at absolute multiples, no heights elsewhere."""
     found = one_scan(PERFECT + "&artefacts=0.1,0.25", 50, 300, 500)
     assert found.encoder.tolist() == list(range(50500, 300001, 500))
     crossbeam, y = VirtualMachine("gantry", seed=3).crossbeam, found.encoder * 1e-6
@@ -122,7 +122,7 @@ def test_a_pass_shows_what_the_twin_computes_for_the_same_lines() -> None:
     assert sum(block.dropped for block in found.blocks) == 0
 
 
-def test_a_warm_pass_shows_the_true_error_of_each_line_at_its_own_moment() -> None:
+def test_a_warm_pass_contains_the_true_error_of_each_line_at_its_time() -> None:
     with gantry(PERFECT + "&artefacts=0.1") as (controller, device):
         cold = scan(controller, device, 60, 140, 160)
         finish(controller)
@@ -146,7 +146,7 @@ def test_a_warm_pass_shows_the_true_error_of_each_line_at_its_own_moment() -> No
     assert np.nanmax(np.abs(change)) > 5e-6  # tens of um along slopes up to 0.5
 
 
-def test_the_warm_up_begins_with_the_first_long_fast_move_and_then_counts_on() -> None:
+def test_the_warm_up_starts_with_the_first_long_fast_move_and_continues() -> None:
     with VirtualController(CONTROL, CONTROLLER) as controller:
         here = world("gantry", 3)
         controller.run_program("G1 Y-600 F1500\nG0 Y0\nG1 Y100 F3600\nM30")
@@ -182,7 +182,7 @@ def test_a_pocket_at_two_lifts_is_that_of_the_twin() -> None:
             assert same(found.heights, truth, STEP / 2 + 1e-12)
 
 
-def test_noise_differs_from_scan_to_scan_and_a_campaign_repeats_to_the_bit() -> None:
+def test_noise_differs_between_scans_and_a_campaign_is_bit_identical() -> None:
     def campaign() -> list[np.ndarray]:
         with gantry(SMALL + "&disturbances=white&artefacts=0.1") as (controller, device):
             scans = []
@@ -203,7 +203,7 @@ def test_all_disturbances_are_the_default() -> None:
     assert 0.9 < there.mean() < 1  # some points are missing
 
 
-def test_without_a_word_eight_artefacts_stand_there() -> None:
+def test_by_default_there_are_eight_artefacts() -> None:
     found = one_scan(PERFECT.replace("=500", "=5000"), -900, 900, 360)
     y = found.encoder[np.isfinite(found.heights).any(axis=1)] * 1e-6
     nearest = np.abs(np.subtract.outer(y, -0.7 + 0.2 * np.arange(8)))
@@ -211,7 +211,7 @@ def test_without_a_word_eight_artefacts_stand_there() -> None:
     assert (np.bincount(nearest.argmin(axis=1)) >= 11).all()  # 60 mm of each
 
 
-def test_a_surface_of_its_own_is_still_to_be_had_on_the_gantry() -> None:
+def test_a_separate_surface_is_also_available_on_the_gantry() -> None:
     with KeyenceLJX("sim://gantry/profiler?artefact=swept&points=80") as profiler:
         assert np.isfinite(profiler.read()).all()
 
@@ -219,7 +219,7 @@ def test_a_surface_of_its_own_is_still_to_be_had_on_the_gantry() -> None:
 # ------------------------------------------------------------------ the encoder
 
 
-def test_profiles_come_in_the_positive_direction_only() -> None:
+def test_profiles_are_only_taken_in_the_positive_direction() -> None:
     program = "G1 Y10 F1500\nY5\nG4 P1\nY12\nG0 Y0\nM30"
     with gantry(PERFECT + "&artefacts=none") as (controller, device):
         controller.run_program(program)
@@ -240,13 +240,13 @@ def test_the_encoders_pitch_start_and_overflow() -> None:
         assert found.encoder[-1] > 1 << 31
         y = controller.state()["position"][1]
         assert (found.encoder[-1] - start) * 5e-7 == pytest.approx(y, abs=1e-12)
-        assert device.counts().encoder == found.encoder[-1] - (1 << 32)  # as the profiler shows it
+        assert device.counts().encoder == found.encoder[-1] - (1 << 32)  # as reported by the profiler
 
 
 # ------------------------------------------------------------------ the clock
 
 
-def test_nothing_moves_before_a_lead_in_that_nobody_told() -> None:
+def test_nothing_moves_before_an_undeclared_lead_in() -> None:
     begins = []
     with gantry(PERFECT + "&artefacts=none") as (controller, device):
         for _ in range(2):
@@ -270,7 +270,7 @@ def test_the_clock_and_the_position_are_those_of_the_last_profile_that_was_read(
         for _ in range(5):
             block = next(stream)
             assert controller.state()["position"][1] == pytest.approx(block.encoder[-1] * 1e-6, abs=1e-12)
-            with pytest.raises(InstrumentError, match="let time pass while profiler stream"):
+            with pytest.raises(InstrumentError, match="advance the time while profiler stream"):
                 controller.elapse(1.0)
         seen = controller.state()["time"]
         stream.close()
@@ -283,7 +283,7 @@ def test_the_clock_and_the_position_are_those_of_the_last_profile_that_was_read(
         assert controller.state()["position"] == [0.0, 0.2, 0.0]
 
 
-def test_a_stream_left_over_an_artefact_goes_on_with_the_next_profile() -> None:
+def test_a_stream_ended_over_an_artefact_continues_with_the_next_profile() -> None:
     whole = one_scan(SMALL + "&artefacts=0.1", 60, 140, 150)
     with gantry(SMALL + "&artefacts=0.1") as (controller, device):
         parts = [scan(controller, device, 60, 140, 50)]
@@ -301,7 +301,7 @@ def test_a_profiler_may_wait_for_the_program() -> None:
         stream.close()
 
 
-def test_where_nothing_moves_nothing_comes() -> None:
+def test_without_motion_there_are_no_profiles() -> None:
     with gantry(PERFECT, FAST) as (controller, device):
         with pytest.raises(InstrumentTimeoutError, match="no data"):
             measure(controller, device, 1, block=1)
@@ -313,7 +313,7 @@ def test_where_nothing_moves_nothing_comes() -> None:
         assert device.counts().encoder == 2000
 
 
-def test_a_profile_by_command_shows_where_the_axis_stands_and_moves_nothing() -> None:
+def test_a_profile_by_command_is_at_the_position_of_the_axis_and_moves_nothing() -> None:
     with gantry(PERFECT + "&artefacts=0.1") as (controller, device):
         assert np.isnan(device.read()).all()  # nothing is there
         controller.run_program("G0 Y110.0004\nM30")
@@ -330,7 +330,7 @@ def test_a_profile_by_command_shows_where_the_axis_stands_and_moves_nothing() ->
     assert all(same(each, truth, STEP / 2 + 1e-12) for each in heights)
 
 
-def test_profiles_by_command_have_noise_of_their_own() -> None:
+def test_profiles_by_command_have_their_own_noise() -> None:
     with gantry(SMALL + "&disturbances=white&artefacts=0.1") as (controller, device):
         controller.run_program("G0 Y110\nM30")
         finish(controller)
@@ -339,7 +339,7 @@ def test_profiles_by_command_have_noise_of_their_own() -> None:
     assert np.nanstd(change) == pytest.approx(np.sqrt(2) * np.hypot(0.5e-6, STEP / np.sqrt(12)), rel=0.4)
 
 
-def test_profiles_by_command_before_and_within_a_scan_leave_it_as_it_is() -> None:
+def test_profiles_by_command_before_and_within_a_scan_do_not_change_it() -> None:
     whole = one_scan(SMALL + "&artefacts=0.1", 60, 140, 160)
     with gantry(SMALL + "&artefacts=0.1") as (controller, device):
         device.read()
@@ -358,7 +358,7 @@ def test_profiles_by_command_before_and_within_a_scan_leave_it_as_it_is() -> Non
 
 
 def heard(profiler: str, timeout: float) -> tuple[Pass, int]:
-    """A pass with a rest of 5 s, heard by somebody who queries again after a silence; how often that was."""
+    """A pass with a rest of 5 s, read by a client that queries again after silence; return the number of queries."""
     found, silences = Pass([], []), 0
     with gantry(profiler, LJXSettings(timeout=timeout)) as (controller, device):
         controller.run_program("G1 Y5.3 F1500\nG4 P5\nG1 Y30\nM30")
@@ -375,8 +375,8 @@ def heard(profiler: str, timeout: float) -> tuple[Pass, int]:
     return found, silences
 
 
-def test_at_a_pace_a_rest_longer_than_the_time_limit_passes_while_somebody_listens() -> None:
-    """At a pace of 2 the rest takes 2.5 s, five times the time limit, and that is long for a busy machine."""
+def test_at_a_pace_a_rest_longer_than_the_time_limit_elapses_while_a_client_reads() -> None:
+    """At a pace of 2 the rest takes 2.5 s, five times the time limit, enough for a busy computer."""
     calm, silences = heard(PERFECT + "&artefacts=none", 10.0)
     assert silences == 0
     paced, silences = heard(PERFECT + "&artefacts=none&pace=2", 0.5)
@@ -395,7 +395,7 @@ def test_at_a_pace_the_machine_moves_in_real_time() -> None:
     assert time.monotonic() - start > found.times[-1] / 10
 
 
-# ------------------------------------------------------------------ orders
+# ------------------------------------------------------------------ commands
 
 
 def test_a_refused_program_moves_nothing() -> None:
@@ -403,7 +403,7 @@ def test_a_refused_program_moves_nothing() -> None:
         for text, message in [
             ("G1 Y100 F1500\nG1 Y901\nM30", r"refuses: Line 2 'G1 Y901': Y travels from -900 to 900 mm; found 901"),
             ("%\nG91\nM30", r"refuses: Line 2 'G91'"),
-            ("G1 Y100 F1500", "is it whole"),
+            ("G1 Y100 F1500", "check that it is complete"),
         ]:
             with pytest.raises(InstrumentError, match=message):
                 controller.run_program(text)
@@ -438,14 +438,14 @@ def test_a_new_schedule_stops_a_program_where_the_machine_is() -> None:
         assert (state["position"], state["running"]) == (there, False)
 
 
-# ------------------------------------------------------------------ what goes wrong
+# ------------------------------------------------------------------ faults
 
 
 @pytest.mark.parametrize(
     ("params", "message"),
     [
         ("&disturbances=some", "expected one of none, white, full"),
-        ("&artefacts=0.1,here", "expected positions in m, joined by commas"),
+        ("&artefacts=0.1,here", "expected positions in m, separated by commas"),
         ("&artefacts=0.1,0.13", "66 mm or more apart along Y"),
         ("&artefacts=0.1,1.3", r"Y travels from -0\.9 to 0\.9 m; found 1\.3 m"),
         ("&pocket=0.1", "56 mm or more apart along Y; .* circular pocket"),
@@ -454,7 +454,7 @@ def test_a_new_schedule_stops_a_program_where_the_machine_is() -> None:
         ("&artefact=ball", "expected one of swept, twin"),
     ],
 )
-def test_an_address_without_sense_is_refused(params: str, message: str) -> None:
+def test_an_invalid_address_is_refused(params: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):
         KeyenceLJX(SMALL + params).open()
 
@@ -464,7 +464,7 @@ def test_only_the_gantry_has_a_table() -> None:
         KeyenceLJX("sim://cframe/profiler?artefact=twin").open()
 
 
-def test_dropped_profiles_over_an_artefact_are_nan_at_their_places() -> None:
+def test_dropped_profiles_over_an_artefact_are_nan_at_their_positions() -> None:
     address = PERFECT + "&artefacts=0.1"
     whole = one_scan(address, 60, 140, 150)
     holes = one_scan(address + "&fault=drop&fault_at=20&fault_every=9", 60, 140, 150)
@@ -475,7 +475,7 @@ def test_dropped_profiles_over_an_artefact_are_nan_at_their_places() -> None:
     assert holes.times == whole.times
 
 
-def test_one_clock_is_driven_by_one_kind_of_device() -> None:
+def test_one_clock_is_controlled_by_one_kind_of_device() -> None:
     slow = OptoSettings(rate=1500.0, timeout=10.0)
     with (
         gantry(PERFECT + "&artefacts=none") as (controller, device),

@@ -1,4 +1,4 @@
-"""The NC programs that the virtual control understands, and how it refuses the others."""
+"""NC programs that the virtual control accepts, and refusals of others."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def run(*lines: str, start: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Pat
     return interpret("\n".join(lines), start, TRAVEL, RAPID)
 
 
-def test_a_measuring_pass_takes_its_way_over_its_feed() -> None:
+def test_the_duration_of_a_measuring_pass_is_path_divided_by_feed() -> None:
     path = run(
         "%",
         "(cold pass; eight artefacts)",
@@ -32,19 +32,19 @@ def test_a_measuring_pass_takes_its_way_over_its_feed() -> None:
     assert path.rapid.tolist() == [False, False, False, True]
 
 
-def test_words_stand_close_or_apart_in_either_case_with_leading_zeros() -> None:
+def test_words_may_have_spaces_either_case_and_leading_zeros() -> None:
     path = run("g01x100.y+20Z.5f600", "G04 P.5", "G 00 X 0", "m02")
     assert path.places[-2].tolist() == [0.1, 0.02, 0.0005]
     assert path.times[1] == pytest.approx(np.linalg.norm([0.1, 0.02, 0.0005]) / 0.01)
 
 
-def test_a_program_begins_where_the_machine_is() -> None:
+def test_a_program_starts_at_the_present_position() -> None:
     path = run("G1 Y200 F1200", "M30", start=(1.0, 0.1, 0.5))
     assert path.places.tolist() == [[1.0, 0.1, 0.5], [1.0, 0.2, 0.5]]
     assert path.duration == pytest.approx(5.0)
 
 
-def test_moves_that_go_nowhere_take_no_time_and_nothing_is_read_behind_the_end() -> None:
+def test_moves_without_travel_take_no_time_and_nothing_is_read_after_the_end() -> None:
     path = run("G1 Y0 F100", "G4 P0", "G0 Z0", "M30 (over)", "what stands here is not read")
     assert path.duration == 0
     assert path.places.shape == (1, 3)
@@ -57,21 +57,21 @@ def test_moves_that_go_nowhere_take_no_time_and_nothing_is_read_behind_the_end()
         ("G20 G1 Y1", "inches"),
         ("M0", "remove the stop"),
         ("M01", "remove the stop"),
-        ("G2 Y10 I5", "'G2' is not understood; understood are %"),
-        ("G1.5 Y10", "'G1.5' is not understood"),
-        ("M8", "'M8' is not understood"),
-        ("M3 S1000", "nothing is connected here that could be a spindle"),
+        ("G2 Y10 I5", "'G2' is not supported; supported are %"),
+        ("G1.5 Y10", "'G1.5' is not supported"),
+        ("M8", "'M8' is not supported"),
+        ("M3 S1000", "a spindle is not available here"),
         ("M3", "expected the spindle's speed"),
         ("M3 M5 S1000", "M3 and M5 in one line"),
         ("S1000", "M3 belongs to it"),
-        ("G31 Y10 F100", "nothing is connected here that could be a probe"),
-        ("DPRNT[Y#5062[53]]", "nothing is connected here that could be a printer"),
-        ("T1", "'T' is not understood"),
-        ("O1234", "'O' is not understood"),
-        ("G1 A10", "'A' is not understood"),
-        ("G1 Y=10", "'Y=10' is no word"),
-        ("/G1 Y10", "'/G1 Y10' is no word"),
-        ("(a comment without end", "is no word"),
+        ("G31 Y10 F100", "a probe is not available here"),
+        ("DPRNT[Y#5062[53]]", "a printer is not available here"),
+        ("T1", "'T' is not supported"),
+        ("O1234", "'O' is not supported"),
+        ("G1 A10", "'A' is not supported"),
+        ("G1 Y=10", "'Y=10' is not a word"),
+        ("/G1 Y10", "'/G1 Y10' is not a word"),
+        ("(a comment without end", "is not a word"),
         ("G1 Y10 Y20", "the same letter twice"),
         ("G0 G1 Y10", "G0 and G1 in one line"),
         ("G1 Y900.1", r"Y travels from -900 to 900 mm; found 900\.1"),
@@ -81,21 +81,21 @@ def test_moves_that_go_nowhere_take_no_time_and_nothing_is_read_behind_the_end()
         ("G4", "expected a dwell as G4 P2.5"),
         ("G4 X2.0", "expected a dwell"),
         ("G4 P-1", "expected a dwell"),
-        ("G1 Y10 P5", "belongs to a dwell"),
+        ("G1 Y10 P5", "only with a dwell"),
     ],
 )
-def test_what_is_not_understood_is_refused_with_its_line(line: str, why: str) -> None:
+def test_unknown_text_is_refused_with_its_line(line: str, why: str) -> None:
     with pytest.raises(InstrumentError, match=rf"^Line 3 '.*': .*{why}"):
         run("%", "G1 Y100 F1500", line, "M30")
 
 
 def test_a_move_needs_its_kind_and_its_feed() -> None:
-    with pytest.raises(InstrumentError, match=r"Line 1 'Y10': a position, but neither G0 nor G1"):
+    with pytest.raises(InstrumentError, match=r"Line 1 'Y10': a position before G0 or G1"):
         run("Y10", "M30")
     with pytest.raises(InstrumentError, match=r"Line 2 'G1 Y20': .* no feed F"):
         run("G0 Y10", "G1 Y20", "M30")
 
 
 def test_a_program_that_was_cut_off_is_refused() -> None:
-    with pytest.raises(InstrumentError, match="without M30 or M2: is it whole"):
+    with pytest.raises(InstrumentError, match="without M30 or M2; check that it is complete"):
         run("G1 Y100 F1500")

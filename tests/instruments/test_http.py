@@ -1,4 +1,4 @@
-"""Requests over HTTP: connections that end, answers that are none, streams of parts, recordings."""
+"""Requests over HTTP: lost connections, invalid answers, streams of parts, recordings."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -28,7 +28,7 @@ def part(body: bytes) -> bytes:
 
 
 class Site:
-    """A server of which a test states what it answers, path by path."""
+    """A scripted server with an answer for each path."""
 
     def __init__(self) -> None:
         self.pages: dict[str, Iterable[bytes] | None] = {}
@@ -64,7 +64,7 @@ def test_an_address_has_a_host_and_perhaps_a_port_and_a_device() -> None:
         parse_address("http:///vmc")
 
 
-def test_a_body_comes_back_with_its_status(site: Site, http: HttpTransport) -> None:
+def test_a_body_is_returned_with_its_status(site: Site, http: HttpTransport) -> None:
     site.pages["/current"] = [answer(b"<x/>")]
     site.pages["/a b"] = [answer(b"no", b"404 Not Found")]
     got = http.get("/current", {"path": "//Axes"})
@@ -79,11 +79,11 @@ def test_a_connection_that_the_server_ended_is_renewed(site: Site, http: HttpTra
     assert [http.get("/once").body for _ in range(2)] == [b"1", b"1"]
     with pytest.raises(InstrumentError, match="closed it without an answer"):
         http.get("/gone")
-    assert len(site.asked) == 3  # on a new connection nobody queries twice
+    assert len(site.asked) == 3  # a request on a new connection is not repeated
     assert http.get("/once").body == b"1"
 
 
-def test_a_connection_that_ended_while_idle_is_asked_again(site: Site, http: HttpTransport) -> None:
+def test_a_request_on_a_connection_that_ended_while_idle_is_repeated(site: Site, http: HttpTransport) -> None:
     site.pages["/kept"] = [answer(b"1")]
     site.pages["/gone"] = None
     http.get("/kept")
@@ -99,11 +99,11 @@ def test_a_connection_that_ended_while_idle_is_asked_again(site: Site, http: Htt
         ([b"* OK IMAP4 ready\r\n"], ProtocolError, "expected an HTTP answer"),
         ([answer(b"1")[:-5]], InstrumentTimeoutError, "sent no data"),
         ([], InstrumentTimeoutError, "sent no data"),
-        ([answer(b"12345")[:-2], b""], ProtocolError, "cut off, 2 bytes before its end"),
+        ([answer(b"12345")[:-2], b""], ProtocolError, "incomplete: 2 bytes are missing"),
         ([answer(b"x" * 2000)], ProtocolError, "larger than 1000 bytes"),
         ([CHUNKED + b"zz\r\n"], ProtocolError, "damaged: expected a chunk size"),
-        ([CHUNKED + b"5\r\nxxxxx\r\n", b""], ProtocolError, "cut off between two chunks"),
-        ([CHUNKED + b"5\r\nxxx", b""], ProtocolError, "cut off within a chunk"),
+        ([CHUNKED + b"5\r\nxxxxx\r\n", b""], ProtocolError, "ends between two chunks"),
+        ([CHUNKED + b"5\r\nxxx", b""], ProtocolError, "ends within a chunk"),
         ([CHUNKED + b"-1\r\n" + b"x" * 50], ProtocolError, "expected a chunk size; found b'-1'"),
         ([CHUNKED + b"-5\r\n" + b"x" * 50], ProtocolError, "expected a chunk size; found b'-5'"),
         ([CHUNKED + b"0x5\r\nxxxxx\r\n0\r\n\r\n"], ProtocolError, "chunk size"),
@@ -114,14 +114,14 @@ def test_a_connection_that_ended_while_idle_is_asked_again(site: Site, http: Htt
         ([CHUNKED + b"0\r\n", *[b"X: 1\r\n"] * 200], ProtocolError, "more than 100 lines"),
         ([b"HTTP/1.1 200 OK\r\n", *[b"X: 1\r\n"] * 200], ProtocolError, "more than 100 lines"),
         ([b"HTTP/1.1 200 OK\r\nX: ", b"y" * 9000], ProtocolError, "longer than 8192 bytes"),
-        ([b"HTTP/1.1 100 Continue\r\n\r\n"] * 20, ProtocolError, "only preliminary"),
+        ([b"HTTP/1.1 100 Continue\r\n\r\n"] * 20, ProtocolError, "only interim"),
         ([answer(b"1", head=b"Content-Length: 2\r\n")], ProtocolError, "two lengths"),
         ([b"HTTP/1.1 200 OK\r\nContent-Length: -1\r\n\r\n"], ProtocolError, "length of the body; found '-1'"),
         ([b"HTTP/1.1 200 OK\r\nTransfer-Encoding: gzip\r\n\r\n"], ProtocolError, "in chunks; found 'gzip'"),
         ([answer(b"1", head=b"Content-Encoding: gzip\r\n")], ProtocolError, "not compressed"),
     ],
 )
-def test_what_is_no_answer_is_an_error_and_the_next_one_is_right(
+def test_an_invalid_answer_is_an_error_and_the_next_one_is_correct(
     site: Site, http: HttpTransport, page: list[bytes], error: type[InstrumentError], message: str
 ) -> None:
     site.pages |= {"/bad": page, "/good": [answer(b"1")]}
@@ -149,7 +149,7 @@ def slowly(head: bytes, piece: bytes, count: int) -> Iterator[bytes]:
     ],
 )
 @pytest.mark.parametrize("streamed", [False, True])
-def test_an_answer_that_drips_ends_at_its_deadline(
+def test_a_slow_answer_ends_at_its_deadline(
     site: Site, head: bytes, piece: bytes, streamed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(client, "_ANSWER_TIMEOUTS", 1.5)
@@ -162,7 +162,7 @@ def test_an_answer_that_drips_ends_at_its_deadline(
     http.close()
 
 
-def test_a_part_that_drips_ends_at_its_deadline(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_part_ends_at_its_deadline(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client, "_ANSWER_TIMEOUTS", 1.5)
     http = HttpTransport(site.url, timeout=0.3)
     site.pages["/sample"] = slowly(MULTIPART + b"\r\n" + part(b"1") + b"--x\r\nContent-length: 999\r\n\r\n", b"x", 150)
@@ -189,7 +189,7 @@ def test_bytes_after_an_answer_are_not_the_next_answer(site: Site, http: HttpTra
 
 
 @pytest.mark.parametrize("chunked", [False, True])
-def test_parts_of_a_stream_come_one_by_one(site: Site, http: HttpTransport, chunked: bool) -> None:
+def test_parts_of_a_stream_are_returned_one_by_one(site: Site, http: HttpTransport, chunked: bool) -> None:
     parts = [part(body) for body in (b"<a/>", b"", b"<b>\r\n--y</b>")]
     if chunked:
         head = MULTIPART + b"Transfer-Encoding: chunked\r\n\r\n"
@@ -228,7 +228,7 @@ def test_a_damaged_stream_is_an_error(site: Site, http: HttpTransport, rest: byt
         next(stream)
 
 
-def test_a_silent_stream_is_a_time_out(site: Site, http: HttpTransport) -> None:
+def test_a_silent_stream_is_a_timeout(site: Site, http: HttpTransport) -> None:
     site.pages["/sample"] = [MULTIPART + b"\r\n", part(b"1")]
     stream = http.parts("/sample")
     assert next(stream) == b"1"

@@ -24,7 +24,7 @@ def profile(layout: StreamLayout, trigger: int) -> bytes:
     return words.tobytes()
 
 
-def test_leaps_of_the_trigger_count_take_no_memory() -> None:
+def test_jumps_of_the_trigger_count_take_no_memory() -> None:
     data = b"".join(profile(LARGE, 60_000 * i) for i in range(9))  # 72 kB
     decoder = StreamDecoder(LARGE)
     HeightDecoder(LARGE).warm_up()
@@ -66,7 +66,7 @@ def test_effort_grows_with_the_length_of_damaged_data() -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(data=st.binary(max_size=400), pieces=st.lists(st.integers(1, 60), max_size=20), kind=st.sampled_from([0, 64]))
-def test_whatever_bytes_come_only_the_projects_errors_end_a_stream(data: bytes, pieces: list[int], kind: int) -> None:
+def test_for_any_bytes_only_errors_of_the_project_end_a_stream(data: bytes, pieces: list[int], kind: int) -> None:
     decoder = StreamDecoder(StreamLayout(1, kind, 3, 1e-7, 0.0, 1e-5))
     while data:
         n = pieces.pop() if pieces else len(data)

@@ -1,4 +1,4 @@
-"""Bytes of the LJ-X8000A: requests, replies, profiles, and what becomes of damaged ones."""
+"""Bytes of the LJ-X8000A: requests, replies, and profiles, also damaged ones."""
 
 import struct
 from itertools import pairwise
@@ -35,7 +35,7 @@ def plain_pack(raws: list[int], intensities: list[int], trigger: int, encoder: i
         bits |= sum(field << 10 * 2 * k for k, field in enumerate(fields)) << 20 * len(raws)
         size += -(-10 * len(intensities) // 32)
     if (20 * len(raws) + 10 * (len(intensities) + len(intensities) % 2)) > 32 * size:
-        bits &= (1 << 20 * len(raws) + 10 * (len(intensities) - 1)) - 1  # the last of an odd number finds no room
+        bits &= (1 << 20 * len(raws) + 10 * (len(intensities) - 1)) - 1  # the last of an odd number does not fit
     body = bits.to_bytes(4 * size, "little")
     words = struct.pack("<IIiIII", 0, trigger, encoder, 0, 0, 0) + body
     total = sum(struct.unpack(f"<{len(words) // 4}I", words)) % (1 << 32)
@@ -47,7 +47,7 @@ def profile(trigger: int, points: int = 16, raws: list[int] | None = None) -> by
 
 
 def decode(data: bytes, where: StreamLayout, pieces: list[int] | None = None) -> tuple[np.ndarray, np.ndarray, object]:
-    """Return packed profiles, reasons and end of a stream that comes in pieces."""
+    """Return packed profiles, reasons and end of a stream that arrives in pieces."""
     decoder, values, reasons, end = StreamDecoder(where), [], [], None
     cuts = sorted({0, len(data), *(cut % (len(data) + 1) for cut in pieces or [])})
     for start, stop in pairwise(cuts):
@@ -83,19 +83,19 @@ def test_the_older_generation_differs_in_one_byte() -> None:
 
 
 @given(opcode=st.integers(0, 255), arguments=st.binary(max_size=40), name=st.sampled_from(sorted(codec.GENERATIONS)))
-def test_requests_come_back(opcode: int, arguments: bytes, name: str) -> None:
+def test_requests_round_trip(opcode: int, arguments: bytes, name: str) -> None:
     frame = codec.request(opcode, arguments, generation=name)
     assert struct.unpack_from("<I", frame)[0] + 4 == len(frame)
     assert codec.parse_request(frame) == (opcode, arguments, name)
 
 
 @given(data=st.binary(max_size=80), code=st.integers(0, 255), program=st.integers(0, 15))
-def test_replies_come_back(data: bytes, code: int, program: int) -> None:
+def test_replies_round_trip(data: bytes, code: int, program: int) -> None:
     assert codec.parse_reply(codec.reply(data, code=code, program=program)) == codec.Reply(code, program, data)
 
 
 @given(st.binary(max_size=80))
-def test_garbage_is_no_request_and_no_reply(data: bytes) -> None:
+def test_garbage_is_neither_a_request_nor_a_reply(data: bytes) -> None:
     with pytest.raises(ProtocolError):
         codec.parse_request(data)
     if len(data) < 28 or struct.unpack_from("<I", data)[0] + 4 != len(data):
@@ -103,19 +103,19 @@ def test_garbage_is_no_request_and_no_reply(data: bytes) -> None:
             codec.parse_reply(data)
 
 
-def test_a_reply_that_is_too_short_for_what_was_asked_is_refused() -> None:
+def test_a_reply_that_is_too_short_for_the_request_is_refused() -> None:
     with pytest.raises(ProtocolError, match="Expected a reply with 6 bytes of data; found 4"):
         codec.parse_reply(codec.reply(bytes(4))).unpack("3h")
 
 
-def test_a_refusal_tells_the_controllers_number_for_it() -> None:
+def test_a_refusal_contains_the_controllers_error_number() -> None:
     error = codec.refusal(codec.START_STREAM, 0xA3)
     assert isinstance(error, InstrumentError)
     assert "A0" in str(error)
     assert "80A3 (another start code was expected)" in str(error)
 
 
-def test_the_reply_that_announces_a_stream_has_its_facts_at_their_places() -> None:
+def test_the_reply_that_announces_a_stream_has_its_fields_at_their_positions() -> None:
     frame = bytearray(codec.reply(bytes(28)))
     struct.pack_into("<i", frame, 32, 4711)
     frame[40] = INTENSITY | 1
@@ -128,13 +128,13 @@ def test_the_reply_that_announces_a_stream_has_its_facts_at_their_places() -> No
 
 
 @pytest.mark.parametrize(("points", "unit"), [(0, 10), (3201, 10), (3200, 0)])
-def test_a_stream_that_cannot_be_is_refused_when_it_is_announced(points: int, unit: int) -> None:
+def test_an_impossible_stream_is_refused_when_it_is_announced(points: int, unit: int) -> None:
     data = codec.layout_data(StreamLayout(1, 0, points, unit * codec.LENGTH, 0.0, 0.0))
     with pytest.raises(ProtocolError, match=f"announces {points} points"):
         codec.parse_layout(codec.Reply(0, 0, data))
 
 
-def test_models_serials_and_errors_are_read_from_their_places() -> None:
+def test_models_serials_and_errors_are_read_from_their_positions() -> None:
     frame = bytearray(codec.reply(bytes(16 + 2 * 52)))
     frame[28] = 2
     frame[44:53], frame[76:80] = b"LJ-X8000A", b"0815"
@@ -158,7 +158,7 @@ I32 = st.integers(-(1 << 31), (1 << 31) - 1)
 
 
 @given(raws=st.lists(RAW, min_size=1, max_size=40), trigger=st.integers(0, (1 << 32) - 1), data=st.data())
-def test_profiles_are_packed_as_the_reference_does_and_come_back(
+def test_profiles_are_packed_as_in_the_reference_and_round_trip(
     raws: list[int], trigger: int, data: st.DataObject
 ) -> None:
     light = data.draw(st.one_of(st.just([]), st.lists(st.integers(0, 1023), min_size=len(raws), max_size=len(raws))))
@@ -225,7 +225,7 @@ def test_the_trigger_count_may_overflow() -> None:
 
 
 @pytest.mark.parametrize("count", [3, 4, 5 + kernels.MAX_GAP_PROFILES + 1])
-def test_a_trigger_count_that_goes_back_or_leaps_is_a_protocol_error_behind_the_profiles_before_it(count: int) -> None:
+def test_a_trigger_count_that_decreases_or_jumps_is_a_protocol_error_after_the_previous_profiles(count: int) -> None:
     profiles, _, end = decode(profile(4) + profile(count), layout())
     assert len(profiles) == 1
     assert isinstance(end, ProtocolError)
@@ -257,7 +257,7 @@ def test_a_changed_byte_costs_one_profile_and_is_counted(place: int, value: int,
     pieces=st.lists(st.integers(0, 10_000), max_size=10),
 )
 def test_stray_bytes_cost_at_most_the_profile_that_they_hit(place: int, stray: bytes, pieces: list[int]) -> None:
-    assume(not stray.startswith(b"\xff" * 4))  # that would be a notice
+    assume(not stray.startswith(b"\xff" * 4))  # this would be a notice
     where = layout()
     stream = b"".join(map(profile, range(6)))
     profiles, reasons, end = decode(stream[:place] + stray + stream[place:], where, pieces)
@@ -271,7 +271,7 @@ def test_stray_bytes_cost_at_most_the_profile_that_they_hit(place: int, stray: b
 
 @settings(max_examples=30)
 @given(garbage=st.randoms(use_true_random=False), pieces=st.lists(st.integers(0, 10_000), max_size=10))
-def test_endless_garbage_is_a_protocol_error_that_says_what_to_do(garbage: object, pieces: list[int]) -> None:
+def test_endless_garbage_is_a_protocol_error_with_a_remedy(garbage: object, pieces: list[int]) -> None:
     where = layout()
     rubbish = garbage.randbytes((UNSYNCHRONISED_PROFILES + 3) * where.words * 4)
     profiles, _, end = decode(profile(0) + b"\1" + rubbish, where, pieces)
@@ -281,7 +281,7 @@ def test_endless_garbage_is_a_protocol_error_that_says_what_to_do(garbage: objec
         assert "Start the stream again" in str(end)
 
 
-def test_zeros_are_no_profiles_although_their_checksum_is_right() -> None:
+def test_zeros_are_not_profiles_although_their_checksum_is_correct() -> None:
     end = decode(profile(0) + bytes(UNSYNCHRONISED_PROFILES * 68 + 100), layout())[2]
     assert isinstance(end, ProtocolError)
 

@@ -1,4 +1,4 @@
-"""Commands of the LJ-X8000A's driver at the wire: replies that come late, twice, in pieces, or not at all."""
+"""Commands of the LJ-X8000A's driver: late, repeated, split and missing replies."""
 
 import struct
 import threading
@@ -24,7 +24,7 @@ def answer(command: int, data: bytes = b"", *, program: int = 0, echo: bool = Tr
 
 
 class Controller:
-    """Answers with a count of its requests; one of the requests may be answered otherwise."""
+    """Answers with the count of its requests; the answer to one request may be different."""
 
     def __init__(self) -> None:
         self.requests: list[int] = []
@@ -105,7 +105,7 @@ def test_a_reply_sent_twice_shifts_no_later_one(controller: Controller) -> None:
     assert profiler.counts().trigger == number
     assert profiler.program() == (number + 1) % 16
     assert profiler.counts().trigger == number + 2
-    time.sleep(0.1)  # the second copy is there
+    time.sleep(0.1)  # the second copy has arrived
     assert profiler.counts().trigger == number + 3
     profiler.close()
 
@@ -135,7 +135,7 @@ def test_a_device_that_stays_silent_gives_typed_errors_until_it_answers(controll
 
 
 def test_a_reply_that_comes_after_the_next_one_is_not_taken_for_it(controller: Controller) -> None:
-    """Late for longer than the request by which the driver finds out: it is lost with its connection."""
+    """Later than the driver's synchronisation request: the answer is lost with its connection."""
     profiler = opened(controller)
     number = len(controller.requests)
     held: list[bytes] = []
@@ -176,7 +176,7 @@ def test_no_thread_is_left(controller: Controller) -> None:
     assert set(threading.enumerate()) <= before | {controller.commands._thread, controller.stream._thread}
 
 
-def test_a_long_gap_in_a_stream_is_counted_and_the_next_block_starts_behind_it(controller: Controller) -> None:
+def test_a_long_gap_in_a_stream_is_counted_and_the_next_block_starts_after_it(controller: Controller) -> None:
     layout = bytearray(28)
     struct.pack_into("<i", layout, 4, 1)
     struct.pack_into("<HHii", layout, 16, 8, 10, 0, 1000)

@@ -42,7 +42,7 @@ def joined(blocks: list[Profiles]) -> np.ndarray:
 
 
 class Ramp:
-    """A slope along the line whose every point is its encoder count high, in steps of the Z unit."""
+    """A surface whose height at every point is the encoder count, in steps of the Z unit."""
 
     def profile(self, encoder_count: int, n_points: int, x: np.ndarray) -> np.ndarray:
         return STEP * (encoder_count + np.arange(n_points, dtype=float))
@@ -61,7 +61,7 @@ def reach(device: SimulatedLJX) -> str:
 
 
 class Waiting:
-    """A feed without an encoder that moves: a profile comes where a trigger by command brings one."""
+    """A feed whose encoder does not move: profiles are only triggered by command."""
 
     def __init__(self, obeys: bool) -> None:
         self._obeys = obeys
@@ -94,20 +94,20 @@ class Waiting:
 def requests(device: SimulatedLJX, monkeypatch: pytest.MonkeyPatch, refused: int = -1, code: int = 0x80) -> list[int]:
     """Opcodes of all requests from now on; one of them is refused."""
     seen: list[int] = []
-    obey = device._obey
+    obey = device._execute
 
     def noted(opcode: int, arguments: bytes) -> tuple[int, bytes]:
         seen.append(opcode)
         return (code, b"") if opcode == refused else obey(opcode, arguments)
 
-    monkeypatch.setattr(device, "_obey", noted)
+    monkeypatch.setattr(device, "_execute", noted)
     return seen
 
 
-# ------------------------------------------------------------------ asking
+# ------------------------------------------------------------------ queries
 
 
-def test_it_tells_who_it_is_and_what_it_counts() -> None:
+def test_it_states_its_identity_and_counts() -> None:
     with KeyenceLJX(SMALL) as profiler:
         identity = profiler.identify()
         assert (identity.manufacturer, identity.model) == ("Keyence", "LJ-X8000A with head LJ-X8060")
@@ -118,20 +118,20 @@ def test_it_tells_who_it_is_and_what_it_counts() -> None:
         profiler.trigger()
 
 
-def test_program_and_x_pitch_are_set_and_asked_for() -> None:
+def test_program_and_x_pitch_are_set_and_queried() -> None:
     with KeyenceLJX(SMALL, LJXSettings(program=3, x_pitch=25e-6)) as profiler:
         assert profiler.program() == 3
         assert profiler.x_pitch() == pytest.approx(25e-6, rel=1e-12)
         (block,) = take(profiler, 1, 2)
         assert np.diff(block.x) == pytest.approx(25e-6, rel=1e-9)
         assert block.x.shape == (80,)
-        with pytest.raises(InstrumentError, match="numbers 0 to 15; found 16"):
+        with pytest.raises(InstrumentError, match="number of a program, 0 to 15; found 16"):
             profiler.change_program(16)
         profiler.change_program(0)
         assert profiler.program() == 0
 
 
-def test_without_settings_the_program_stays_as_it_is(ramp: SimulatedLJX) -> None:
+def test_without_settings_the_program_is_unchanged(ramp: SimulatedLJX) -> None:
     with KeyenceLJX(reach(ramp), LJXSettings(program=5, x_pitch=30e-6)):
         pass
     with KeyenceLJX(reach(ramp)) as profiler:
@@ -147,7 +147,7 @@ def test_errors_are_shown_and_cleared(ramp: SimulatedLJX) -> None:
         assert profiler.errors() == [71]
 
 
-def test_settings_of_a_bench_file_need_units_and_sense() -> None:
+def test_settings_of_a_bench_file_need_units_and_valid_values() -> None:
     said = {"x_pitch": "12.5 um", "rate": "4 kHz", "noise": "0.5 um", "timeout": "2 s", "program": 1}
     read = LJXSettings.model_validate(said, context=EDGE)
     assert (read.x_pitch, read.rate, read.noise, read.timeout) == pytest.approx((12.5e-6, 4000.0, 0.5e-6, 2.0))
@@ -156,7 +156,7 @@ def test_settings_of_a_bench_file_need_units_and_sense() -> None:
             LJXSettings.model_validate(wrong, context=EDGE)
 
 
-def test_a_refusal_is_an_error_with_its_number_and_harms_nothing(ramp: SimulatedLJX) -> None:
+def test_a_refusal_is_an_error_with_its_number_and_has_no_effect(ramp: SimulatedLJX) -> None:
     with KeyenceLJX(reach(ramp)) as profiler:
         with pytest.raises(InstrumentError, match=r"refuses request A0: error 80A2 .*not prepared"):
             profiler.command(codec.START_STREAM, bytes(8))
@@ -185,12 +185,12 @@ def test_a_wrong_start_code_is_refused(ramp: SimulatedLJX) -> None:
 # ------------------------------------------------------------------ measuring
 
 
-def test_a_profile_is_what_lies_below_it_to_the_z_unit(ramp: SimulatedLJX) -> None:
+def test_a_profile_equals_the_surface_to_one_z_unit(ramp: SimulatedLJX) -> None:
     with KeyenceLJX(reach(ramp)) as profiler:
         assert profiler.read() == pytest.approx(STEP * np.arange(80), abs=1e-15)
 
 
-def test_reading_once_triggers_once_behind_the_start_of_the_stream(
+def test_reading_once_triggers_once_after_the_start_of_the_stream(
     ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with KeyenceLJX(reach(ramp)) as profiler:
@@ -234,7 +234,7 @@ def test_a_profiler_that_waits_is_read_by_a_trigger(ramp: SimulatedLJX) -> None:
         (codec.TRIGGER, r"by command was refused: .* 8080 \(not possible in this"),
     ],
 )
-def test_where_no_profile_comes_the_message_says_what_the_profiler_waits_for(
+def test_without_a_profile_the_message_states_the_missing_trigger(
     ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch, refused: int, says: str
 ) -> None:
     ramp._feed = Waiting(obeys=False)
@@ -247,9 +247,7 @@ def test_where_no_profile_comes_the_message_says_what_the_profiler_waits_for(
         assert profiler.program() == 0  # it is not lost
 
 
-def test_counts_that_cannot_be_had_are_left_out_of_the_message(
-    ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unavailable_counts_are_omitted_from_the_message(ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch) -> None:
     ramp._feed = Waiting(obeys=False)
     with KeyenceLJX(reach(ramp), FAST) as profiler:
         requests(ramp, monkeypatch, refused=codec.GET_COUNTS)
@@ -257,7 +255,7 @@ def test_counts_that_cannot_be_had_are_left_out_of_the_message(
             profiler.read()
 
 
-def test_a_profiler_that_falls_silent_at_the_trigger_gives_timeouts(
+def test_silence_of_a_profiler_at_the_trigger_gives_timeouts(
     ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ramp._feed = Waiting(obeys=False)
@@ -286,7 +284,7 @@ def test_blocks_follow_one_another_without_a_gap_with_their_counts(ramp: Simulat
     assert (block.dropped, dict(block.invalid), block.intensity, block.rate) == (0, {}, None, 1000.0)
 
 
-def test_the_built_in_surface_comes_with_its_noise() -> None:
+def test_the_built_in_surface_includes_its_noise() -> None:
     (block,) = session(SMALL, 1, 200)
     surface = SweptSurface(3)
     truth = np.array([surface.height(block.x, count * 1e-6) for count in block.encoder])
@@ -295,7 +293,7 @@ def test_the_built_in_surface_comes_with_its_noise() -> None:
     assert np.ptp(truth) > 1e-4
 
 
-def test_intensities_come_beside_the_heights() -> None:
+def test_intensities_are_returned_with_the_heights() -> None:
     (block,) = session(SMALL + "&intensity=1", 1, 5)
     assert block.intensity is not None
     assert block.intensity.shape == (5, 80)
@@ -331,7 +329,7 @@ def test_streams_can_be_started_again_and_again() -> None:
             assert profiler.read().shape == (80,)
 
 
-def test_a_caller_who_is_slow_loses_nothing() -> None:
+def test_a_slow_caller_loses_nothing() -> None:
     with KeyenceLJX(SMALL, LJXSettings(rate=100.0)) as profiler:
         stream = profiler.stream(50)
         blocks = [next(stream)]
@@ -343,7 +341,7 @@ def test_a_caller_who_is_slow_loses_nothing() -> None:
     assert not np.isnan(joined(blocks)).any()
 
 
-def test_at_a_pace_profiles_come_when_they_are_due() -> None:
+def test_at_a_pace_profiles_are_sent_when_they_are_due() -> None:
     start = time.monotonic()
     blocks = session(SMALL + "&pace=1&rate=200", 3, 20)
     assert time.monotonic() - start > 59 / 200
@@ -353,7 +351,7 @@ def test_at_a_pace_profiles_come_when_they_are_due() -> None:
 # ------------------------------------------------------------------ faults
 
 
-def test_dropped_profiles_are_nan_at_their_places_and_counted() -> None:
+def test_dropped_profiles_are_nan_at_their_positions_and_counted() -> None:
     whole = session(SMALL)
     holes = session(SMALL + "&fault=drop&fault_at=10&fault_every=7")
     gone = np.arange(10, 120, 7)
@@ -373,25 +371,25 @@ def test_damaged_profiles_are_nan_and_counted_as_garbled(fault: str) -> None:
     there = ~np.isnan(joined(blocks)).all(axis=1)
     garbled = sum(block.invalid.get("garbled", 0) for block in blocks)
     assert garbled == 80 * (~there).sum()
-    assert 6 <= (~there).sum() <= 12  # a stray byte that falls between two profiles harms none
+    assert 6 <= (~there).sum() <= 12  # a stray byte between two profiles damages none
     assert set(np.flatnonzero(~there)) <= set(range(5, 120, 10))
     assert (joined(blocks)[there] == whole[there]).all()
     assert sum(block.dropped for block in blocks) == 0
 
 
-def test_split_pieces_change_nothing() -> None:
+def test_split_pieces_have_no_effect() -> None:
     assert (joined(session(SMALL)) == joined(session(SMALL + "&fault=split"))).all()
 
 
-def test_nothing_to_see_is_nan_with_its_reason() -> None:
+def test_a_missing_target_is_nan_with_its_reason() -> None:
     blocks = session(SMALL + "&fault=out_of_range&fault_at=30&fault_for=20")
     nothing = np.isnan(joined(blocks)).all(axis=1)
     assert np.flatnonzero(nothing).tolist() == list(range(30, 50))
     assert [block.invalid.get("invalid", 0) for block in blocks] == [80 * 10, 80 * 10, 0]
 
 
-def test_checksums_that_are_never_right_end_in_a_protocol_error() -> None:
-    with pytest.raises(ProtocolError, match="No profile of 57 words with a right checksum"):
+def test_checksums_that_are_always_wrong_end_in_a_protocol_error() -> None:
+    with pytest.raises(ProtocolError, match="No profile of 57 words with a valid checksum"):
         session(SMALL + "&fault=checksum&fault_at=8&fault_every=1")
 
 
@@ -436,13 +434,13 @@ def test_a_profiler_that_ends_the_stream_by_itself_is_an_instrument_error() -> N
     with KeyenceLJX(SMALL) as profiler:
         stream = profiler.stream(10)
         next(stream)
-        profiler.command(codec.STOP_STREAM)  # as if somebody else had sent it
+        profiler.command(codec.STOP_STREAM)  # as if another client had sent it
         with pytest.raises(InstrumentError, match="has ended the stream"):
             list(stream)
         assert profiler.read().shape == (80,)
 
 
-def test_the_notice_of_the_stream_before_does_not_end_the_next_one() -> None:
+def test_the_notice_of_the_previous_stream_does_not_end_the_next_one() -> None:
     late = f"{SMALL}&notice_delay={2 * QUIET_INTERVAL}"
     with KeyenceLJX(late) as profiler:
         for _ in range(2):
@@ -450,7 +448,7 @@ def test_the_notice_of_the_stream_before_does_not_end_the_next_one() -> None:
             assert profiler.read().shape == (80,)
 
 
-def test_only_one_notice_ahead_of_the_first_profile_is_taken_as_late() -> None:
+def test_only_one_notice_before_the_first_profile_is_treated_as_late() -> None:
     layout = StreamLayout(1, 0, 8, STEP, 0.0, 1e-5)
     profile = packed(layout, np.zeros((1, 8)), np.zeros(1, np.int64), np.zeros(1, np.int64)).tobytes()
     stopped = codec.notice(1)
@@ -473,7 +471,7 @@ def test_only_one_notice_ahead_of_the_first_profile_is_taken_as_late() -> None:
         (b"HTTP/1.1 400 Bad Request\r\n\r\n", ProtocolError, "A reply has 28 to"),
     ],
 )
-def test_a_stranger_at_the_address_is_a_typed_error(answer: bytes, error: type, message: str) -> None:
+def test_another_device_at_the_address_is_a_typed_error(answer: bytes, error: type, message: str) -> None:
     stranger = TcpServer("stranger", lambda data: stranger.send(answer))
     other = TcpServer("other", lambda data: None)
     stranger.start()
@@ -486,7 +484,7 @@ def test_a_stranger_at_the_address_is_a_typed_error(answer: bytes, error: type, 
         other.close()
 
 
-def test_a_stream_port_at_which_nobody_is_is_named(ramp: SimulatedLJX) -> None:
+def test_a_stream_port_without_a_server_is_named(ramp: SimulatedLJX) -> None:
     with pytest.raises(InstrumentError, match=r"No connection to tcp://127\.0\.0\.1:9"):
         KeyenceLJX(f"{ramp.url}?stream=9").open()
     with pytest.raises(InstrumentError, match=r"'stream' in .* expected a port from 1 to 65535; found 70000"):
@@ -502,7 +500,7 @@ def test_a_stream_port_at_which_nobody_is_is_named(ramp: SimulatedLJX) -> None:
         ("serial:///dev/ttyUSB0", "2 network connections"),
     ],
 )
-def test_an_address_that_makes_no_sense_is_refused(address: str, message: str) -> None:
+def test_an_invalid_address_is_refused(address: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):
         KeyenceLJX(address).open()
 

@@ -43,7 +43,7 @@ def reasons(blocks: list[Samples]) -> Counter[str]:
 
 
 @pytest.mark.parametrize("wire", ["pty", "tcp"])
-def test_readings_and_why_there_is_none(wire: str) -> None:
+def test_readings_and_reasons_of_missing_ones(wire: str) -> None:
     with KeyenceLK(f"{SIX}&wire={wire}", PATIENT) as sensor:
         seen = [(sensor.read(), sensor.no_value) for _ in range(6)]
     np.testing.assert_allclose([value for value, _ in seen], SHOWN, rtol=1e-12, atol=0)
@@ -62,7 +62,7 @@ def test_a_stream_has_the_same_readings_and_counts_the_missing_ones(wire: str) -
     assert all(sum(block.invalid.values()) == np.isnan(block.values).sum() for block in blocks)
 
 
-def test_readings_count_along_the_beam_whichever_side_the_controller_counts_to() -> None:
+def test_readings_increase_along_the_beam_whatever_the_sign_of_the_controller() -> None:
     for positive in ("near", "far"):
         with KeyenceLK(f"{SIX}&positive={positive}", LKSettings(positive=positive)) as sensor:
             assert sensor.read() == pytest.approx(1.2345e-3)
@@ -81,7 +81,7 @@ def test_a_reading_has_the_digits_of_the_display(display: str) -> None:
     assert reading / step == pytest.approx(round(reading / step), abs=1e-6)
 
 
-def test_an_older_controller_is_asked_in_its_own_way() -> None:
+def test_an_older_controller_is_queried_with_its_own_commands() -> None:
     settings = LKSettings(controller="LK-G3000", head="LK-G30", output=2)
     with KeyenceLK("sim://cframe/lk?controller=LK-G3000&head=LK-G30&output=2&readings=3.25,6", settings) as sensor:
         assert sensor.read() == pytest.approx(3.25e-3)
@@ -89,7 +89,7 @@ def test_an_older_controller_is_asked_in_its_own_way() -> None:
         assert sensor.measuring_range == (-5e-3, 5e-3)
 
 
-def test_a_sensor_says_where_its_middle_is_and_how_far_it_sees() -> None:
+def test_a_sensor_states_its_mid_range_and_measuring_range() -> None:
     sensor = KeyenceLK(SIX)
     assert sensor.mid_range == 0.0
     assert sensor.measuring_range == (-10e-3, 10e-3)
@@ -116,7 +116,7 @@ def test_on_the_machine_it_reads_its_depth_to_a_plane() -> None:
             assert sensor.no_value == ""
 
 
-def test_on_the_machine_beyond_the_range_is_reported_from_before_it() -> None:
+def test_on_the_machine_beyond_and_before_the_range_are_distinguished() -> None:
     with KeyenceLK("sim://cframe/lk?seed=3", PATIENT) as sensor:
         here = world("cframe", 3)
         here.set_target("plane", INCLINED, 0.0)
@@ -129,7 +129,7 @@ def test_on_the_machine_beyond_the_range_is_reported_from_before_it() -> None:
     assert shown == ["under range", "over range"]
 
 
-def test_a_reading_on_the_machine_is_as_noisy_as_the_settings_say() -> None:
+def test_a_reading_on_the_machine_has_the_noise_of_the_settings() -> None:
     """Of 200 readings in one position the scatter is that of the noise and of the last digit, to 5 sigma (25 %)."""
     with KeyenceLK("sim://cframe/lk?seed=3", PATIENT) as sensor:
         here = world("cframe", 3)
@@ -140,7 +140,7 @@ def test_a_reading_on_the_machine_is_as_noisy_as_the_settings_say() -> None:
     assert np.std(readings) == pytest.approx(expected, rel=0.25)
 
 
-# ---------------------------------------------------------------------- what the controller is set to
+# ---------------------------------------------------------------------- settings of the controller
 
 
 def test_another_display_unit_than_the_settings_say_is_refused_or_set() -> None:
@@ -162,7 +162,7 @@ def test_an_offset_is_refused_or_taken_back_and_so_is_a_zero_of_the_panel() -> N
         assert sensor.read() == pytest.approx(1.2345e-3)
 
 
-def test_other_settings_hold_from_the_next_reading_on() -> None:
+def test_new_settings_apply_from_the_next_reading_on() -> None:
     with KeyenceLK(SIX, PATIENT) as sensor:
         stream = sensor.stream(block=1)
         next(stream)
@@ -174,7 +174,7 @@ def test_other_settings_hold_from_the_next_reading_on() -> None:
         assert take(sensor, 1)[0].rate == 10.0
 
 
-def test_after_refused_settings_the_old_ones_go_on() -> None:
+def test_after_refused_settings_the_old_ones_remain() -> None:
     with KeyenceLK(SIX) as sensor:
         with pytest.raises(InstrumentError, match="a parameter is out of range"):
             sensor.configure(LKSettings(output=2))
@@ -196,7 +196,7 @@ def test_the_wrong_generation_is_refused() -> None:
         sensor.read()
 
 
-def test_it_tells_who_it_is_as_far_as_it_can() -> None:
+def test_it_states_its_identity_as_far_as_known() -> None:
     with KeyenceLK(f"{SIX}&wire=pty") as sensor:
         identity = sensor.identify()
     assert (identity.manufacturer, identity.model) == ("Keyence", "LK-G5000 with LK-H050")
@@ -235,7 +235,7 @@ def test_settings_that_the_sensor_does_not_have_are_refused(wrong: dict[str, obj
 
 
 def test_a_rate_that_the_line_of_the_address_does_not_carry_is_refused_before_it_is_opened() -> None:
-    with pytest.raises(InstrumentError, match=r"do not fit through 9600 baud"):
+    with pytest.raises(InstrumentError, match=r"exceed 9600 baud"):
         KeyenceLK("serial:///dev/ttyUSB0?baudrate=9600").open()
 
 
@@ -259,7 +259,7 @@ def test_each_fault_becomes_a_typed_error(wire: str, fault: str, error: type[Ins
         take(sensor, 2, block=10)
 
 
-def test_split_answers_change_nothing() -> None:
+def test_split_answers_have_no_effect() -> None:
     with KeyenceLK(f"{SIX}&fault=split&wire=pty", PATIENT) as sensor:
         np.testing.assert_allclose(values(take(sensor, 1, block=12)), SHOWN * 2, rtol=1e-12, atol=0)
 
@@ -290,8 +290,8 @@ def test_out_of_range_is_nan_with_its_reason(fault: str, reason: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_garbage_spoils_the_reading_it_hits_and_no_other(seed: int) -> None:
-    """Behind a spoilt answer the driver and the controller agree again which answer belongs to which request."""
+def test_garbage_only_changes_its_own_reading(seed: int) -> None:
+    """After a damaged answer, driver and controller resynchronise answers and requests."""
     address = f"sim://cframe/lk?seed={seed}&readings=1,2,3,4,5,6,7&fault=garbage&fault_at=8&fault_every=6"
     with KeyenceLK(address, PATIENT) as sensor:
         blocks = take(sensor, 3, block=20)
@@ -299,18 +299,18 @@ def test_garbage_spoils_the_reading_it_hits_and_no_other(seed: int) -> None:
     known = np.isfinite(seen)
     np.testing.assert_allclose(seen[known], np.resize(1e-3 * np.arange(1, 8), seen.size)[known], rtol=1e-12)
     assert reasons(blocks) == {"garbled": (~known).sum()}
-    assert 0 < (~known).sum() <= 12  # every sixth answer; some hit the agreement and do no harm
+    assert 0 < (~known).sum() <= 12  # every sixth answer; some affect the synchronisation without effect
 
 
 def test_a_late_answer_is_not_taken_for_the_next_one() -> None:
     with KeyenceLK("sim://cframe/lk?readings=1,2,3", PATIENT) as sensor:
         assert sensor.read() == pytest.approx(1e-3)
-        sensor.transport.write(b"MS,01\r")  # read by somebody who did not wait for the answer
+        sensor.transport.write(b"MS,01\r")  # read by a client that did not wait for the answer
         sensor._synchronised = False
         assert sensor.read() == pytest.approx(3e-3)
 
 
-def test_a_lost_answer_is_an_error_and_the_next_reading_is_right() -> None:
+def test_a_lost_answer_is_an_error_and_the_next_reading_is_correct() -> None:
     with KeyenceLK("sim://cframe/lk?readings=1,2,3&fault=drop&fault_at=6&fault_every=1000", QUICK) as sensor:
         assert sensor.read() == pytest.approx(1e-3)
         with pytest.raises(InstrumentTimeoutError, match="received nothing"):
@@ -318,7 +318,7 @@ def test_a_lost_answer_is_an_error_and_the_next_reading_is_right() -> None:
         assert sensor.read() == pytest.approx(3e-3)
 
 
-def test_a_controller_left_in_its_setting_mode_is_brought_to_measure() -> None:
+def test_a_controller_in_its_setting_mode_is_switched_to_measuring() -> None:
     with KeyenceLK(SIX, PATIENT) as sensor:
         sensor.transport.write(b"Q0\r")
         assert sensor.transport.read_until(b"\r") == b"Q0\r"
@@ -328,7 +328,7 @@ def test_a_controller_left_in_its_setting_mode_is_brought_to_measure() -> None:
         assert sensor.read() == pytest.approx(1.2345e-3)
 
 
-def test_a_babbling_device_is_no_controller() -> None:
+def test_endless_bytes_are_not_a_controller() -> None:
     device = SimulatedKeyenceLK(parse_address(SIX))
     try:
         device.answer = lambda request: b"hello\r" * 20
@@ -338,7 +338,7 @@ def test_a_babbling_device_is_no_controller() -> None:
         device.close()
 
 
-# ---------------------------------------------------------------------- the wire simulator by itself
+# ---------------------------------------------------------------------- the simulator without the driver
 
 
 @pytest.mark.parametrize(
@@ -359,7 +359,7 @@ def test_a_babbling_device_is_no_controller() -> None:
         ("", "ER,,50"),
     ],
 )
-def test_the_controller_answers_as_the_manual_says(request_text: str, answer: str) -> None:
+def test_the_controller_answers_as_in_the_manual(request_text: str, answer: str) -> None:
     device = SimulatedKeyenceLK(parse_address("sim://cframe/lk?readings=1.5"))
     try:
         assert device.answer(request_text.encode()) == answer.encode() + b"\r"
@@ -367,7 +367,7 @@ def test_the_controller_answers_as_the_manual_says(request_text: str, answer: st
         device.close()
 
 
-def test_the_controller_answers_in_its_setting_mode_as_the_manual_says() -> None:
+def test_the_controller_answers_in_its_setting_mode_as_in_the_manual() -> None:
     device = SimulatedKeyenceLK(parse_address("sim://cframe/lk?readings=1.5&offset=-0.25"))
     try:
         talk = [
@@ -396,7 +396,7 @@ def test_the_controller_answers_in_its_setting_mode_as_the_manual_says() -> None
 @pytest.mark.parametrize(
     "wrong", ["head=LK-X1", "controller=LK-G9", "display=9", "positive=up", "readings=one", "offset=x"]
 )
-def test_a_controller_that_there_is_not_is_refused_by_name(wrong: str) -> None:
+def test_an_unknown_controller_is_refused_by_name(wrong: str) -> None:
     with pytest.raises(InstrumentError, match=wrong.partition("=")[0]):
         KeyenceLK(f"sim://cframe/lk?{wrong}").open()
 
@@ -405,7 +405,7 @@ def test_a_controller_that_there_is_not_is_refused_by_name(wrong: str) -> None:
 
 
 class Clock:
-    """A clock that only sleeping and answering move."""
+    """A clock that only advances by sleeping and answering."""
 
     def __init__(self, answering: float) -> None:
         self.now, self.answering, self.slept = 100.0, answering, 0.0
@@ -436,8 +436,8 @@ def on_clock(monkeypatch: pytest.MonkeyPatch, sensor: KeyenceLK, clock: Clock) -
     monkeypatch.setattr("errormotion.instruments.point_lds.keyence_lk.driver.time", clock)
 
 
-def test_a_real_sensor_is_asked_in_the_rhythm_of_its_rate(monkeypatch: pytest.MonkeyPatch, device) -> None:
-    with KeyenceLK(device.url, LKSettings(rate=50.0)) as sensor:  # tcp:// : nobody knows that it is simulated
+def test_requests_to_a_real_sensor_are_sent_at_its_rate(monkeypatch: pytest.MonkeyPatch, device) -> None:
+    with KeyenceLK(device.url, LKSettings(rate=50.0)) as sensor:  # tcp:// : not known to be simulated
         clock = Clock(answering=0.004)
         on_clock(monkeypatch, sensor, clock)
         blocks = take(sensor, 2, block=50)
@@ -499,7 +499,7 @@ def test_a_recorded_session_plays_back(tmp_path: Path, wire: str) -> None:
     assert reasons(blocks)["garbled"] == 1
 
 
-def test_a_driver_that_asks_something_else_fails_in_replay(tmp_path: Path) -> None:
+def test_a_driver_that_sends_another_request_fails_in_replay(tmp_path: Path) -> None:
     path = tmp_path / "session.rec"
     with KeyenceLK(SIX, record=path):
         pass

@@ -1,4 +1,4 @@
-"""What an LK-G or LK-H states, without a wire."""
+"""The codec of LK-G and LK-H."""
 
 import math
 
@@ -52,19 +52,19 @@ def test_anything_else_is_garbled(text: str) -> None:
     assert REASONS[code] == "garbled"
 
 
-def test_other_decimals_than_the_display_has_are_an_error_and_no_reading_off_by_ten() -> None:
+def test_decimals_that_differ_from_the_display_are_an_error() -> None:
     with pytest.raises(ProtocolError, match=r"4 decimals, as in the settings; found '\+001\.234'"):
         codec.parse_value("+001.234", MM4)
 
 
-def test_mm_and_um_can_look_alike_so_the_display_decides() -> None:
+def test_mm_and_um_can_be_ambiguous_so_the_display_decides() -> None:
     text = "+0001.25"
     assert codec.parse_value(text, DISPLAYS["0.01 mm"])[0] == pytest.approx(1.25e-3)
     assert codec.parse_value(text, UM2)[0] == pytest.approx(1.25e-6)
 
 
 @given(st.sampled_from(sorted(DISPLAYS)), st.floats(-1, 1))
-def test_a_value_comes_back_to_half_a_step(name: str, share: float) -> None:
+def test_a_value_round_trips_to_half_a_step(name: str, share: float) -> None:
     display = DISPLAYS[name]
     value = share * display.largest
     text = codec.format_value(value, display)
@@ -75,19 +75,19 @@ def test_a_value_comes_back_to_half_a_step(name: str, share: float) -> None:
 
 
 @given(st.sampled_from(sorted(DISPLAYS)), st.floats(min_value=1.0001, max_value=1e6))
-def test_what_the_digits_do_not_hold_is_out_of_range_and_not_cut(name: str, times: float) -> None:
+def test_values_beyond_the_digits_are_out_of_range_and_not_truncated(name: str, times: float) -> None:
     display = DISPLAYS[name]
     assert codec.format_value(times * display.largest, display) == codec.OVER
     assert codec.format_value(-times * display.largest, display) == codec.UNDER
 
 
-def test_nothing_is_sent_as_no_value_and_zero_without_a_minus() -> None:
+def test_missing_is_sent_as_no_value_and_zero_without_a_minus() -> None:
     assert codec.format_value(float("nan"), MM4) == "XXXXXXXX"
     assert codec.format_value(-1e-9, MM4) == "+00.0000"
 
 
 @given(st.text(max_size=12) | st.from_regex(r"[+-][0-9F.X]{7}", fullmatch=True))
-def test_whatever_comes_is_a_number_a_reason_or_a_protocol_error(text: str) -> None:
+def test_any_answer_is_a_number_a_reason_or_a_protocol_error(text: str) -> None:
     try:
         value, reason = codec.parse_value(text, MM4)
     except ProtocolError:
@@ -98,7 +98,7 @@ def test_whatever_comes_is_a_number_a_reason_or_a_protocol_error(text: str) -> N
 
 
 @pytest.mark.parametrize("vector", vectors("keyence_lk", "answer"), ids=str)
-def test_answers_that_clients_of_others_read_are_read(vector: Vector) -> None:
+def test_answers_that_foreign_clients_read_are_read(vector: Vector) -> None:
     expected = vector.expected
     display = next(each for each in DISPLAYS.values() if each.decimals == expected["decimals"])
     text = codec.parse_answer(expected["request"], codec.decode(vector.data + codec.LINE_END))
@@ -122,7 +122,7 @@ def test_requests_of_both_generations() -> None:
 
 
 @pytest.mark.parametrize("request_text", ["MS,01", "M1"])
-def test_an_answer_repeats_what_was_asked(request_text: str) -> None:
+def test_an_answer_repeats_the_request(request_text: str) -> None:
     assert codec.parse_answer(request_text, f"{request_text},+01.2345") == "+01.2345"
     assert codec.parse_answer(request_text, request_text) == ""
     assert codec.parse_answer("SW,OF,01,+000000", "SW,OF", header="SW,OF") == ""
@@ -163,14 +163,14 @@ def test_an_error_repeats_the_command_or_the_setting(repeated: str) -> None:
     assert codec.error_code("SR,OF,01", f"ER,{repeated},22") == "22"
 
 
-def test_an_error_of_another_request_is_no_answer() -> None:
+def test_an_error_of_another_request_is_not_an_answer() -> None:
     assert codec.error_code("MS,01", "ER,SR,01") is None
     with pytest.raises(ProtocolError, match="found 'ER,SR,01'"):
         codec.parse_answer("MS,01", "ER,SR,01")
 
 
 @given(st.from_regex(r"[A-Z0-9,+.]{0,40}", fullmatch=True))
-def test_lines_come_back(text: str) -> None:
+def test_lines_round_trip(text: str) -> None:
     assert codec.decode(codec.encode(text)) == text
 
 

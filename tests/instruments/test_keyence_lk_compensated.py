@@ -1,4 +1,4 @@
-"""Any point sensor, with its inclination error taken off: an LK-H and an optoNCDT before the same plane."""
+"""Point sensors with correction of the inclination error: an LK-H and an optoNCDT in front of the same plane."""
 
 import math
 from itertools import islice
@@ -80,7 +80,8 @@ def opto() -> OptoNCDT:
 
 
 def before_a_plane(lift: float) -> tuple[float, float, float]:
-    """Move before a plane at 40 deg to the beam; return the true depth from mid-range, inclination and rotation."""
+    """Move in front of a plane at 40 deg to the beam; return the true depth from mid-range, inclination and
+    rotation."""
     here = world("cframe", 3)
     here.set_target("plane", FACE, 0.0)
     here.move_to(here.machine.home() + np.array([0.0, 0.0, lift]))
@@ -103,7 +104,7 @@ def test_every_point_sensor_reads_the_depth_from_its_mid_range(make) -> None:
 
 @pytest.mark.parametrize("make", [lk, opto])
 @pytest.mark.parametrize("lift", [-3e-3, 3e-3])
-def test_the_inclination_error_goes_and_the_raw_reading_stays(make, lift: float, known) -> None:
+def test_the_inclination_error_is_corrected_and_the_raw_reading_unchanged(make, lift: float, known) -> None:
     with make() as sensor:
         compensated = CompensatedSensor(sensor, known, allow_other_sensor=True)
         depth, alpha, beta = before_a_plane(lift)
@@ -120,7 +121,7 @@ def test_the_inclination_error_goes_and_the_raw_reading_stays(make, lift: float,
 
 
 @pytest.mark.parametrize("make", [lk, opto])
-def test_a_compensated_block_is_a_block_with_the_raw_one_beside(make, known) -> None:
+def test_a_compensated_block_also_contains_the_raw_one(make, known) -> None:
     with make() as sensor:
         _, alpha, beta = before_a_plane(2e-3)
         blocks = list(
@@ -135,14 +136,14 @@ def test_a_compensated_block_is_a_block_with_the_raw_one_beside(make, known) -> 
         np.testing.assert_array_equal(again.value, block.values)
 
 
-def test_what_has_no_value_has_none_compensated_and_is_counted(known) -> None:
+def test_missing_values_are_also_missing_when_compensated_and_are_counted(known) -> None:
     with KeyenceLK("sim://cframe/lk?seed=3&readings=1,nan,12") as sensor:
         block = next(iter(CompensatedSensor(sensor, known).stream(STEEP, 0.0, block=6)))
     assert np.isnan(block.values[0]).tolist() == [False, True, True] * 2
     assert block.invalid == {"no value": 2, "under range": 2}
 
 
-def test_a_tilt_beyond_the_calibrated_ones_is_refused_unless_asked_for(known) -> None:
+def test_a_tilt_beyond_the_calibrated_ones_is_refused_unless_permitted(known) -> None:
     with KeyenceLK("sim://cframe/lk?seed=3&readings=5") as sensor:
         with pytest.raises(MethodError, match="beyond the steepest calibrated setting"):
             CompensatedSensor(sensor, known).read(math.radians(55.0), 0.0)

@@ -5,7 +5,7 @@ DIFFERENT = ",".join(f"{0.25 * number - 3.1:.2f}" for number in range(25))
 
 
 class TestKit(InstrumentConformance):
-    """Over a pty, with readings of both signs and of every reason to have none."""
+    """Over a pty, with readings of both signs and all reasons of missing readings."""
 
     subject = InstrumentSubject(
         KeyenceLK,

@@ -1,4 +1,4 @@
-"""Kinds of instrument: contracts that anybody can register."""
+"""Kinds of instrument: contracts that plugins can register."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -88,7 +88,7 @@ class WithOptional(Protocol):
     capabilities = (Optional,)
 
 
-def test_a_capability_is_demanded_whole_from_whoever_has_its_first_method() -> None:
+def test_a_driver_with_the_first_method_of_a_capability_must_have_all() -> None:
     other = type("Other", (), {"extra": 1})()
     assert kinds.deviations(other, WithOptional) == []
     half = type("Half", (), {"act": lambda self, first, *, second=0: None})()

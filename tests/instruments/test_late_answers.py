@@ -65,7 +65,7 @@ def read_all(driver: Any, count: int = READINGS) -> list[Any]:
         (keyence, "pty", ""),
     ],
 )
-def test_the_reading_after_a_late_answer_is_its_own(make: Callable[[str], Any], wire: str, late: str) -> None:
+def test_the_reading_after_a_late_answer_is_correct(make: Callable[[str], Any], wire: str, late: str) -> None:
     sound = read_all(make(f"wire={wire}"), READINGS + 1)
     assert all(first != second for first, second in pairwise(sound))
     at = {dcon: 4, modbus: 3, keyence: 7}[make]
@@ -78,7 +78,7 @@ def test_the_reading_after_a_late_answer_is_its_own(make: Callable[[str], Any], 
     assert found[number + 1 :] == sound[asked : asked + READINGS - number - 1]
 
 
-def test_an_order_after_a_late_answer_gets_its_own_answer() -> None:
+def test_a_command_after_a_late_answer_gets_its_own_answer() -> None:
     with controller("fault=late&fault_at=2&late_by=0.45") as machine:
         machine.state()
         with pytest.raises(InstrumentTimeoutError):

@@ -53,7 +53,7 @@ def test_displacements_are_those_of_the_machine_with_its_errors() -> None:
     assert 0 < abs(found[0].distance - truth[0]) < 0.01
 
 
-def test_an_at4xx_tells_absolute_distances_and_angles_of_places_it_goes_to() -> None:
+def test_an_at4xx_measures_absolute_distances_and_angles_at_positions() -> None:
     place = (0.1, -0.1, 0.2)
     with LeicaEmScon(ADDRESS + "&tracker=AT4xx&noise=0&angle_noise=0&dead_path=0", ABSOLUTE) as tracker:
         simulators.world("cframe", seed=3).move_to(place)
@@ -64,7 +64,7 @@ def test_an_at4xx_tells_absolute_distances_and_angles_of_places_it_goes_to() -> 
     assert found.reason == ""
 
 
-def test_a_place_without_a_reflector_gives_a_measurement_that_says_so() -> None:
+def test_a_position_without_a_reflector_is_a_measurement_with_that_reason() -> None:
     with LeicaEmScon(ADDRESS + "&tracker=AT4xx", ABSOLUTE) as tracker:
         found = tracker.measure((-1.0, 2.0, 0.5))
         again = tracker.measure(tuple(-STATION))
@@ -73,7 +73,7 @@ def test_a_place_without_a_reflector_gives_a_measurement_that_says_so() -> None:
     assert again.valid
 
 
-def test_an_interferometer_keeps_its_count_where_it_follows_the_reflector() -> None:
+def test_an_interferometer_keeps_its_count_while_it_follows_the_reflector() -> None:
     with LeicaEmScon(ADDRESS, QUICK) as tracker:
         first = tracker.measure(tuple(-STATION))
         simulators.world("cframe", seed=3).move_to((0.1, 0.1, 0.1))
@@ -87,7 +87,7 @@ def test_an_interferometer_keeps_its_count_where_it_follows_the_reflector() -> N
     assert third.distance != pytest.approx(second.distance, abs=1e-6)  # another dead path
 
 
-def test_a_broken_beam_is_found_again_and_counts_as_another_dead_path() -> None:
+def test_a_broken_beam_is_locked_again_and_counts_as_a_new_dead_path() -> None:
     with LeicaEmScon(ADDRESS + "&fault=beam_broken&fault_at=1&fault_for=1", QUICK) as tracker:
         first, second = tracker.measure(), tracker.measure()
         kinds = [event.kind for event in tracker.events]
@@ -108,7 +108,7 @@ def test_a_beam_that_stays_broken_is_nan_with_its_reason() -> None:
     assert "no result" in found.reason
 
 
-def test_without_reacquisition_a_broken_beam_is_left_alone() -> None:
+def test_without_reacquisition_a_broken_beam_stays_broken() -> None:
     settings = EmSconSettings(reacquire=0, timeout=0.5)
     with LeicaEmScon(ADDRESS + "&fault=beam_broken&fault_for=1", settings) as tracker:
         reasons = [tracker.measure().reason for _ in range(2)]
@@ -116,7 +116,7 @@ def test_without_reacquisition_a_broken_beam_is_left_alone() -> None:
     assert reasons[1] == "beam broken"
 
 
-def test_points_that_a_broken_beam_left_out_are_counted_where_the_clock_puts_them() -> None:
+def test_points_lost_by_a_broken_beam_are_counted_at_their_times() -> None:
     with LeicaEmScon(ADDRESS + "&fault=beam_broken&fault_at=30&fault_for=25", QUICK) as tracker:
         blocks = list(islice(tracker.stream(40), 2))
         dead_path = tracker.dead_path
@@ -127,7 +127,7 @@ def test_points_that_a_broken_beam_left_out_are_counted_where_the_clock_puts_the
     assert abs(np.nanmean(values[:30]) - np.nanmean(values[55:])) > 1e-6
 
 
-def test_lost_points_are_nan_at_their_places() -> None:
+def test_lost_points_are_nan_at_their_positions() -> None:
     with LeicaEmScon(ADDRESS + "&fault=drop&fault_at=3&fault_every=4", QUICK) as tracker:
         (block,) = islice(tracker.stream(20), 1)
     assert np.flatnonzero(np.isnan(block.values[0])).tolist() == [3, 7, 11, 15, 19]
@@ -203,7 +203,7 @@ def test_reflectors_are_chosen_by_name() -> None:
     assert known[0].surface_offset == 0.01905
 
 
-def test_a_tracker_is_initialised_where_it_is_not() -> None:
+def test_a_tracker_is_initialised_if_necessary() -> None:
     with LeicaEmScon(ADDRESS + "&initialised=0", QUICK) as tracker:
         assert tracker.measure().valid
         assert any(event.text == "initialisation changed" for event in tracker.events)
@@ -215,12 +215,12 @@ def test_a_tracker_is_initialised_where_it_is_not() -> None:
         tracker.measure()
 
 
-def test_a_busy_tracker_is_asked_again() -> None:
+def test_a_request_to_a_busy_tracker_is_repeated() -> None:
     with LeicaEmScon(ADDRESS + "&fault=busy&fault_at=9&fault_for=2", QUICK) as tracker:
         assert tracker.measure().valid
 
 
-def test_a_tracker_that_stays_busy_is_named_so() -> None:
+def test_a_tracker_that_stays_busy_is_reported_as_busy() -> None:
     with pytest.raises(InstrumentError, match=r"status 1: the server is busy, for 0\.3 s"):
         LeicaEmScon(ADDRESS + "&fault=busy", QUICK).open()
 
@@ -229,7 +229,7 @@ def test_a_tracker_that_stays_busy_is_named_so() -> None:
 @pytest.mark.parametrize(
     ("code", "words"), [(10015, "does not answer its controller"), (3007, "an error of the tracker processor")]
 )
-def test_refusals_and_errors_are_reported_in_words(fault: str, code: int, words: str) -> None:
+def test_refusals_and_errors_are_reported_with_a_text(fault: str, code: int, words: str) -> None:
     with (
         LeicaEmScon(ADDRESS + f"&fault={fault}&fault_at=8&code={code}", QUICK) as tracker,
         pytest.raises(InstrumentError, match=f"status {code}.*{words}"),
@@ -237,7 +237,7 @@ def test_refusals_and_errors_are_reported_in_words(fault: str, code: int, words:
         tracker.measure()
 
 
-def test_after_silence_or_stray_bytes_the_connection_is_of_no_use() -> None:
+def test_after_silence_or_stray_bytes_the_connection_is_unusable() -> None:
     for fault, error in (("silence", InstrumentTimeoutError), ("garbage", ProtocolError)):
         with LeicaEmScon(ADDRESS + f"&fault={fault}&fault_at=8&fault_every=1000", QUICK) as tracker:
             with pytest.raises(error):
@@ -247,7 +247,7 @@ def test_after_silence_or_stray_bytes_the_connection_is_of_no_use() -> None:
 
 
 def test_settings_refuse_what_does_not_go_together() -> None:
-    with pytest.raises(ValueError, match="whole ms"):
+    with pytest.raises(ValueError, match="multiple of 1 ms"):
         EmSconSettings(rate=300.0)
     with pytest.raises(ValueError, match="meteo = read or manual"):
         EmSconSettings(refraction_index=1.00027)
@@ -259,7 +259,7 @@ def test_addresses_of_no_tracker_are_refused(query: str) -> None:
         LeicaEmScon(f"sim://cframe/tracker?seed=3&{query}", QUICK).open()
 
 
-def test_two_trackers_beside_one_machine_see_the_same_reflector() -> None:
+def test_two_trackers_at_one_machine_measure_the_same_reflector() -> None:
     places = ["-1.2,-0.9,0.3", "1.5,-0.7,0.2"]
     found = []
     with (
@@ -276,7 +276,7 @@ def test_two_trackers_beside_one_machine_see_the_same_reflector() -> None:
     np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-14)
 
 
-def test_what_repeats_badly_repeats_within_one_stay() -> None:
+def test_deviations_between_set_ups_are_constant_within_one_set_up() -> None:
     with LeicaEmScon(ADDRESS + "&noise=0&repeatability=1e-5", QUICK) as tracker:
         world = simulators.world("cframe", seed=3)
         first, same = tracker.read(), tracker.read()

@@ -113,27 +113,27 @@ def test_a_continuous_measurement_names_a_region_that_every_version_of_the_inter
 
 
 @given(command_and_values("request"))
-def test_a_command_comes_back_from_its_bytes(pair: tuple[int, dict[str, object]]) -> None:
+def test_a_command_round_trips(pair: tuple[int, dict[str, object]]) -> None:
     number, values = pair
     assert codec.decode_command(codec.encode_command(number, **values)) == (number, values)
 
 
 @given(command_and_values("answer"))
-def test_an_answer_comes_back_from_its_bytes(pair: tuple[int, dict[str, object]]) -> None:
+def test_an_answer_round_trips(pair: tuple[int, dict[str, object]]) -> None:
     number, values = pair
     packet = decoded(codec.encode_answer(number, 0, **values))
     assert (packet.kind, packet.command, packet.status, packet.values) == (codec.COMMAND, number, 0, values)
 
 
 @given(st.sampled_from([codec.MULTI, codec.MULTI2]), st.data())
-def test_points_come_back_from_their_bytes(kind: int, data: st.DataObject) -> None:
+def test_points_round_trip(kind: int, data: st.DataObject) -> None:
     points = data.draw(st.lists(values_of(codec.POINTS[kind]), max_size=5))
     packet = decoded(codec.encode_result(kind, {"temperature": 21.5}, points=points))
     assert list(packet.points) == points
     assert (packet.values["count"], packet.values["temperature"]) == (len(points), 21.5)
 
 
-def test_a_single_measurement_has_156_bytes_with_the_distance_behind_two_angles() -> None:
+def test_a_single_measurement_has_156_bytes_with_the_distance_after_two_angles() -> None:
     # size, type, status, mode, try flag; 3 values, 4 deviations, 3 pointing errors, 4 a priori, 3 of the air
     numbers = [float(k) for k in range(1, 18)]
     data = struct.pack("<iIIIi17d", 156, 2, 0, 0, 0, *numbers)
@@ -151,12 +151,12 @@ def test_results_have_the_sizes_of_the_c_structures(kind: int, size: int) -> Non
     assert len(codec.encode_result(kind, {})) == size
 
 
-def test_a_refusal_has_no_values_behind_its_status() -> None:
+def test_a_refusal_has_no_values_after_its_status() -> None:
     packet = decoded(codec.encode_answer(codec.GET_REFLECTORS, statuses.BUSY))
     assert (packet.status, dict(packet.values)) == (statuses.BUSY, {})
 
 
-def test_a_command_that_is_not_known_here_is_reported_by_its_number() -> None:
+def test_an_unknown_command_is_reported_by_its_number() -> None:
     assert codec.decode_command(struct.pack("<iII", 12, 0, 9999)) == (9999, {})
     assert decoded(codec.encode_answer(9999, statuses.NOT_IMPLEMENTED)).command == 9999
 
@@ -171,7 +171,7 @@ def test_a_command_that_is_not_known_here_is_reported_by_its_number() -> None:
         struct.pack("<iI", 1 << 17, 3),
     ],
 )
-def test_what_is_no_header_is_named_so(header: bytes) -> None:
+def test_invalid_headers_are_reported(header: bytes) -> None:
     with pytest.raises(ProtocolError, match="Expected the header of an emScon packet"):
         codec.decode_header(header)
 

@@ -1,6 +1,6 @@
 """The driver against a small server that is written from the C definitions of the interface alone.
 
-It answers late, changes units behind the driver's back, and notes the commands that it receives.
+It answers late, changes units without the driver, and records the commands that it receives.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SET_SYSTEM, GET_SYSTEM, START, SET_CONTINUOUS = 47, 48, 49, 30
 
 
 class HeaderServer:
-    """One client at a time; state is held as the bytes that the client sent."""
+    """A server for one client at a time; its state is the bytes that the client sent."""
 
     def __init__(self) -> None:
         self.kept = {SET_UNITS: bytes(20), SET_KIND: bytes(4), SET_SYSTEM: bytes(36)}
@@ -137,7 +137,7 @@ def test_a_late_measurement_is_not_taken_for_the_next_one(server: HeaderServer) 
             held.append(self.distance)
             self.before = lambda *_: None
             self.send(0, struct.pack("<II", START, 0))
-            time.sleep(3.0)  # longer than the driver waits: the result comes behind
+            time.sleep(3.0)  # longer than the driver waits: the result follows later
 
     with LeicaEmScon(server.url, SETTINGS) as tracker:
         tracker.refraction()
@@ -146,7 +146,7 @@ def test_a_late_measurement_is_not_taken_for_the_next_one(server: HeaderServer) 
             tracker.measure()
         server.distance = 2.0
         deadline = time.monotonic() + 20
-        while True:  # errors are typed until the server is heard again
+        while True:  # errors are typed until the server answers again
             try:
                 found = tracker.measure()
                 break
@@ -155,7 +155,7 @@ def test_a_late_measurement_is_not_taken_for_the_next_one(server: HeaderServer) 
         assert found.distance == 2.0
 
 
-def test_a_server_that_is_busy_with_the_late_command_is_waited_for(server: HeaderServer) -> None:
+def test_the_driver_waits_for_a_server_busy_with_a_late_command(server: HeaderServer) -> None:
     def before(self: HeaderServer, number: int) -> None:
         if number == GET_AIR:
             self.before = lambda *_: None
@@ -187,7 +187,7 @@ def test_a_server_that_stays_silent_gives_typed_errors(server: HeaderServer) -> 
     ],
     ids=["mm", "rectangular", "transformed"],
 )
-def test_what_another_client_has_changed_is_an_error_until_it_is_configured_again(
+def test_a_change_by_another_client_is_an_error_until_reconfigured(
     server: HeaderServer, number: int, value: bytes, event: int
 ) -> None:
     with LeicaEmScon(server.url, SETTINGS) as tracker:

@@ -114,7 +114,7 @@ def running(script: str, simulator: str) -> Iterator[int]:
 
 def connected(port: int, settings: EmSconSettings) -> LeicaEmScon:
     tracker = LeicaEmScon(f"tcp://127.0.0.1:{port}", settings)
-    for _ in range(100):  # it states that it is up shortly before it listens
+    for _ in range(100):  # it reports its start shortly before it listens
         try:
             tracker.open()
         except InstrumentError as error:
@@ -126,7 +126,7 @@ def connected(port: int, settings: EmSconSettings) -> LeicaEmScon:
     return tracker
 
 
-def test_a_simulator_of_another_origin_is_spoken_to_without_change(port: int) -> None:
+def test_the_driver_works_with_a_foreign_simulator(port: int) -> None:
     tracker = connected(port, EmSconSettings(timeout=5.0))
     try:
         identity, air = tracker.identify(), tracker.environment()
@@ -140,7 +140,7 @@ def test_a_simulator_of_another_origin_is_spoken_to_without_change(port: int) ->
         tracker.close()
     assert (identity.serial_number, identity.firmware) == ("390793", "emScon 3.8.900")
     assert (air.temperature, air.pressure, air.humidity) == (22.0, 101_325.0, 0.42)
-    assert (index, reflectors) == (1.00027, ())  # it states that it knows 0 reflectors
+    assert (index, reflectors) == (1.00027, ())  # it reports 0 reflectors
     assert np.isfinite(direction).all()
     assert changes == ["initialisation changed", "ready to measure", "statistics changed"]
 
@@ -157,7 +157,7 @@ def test_a_measurement_that_another_implementation_encodes_is_read(measuring_por
     assert found.refraction_index == 1.00027
 
 
-def test_a_client_of_another_origin_measures_with_our_simulator() -> None:
+def test_a_foreign_client_measures_with_the_simulator() -> None:
     device = SimulatedEmScon(
         parse_address("sim://cframe/tracker?seed=3&tracker=AT4xx&noise=0&angle_noise=0&dead_path=0")
     )
@@ -172,7 +172,7 @@ def test_a_client_of_another_origin_measures_with_our_simulator() -> None:
     finally:
         device.close()
         simulators.reset()
-    # in mm, and divided by the index of the air that the server reckons with: 20 degC, 1013.25 mbar
+    # in mm, and divided by the refraction index of the server: 20 degC, 1013.25 mbar
     assert (azimuth, zenith) == pytest.approx(seen[:2], abs=1e-15)
     assert distance == pytest.approx(1e3 * seen[2], rel=5e-6)
     assert (temperature, pressure) == (20.0, 1013.25)

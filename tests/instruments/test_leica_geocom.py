@@ -1,4 +1,4 @@
-"""The driver leica_geocom against the simulated station of another hand, and against a scripted line."""
+"""The driver leica_geocom against the simulated station, and against a scripted line."""
 
 import math
 import socket
@@ -27,7 +27,7 @@ def test_a_measurement_without_motion() -> None:
     assert found.std == pytest.approx((math.hypot(0.6e-3, 1e-6 * found.distance), 2.4e-6, 2.4e-6))
 
 
-def test_the_station_moves_only_where_it_is_armed() -> None:
+def test_the_station_only_moves_if_armed() -> None:
     with LeicaGeoCom(ADDRESS) as station:
         before = station.direction()
         with pytest.raises(InstrumentError, match="move = true"):
@@ -72,14 +72,14 @@ def test_the_air_is_set_and_returned() -> None:
 @pytest.mark.parametrize(
     "wrong", [Environment(), Environment(20.0, 1013.25, 50.0), Environment(20.0, 1e5, 120.0), Environment(290, 1e5, 50)]
 )
-def test_what_is_no_air_is_not_set(wrong: Environment) -> None:
+def test_invalid_air_values_are_not_set(wrong: Environment) -> None:
     with LeicaGeoCom(ADDRESS) as station:
         with pytest.raises(InstrumentError, match="Expected the air"):
             station.set_environment(wrong)
         assert station.environment().pressure == pytest.approx(101_325.0)
 
 
-def test_a_broken_beam_is_no_error_but_no_distance() -> None:
+def test_a_broken_beam_is_a_missing_distance_not_an_error() -> None:
     with LeicaGeoCom(f"{ADDRESS}&fault=beam_broken", GeoComSettings(measuring_timeout=0.5)) as station:
         found = station.measure()
         assert math.isnan(station.read())
@@ -87,7 +87,7 @@ def test_a_broken_beam_is_no_error_but_no_distance() -> None:
     assert found.reason
 
 
-def test_after_a_late_answer_the_next_one_is_its_own() -> None:
+def test_after_a_late_answer_the_next_one_is_correct() -> None:
     address = f"{ADDRESS}&fault=late&fault_at=4&late_by=0.5"
     with LeicaGeoCom(address, GeoComSettings(timeout=0.3, measuring_timeout=0.5)) as station:
         found: list[object] = []
@@ -110,7 +110,7 @@ def test_over_a_serial_line() -> None:
 
 @contextmanager
 def scripted(answer: Callable[[int, int, list[str]], bytes]) -> Iterator[str]:
-    """Serve a line whose answers a function of call, transaction and parameters gives."""
+    """Serve a line; a function of call, transaction and parameters returns the answers."""
     server = socket.create_server(("127.0.0.1", 0))
     server.settimeout(5.0)
     connections: list[socket.socket] = []
@@ -139,7 +139,7 @@ def scripted(answer: Callable[[int, int, list[str]], bytes]) -> Iterator[str]:
 
 
 def station_line(**changed: str) -> Callable[[int, int, list[str]], bytes]:
-    """Return answers of a station; ``changed`` gives those of some calls, as ``c2108="0,..."``."""
+    """Return answers of a station; ``changed`` replaces those of some calls, as ``c2108="0,..."``."""
     plain = {
         "c0": "0",
         "c5004": '0,"TCRP1201"',
@@ -157,7 +157,7 @@ def station_line(**changed: str) -> Callable[[int, int, list[str]], bytes]:
     return answer
 
 
-def test_the_azimuth_counts_against_the_horizontal_angle() -> None:
+def test_the_azimuth_is_opposite_to_the_horizontal_angle() -> None:
     with scripted(station_line()) as address, LeicaGeoCom(address) as station:
         found = station.measure()
     assert found.angles == (-0.5, 1.5)

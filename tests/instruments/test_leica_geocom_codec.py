@@ -44,7 +44,7 @@ def test_replies(vector: Vector) -> None:
         b"%R1P,0,1:0," + codec.LONGEST_REPLY * b"1",
     ],
 )
-def test_what_is_no_reply_is_an_error(line: bytes) -> None:
+def test_invalid_replies_are_an_error(line: bytes) -> None:
     with pytest.raises(ProtocolError):
         codec.reply(line)
 
@@ -117,7 +117,7 @@ def test_wet_temperature_and_humidity_are_inverse(dry: float, relative: float, p
     assert air.humidity(dry, wet, pressure) == pytest.approx(relative, abs=1e-6)
 
 
-def test_humidity_worked_out_by_hand() -> None:
+def test_humidity_calculated_manually() -> None:
     # E(14) = 15.98 hPa, less 0.662 * 6 = 3.97 hPa, over E(20) = 23.33 hPa
     assert air.humidity(20.0, 14.0, 1e5) == pytest.approx(51.5, abs=0.2)
     assert air.humidity(20.0, 20.0, 1e5) == pytest.approx(100.0)

@@ -12,7 +12,7 @@ from errormotion.instruments.transports.loopback.serving import TcpServer
 
 
 class Twofold:
-    """A device that answers on its second line what it gets on its first, in capitals."""
+    """A device that repeats on its second line, in capitals, the bytes of its first line."""
 
     def __init__(self) -> None:
         self.second = TcpServer("second", lambda data: None)
@@ -57,20 +57,20 @@ def test_each_line_goes_to_its_port(device: Twofold) -> None:
         lines.line("data").read()
 
 
-def test_without_a_parameter_the_default_port_is_taken(device: Twofold) -> None:
+def test_without_a_parameter_the_default_port_is_used(device: Twofold) -> None:
     port = parse_address(device.second.url).port
     lines = open_lines(device.first.url, {"data": port})
     assert talk(lines) == b"HELLO"
     lines.close()
 
 
-def test_when_one_line_cannot_be_opened_none_stays_open(device: Twofold) -> None:
+def test_if_one_line_cannot_be_opened_none_stays_open(device: Twofold) -> None:
     with pytest.raises(InstrumentError, match=r"No connection to tcp://127\.0\.0\.1:9"):
         open_lines(f"{device.first.url}?data=9", {"data": 1})
 
 
 @pytest.mark.parametrize("port", ["x", "0", "65536", "1.5"])
-def test_a_port_that_is_none_is_named(device: Twofold, port: str) -> None:
+def test_an_invalid_port_is_named(device: Twofold, port: str) -> None:
     with pytest.raises(InstrumentError, match=f"'data' in .*found '?{port}"):
         open_lines(f"{device.first.url}?data={port}", {"data": 1})
 
@@ -86,7 +86,7 @@ def test_a_simulated_device_without_such_a_line_is_refused() -> None:
         open_lines("sim://cframe/thermometer", {"data": 1}, simulator=simulator)
 
 
-def test_lines_are_recorded_beside_one_another_and_play_back(device: Twofold, tmp_path: Path) -> None:
+def test_parallel_lines_are_recorded_and_play_back(device: Twofold, tmp_path: Path) -> None:
     recording = tmp_path / "both.rec"
     lines = open_lines(device.url, {"data": 1}, record=recording)
     assert talk(lines) == b"HELLO"
@@ -104,7 +104,7 @@ def test_lines_are_recorded_beside_one_another_and_play_back(device: Twofold, tm
         open_lines(f"replay://{recording}", {"light": 1})
 
 
-def test_silence_on_one_line_is_its_own(device: Twofold) -> None:
+def test_silence_on_one_line_does_not_affect_the_other(device: Twofold) -> None:
     lines = open_lines(device.url, {"data": 1}, timeout=0.2)
     with pytest.raises(InstrumentTimeoutError, match="sent no data"):
         lines.line("data").read()

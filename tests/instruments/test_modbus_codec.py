@@ -1,4 +1,4 @@
-"""Modbus frames and registers: published bytes, and what comes back of any numbers."""
+"""Modbus frames and registers: published bytes, and round trips of any numbers."""
 
 import math
 import struct
@@ -44,16 +44,16 @@ def test_an_answer_is_read_as_published() -> None:
 
 
 @given(FRAMINGS, st.integers(0, 255), st.sampled_from([3, 4]), REGISTERS, st.integers(0, 65535))
-def test_registers_come_back(framing: str, unit: int, function: int, registers: list[int], number: int) -> None:
+def test_registers_round_trip(framing: str, unit: int, function: int, registers: list[int], number: int) -> None:
     frame = encode_answer(framing, unit, function, registers, number)
     assert decode_answer(framing, frame, unit, function, len(registers), number) == registers
     assert missing(framing, frame) == 0
     for size in range(len(frame)):
-        assert 0 < missing(framing, frame[:size]) <= len(frame) - size  # never waits for more than there is
+        assert 0 < missing(framing, frame[:size]) <= len(frame) - size  # never waits for more than available
 
 
 @given(st.data(), REGISTERS)
-def test_a_changed_byte_of_an_rtu_answer_is_noticed(data: st.DataObject, registers: list[int]) -> None:
+def test_a_changed_byte_of_an_rtu_answer_is_detected(data: st.DataObject, registers: list[int]) -> None:
     frame = bytearray(encode_answer("rtu", 1, 3, registers))
     frame[data.draw(st.integers(0, len(frame) - 1))] ^= data.draw(st.integers(1, 255))
     with pytest.raises(ProtocolError):
@@ -61,7 +61,7 @@ def test_a_changed_byte_of_an_rtu_answer_is_noticed(data: st.DataObject, registe
 
 
 @given(FRAMINGS, st.binary(max_size=300))
-def test_rubbish_is_a_protocol_error(framing: str, rubbish: bytes) -> None:
+def test_invalid_data_are_a_protocol_error(framing: str, rubbish: bytes) -> None:
     try:
         found = decode_answer(framing, rubbish, 1, 3, 5, number=7)
     except (ProtocolError, ModbusRefusal):
@@ -73,7 +73,7 @@ def test_rubbish_is_a_protocol_error(framing: str, rubbish: bytes) -> None:
 @pytest.mark.parametrize(
     ("framing", "frame"), [("tcp", bytes.fromhex("0009 0000 0003 01 83 02")), ("rtu", bytes.fromhex("01 83 02 C0F1"))]
 )
-def test_an_exception_reply_is_a_refusal_in_words(framing: str, frame: bytes) -> None:
+def test_an_exception_reply_is_a_refusal_with_a_text(framing: str, frame: bytes) -> None:
     with pytest.raises(ModbusRefusal, match=r"exception 2 \(illegal data address\)") as refusal:
         decode_answer(framing, frame, 1, 3, 5, 9)
     assert refusal.value.code == 2
@@ -94,7 +94,7 @@ def test_the_answer_to_something_else_is_refused(framing: str, frame: tuple[int,
         decode_answer(framing, encode_answer(framing, *frame, number=5), 1, 3, 2, 5)
 
 
-def test_a_late_answer_is_passed_over_and_one_from_the_future_is_not() -> None:
+def test_a_late_answer_is_skipped_but_one_to_a_later_request_is_not() -> None:
     assert decode_answer("tcp", encode_answer("tcp", 1, 3, [1], 4), 1, 3, 1, 5) is None
     assert decode_answer("tcp", encode_answer("tcp", 1, 3, [1], 65535), 1, 3, 1, 0) is None
     with pytest.raises(ProtocolError, match="transaction 5"):
@@ -102,14 +102,14 @@ def test_a_late_answer_is_passed_over_and_one_from_the_future_is_not() -> None:
 
 
 @given(KINDS, ORDERS, ORDERS, st.floats(-40000, 40000, width=32))
-def test_numbers_come_back_in_every_order(kind: str, words: str, octets: str, number: float) -> None:
+def test_numbers_round_trip_in_every_order(kind: str, words: str, octets: str, number: float) -> None:
     encoded = encode_number(number, kind, words, octets)
     found = decode_number(encoded, kind, words, octets)
     low, high = {"u16": (0, 65535), "i16": (-32768, 32767), "u32": (0, math.inf)}.get(kind, (-math.inf, math.inf))
     assert found == (number if kind == "f32" else min(max(round(number), low), high))
 
 
-def test_words_and_bytes_lie_as_the_orders_say() -> None:
+def test_words_and_bytes_have_the_stated_orders() -> None:
     a, b = struct.unpack(">HH", struct.pack(">f", 21.5))
     swapped = [int.from_bytes(word.to_bytes(2, "big"), "little") for word in (a, b)]
     assert encode_number(21.5, "f32") == [a, b]
@@ -138,7 +138,7 @@ def test_the_logger_counts_tenths_and_is_open_from_10000_on() -> None:
     assert [logger.temperature(0, [code])[1] for code in (10000, 10001, 32767)] == ["open"] * 3
 
 
-def test_a_setting_wins_over_its_map() -> None:
+def test_a_setting_overrides_its_map() -> None:
     settings = ModbusSettings(map="logger-16", first=0x40, scale=0.01)
     assert (settings.first, settings.scale, settings.open_from) == (0x40, 0.01, 10000)
     assert ModbusSettings.model_validate_json(settings.model_dump_json()) == settings
@@ -165,13 +165,13 @@ def test_blocks_take_what_lies_between_even_channels_only() -> None:
         ({"map": "adam-6018", "channels": tuple("abcdefghi")}, "has 8 channels; found 9"),
         ({"registers": (1, 2)}, "one for each of the 5 channels; found 2"),
         ({"scale": (1.0, 2.0)}, "one, or one for each of the 5 channels"),
-        ({"type": "f32", "stride": 1}, "a f32 fills 2 registers"),
+        ({"type": "f32", "stride": 1}, "a f32 needs 2 registers"),
         ({"first": 65533}, "registers up to 65535"),
         ({"channels": ("a", "a")}, "has a twice"),
         ({"places": {"bed": (0, 0, 0)}}, "'places' has bed"),
         ({"map": "adam-6017"}, "custom"),
     ],
 )
-def test_a_map_that_cannot_be_is_refused(settings: dict[str, object], message: str) -> None:
+def test_an_invalid_map_is_refused(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         ModbusSettings.model_validate(settings)

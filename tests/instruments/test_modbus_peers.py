@@ -1,4 +1,4 @@
-"""Modbus of others: their clients against our simulator, the server of libmodbus against our driver."""
+"""Foreign Modbus implementations: clients against the simulator, the server of libmodbus against the driver."""
 
 import struct
 from collections.abc import Iterator
@@ -95,7 +95,7 @@ def test_pymodbus_reads_the_simulator(device: SimulatedModbus) -> None:
 
 @needs_libmodbus
 @pytest.mark.parametrize("function", [3, 4])
-def test_our_driver_reads_a_server_of_libmodbus(function: int) -> None:
+def test_the_driver_reads_a_server_of_libmodbus(function: int) -> None:
     words = [*struct.unpack(">2H", struct.pack(">f", 20.25)), *struct.unpack(">2H", struct.pack(">f", -3.5))]
     settings = ModbusSettings(
         channels=("air", "bed"), function=function, first=100, type="f32", unit=7, timeout=TIMEOUT

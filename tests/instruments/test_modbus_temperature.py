@@ -1,4 +1,4 @@
-"""Thermometers with Modbus: against a server that is not ours, a client that is not ours, and every fault."""
+"""Thermometers with Modbus: a foreign server, a foreign client, and all faults."""
 
 import asyncio
 import math
@@ -36,12 +36,12 @@ QUICK = ModbusSettings(map="logger-16", timeout=0.7, retry=0.05, retries=0)
 TWO = ("air", "bed")
 
 
-# ---------------------------------------------------------------------- a server of somebody else
+# ---------------------------------------------------------------------- a foreign server
 
 
 @contextmanager
 def served(make: Callable[[SimDevice], Any], device: SimDevice) -> Iterator[int]:
-    """Run a server of pymodbus in a thread; give its port, 0 on a serial line."""
+    """Run a server of pymodbus in a thread; yield its port, 0 on a serial line."""
     loop, ready, end = asyncio.new_event_loop(), threading.Event(), asyncio.Event()
     ports: list[int] = []
 
@@ -68,7 +68,7 @@ def served(make: Callable[[SimDevice], Any], device: SimDevice) -> Iterator[int]
 
 @contextmanager
 def null_modem() -> Iterator[tuple[str, str]]:
-    """Give the two ends of a serial line."""
+    """Yield the two ends of a serial line."""
     pairs = [os.openpty(), os.openpty()]
     for near, far in pairs:
         tty.setraw(near)
@@ -130,7 +130,7 @@ def test_reads_a_pymodbus_server_on_a_serial_line() -> None:
             assert [thermometer.read() for _ in range(5)] == [{"air": 20.25, "bed": -3.5}] * 5
 
 
-# ---------------------------------------------------------------------- a client of somebody else
+# ---------------------------------------------------------------------- a foreign client
 
 
 @pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed (Debian package mbpoll)")
@@ -205,7 +205,7 @@ def test_open_and_shorted_sensors_are_nan_with_a_flag() -> None:
         assert thermometer.open_sensors == ("frame", "ambient", "spindle_rear")
 
 
-def test_places_are_settings_with_units() -> None:
+def test_positions_are_settings_with_units() -> None:
     settings = ModbusSettings.model_validate({"channels": TWO, "places": {"bed": ("0.4 m", "-20 mm", 0.0)}})
     assert ModbusTemperature("modbus+tcp://host", settings).places == {"air": None, "bed": (0.4, -0.02, 0.0)}
 
@@ -228,13 +228,13 @@ def test_another_unit_does_not_answer() -> None:
         ("modbus+rtu://", "Expected modbus.rtu:///dev/NAME"),
         ("modbus+tcp://127.0.0.1:9?unit=300", "'unit' .* from 0 to 255; found 300"),
         ("modbus+tcp://127.0.0.1:9", "No connection to modbus.tcp://127.0.0.1:9"),
-        (f"{LOGGER}&wire=pty&framing=tcp", "on a pty 'rtu' only"),
+        (f"{LOGGER}&wire=pty&framing=tcp", "'rtu' on a pty"),
         (f"{LOGGER}&sensors=coffee", "found coffee"),
         (f"{LOGGER}&open=7", "inputs from 0 to 4; found '7'"),
-        (f"{LOGGER}&type=f64", "register map .* cannot be"),
+        (f"{LOGGER}&type=f64", "register map .* is invalid"),
     ],
 )
-def test_a_wrong_address_says_what_is_expected(address: str, message: str) -> None:
+def test_the_message_for_a_wrong_address_states_the_expected_form(address: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):
         ModbusTemperature(address, QUICK).open()
 
@@ -255,7 +255,7 @@ def test_a_wrong_address_says_what_is_expected(address: str, message: str) -> No
         ("unit", ProtocolError, "answer of unit 1; found that of unit 3"),
     ],
 )
-def test_each_fault_is_a_state_of_its_own(wire: str, fault: str, error: type[InstrumentError], message: str) -> None:
+def test_each_fault_has_its_own_state(wire: str, fault: str, error: type[InstrumentError], message: str) -> None:
     with ModbusTemperature(f"{LOGGER}&{wire}&fault={fault}&fault_at=2", QUICK) as thermometer:
         thermometer.read()
         with pytest.raises(error, match=message) as raised:
@@ -273,7 +273,7 @@ def test_a_wrong_checksum_is_reported_from_silence(wire: str) -> None:
         thermometer.read()
 
 
-def test_a_damaged_answer_is_asked_for_again_and_counted() -> None:
+def test_a_damaged_answer_is_requested_again_and_counted() -> None:
     settings = QUICK.model_copy(update={"retries": 1})
     address = f"{LOGGER}&framing=rtu&fault=checksum&fault_at=1&fault_every=2"
     with ModbusTemperature(address, settings) as thermometer:
@@ -288,7 +288,7 @@ def test_answers_in_pieces_are_whole() -> None:
 
 
 @pytest.mark.parametrize("wire", ["framing=tcp", "framing=rtu", "wire=pty"])
-def test_a_thermometer_that_was_unplugged_is_heard_again_by_itself(wire: str) -> None:
+def test_an_unplugged_thermometer_is_received_again_automatically(wire: str) -> None:
     address = f"{LOGGER}&{wire}&fault=unplugged&fault_at=2&unplugged_for=1.6"
     with ModbusTemperature(address, QUICK) as thermometer:
         before = thermometer.read()
@@ -306,7 +306,7 @@ def test_a_thermometer_that_was_unplugged_is_heard_again_by_itself(wire: str) ->
         assert set(thermometer.flags.values()) == {""}
 
 
-def test_a_lost_connection_is_tried_again_at_a_limited_rate() -> None:
+def test_a_lost_connection_is_retried_at_a_limited_rate() -> None:
     settings = QUICK.model_copy(update={"retry": 60.0})
     with ModbusTemperature(f"{LOGGER}&fault=disconnect&fault_at=2", settings) as thermometer:
         thermometer.read()
@@ -317,7 +317,7 @@ def test_a_lost_connection_is_tried_again_at_a_limited_rate() -> None:
                 thermometer.read()
 
 
-def test_a_server_that_goes_and_comes_back_at_its_port_is_read_again() -> None:
+def test_a_server_that_restarts_at_its_port_is_read_again() -> None:
     settings = ModbusSettings(channels=TWO, first=100, type="f32", unit=7, timeout=0.5, retry=0.0)
     at = lambda port: lambda device: ModbusTcpServer(device, address=("127.0.0.1", port))  # noqa: E731
     with served(at(0), two_floats(3)) as port:
@@ -366,7 +366,7 @@ def test_a_session_with_gaps_plays_back_with_the_same_gaps(tmp_path: Path) -> No
 
 
 class Answering(Transport):
-    """A serial line whose device answers as a function of the request says."""
+    """A serial line; a function of the request returns the answers."""
 
     def __init__(self, answer: Callable[[int], list[bytes]]) -> None:
         super().__init__("serial://test", 0.1)

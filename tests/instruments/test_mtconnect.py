@@ -1,4 +1,4 @@
-"""MTConnect agents at the wire: states, sequence numbers, lost observations, restarts, faults."""
+"""MTConnect agents: states, sequence numbers, lost observations, restarts, faults."""
 
 import math
 from itertools import islice
@@ -21,7 +21,7 @@ def read_often(agent: MTConnect) -> None:
         agent.read()
 
 
-def test_a_state_is_what_the_machine_does() -> None:
+def test_a_state_is_that_of_the_machine() -> None:
     with MTConnect(ADDRESS) as agent, VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
         assert agent.identify().model == "cframe"
         assert agent.identify().simulated
@@ -42,7 +42,7 @@ def test_a_state_is_what_the_machine_does() -> None:
     assert reported["unavailable"] == ["program"]
 
 
-def test_a_program_and_its_feed_show_while_it_runs() -> None:
+def test_a_program_and_its_feed_are_reported_while_it_runs() -> None:
     program = "(there and back)\nG1 X100 F600\nG1 X0\nM30\n"
     with MTConnect(ADDRESS) as agent, VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
         control.run_program(program)
@@ -76,7 +76,7 @@ def test_a_machine_that_is_off_is_unknown_and_not_zero() -> None:
     assert "homed" not in reading
 
 
-def test_samples_are_what_is_new() -> None:
+def test_samples_are_new_observations() -> None:
     with MTConnect(ADDRESS) as agent:
         first = agent.sample()
         numbers = [each.sequence for each in first.observations]
@@ -91,7 +91,7 @@ def test_samples_are_what_is_new() -> None:
         assert (agent.lost, agent.restarts) == (0, 0)
 
 
-def test_a_small_count_is_asked_for_until_all_is_there() -> None:
+def test_a_small_count_is_requested_until_all_have_been_received() -> None:
     with MTConnect(ADDRESS, MTConnectSettings(count=1)) as agent:
         agent.sample()
         world("cframe", 3).move_to((0.1, 0.0, 0.0))
@@ -107,7 +107,7 @@ def test_observations_that_were_overwritten_are_counted(fault: str, streaming: b
         hole = next(each for each in source if each.lost)
         assert hole.observations[0].sequence == before + hole.lost
         assert len(hole.observations) == 50
-        assert hole.next == before + 101  # twice what the buffer holds, and then the load as it really is
+        assert hole.next == before + 101  # twice the size of the buffer, and then the actual load
         assert agent.lost == hole.lost == 101 - 50
         assert next(source).lost == 0
         if streaming:
@@ -116,7 +116,7 @@ def test_observations_that_were_overwritten_are_counted(fault: str, streaming: b
 
 
 @pytest.mark.parametrize("streaming", [False, True])
-def test_a_restarted_agent_is_noticed_and_read_from_its_beginning(streaming: bool) -> None:
+def test_a_restarted_agent_is_detected_and_read_from_its_start(streaming: bool) -> None:
     with MTConnect(f"{ADDRESS}&fault=restart&fault_at=5") as agent:
         before = agent.sample()
         source = agent.observations(0.01) if streaming else iter(agent.sample, None)
@@ -129,18 +129,18 @@ def test_a_restarted_agent_is_noticed_and_read_from_its_beginning(streaming: boo
             source.close()
 
 
-def test_a_restart_while_nobody_listened_is_noticed_too() -> None:
+def test_a_restart_without_a_listener_is_detected_too() -> None:
     agent = MTConnect(ADDRESS)
     with agent:
         agent.sample()
-    agent._instance = 1  # what it was before: a simulated agent always starts with the same
+    agent._instance = 1  # as before: a simulated agent always starts with the same
     with agent:
         assert agent.restarts == 1
         assert agent.sample().restarted
         assert not agent.sample().restarted
 
 
-def test_a_stream_goes_on_where_the_last_one_ended() -> None:
+def test_a_stream_continues_from_the_end_of_the_last_one() -> None:
     with MTConnect(ADDRESS) as agent:
         stream = agent.observations(0.01)
         first = next(stream)
@@ -177,7 +177,7 @@ def test_a_fault_in_the_middle_of_a_stream_is_a_typed_error(fault: str, error: t
         list(islice(agent.observations(0.01), 30))
 
 
-def test_splitting_changes_nothing() -> None:
+def test_splitting_has_no_effect() -> None:
     readings = []
     for fault in ("", "&fault=split"):
         with MTConnect(ADDRESS + fault) as agent:

@@ -1,4 +1,4 @@
-"""The driver at agents other than the simulated one: published devices, agents that state less, another project's."""
+"""The driver with other agents: published devices, agents with less information, another project's."""
 
 import http.server
 import math
@@ -22,7 +22,7 @@ TIME = 'timestamp="2025-03-01T12:00:00Z"'
 
 
 class Agent:
-    """An agent of which a test states the observations; it answers with those from the requested number on."""
+    """A scripted agent; it answers with its observations from the requested number on."""
 
     def __init__(self, probe: bytes, *, numbers: bool = True) -> None:
         self.probe, self.numbers = probe, numbers
@@ -80,7 +80,7 @@ def test_an_agent_that_states_no_next_number_does_not_repeat_observations() -> N
         assert (driver.lost, driver.restarts) == (0, 0)
 
 
-def test_of_a_time_series_that_is_named_the_last_value_counts() -> None:
+def test_the_last_value_of_a_named_time_series_counts() -> None:
     series = FEED.replace('id="f"', 'id="s" representation="TIME_SERIES"')
     with agent(probe_of(series + FEED)) as there:
         there.observations = [feed(1, "1 2 3", "s"), feed(2, "10")]
@@ -147,7 +147,7 @@ def _peer_device(_: str) -> tuple[dict[str, object], ElementTree.ElementTree]:
 
 @contextmanager
 def peer(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[object, str]]:
-    """Yield an agent of the package, and the address of a server of the standard library that asks it."""
+    """Yield an agent of the package, and the address of a server of the standard library in front of it."""
     package = pytest.importorskip("mtconnect")
     monkeypatch.setattr("mtconnect.agent.read_devices", _peer_device)
     made = package.MTConnect()
@@ -205,7 +205,7 @@ def test_an_agent_of_the_package_mtconnect_is_read(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.filterwarnings("ignore:datetime.datetime.utcnow:DeprecationWarning")
-def test_observations_of_the_package_mtconnect_come_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_observations_of_the_package_mtconnect_are_returned_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its header states no sequence numbers at all."""
     with peer(monkeypatch) as (there, url), MTConnect(url) as driver:
         first = driver.sample()
@@ -220,7 +220,7 @@ def test_observations_of_the_package_mtconnect_come_once(monkeypatch: pytest.Mon
 def test_a_device_that_the_address_does_not_name_is_refused() -> None:
     two = b"<Device id='a' name='A'/><Device id='b' name='B'/>"
     probe = b"<MTConnectDevices>%s/><Devices>%s</Devices></MTConnectDevices>" % (HEADER.encode(), two)
-    with agent(probe) as there, pytest.raises(InstrumentError, match="the devices A, B; name one in the address"):
+    with agent(probe) as there, pytest.raises(InstrumentError, match="the devices A, B; state one in the address"):
         MTConnect(there.url).open()
 
 

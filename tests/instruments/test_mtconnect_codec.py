@@ -1,4 +1,4 @@
-"""XML of MTConnect agents: every version, hostile documents, and which data item reports what."""
+"""XML of MTConnect agents: all versions, hostile documents, and the assignment of data items."""
 
 import math
 import re
@@ -65,7 +65,7 @@ def device(**settings: object) -> tuple[Device, MTConnectSettings]:
 def test_devices_are_read_with_components_and_without_namespaces() -> None:
     document = parse(DEVICES.encode())
     assert (document.header.instance, document.header.version) == (17, "2.0.0.1")
-    (vmc,) = document.devices  # the agent itself is none
+    (vmc,) = document.devices  # the agent itself is not one
     assert (vmc.name, vmc.manufacturer, vmc.model, vmc.serial_number) == ("VMC", "Maker", "V5", "123")
     assert vmc.items["xm"] == DataItem(
         *("xm", "SAMPLE", "POSITION", "ACTUAL", "", "MILLIMETER", "MACHINE", "Linear", "X1", "X", "x")
@@ -74,7 +74,7 @@ def test_devices_are_read_with_components_and_without_namespaces() -> None:
     assert len(vmc.items) == 9
 
 
-def test_observations_come_in_the_order_of_their_numbers() -> None:
+def test_observations_are_in_the_order_of_their_numbers() -> None:
     document = parse(STREAMS.encode())
     header = document.header
     assert (header.first, header.last, header.next, header.buffer) == (5, 9, 10, 131072)
@@ -93,10 +93,10 @@ def test_observations_come_in_the_order_of_their_numbers() -> None:
         '<Errors><Error errorCode="OUT_OF_RANGE">from must be more</Error></Errors>',
         '<Errors><OutOfRange errorCode="OUT_OF_RANGE"><URI/><ErrorMessage>from must be more</ErrorMessage>'
         "</OutOfRange></Errors>",
-        '<Error errorCode="OUT_OF_RANGE">from must be more</Error>',  # agents of version 1.0 still stand about
+        '<Error errorCode="OUT_OF_RANGE">from must be more</Error>',  # agents of version 1.0 are still in use
     ],
 )
-def test_errors_are_known_by_their_code_in_every_version(errors: str) -> None:
+def test_errors_are_identified_by_their_code_in_every_version(errors: str) -> None:
     document = parse(f"<MTConnectError>{HEADER}/>{errors}</MTConnectError>".encode())
     assert document.errors == {"OUT_OF_RANGE": "from must be more"}
 
@@ -132,14 +132,14 @@ def test_anything_else_is_a_protocol_error(document: str, message: str) -> None:
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
-def test_no_entity_ever_comes_to_be(doctype: str, encoding: str) -> None:
+def test_no_entity_is_ever_expanded(doctype: str, encoding: str) -> None:
     document = f'<?xml version="1.0" encoding="{encoding}"?>{doctype}<a>&x;&b;</a>'
     with pytest.raises(ProtocolError, match=r"without document type"):
         parse(document.encode(encoding))
 
 
 @given(st.binary(max_size=300))
-def test_no_bytes_do_anything_but_a_protocol_error(data: bytes) -> None:
+def test_any_invalid_bytes_are_a_protocol_error(data: bytes) -> None:
     with pytest.raises(ProtocolError):
         parse(data)
 
@@ -155,7 +155,7 @@ def test_a_damaged_document_is_read_or_refused(place: int, stray: bytes) -> None
 
 
 @given(st.lists(st.floats(-1e4, 1e4), min_size=1, max_size=3))
-def test_numbers_come_back_in_si(values: list[float]) -> None:
+def test_numbers_round_trip_in_si(values: list[float]) -> None:
     observation = Observation("p", 1, 0.0, " ".join(map(repr, values)))
     assert observation.numbers(1e-3) == [value * 1e-3 for value in values]
 
@@ -182,7 +182,7 @@ def test_units_become_si(units: str, value: float, si: float) -> None:
     assert value * DataItem("i", "SAMPLE", "POSITION", units=units).scale == pytest.approx(si, rel=1e-12)
 
 
-def test_units_that_are_left_out_follow_from_the_type_and_unknown_ones_are_refused() -> None:
+def test_missing_units_follow_from_the_type_and_unknown_ones_are_refused() -> None:
     assert DataItem("i", "SAMPLE", "POSITION").scale == 1e-3
     with pytest.raises(ProtocolError, match="is in 'FURLONG'"):
         _ = DataItem("i", "SAMPLE", "POSITION", units="FURLONG").scale
@@ -195,8 +195,8 @@ def test_times_without_a_zone_are_utc() -> None:
 # ---------------------------------------------------------------------- limits
 
 
-def test_a_long_namespace_costs_nothing_but_its_own_length() -> None:
-    """Resolved into each of 8000 names, these 500 kB were 4 GB."""
+def test_the_cost_of_a_long_namespace_is_linear() -> None:
+    """Expanded into each of 8000 names, these 500 kB would be 4 GB."""
     tags = "<t/>" * 8000
     document = f'<MTConnectStreams xmlns="urn:{"x" * 500_000}">{HEADER}/><Streams>{tags}</Streams></MTConnectStreams>'
     tracemalloc.start()
@@ -220,25 +220,25 @@ def test_a_long_namespace_costs_nothing_but_its_own_length() -> None:
         (f'<P dataItemId="x" timestamp="{"2" * 5000}" sequence="1">1</P>', "Expected a time"),
     ],
 )
-def test_what_is_larger_than_its_limit_is_refused(inside: str, message: str) -> None:
+def test_data_beyond_their_limit_are_refused(inside: str, message: str) -> None:
     with pytest.raises(ProtocolError, match=message):
         parse(f"<MTConnectStreams>{HEADER}/>{inside}</MTConnectStreams>".encode())
 
 
 @pytest.mark.parametrize("text", ["1e999", "inf", "nan", "1_0", "0x10", "1" * 200_000 + "x", "\u0661"])
-def test_values_that_python_takes_for_numbers_are_no_numbers(text: str) -> None:
+def test_values_that_only_python_accepts_as_numbers_are_refused(text: str) -> None:
     with pytest.raises(ProtocolError, match="expected a number"):
         Observation("p", 1, 0.0, text).number()
 
 
-def test_an_observation_that_holds_others_does_not_repeat_their_text() -> None:
+def test_an_observation_that_contains_others_does_not_repeat_their_text() -> None:
     inner = '<P dataItemId="x" timestamp="2025-03-01T12:00:00Z" sequence="2">7</P>'
     outer = f'<P dataItemId="y" timestamp="2025-03-01T12:00:00Z" sequence="1">5{inner}</P>'
     document = parse(f"<MTConnectStreams>{HEADER}/>{outer}</MTConnectStreams>".encode())
     assert [each.value for each in document.observations] == ["5", "7"]
 
 
-# ---------------------------------------------------------------------- which item reports what
+# ---------------------------------------------------------------------- assignment of data items
 
 
 def test_native_names_and_machine_coordinates_decide() -> None:
@@ -252,7 +252,7 @@ def test_native_names_and_machine_coordinates_decide() -> None:
     assert "mode" not in chosen
 
 
-def test_a_path_position_stands_in_where_no_axis_tells_its_own() -> None:
+def test_a_path_position_replaces_missing_axis_positions() -> None:
     chosen = choose(*device(spindle="C", axes=("U", "V", "W"))).items
     assert chosen["position"].id == "pp"
 
@@ -274,7 +274,7 @@ def test_two_spindles_are_unknown_until_a_setting_decides() -> None:
 
 
 def made(inside: str, configuration: str = "", **settings: object) -> Choice:
-    """Return what is chosen of a device with these components."""
+    """Return the selected data items of a device with these components."""
     document = (
         f'<MTConnectDevices>{HEADER}/><Devices><Device id="d" name="M">{configuration}<Components>{inside}'
         "</Components></Device></Devices></MTConnectDevices>"
@@ -303,14 +303,14 @@ def test_from_version_2_the_configuration_of_the_device_decides_on_the_coordinat
     assert (chosen.id, chosen.coordinate_system) == ("xm", "MACHINE")
 
 
-def test_work_coordinates_are_only_taken_where_there_are_no_others() -> None:
+def test_work_coordinates_are_only_used_without_others() -> None:
     work = item("xw", "POSITION", subType="ACTUAL", coordinateSystemIdRef="w")
     plain = item("x", "POSITION", subType="ACTUAL")
     assert made(axis("X", work, plain), SYSTEMS).items["position.X"].id == "x"
     assert made(axis("X", work), SYSTEMS).items["position.X"].coordinate_system == "WORK"
 
 
-def test_percent_is_an_override_and_no_speed() -> None:
+def test_percent_is_an_override_not_a_speed() -> None:
     feeds = [item("f", "PATH_FEEDRATE", units="MILLIMETER/SECOND"), item("o", "PATH_FEEDRATE", units="PERCENT")]
     speeds = [
         item("s", "SPINDLE_SPEED", subType="ACTUAL", units="REVOLUTION/MINUTE"),
@@ -345,7 +345,7 @@ def test_a_time_series_can_be_named_and_a_set_cannot() -> None:
         made(axis("P", table, component="Path"), items={"feed": "ft"})
 
 
-def test_of_numbered_axes_the_first_one_is_meant() -> None:
+def test_the_first_of_numbered_axes_is_used() -> None:
     axes = [axis(name, item(name, "POSITION", subType="ACTUAL")) for name in ("Z4", "Z1", "X")]
     chosen = made("".join(axes)).items
     assert (chosen["position.Z"].id, chosen["position.X"].id) == ("Z1", "X")

@@ -69,7 +69,7 @@ def need_memory(data: bytes) -> None:
     ("read", "failure"),
     [(raise_other, "ValueError"), (need_time, "ms for"), (need_memory, "bytes of memory")],
 )
-def test_what_is_not_allowed_is_found(read, failure: str) -> None:
+def test_forbidden_motion_is_detected(read, failure: str) -> None:
     found = fuzz(Codec("a", "b", read, lambda: [b"good"], 8), range(1, 3), sampled=1)
     assert found.failures
     assert failure in found.failures[0]
@@ -88,10 +88,10 @@ def test_good_frames_that_nothing_accepts_are_found() -> None:
         fuzz(Codec("a", "b", refuse, lambda: [b"bad"], 8), range(1))
 
 
-# ---------------------------------------------------------------------- what damaged frames have shown
+# ---------------------------------------------------------------------- errors found with damaged frames
 
 
-def test_a_long_line_of_digits_is_no_work() -> None:
+def test_a_long_line_of_digits_is_refused_quickly() -> None:
     digits = "1" * 300
     start = time.thread_time()
     assert not re.fullmatch(PATTERN, f"X{digits}Y{digits}Z{digits}?")
@@ -111,7 +111,7 @@ def test_an_answer_of_a_sensor_has_a_limited_number_of_lines() -> None:
 
 
 @pytest.mark.parametrize("text", ["s", r"\s", r"\\"])
-def test_an_unfinished_text_of_a_station_takes_no_more_memory_than_it_is_long(text: str) -> None:
+def test_an_incomplete_text_of_a_station_takes_no_more_memory_than_its_length(text: str) -> None:
     line = b'%R1P,0,1:0,"' + (1000 // len(text) * text).encode()
     with pytest.raises(ProtocolError, match="unfinished"):
         geocom.reply(line)
@@ -124,7 +124,7 @@ def test_an_unfinished_text_of_a_station_takes_no_more_memory_than_it_is_long(te
         tracemalloc.stop()
 
 
-def test_whole_numbers_beyond_a_float_are_errors_of_the_bridge() -> None:
+def test_integers_beyond_a_float_are_errors_of_the_bridge() -> None:
     with pytest.raises(ProtocolError, match="an answer of the bridge"):
         linuxcnc.decode(json.dumps({"id": 1, "beat": 1, "time": HUGE}).encode())
     with pytest.raises(ProtocolError, match="result of a touch"):
@@ -139,7 +139,7 @@ def test_whole_numbers_beyond_a_float_are_errors_of_the_bridge() -> None:
 
 
 @pytest.mark.parametrize("line", [b"* PONG", b"* PONG ", b"* PONG: 12x", b"* PONG x"])
-def test_a_heartbeat_without_a_number_is_none(line: bytes) -> None:
+def test_a_heartbeat_without_a_number_is_not_one(line: bytes) -> None:
     command = shdr.parse_line(line)
     assert isinstance(command, shdr.Command)
     assert shdr.pong(command) is None
@@ -170,7 +170,7 @@ def test_a_list_of_recordings_names_files(tmp_path) -> None:
         read_index(path)
 
 
-def test_a_long_list_of_recordings_is_refused_before_it_is_taken_apart(tmp_path) -> None:
+def test_a_long_list_of_recordings_is_refused_before_it_is_parsed(tmp_path) -> None:
     path = tmp_path / "list.rec"
     path.write_text("errormotion-sessions/1\n" + 50_000 * "\n")
     tracemalloc.start()

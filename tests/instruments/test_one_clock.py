@@ -22,7 +22,7 @@ def here() -> Iterator[VirtualWorld]:
     simulators.reset()
 
 
-def test_the_clock_is_set_back_to_the_same_state(here: VirtualWorld) -> None:
+def test_resetting_the_clock_restores_the_state(here: VirtualWorld) -> None:
     here.follow(HEAT, 3600.0)
     first = here.machine.temperatures([here.time])
     here.move_to([1.0, 0.2, 0.1])
@@ -36,7 +36,7 @@ def test_the_clock_is_set_back_to_the_same_state(here: VirtualWorld) -> None:
     assert here.commanded_speed(here.time) == 12000.0
 
 
-def test_orders_to_the_spindle_turn_it_and_do_not_change_the_heat(here: VirtualWorld) -> None:
+def test_commands_to_the_spindle_turn_it_and_do_not_change_the_heat(here: VirtualWorld) -> None:
     here.follow(HEAT, 3600.0)
     before = here.machine.temperatures([7200.0])
     here.spindle(0.0)

@@ -34,7 +34,7 @@ def reasons(blocks: list[Samples]) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("wire", ["tcp", "pty"])
-def test_a_sensor_tells_who_it_is_and_that_it_is_simulated(wire: str) -> None:
+def test_a_sensor_states_its_identity_and_that_it_is_simulated(wire: str) -> None:
     address = f"sim://cframe/X1?seed=3&wire={wire}"
     with OptoNCDT(address, SLOW) as sensor:
         identity = sensor.identify()
@@ -88,7 +88,7 @@ def test_without_the_counter_distances_alone_are_sent() -> None:
     np.testing.assert_allclose(values(blocks), truth, rtol=0, atol=RESOLUTION / 2 * 1.001)
 
 
-def test_other_settings_hold_from_the_next_stream_on() -> None:
+def test_new_settings_apply_from_the_next_stream_on() -> None:
     with OptoNCDT("sim://cframe/X1?seed=3", SLOW) as sensor:
         take(sensor, 1)
         sensor.configure(OptoSettings(rate=30e3))
@@ -129,7 +129,7 @@ def test_settings_that_the_sensor_does_not_have_are_refused(wrong: dict[str, obj
 
 @pytest.mark.parametrize("address", ["serial:///dev/ttyUSB0", "serial:///dev/ttyUSB0?baudrate=921600"])
 def test_a_rate_that_the_line_does_not_carry_is_refused_before_it_is_opened(address: str) -> None:
-    with pytest.raises(InstrumentError, match=r"20 kHz does not fit through 921600 baud: .* = 1200000 bit/s"):
+    with pytest.raises(InstrumentError, match=r"20 kHz exceeds 921600 baud: .* = 1200000 bit/s"):
         OptoNCDT(address, OptoSettings(rate=20e3)).open()
 
 
@@ -156,7 +156,7 @@ def test_a_sensor_whose_user_may_only_read_is_refused_with_a_hint() -> None:
 
 @pytest.mark.parametrize("model", ["ILD2300", "ILD1420"])
 @pytest.mark.parametrize("echo", ["ON", "OFF"])
-def test_what_an_earlier_user_left_on_changes_no_value(model: str, echo: str) -> None:
+def test_settings_of_an_earlier_user_change_no_value(model: str, echo: str) -> None:
     left = f"OUTADD_RS422+SHUTTER+TIMESTAMP;AVERAGE+MEDIAN+9;OUTHOLD+INFINITE;ECHO+{echo}"
     rate = 1500.0 if model == "ILD2300" else 2000.0
     with OptoNCDT(
@@ -195,7 +195,7 @@ def test_silence_in_a_stream_is_a_timeout_error_after_the_samples_before_it() ->
     assert len(got) == 5
 
 
-def test_a_sensor_that_fell_silent_gives_timeouts_until_it_answers_again() -> None:
+def test_a_silent_sensor_gives_timeouts_until_it_answers_again() -> None:
     settings = OptoSettings(rate=1500.0, timeout=0.2)
     with OptoNCDT("sim://cframe/X1?seed=3&fault=silence&fault_at=5000", settings) as sensor:
         with pytest.raises(InstrumentTimeoutError):
@@ -227,14 +227,14 @@ def test_a_sensor_whose_stop_is_confirmed_late_is_stopped_again(wire: str, late:
         assert sensor.identify().manufacturer == "Micro-Epsilon"
 
 
-def test_split_frames_change_nothing() -> None:
+def test_split_frames_have_no_effect() -> None:
     with OptoNCDT("sim://cframe/X1?seed=3", SLOW) as sensor:
         whole = values(take(sensor, 8))
     with OptoNCDT("sim://cframe/X1?seed=3&fault=split", SLOW) as sensor:
         np.testing.assert_array_equal(values(take(sensor, 8)), whole)
 
 
-def test_garbage_is_counted_and_spoils_no_other_sample() -> None:
+def test_garbage_is_counted_and_changes_no_other_sample() -> None:
     with OptoNCDT("sim://cframe/X1?seed=3", SLOW) as sensor:
         whole = values(take(sensor, 20))
     with OptoNCDT("sim://cframe/X1?seed=3&fault=garbage&fault_every=100", SLOW) as sensor:
@@ -253,7 +253,7 @@ def test_out_of_range_is_nan_with_its_reason() -> None:
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(values(blocks))), np.arange(1000, 1500))
 
 
-def test_dropped_samples_are_counted_and_nan_at_their_places() -> None:
+def test_dropped_samples_are_counted_and_nan_at_their_positions() -> None:
     with OptoNCDT("sim://cframe/X1?seed=3", SLOW) as sensor:
         whole = values(take(sensor, 4))
     with OptoNCDT("sim://cframe/X1?seed=3&fault=drop&fault_at=7&fault_every=100", SLOW) as sensor:
@@ -276,7 +276,8 @@ def test_a_broken_connection_is_an_instrument_error_and_can_be_opened_again() ->
 
 
 @pytest.mark.parametrize(
-    ("fault", "message"), [("checksum", "no such fault"), ("fire", "unknown fault"), ("silenc", "choose from silence")]
+    ("fault", "message"),
+    [("checksum", "does not have this fault"), ("fire", "unknown fault"), ("silenc", "expected one of silence")],
 )
 def test_a_fault_that_is_not_on_the_menu_is_refused(fault: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):

@@ -32,7 +32,7 @@ def wire(raws: list[int], first: int = 0, counter: bool = True, *, counter_first
 def decode(
     pieces: list[bytes], counter: bool = True, from_zero: bool = True, *, counter_first: bool = False
 ) -> tuple[np.ndarray, np.ndarray, bytes]:
-    """Values (range 1, so that they are relative), reasons and text."""
+    """Values (range 1: relative), reasons and text."""
     decoder = StreamDecoder(1.0, highest=HIGHEST, counter=counter, counter_first=counter_first, from_zero=from_zero)
     another = [codec.encode_value(0), codec.encode_value(0, first=False)]  # confirms the last one
     confirming = another[:1] if not counter else another if counter_first else []
@@ -85,7 +85,7 @@ def test_answers_by_the_documents(vector: Vector) -> None:
 
 
 @pytest.mark.parametrize("vector", vectors("optoncdt", "command"), ids=str)
-def test_the_sensor_of_the_tests_takes_the_commands_of_the_manuals(vector: Vector) -> None:
+def test_the_scripted_sensor_accepts_the_commands_of_the_manuals(vector: Vector) -> None:
     for model in MODELS:
         sensor = Sensor(model)
         try:
@@ -111,7 +111,7 @@ def test_measuring_range_ends_where_it_is_published() -> None:
 
 
 @pytest.mark.parametrize("code", ALL_CODES)
-def test_each_error_code_has_a_reason_of_its_own(code: int) -> None:
+def test_each_error_code_has_its_own_reason(code: int) -> None:
     values, reasons, _ = decode([wire([code])])
     assert np.isnan(values).all()
     assert codec.REASONS[reasons[0]] == codec.ERROR_CODES[code]
@@ -133,13 +133,13 @@ def test_the_error_codes_are_the_published_ones() -> None:
         (262083, "unknown code"),
     ],
 )
-def test_what_is_no_distance_says_why(raw: int, reason: str) -> None:
+def test_values_other_than_distances_have_a_reason(raw: int, reason: str) -> None:
     assert codec.reason(raw, HIGHEST) == reason
     _, reasons, _ = decode([wire([raw])])
     assert codec.REASONS[reasons[0]] == reason
 
 
-def test_a_value_has_18_bits_and_right_tags() -> None:
+def test_a_value_has_18_bits_and_valid_tags() -> None:
     for raw in (-1, 1 << 18):
         with pytest.raises(ProtocolError, match="18 bits"):
             codec.encode_value(raw)
@@ -149,7 +149,7 @@ def test_a_value_has_18_bits_and_right_tags() -> None:
 
 
 @given(st.integers(0, (1 << 18) - 1), st.booleans())
-def test_every_value_comes_back(raw: int, first: bool) -> None:
+def test_every_value_round_trips(raw: int, first: bool) -> None:
     triple = codec.encode_value(raw, first=first)
     assert codec.decode_value(triple) == raw
     assert (triple[2] >> 6) == (0b10 if first else 0b11)
@@ -189,7 +189,7 @@ TEXT = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=3
 
 @given(st.data(), st.lists(st.integers(643, 64876), min_size=1, max_size=20), st.lists(TEXT, max_size=4))
 @compiled
-def test_answers_between_the_data_are_reported_apart_and_harm_nothing(
+def test_answers_between_the_data_are_reported_separately_and_have_no_effect(
     data: st.DataObject, raws: list[int], answers: list[bytes]
 ) -> None:
     samples = [wire([raw], number) for number, raw in enumerate(raws)]
@@ -209,10 +209,10 @@ def test_answers_between_the_data_are_reported_apart_and_harm_nothing(
     st.booleans(),
 )
 @compiled
-def test_garbage_makes_no_wrong_value_and_costs_few_samples(
+def test_garbage_causes_no_wrong_value_and_loses_few_samples(
     data: st.DataObject, raws: list[int], garbage: list[bytes], counter_first: bool
 ) -> None:
-    """One stray burst spoils at most the sample it hits and two after it; what keeps a value has the right one."""
+    """One burst of stray bytes affects at most its sample and the next two; all remaining values are correct."""
     base = 123456  # no burst of 5 bytes is a sample with the right counter, which takes 6
     stream = wire(raws, base, counter_first=counter_first)
     places = sorted(data.draw(st.lists(st.integers(2, 25), min_size=len(garbage), max_size=len(garbage), unique=True)))
@@ -228,28 +228,28 @@ def test_garbage_makes_no_wrong_value_and_costs_few_samples(
 
 
 @given(st.sets(st.integers(1, 98), max_size=97), st.integers(0, (1 << 18) - 1))
-@example({1, 2, 3, *range(5, 99, 2)}, (1 << 18) - 50)  # over the end of the counter's circle
+@example({1, 2, 3, *range(5, 99, 2)}, (1 << 18) - 50)  # across the overflow of the counter
 @compiled
-def test_missing_samples_are_lost_at_their_places(missing: set[int], base: int) -> None:
+def test_missing_samples_are_lost_at_their_positions(missing: set[int], base: int) -> None:
     raws = [1000 + number for number in range(100)]
     data = b"".join(wire([raw], base + number) for number, raw in enumerate(raws) if number not in missing)
     values, reasons, _ = decode([data], from_zero=False)
     truth = np.array(expected(raws))
     truth[sorted(missing)] = np.nan
-    # A jump is believed when the sample behind it confirms it, so a jump at the very end stays open.
+    # A jump is accepted if the next sample confirms it; a jump at the end remains unconfirmed.
     assert values.size == 100 or (values.size < 100 and 98 in missing)
     np.testing.assert_allclose(values, truth[: values.size], rtol=1e-12)
     assert set(np.flatnonzero(reasons)) == {number for number in missing if number < values.size}
 
 
-def test_a_counter_known_to_begin_at_zero_shows_what_was_lost_before() -> None:
+def test_a_counter_that_starts_at_zero_shows_samples_lost_before() -> None:
     values, reasons, _ = decode([wire([2000, 2001, 2002], first=4)], from_zero=True)
     assert np.isnan(values[:4]).all()
     np.testing.assert_allclose(values[4:], expected([2000, 2001, 2002]), rtol=1e-12)
     assert [codec.REASONS[code] for code in reasons[:4]] == ["lost"] * 4
 
 
-def test_a_counter_goes_on_over_its_18_bits() -> None:
+def test_a_counter_continues_beyond_18_bits() -> None:
     raws = np.full(300_000, 5000, dtype=np.int32)
     values, reasons, _ = decode([wire(raws.tolist())])
     assert values.size == 300_000
@@ -264,7 +264,7 @@ def test_a_counter_that_starts_again_is_a_protocol_error() -> None:
 
 
 def reference_split(data: bytes) -> tuple[list[int], bytes]:
-    """The plain way to report values from the rest, of a complete stretch of bytes."""
+    """Reference implementation: separate values and other bytes of complete data."""
     triple = re.compile(rb"[\x00-\x3f][\x40-\x7f][\x80-\xff]")
     values = [codec.decode_value(match[0]) for match in triple.finditer(data)]
     return values, triple.sub(b"", data)
@@ -273,7 +273,7 @@ def reference_split(data: bytes) -> tuple[list[int], bytes]:
 @given(st.lists(st.binary(max_size=12) | st.integers(0, (1 << 18) - 1).map(codec.encode_value), max_size=30))
 @compiled
 def test_the_compiled_splitter_agrees_with_the_plain_one(parts: list[bytes]) -> None:
-    data = b"".join(parts) + b"\xff\xff"  # closes whatever was started
+    data = b"".join(parts) + b"\xff\xff"  # closes everything that was started
     values = np.empty(len(data), dtype=np.uint32)
     text = np.empty(len(data), dtype=np.uint8)
     used, n_values, n_text, _ = kernels.split(np.frombuffer(data, dtype=np.uint8), values, text, False)
@@ -285,7 +285,7 @@ def test_the_compiled_splitter_agrees_with_the_plain_one(parts: list[bytes]) -> 
 
 @given(st.binary(max_size=200), st.sampled_from(["GETINFO", "SYNC", "GETOUTINFO_RS422", "MEASRATE 20"]))
 @compiled
-def test_whatever_the_sensor_answers_is_an_answer_or_an_error_of_the_project(text: bytes, command: str) -> None:
+def test_any_answer_of_the_sensor_is_an_answer_or_an_error_of_the_project(text: bytes, command: str) -> None:
     try:
         lines = commands.parse_answer(command, text)
         commands.setting(command, lines)
@@ -301,7 +301,7 @@ def test_an_answer_that_is_too_long_is_a_protocol_error() -> None:
 
 
 @pytest.mark.parametrize("wrong", ["20.00um", "mm", "-1.00mm", "0.00mm", "1e99mm", "9" * 400 + "mm"])
-def test_a_range_that_is_no_length_is_a_protocol_error(wrong: str) -> None:
+def test_an_invalid_range_is_a_protocol_error(wrong: str) -> None:
     with pytest.raises(ProtocolError, match="a measuring range such as"):
         commands.reported_range({"measuring range": wrong})
 

@@ -1,4 +1,4 @@
-"""The optoNCDT driver at the wire, against sensors that answer as the manuals print it."""
+"""The optoNCDT driver against scripted sensors that answer as in the manuals."""
 
 import itertools
 from pathlib import Path
@@ -96,7 +96,7 @@ def test_the_range_is_the_one_that_the_sensor_reports(millimetres: float) -> Non
         ("ILD1420", {"OUTHOLD": "100", "AVERAGE": "MOVING 16", "TRIGGER": "EDGE"}),
     ],
 )
-def test_what_an_earlier_user_left_on_is_cleared_and_restored(model: str, left_on: dict[str, str]) -> None:
+def test_outputs_of_an_earlier_user_are_cleared_and_restored(model: str, left_on: dict[str, str]) -> None:
     sensor = Sensor(model, millimetres=10.0, **left_on)
     settings = OPTO_2300 if model == "ILD2300" else OPTO_1420
     with Bench(sensor):
@@ -122,14 +122,14 @@ def test_the_counter_may_precede_the_distance() -> None:
     np.testing.assert_allclose(np.diff(values) / (2e-3 * 1.02 / 65520), 1.0, atol=1e-6)
 
 
-def test_a_sensor_that_streams_already_and_half_a_command_are_no_obstacle() -> None:
+def test_a_streaming_sensor_and_an_incomplete_command_are_handled() -> None:
     sensor = Sensor("ILD2300", OUTPUT="RS422", OUTADD_RS422="SHUTTER INTENSITY")
     sensor._line = b"MEASRA"
     with Bench(sensor), OptoNCDT(sensor.url, OPTO_2300) as driver:
         assert np.isfinite(readings(driver, 100)).all()
 
 
-def test_an_output_that_others_use_is_restored_and_one_that_nobody_reads_is_not() -> None:
+def test_an_output_in_use_is_restored_and_an_unused_one_is_not() -> None:
     for before, after in (("ANALOG", "ANALOG"), ("RS422", "NONE")):
         sensor = Sensor("ILD1420", OUTPUT=before, MEASRATE="2")
         with Bench(sensor):
@@ -138,7 +138,7 @@ def test_an_output_that_others_use_is_restored_and_one_that_nobody_reads_is_not(
             assert (sensor.settings["OUTPUT"], sensor.settings["MEASRATE"]) == (after, "2")
 
 
-def test_a_mastered_sensor_counts_from_the_start_of_its_range_again_and_is_not_mastered_anew() -> None:
+def test_a_mastered_sensor_measures_from_the_start_of_its_range_and_is_not_mastered_again() -> None:
     sensor = Sensor("ILD2300", MASTERMV="MASTER 1.5")
     with Bench(sensor):
         with OptoNCDT(sensor.url, OPTO_2300):
@@ -154,7 +154,7 @@ def test_the_termination_of_the_sync_line_stays() -> None:
 
 
 @pytest.mark.parametrize(("model", "last"), [("ILD2300", 64876), ("ILD1420", 64877)])
-def test_the_measuring_range_ends_where_the_models_manual_says(model: str, last: int) -> None:
+def test_the_measuring_range_ends_as_in_the_manual_of_the_model(model: str, last: int) -> None:
     for raw, known in ((last, True), (last + 1, False)):
         sensor = Sensor(model, millimetres=10.0, values=lambda n, raw=raw: raw)
         with Bench(sensor), OptoNCDT(sensor.url, OPTO_2300 if model == "ILD2300" else OPTO_1420) as driver:
@@ -164,7 +164,7 @@ def test_the_measuring_range_ends_where_the_models_manual_says(model: str, last:
 # ---------------------------------------------------------------------- late answers
 
 
-def test_after_a_late_answer_the_next_one_is_right() -> None:
+def test_after_a_late_answer_the_next_one_is_correct() -> None:
     sensor = Sensor("ILD2300")
     with Bench(sensor), OptoNCDT(sensor.url, OptoSettings(rate=2500.0, timeout=0.3)) as driver:
         sensor.late, sensor.late_for = 0.45, "GETINFO"
@@ -175,7 +175,7 @@ def test_after_a_late_answer_the_next_one_is_right() -> None:
         assert np.isfinite(driver.read())
 
 
-def test_after_a_late_answer_in_a_stream_the_next_one_is_right() -> None:
+def test_after_a_late_answer_in_a_stream_the_next_one_is_correct() -> None:
     sensor = Sensor("ILD2300")
     with Bench(sensor), OptoNCDT(sensor.url, OptoSettings(rate=2500.0, timeout=0.3)) as driver:
         stream = driver.stream(block=10)
@@ -208,7 +208,7 @@ def test_a_sensor_that_stays_silent_is_a_timeout_error_each_time() -> None:
 def test_five_sensors_on_one_sync_line_start_at_the_same_instant_each_time() -> None:
     bus = Bus()
     sensors = {name: Sensor("ILD2300", bus=bus) for name in CHANNELS}
-    sensors["Y2"].settings["SYNC"] = "MASTER TERMON"  # as an earlier user left it
+    sensors["Y2"].settings["SYNC"] = "MASTER TERMON"  # as after an earlier user
     addresses = {name: sensor.url for name, sensor in sensors.items()}
     with (
         Bench(*sensors.values()),

@@ -1,4 +1,4 @@
-"""Scans in files: what is read from each kind, and what is refused with which words."""
+"""Scans in files: values from each kind of file, and refusals with their messages."""
 
 import subprocess
 import sys
@@ -26,7 +26,7 @@ GRID = ProfileFileSettings(unit="um", x_pitch=12.5e-6, y_pitch=70e-6)
 
 
 def points() -> np.ndarray:
-    """The scan as points (n, 3), m, without those that have no height, in no order."""
+    """The scan as points (n, 3), m, without missing heights, in any order."""
     grid = np.stack([np.broadcast_to(X, HEIGHTS.shape), np.broadcast_to(Y[:, None], HEIGHTS.shape), HEIGHTS], axis=-1)
     flat = grid.reshape(-1, 3)
     return np.random.default_rng(1).permutation(flat[np.isfinite(flat[:, 2])])
@@ -88,7 +88,7 @@ def test_a_netcdf_file_names_its_own_units(tmp_path: Path, unit: str) -> None:
     assert found.x == pytest.approx(X, rel=1e-12, abs=1e-18)
 
 
-def test_a_number_may_stand_for_no_height(tmp_path: Path) -> None:
+def test_a_number_may_mean_a_missing_height(tmp_path: Path) -> None:
     (tmp_path / "scan.csv").write_text("1;-9999;3\n4;5;-9999\n")
     chosen = GRID.model_copy(update={"no_value": -9999.0, "delimiter": ";"})
     found = scan(tmp_path / "scan.csv", chosen)
@@ -102,7 +102,7 @@ def test_a_delimiter_at_the_end_of_the_lines_adds_no_column(tmp_path: Path, text
     (tmp_path / "scan.csv").write_text(text)
     found = scan(tmp_path / "scan.csv", GRID)
     expected = [[1, np.nan, 3], [4, 5, np.nan]]
-    if text.endswith(",,,\n"):  # one delimiter ends the line, the others stand between cells
+    if text.endswith(",,,\n"):  # one delimiter ends the line, the others separate cells
         expected = [[*row, np.nan] for row in expected]
     assert found.heights == pytest.approx(1e-6 * np.array(expected), nan_ok=True)
     assert found.x.size == len(expected[0])
@@ -163,7 +163,7 @@ assert total(10) == 45
     assert done.returncode == 0, done.stderr
 
 
-# ------------------------------------------------------------------ what is refused
+# ------------------------------------------------------------------ refusals
 
 
 def test_without_a_unit_a_file_that_names_none_is_refused(tmp_path: Path) -> None:
@@ -172,7 +172,7 @@ def test_without_a_unit_a_file_that_names_none_is_refused(tmp_path: Path) -> Non
             scan(path)
 
 
-def test_millimetres_taken_for_metres_are_found(tmp_path: Path) -> None:
+def test_millimetres_taken_for_metres_are_detected(tmp_path: Path) -> None:
     path = write_cloud(tmp_path / "scan.ply", 1e3 * points())
     with pytest.raises(InstrumentError, match=r"a height of 1 m; check its unit 'm'"):
         scan(path, ProfileFileSettings(unit="m"))
@@ -188,7 +188,7 @@ def test_millimetres_taken_for_metres_are_found(tmp_path: Path) -> None:
         (",,\n,,\n", "expected heights; found none"),
     ],
 )
-def test_a_csv_file_that_is_none_is_refused_with_its_line(tmp_path: Path, text: str, message: str) -> None:
+def test_a_file_that_is_not_csv_is_refused_with_its_line(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "scan.csv").write_text(text)
     with pytest.raises(InstrumentError, match=message):
         scan(tmp_path / "scan.csv", GRID)
@@ -230,7 +230,7 @@ def test_a_netcdf_file_without_units_or_variables_is_refused(tmp_path: Path) -> 
         scan(tmp_path / "b.nc")
 
 
-def test_a_cloud_that_is_no_height_map_is_refused(tmp_path: Path) -> None:
+def test_a_point_cloud_that_is_not_a_height_map_is_refused(tmp_path: Path) -> None:
     anywhere = np.random.default_rng(2).uniform(0, 1e-2, (500, 3))
     with pytest.raises(InstrumentError, match="is not a height map: 500 points have"):
         height_map(anywhere, tmp_path)
@@ -240,7 +240,7 @@ def test_a_cloud_that_is_no_height_map_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("address", "message"),
-    [("none.ply", "no file 'none.ply'"), ("tcp://127.0.0.1:9", "Expected a file"), ("*.nc", "there is no file")],
+    [("none.ply", "no file 'none.ply'"), ("tcp://127.0.0.1:9", "Expected a file"), ("*.nc", "found no file")],
 )
 def test_an_address_without_files_is_refused(address: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):
@@ -264,7 +264,7 @@ def test_settings_name_their_units() -> None:
 # ------------------------------------------------------------------ recordings
 
 
-def test_a_recording_holds_to_the_files_as_they_were(tmp_path: Path) -> None:
+def test_a_recording_refers_to_the_unchanged_files(tmp_path: Path) -> None:
     path, recording = write_netcdf(tmp_path / "scan.nc"), tmp_path / "session.rec"
     with ProfileFiles(str(path), record=recording) as files:
         heights = files.read()

@@ -1,4 +1,4 @@
-"""A recorded session plays back as it was, and in no other way."""
+"""A recorded session is replayed exactly, and deviations are errors."""
 
 import threading
 from pathlib import Path
@@ -13,7 +13,7 @@ from errormotion.instruments.transports.recording import Recorder, read_index, r
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """Two questions and their answers, recorded from a real connection."""
+    """Two requests and their answers, recorded from a real connection."""
     path = tmp_path / "session.rec"
     server = make_server("tcp", "echo", lambda data: server.send(data.upper()))
     server.start()
@@ -65,7 +65,7 @@ def test_a_changed_byte_in_a_write_is_an_error(recording: Path) -> None:
         line.close()
 
 
-def test_a_write_too_many_is_an_error(recording: Path) -> None:
+def test_an_excess_write_is_an_error(recording: Path) -> None:
     line = play(recording)
     line.write(b"abc;de;")
     with pytest.raises(ReplayError, match="no further write"):
@@ -75,7 +75,7 @@ def test_a_write_too_many_is_an_error(recording: Path) -> None:
         line.close()
 
 
-def test_a_read_too_many_is_an_error(recording: Path) -> None:
+def test_an_excess_read_is_an_error(recording: Path) -> None:
     line = play(recording)
     line.write(b"abc;de;")
     line.read_until(b"DE;")
@@ -84,7 +84,7 @@ def test_a_read_too_many_is_an_error(recording: Path) -> None:
     line.close()
 
 
-def test_an_answer_does_not_come_before_its_question(recording: Path) -> None:
+def test_an_answer_does_not_precede_its_request(recording: Path) -> None:
     line = play(recording)
     with pytest.raises(InstrumentTimeoutError, match=r"before the driver has written b'abc;'"):
         line.read()
@@ -138,7 +138,7 @@ def test_a_missing_frame_is_an_error(recording: Path) -> None:
 
 def test_a_cut_recording_is_an_error(recording: Path) -> None:
     recording.write_text("".join(recording.read_text().splitlines(keepends=True)[:-1]))
-    with pytest.raises(ReplayError, match="cut off"):
+    with pytest.raises(ReplayError, match="is incomplete"):
         play(recording)
 
 
@@ -154,7 +154,7 @@ def test_a_missing_or_foreign_file_is_an_error(tmp_path: Path) -> None:
 
 
 def test_a_recording_is_never_overwritten(recording: Path) -> None:
-    with pytest.raises(InstrumentError, match="exists already"):
+    with pytest.raises(InstrumentError, match="already exists"):
         Recorder(recording, "tcp://x:1")
 
 
@@ -162,7 +162,7 @@ def test_a_recorder_that_was_not_closed_leaves_a_recording_that_is_refused(tmp_p
     recorder = Recorder(tmp_path / "a.rec", "tcp://x:1")
     recorder.frame("W", b"abc")
     recorder._file.flush()  # as after a crash
-    with pytest.raises(ReplayError, match="cut off"):
+    with pytest.raises(ReplayError, match="is incomplete"):
         read_recording(tmp_path / "a.rec")
     recorder.close()
     assert read_recording(tmp_path / "a.rec") == ("tcp://x:1", [("W", b"abc")])

@@ -1,4 +1,4 @@
-"""SCPI data acquisition units: codec against vectors, driver against a scripted unit at the wire."""
+"""SCPI data acquisition units: codec against vectors, driver against a scripted unit."""
 
 import math
 import os
@@ -115,7 +115,7 @@ def test_a_channel_list_names_each_channel_once(channels: set[int]) -> None:
 # ---------------------------------------------------------------------- settings
 
 
-def test_settings_state_the_unit_in_its_words() -> None:
+def test_settings_state_the_unit_in_its_terms() -> None:
     settings = ScpiSettings(
         channels=("frame", "motor", "oil"),
         inputs=(103, 101, 205),
@@ -165,7 +165,7 @@ def test_settings_that_no_unit_takes_are_refused(given_: dict[str, object], mess
 
 
 class Unit:
-    """A scripted unit: answers commands in order, one line each; knows a scan list and an error queue."""
+    """A scripted unit: answers commands in order, one line each; has a scan list and an error queue."""
 
     def __init__(self, identity: str = IDENTITY) -> None:
         self.identity, self.received, self.queue = identity, [], []
@@ -312,7 +312,7 @@ def test_another_device_is_refused() -> None:
         assert thermometer.identify().manufacturer == "FLUKE"
 
 
-def test_errors_that_an_earlier_user_left_are_reported_apart() -> None:
+def test_errors_of_an_earlier_user_are_reported_separately() -> None:
     unit = Unit()
     unit.queue = ['-222,"Data out of range"', '-410,"Query INTERRUPTED"']
     with listening(unit) as address, ScpiTemperature(address, pt100()) as thermometer:
@@ -386,10 +386,10 @@ class Line:
         raise InstrumentTimeoutError("no data")
 
     def reopen(self) -> None:
-        """A serial line stays as it is."""
+        """A serial line is not changed."""
 
     def read_until(self, terminator: bytes, *, limit: int = 65536, timeout: float | None = None) -> bytes:
-        if self.late:  # this answer comes after the next request
+        if self.late:  # this answer arrives after the next request
             self.late -= 1
             raise InstrumentTimeoutError("no answer")
         return self.waiting.pop(0)
@@ -422,7 +422,7 @@ def test_late_answers_on_a_serial_line_are_discarded_until_the_identity(
         assert all(each == {"frame": 30.0, "oil": 31.0} for each in found)
 
 
-def test_garbage_is_a_typed_error_and_the_next_reading_is_right() -> None:
+def test_garbage_is_a_typed_error_and_the_next_reading_is_correct() -> None:
     unit = Unit()
     with listening(unit) as address, ScpiTemperature(address, pt100()) as thermometer:
         unit.end = "\xff\n"

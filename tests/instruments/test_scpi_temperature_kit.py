@@ -1,4 +1,4 @@
-"""The conformance kit on SCPI data acquisition units, and the driver against the simulated unit of another hand."""
+"""The conformance kit on SCPI data acquisition units, and the driver against the simulated unit."""
 
 import math
 
@@ -40,14 +40,14 @@ def test_an_open_sensor_and_a_channel_without_one_are_open() -> None:
     ("inputs", "refusal"),
     [(111, "refuses 'CONF:TEMP FRTD,85,.*': 305"), (121, "': 112 Channel list"), (201, "': 111 Channel list: slot")],
 )
-def test_channels_that_the_unit_does_not_have_are_refused_with_its_words(inputs: int, refusal: str) -> None:
+def test_channels_that_the_unit_does_not_have_are_refused_with_its_text(inputs: int, refusal: str) -> None:
     settings = ScpiSettings(channels=("frame",), inputs=(inputs,), timeout=1.0)
     with pytest.raises(InstrumentError, match=refusal):
         ScpiTemperature(ADDRESS, settings).open()
 
 
 @pytest.mark.parametrize("vector", vectors("scpi_temperature", "command"), ids=str)
-def test_settings_behind_the_vectors_are_taken(vector: Vector) -> None:
+def test_settings_of_the_vectors_are_accepted(vector: Vector) -> None:
     if max(vector.expected["inputs"]) > 120:
         vector.expected["inputs"] = [101 + k for k in range(len(vector.expected["inputs"]))]  # a unit with one slot
     names = tuple(f"sensor {k}" for k in range(len(vector.expected["inputs"])))

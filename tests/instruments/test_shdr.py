@@ -1,4 +1,4 @@
-"""SHDR adapters at the wire: states, units, conditions, heartbeat, lost connections, faults."""
+"""SHDR adapters: states, units, conditions, heartbeat, lost connections, faults."""
 
 import math
 import socket
@@ -25,11 +25,11 @@ OKUMA = {
     "mode": "pmode",
     "execution": "pexecution",
 }
-WAIT = 2.0  # s, for what an adapter that looks at the machine in turns reports
+WAIT = 2.0  # s, for reports of an adapter that polls the machine
 
 
 class Adapter:
-    """An adapter of which a test states what it sends: at once, and for each ``* PING``."""
+    """A scripted adapter: its lines after the connection, and for each ``* PING``."""
 
     def __init__(self, first: bytes, pong: bytes = b"* PONG 10000\n") -> None:
         self.first, self.pong = first, pong
@@ -121,7 +121,7 @@ def test_the_state_is_that_of_the_machine(query: str, settings: dict[str, Any]) 
         assert math.isnan(state["time"])
 
 
-def test_a_feed_in_millimetres_a_minute() -> None:
+def test_a_feed_in_millimetres_per_minute() -> None:
     settings = ShdrSettings(items=OKUMA, feed_unit="mm/min")
     with (
         Shdr("sim://cframe/shdr?seed=3&style=okuma", settings) as driver,
@@ -167,7 +167,7 @@ def test_a_position_of_three_numbers_and_a_second_key() -> None:
         assert "position" in driver.state()["unavailable"]
 
 
-def test_conditions_come_and_go_by_their_codes() -> None:
+def test_conditions_start_and_end_by_their_codes() -> None:
     with adapter(b"|servo|FAULT|12|1|HIGH|hot|\n".replace(b"hot|", b"hot")) as there, Shdr(there.url) as driver:
         assert driver.state()["alarms"] == ["servo 12: hot"]
         there.send(b"|servo|FAULT|13|1||torn\n|oil|WARNING|7|||low\n")
@@ -195,15 +195,15 @@ def test_a_connection_that_is_older_than_its_heartbeat_is_renewed() -> None:
         assert driver.heartbeat == 1.2
         driver.state()
         assert there.connections == 1
-        time.sleep(1.3)  # the adapter gives a connection without '* PING' up after twice its heartbeat
+        time.sleep(1.3)  # the adapter closes a connection without '* PING' after twice its heartbeat
         there.first = b"|Xact|4\n"
         state = driver.state()
         assert there.connections == 2
         assert state["position"][0] == 0.004
-        assert math.isnan(state["position"][1])  # what the adapter has not said again is unknown
+        assert math.isnan(state["position"][1])  # values that the adapter has not repeated are unknown
 
 
-def test_a_lost_connection_is_an_error_and_the_next_reading_is_right() -> None:
+def test_a_lost_connection_is_an_error_and_the_next_reading_is_correct() -> None:
     with adapter(b"|Xact|1|Yact|2|Zact|3\n") as there, Shdr(there.url) as driver:
         driver.state()
         there.disconnect()
@@ -220,22 +220,22 @@ def test_a_lost_connection_is_an_error_and_the_next_reading_is_right() -> None:
                 time.sleep(0.1)
 
 
-def test_a_driver_that_is_opened_again_has_forgotten_the_values_of_the_session_before() -> None:
+def test_reopening_a_driver_discards_the_values_of_the_previous_session() -> None:
     with adapter(b"2026-01-01T00:00:00Z|S1speed|240\n") as device:
         driver = Shdr(device.url, ShdrSettings(items=OKUMA))
         with driver:
             assert driver.state()["spindle_speed"] == 240.0
-        device.first = b"* device: M1\n"  # its values come later
+        device.first = b"* device: M1\n"  # its values arrive later
         with driver:
             assert math.isnan(driver.state()["spindle_speed"])
 
 
-def test_an_adapter_without_heartbeat_is_believed_for_a_time() -> None:
+def test_values_of_an_adapter_without_heartbeat_are_valid_for_a_time() -> None:
     settings = ShdrSettings(timeout=0.2, silence=1.0)
     with adapter(b"|Xact|1\n", b"") as there, Shdr(there.url, settings) as driver:
         assert math.isinf(driver.heartbeat)
         assert driver.state()["position"][0] == 0.001
-        assert there.pings == 1  # it is not asked again
+        assert there.pings == 1  # there are no further requests
         time.sleep(1.1)
         with pytest.raises(InstrumentTimeoutError, match=r"no data for 1 s"):
             driver.state()
@@ -253,7 +253,9 @@ def test_an_adapter_without_heartbeat_is_believed_for_a_time() -> None:
         (b"".join(b"|k|FAULT|%d|||x\n" % k for k in range(1001)), ProtocolError, "at most 1000 conditions"),
     ],
 )
-def test_what_is_no_adapter_is_a_typed_error(sent: bytes, error: type[InstrumentError], message: str) -> None:
+def test_another_service_instead_of_an_adapter_is_a_typed_error(
+    sent: bytes, error: type[InstrumentError], message: str
+) -> None:
     with adapter(sent, b"") as there, pytest.raises(error, match=message):
         Shdr(there.url, ShdrSettings(timeout=5.0 if sent else 0.5)).open()  # megabytes, on a busy computer
 
@@ -264,7 +266,7 @@ def test_an_endless_stream_without_an_answer_ends_at_the_time_limit() -> None:
         assert driver.state()["position"][0] == 0.002
 
 
-def test_lines_that_are_none_are_counted_where_the_settings_say_so() -> None:
+def test_invalid_lines_are_counted_if_so_set() -> None:
     with adapter(b"|Xact|1\nnonsense\n|Xact|2\n") as there:
         with pytest.raises(ProtocolError, match="'nonsense'; set 'lenient'"):
             Shdr(there.url).open()

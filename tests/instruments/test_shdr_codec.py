@@ -1,4 +1,4 @@
-"""Lines of SHDR adapters: published ones, hostile ones, and what belongs to a key."""
+"""Lines of SHDR adapters: published ones, hostile ones, and assignment to keys."""
 
 import math
 import time
@@ -61,7 +61,7 @@ def test_a_key_may_occur_twice_in_a_line() -> None:
     assert [(each.key, each.value) for each in found] == [("Xact", "1"), ("Xact", "2")]
 
 
-def test_unavailable_values_are_no_condition() -> None:
+def test_unavailable_values_are_not_a_condition() -> None:
     found = parse_line(b"|avail|UNAVAILABLE|Xact|UNAVAILABLE|Yact|UNAVAILABLE")
     assert [each.level for each in found] == ["", "", ""]
     (condition,) = parse_line(b"|servo|UNAVAILABLE||||")
@@ -101,7 +101,7 @@ def test_unknown_numbers_are_nan(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["two", "1,5", "0x10", "nan", "inf", "1e999", "1_0"])
-def test_what_is_no_number_is_an_error(text: str) -> None:
+def test_invalid_numbers_are_an_error(text: str) -> None:
     with pytest.raises(ProtocolError, match="Expected a number"):
         parse_numbers(text)
 
@@ -156,7 +156,7 @@ def test_too_many_fields_are_refused() -> None:
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_do_anything_but_a_protocol_error(data: bytes) -> None:
+def test_any_invalid_bytes_are_a_protocol_error(data: bytes) -> None:
     lines = Lines()
     for line in lines.feed(data + b"\n"):
         try:
@@ -182,6 +182,6 @@ def test_the_longest_lines_are_parsed_in_linear_time(line: bytes) -> None:
     try:
         for each in parse_line(line):
             parse_numbers(each.value)
-    except (ProtocolError, TypeError):  # TypeError: a command is no list
+    except (ProtocolError, TypeError):  # TypeError: a command is not a list
         pass
     assert time.thread_time() - start < 2.0  # quadratic: minutes

@@ -15,7 +15,7 @@ OVERRUN = 9
 
 
 class Tap(Transport):
-    """Gives the bytes that a test puts in; each byte is a sample of that value, capitals are text."""
+    """A source of the bytes of a test; each byte is a sample of that value, capitals are text."""
 
     def __init__(self, flow_control: bool) -> None:
         super().__init__("tap://", timeout=1.0)
@@ -30,7 +30,7 @@ class Tap(Transport):
             self.change.notify_all()
 
     def taken(self) -> None:
-        """Wait until the thread has come back for more."""
+        """Wait until the thread reads again."""
         with self.change:
             assert self.change.wait_for(lambda: not self.waiting, 5.0)
 
@@ -81,7 +81,7 @@ def fill(reader: Reader, size: int, timeout: float = 1.0) -> tuple[list[float], 
     return values.tolist(), reasons.tolist()
 
 
-def test_samples_come_in_order_whatever_the_pieces(tap: Tap, reader: Reader) -> None:
+def test_samples_are_in_order_whatever_the_pieces(tap: Tap, reader: Reader) -> None:
     for piece in (b"\1\2\3", b"\4", b"\5\6"):
         tap.put(piece)
     assert fill(reader, 2)[0] == [1, 2]
@@ -93,12 +93,12 @@ def test_a_full_queue_holds_the_device_back(tap: Tap, reader: Reader) -> None:
     tap.put(b"\1\2\3\4")
     tap.put(b"\5")
     tap.taken()
-    tap.put(b"\6")  # stays with the device: the thread waits with \5 in its hand
+    tap.put(b"\6")  # not read from the device: the thread waits with \5
     assert fill(reader, 6)[0] == [1, 2, 3, 4, 5, 6]
 
 
 @pytest.mark.parametrize("tap", [False], indirect=True)
-def test_what_nothing_holds_back_is_thrown_away_and_counted_at_its_place(tap: Tap, reader: Reader) -> None:
+def test_unread_samples_are_discarded_and_counted_at_their_position(tap: Tap, reader: Reader) -> None:
     for piece in (b"\1\2\3\4", b"\5\6", b"\7"):
         tap.put(piece)
     tap.put(b"\7")
@@ -116,7 +116,7 @@ def test_an_answer_gets_through_a_full_queue(tap: Tap, reader: Reader) -> None:
     assert fill(reader, 7)[0] == [1, 2, 3, 4, 5, 6, 7]
 
 
-def test_bytes_that_nobody_asked_for_are_counted(tap: Tap, reader: Reader) -> None:
+def test_unrequested_bytes_are_counted(tap: Tap, reader: Reader) -> None:
     tap.put(b"AB\1C")
     assert fill(reader, 1)[0] == [1]
     assert reader.stray_bytes == 3
@@ -126,7 +126,7 @@ def test_bytes_that_nobody_asked_for_are_counted(tap: Tap, reader: Reader) -> No
     ("data", "error", "message"),
     [(b"!", InstrumentError, "tap: the cable is cut"), (b"?", ProtocolError, "tap: these are no samples")],
 )
-def test_an_error_in_the_thread_comes_out_behind_the_samples_before_it(
+def test_an_error_in_the_thread_is_raised_after_the_previous_samples(
     tap: Tap, reader: Reader, data: bytes, error: type[InstrumentError], message: str
 ) -> None:
     tap.put(b"\1\2")
@@ -143,7 +143,7 @@ def test_silence_is_a_timeout_error(reader: Reader) -> None:
         fill(reader, 1, timeout=0.05)
 
 
-def test_stopping_ends_the_thread_even_when_nobody_takes_the_samples(tap: Tap, reader: Reader) -> None:
+def test_stopping_ends_the_thread_even_if_the_samples_are_not_read(tap: Tap, reader: Reader) -> None:
     for piece in (b"\1\2\3\4", b"\5\6", b"\7"):
         tap.put(piece)
     assert reader.stop(b"stop", 2.0) == b"OK>"
@@ -165,14 +165,14 @@ def test_samples_may_have_any_shape(tap: Tap) -> None:
     assert tap.reported == [3]
 
 
-def test_a_stream_that_ends_by_itself_gives_its_last_samples_first(tap: Tap, reader: Reader) -> None:
+def test_a_stream_that_ends_unexpectedly_first_returns_its_last_samples(tap: Tap, reader: Reader) -> None:
     tap.put(b"\1\2$")
     assert fill(reader, 2)[0] == [1, 2]
     with pytest.raises(ProtocolError, match="tap: this was the last one"):
         fill(reader, 1)
 
 
-def test_finishing_waits_for_the_end_of_the_stream_and_tells_why_it_ended(tap: Tap, reader: Reader) -> None:
+def test_finishing_waits_for_the_end_of_the_stream_and_reports_its_reason(tap: Tap, reader: Reader) -> None:
     tap.put(b"\1\2")
     threading.Timer(0.1, tap.put, [b"\3$"]).start()
     ended = reader.finish(quiet=5.0, timeout=5.0)
@@ -180,7 +180,7 @@ def test_finishing_waits_for_the_end_of_the_stream_and_tells_why_it_ended(tap: T
     assert "the last one" in str(ended)
 
 
-def test_finishing_takes_silence_for_the_end(tap: Tap, reader: Reader) -> None:
+def test_finishing_treats_silence_as_the_end(tap: Tap, reader: Reader) -> None:
     tap.put(b"\1\2")
     start = time.monotonic()
     assert reader.finish(quiet=0.1, timeout=60.0) is None

@@ -1,4 +1,4 @@
-"""The conformance kit on thermometers as they are met: by map, by wire, by bus."""
+"""The conformance kit on thermometers of all maps, lines and buses."""
 
 from errormotion.instruments.thermometer.can_temperature import CanTemperature
 from errormotion.instruments.thermometer.modbus_temperature import ModbusTemperature
@@ -6,7 +6,7 @@ from errormotion.testing import InstrumentConformance, InstrumentSubject
 
 
 class TestAdam(InstrumentConformance):
-    """Modbus TCP; nobody at a port."""
+    """Modbus TCP; a port without a server."""
 
     subject = InstrumentSubject(
         ModbusTemperature,
@@ -30,7 +30,7 @@ class TestLogger(InstrumentConformance):
 
 
 class TestNode(InstrumentConformance):
-    """A sensor open and one shorted; nobody on the bus."""
+    """One sensor open and one shorted; a bus without a device."""
 
     subject = InstrumentSubject(
         CanTemperature,

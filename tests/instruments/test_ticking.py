@@ -1,4 +1,4 @@
-"""A virtual machine whose time goes on by itself."""
+"""A virtual machine whose time advances continuously."""
 
 import time
 
@@ -8,15 +8,16 @@ from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.thermometer.dcon import DconSettings, DconTemperature
 
 
-def test_time_stands_still_unless_it_is_asked_to_tick() -> None:
+def test_time_stands_still_unless_ticking_is_on() -> None:
     with VirtualController("sim://cframe/controller?seed=61", CONTROLLER) as control:
         before = control.state()["time"]
         time.sleep(0.05)
         assert control.state()["time"] == before
 
 
-def test_a_watched_machine_warms_up_by_itself() -> None:
-    """A tenth of a second at 36 000 simulated seconds a second is an hour; the front bearing warms by kelvins."""
+def test_a_monitored_machine_warms_up_automatically() -> None:
+    """A tenth of a second at 36 000 simulated seconds per second is an hour; the front bearing warms by several
+    kelvins."""
     sensors = DconSettings(channels=("spindle_front",))
     with (
         VirtualController("sim://cframe/controller?seed=62&clock=36000", CONTROLLER) as control,
@@ -30,7 +31,7 @@ def test_a_watched_machine_warms_up_by_itself() -> None:
         assert thermometer.read()["spindle_front"] > cold + 3.0
 
 
-def test_time_that_is_set_goes_on_from_there() -> None:
+def test_time_continues_from_the_value_that_is_set() -> None:
     with VirtualController("sim://cframe/controller?seed=63&clock=1", CONTROLLER) as control:
         control.elapse(5000.0)
         assert 5000.0 <= control.state()["time"] < 5100.0

@@ -33,7 +33,7 @@ class TestKit(InstrumentConformance):
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\x0b", "\u2028"])
-def test_a_table_of_too_many_lines_is_refused_before_it_is_taken_apart(tmp_path: Path, end: str) -> None:
+def test_a_table_of_too_many_lines_is_refused_before_it_is_parsed(tmp_path: Path, end: str) -> None:
     path = tmp_path / "lines.csv"
     path.write_bytes((HEAD + end + (MOST_LINES + 1) * f"]{end}").encode())
     tracemalloc.start()
@@ -45,7 +45,7 @@ def test_a_table_of_too_many_lines_is_refused_before_it_is_taken_apart(tmp_path:
     assert f"at most {MOST_LINES} lines; found {MOST_LINES + 2}" in message
 
 
-def test_lengths_come_by_station_and_target_in_si(tmp_path: Path) -> None:
+def test_lengths_are_by_station_and_target_in_si(tmp_path: Path) -> None:
     with TrackerTable(write(tmp_path, *LINES)) as table:
         found, air = table.table(), table.environment()
         np.testing.assert_array_equal(table.read(), found["displacement"].values)
@@ -60,7 +60,7 @@ def test_the_order_of_lines_does_not_matter(tmp_path: Path) -> None:
     lines = [f"S{k},{i},{1000 + 100 * k + i},20,1000,50" for k in (1, 2) for i in range(1, 13)]
     shuffled = [lines[k] for k in np.random.default_rng(3).permutation(len(lines))]
     with TrackerTable(write(tmp_path, *shuffled), TrackerTableSettings(stations=("S1", "S2"))) as table:
-        assert table.readings.targets == tuple(map(str, range(1, 13)))  # by number, not by letters
+        assert table.readings.targets == tuple(map(str, range(1, 13)))  # by number, not alphabetically
         expected = 1e-3 * (1000 + 100 * np.array([[1], [2]]) + np.arange(1, 13))
         np.testing.assert_allclose(table.read(), expected, rtol=1e-15)
 
@@ -73,7 +73,7 @@ def test_missing_cells_and_lines_are_nan_and_counted(tmp_path: Path) -> None:
         assert table.identify().details["missing"] == {"empty": 1, "no line": 1}
 
 
-def test_a_table_may_know_nothing_of_the_air(tmp_path: Path) -> None:
+def test_a_table_may_contain_no_air_values(tmp_path: Path) -> None:
     with TrackerTable(write(tmp_path, "A;1;1.5", "A;2;1.6", head="tracker;point;displacement (m)")) as table:
         assert set(table.table()) == {"displacement"}
         assert np.isnan(table.environment().temperature)
@@ -88,16 +88,16 @@ def test_units_are_those_of_the_title(tmp_path: Path, title: str, value: str, me
         assert table.read()[0, 0] == pytest.approx(metres, rel=1e-15)
 
 
-def test_a_line_that_comes_again_is_refused_unless_settings_say_which_counts(tmp_path: Path) -> None:
+def test_a_repeated_line_is_refused_unless_settings_choose_one(tmp_path: Path) -> None:
     address = write(tmp_path, "S1,1,1500,20,1013,40", "S1,2,1510,20,1013,40", "S1,1,1502,22,1013,40")
-    assert "line 4: station 'S1', target '1': expected one line; line 2 is another one" in refusal(address)
+    assert "line 4: station 'S1', target '1': expected one line; line 2 is another" in refusal(address)
     for repeats, expected in (("last", 1.502), ("mean", 1.501)):
         with TrackerTable(address, TrackerTableSettings(repeats=repeats)) as table:
             assert table.read()[0, 0] == pytest.approx(expected, rel=1e-15)
             assert table.readings.repeated == 1
 
 
-def test_a_station_that_nobody_named_is_refused(tmp_path: Path) -> None:
+def test_an_unnamed_station_is_refused(tmp_path: Path) -> None:
     message = refusal(write(tmp_path, *LINES, "S3,1,1500,20,1013,40"), stations=("S1", "S2"))
     assert "line 6: column 'station': expected one of S1, S2; found 'S3'" in message
 
@@ -108,12 +108,12 @@ def test_a_station_without_lines_is_nan(tmp_path: Path) -> None:
         assert table.readings.missing == {"no line": 2}
 
 
-def test_millimetres_called_metres_are_found(tmp_path: Path) -> None:
+def test_millimetres_declared_as_metres_are_detected(tmp_path: Path) -> None:
     message = refusal(write(tmp_path, "S1,1,1500.5", head="station,target,length [m]"))
-    assert "expected -160 to 160; found 1500.5. Is its unit really m?" in message
+    assert "expected -160 to 160; found 1500.5. Check its unit, m" in message
 
 
-def test_metres_called_millimetres_are_found(tmp_path: Path) -> None:
+def test_metres_declared_as_millimetres_are_detected(tmp_path: Path) -> None:
     address = write(tmp_path, "S1,1,1.5005", "S1,2,2.1", head="station,target,length [mm]")
     assert "the longest length is 0.0021 m; check its unit" in refusal(address)
     with TrackerTable(address, TrackerTableSettings(least_length=0.0)) as table:
@@ -161,7 +161,7 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
     [
         ((), "expected lines of measurements"),
         (("S1,1,,20,1013,40",), "expected lengths; found none"),
-        (("S1,1,1500,20,1013,40", "", "S1,2,1500,20,1013,40"), "found the start of a second one"),
+        (("S1,1,1500,20,1013,40", "", "S1,2,1500,20,1013,40"), "found the start of a second table"),
     ],
 )
 def test_tables_without_lengths_or_in_two_parts_are_refused(tmp_path: Path, lines: tuple[str, ...], words: str) -> None:
@@ -173,7 +173,7 @@ def test_files_that_are_not_there_are_refused(tmp_path: Path) -> None:
     assert "Expected the path of a table" in refusal("tcp://127.0.0.1:700")
 
 
-def test_a_recording_is_a_copy_and_refused_where_it_is_no_table(tmp_path: Path) -> None:
+def test_a_recording_is_a_copy_and_refused_if_not_a_table(tmp_path: Path) -> None:
     address, copy = write(tmp_path, *LINES), tmp_path / "copy.rec"
     with TrackerTable(address, record=copy) as table:
         original, lengths = table.identify(), table.read()

@@ -1,4 +1,4 @@
-"""Addresses, and the wires beneath them."""
+"""Addresses and transports."""
 
 import socket
 from pathlib import Path
@@ -11,7 +11,7 @@ from errormotion.instruments.transports.loopback.serving import Server, TcpServe
 
 
 class Echo:
-    """A device that sends back what it gets, in capitals."""
+    """A device that returns received bytes in capitals."""
 
     def __init__(self, wire: str) -> None:
         self.server: Server = make_server(wire, "echo", self._answer)
@@ -46,7 +46,7 @@ def line(echo: Echo) -> object:
         ("replay:///tmp/x.rec", "replay", "", None, "/tmp/x.rec"),
     ],
 )
-def test_an_address_is_taken_apart(url: str, scheme: str, host: str, port: int | None, path: str) -> None:
+def test_an_address_is_parsed(url: str, scheme: str, host: str, port: int | None, path: str) -> None:
     address = parse_address(url)
     assert (address.scheme, address.host, address.port, address.path) == (scheme, host, port, path)
 
@@ -73,12 +73,12 @@ def test_a_parameter_that_is_no_number_is_named() -> None:
         parse_address("sim://cframe/X1?seed=three").number("seed", 0)
 
 
-def test_bytes_go_out_and_come_back(line: Transport) -> None:
+def test_bytes_are_sent_and_received(line: Transport) -> None:
     line.write(b"hello")
     assert line.read_until(b"O") == b"HELLO"
 
 
-def test_what_follows_a_terminator_stays_for_the_next_read(line: Transport) -> None:
+def test_bytes_after_a_terminator_are_kept_for_the_next_read(line: Transport) -> None:
     line.write(b"one;two;three")
     assert line.read_until(b";") == b"ONE;"
     assert line.read(1) == b"T"
@@ -86,7 +86,7 @@ def test_what_follows_a_terminator_stays_for_the_next_read(line: Transport) -> N
     assert line.read_until(b"E", limit=100) == b"THRE"
 
 
-def test_silence_becomes_a_timeout_error_that_shows_what_came(line: Transport) -> None:
+def test_silence_becomes_a_timeout_error_with_the_received_bytes(line: Transport) -> None:
     line.write(b"half")
     with pytest.raises(InstrumentTimeoutError, match=r"received b'HALF'"):
         line.read_until(b";", timeout=0.2)
@@ -109,7 +109,7 @@ def test_an_endless_line_becomes_a_protocol_error(line: Transport) -> None:
         line.read_until(b";", limit=10)
 
 
-def test_a_closed_transport_says_so(line: Transport) -> None:
+def test_a_closed_transport_is_reported(line: Transport) -> None:
     line.close()
     line.close()
     with pytest.raises(InstrumentError, match="closed"):
@@ -134,7 +134,7 @@ def test_a_broken_tcp_connection_is_an_instrument_error_and_can_be_opened_again(
     echo.server.close()
 
 
-def test_nobody_at_an_address_is_an_instrument_error(tmp_path: Path) -> None:
+def test_an_address_without_a_server_is_an_instrument_error(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(InstrumentError, match=f"No connection to tcp://127.0.0.1:{port}"):
@@ -147,12 +147,12 @@ def test_nobody_at_an_address_is_an_instrument_error(tmp_path: Path) -> None:
     ("simulator", "message"),
     [(None, "has no simulator"), ("errormotion.nowhere:X", "does not load"), ("errormotion.errors:X", "does not load")],
 )
-def test_a_simulator_that_is_not_there_is_named(simulator: str | None, message: str) -> None:
+def test_a_missing_simulator_is_named(simulator: str | None, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):
         open_transport("sim://cframe/X1", simulator=simulator)
 
 
-def test_a_server_knows_whether_somebody_is_connected() -> None:
+def test_a_server_reports_whether_a_client_is_connected() -> None:
     server = TcpServer("quiet", lambda data: None)
     server.start()
     assert not server.await_connection(0.01)

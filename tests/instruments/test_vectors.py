@@ -1,4 +1,4 @@
-"""Every golden vector names its source, and every device of a file has a page that states what is assumed."""
+"""Every golden vector names its source, and every device of a file has a page with its assumptions."""
 
 import pytest
 from wire_vectors import FOLDER, KINDS, vectors

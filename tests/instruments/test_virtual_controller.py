@@ -1,4 +1,4 @@
-"""The controller of the virtual machine, over its wire."""
+"""The controller of the virtual machine, over its line."""
 
 import itertools
 from pathlib import Path
@@ -46,7 +46,7 @@ def test_events_are_objects_or_mappings(event: object) -> None:
 
 
 @pytest.mark.parametrize("event", [{}, {"time": 1.0, "speed": 3}, "now"])
-def test_what_is_no_event_is_refused(event: object) -> None:
+def test_invalid_events_are_refused(event: object) -> None:
     with pytest.raises(InstrumentError, match="Expected an event"):
         event_fields(event)
 
@@ -82,7 +82,7 @@ def test_the_state_follows_the_schedule() -> None:
         assert controller.state()["time"] == 0.0
 
 
-def test_the_identity_says_simulated() -> None:
+def test_the_identity_states_simulated() -> None:
     with VirtualController(ADDRESS, CONTROLLER) as controller:
         identity = controller.identify()
     assert (identity.model, identity.serial_number, identity.simulated) == ("cframe", "seed 3", True)
@@ -99,7 +99,7 @@ def test_the_identity_says_simulated() -> None:
         (lambda c: c._call("mount"), "expected a request in JSON"),
     ],
 )
-def test_what_the_machine_cannot_do_is_refused_in_words(order: object, message: str) -> None:
+def test_commands_that_the_machine_cannot_execute_are_refused_with_a_text(order: object, message: str) -> None:
     with VirtualController(ADDRESS, CONTROLLER) as controller:
         with pytest.raises(InstrumentError, match=message):
             order(controller)
@@ -112,7 +112,7 @@ def ask_often(controller: VirtualController, times: int) -> None:
 
 
 def step_in_front_of_x1(frame: FiveSensorFrame, controller: VirtualController, count: int) -> np.ndarray:
-    """Readings of X1 while the sphere steps along y in front of it, 20 um a step."""
+    """Readings of X1 while the sphere moves along y in front of it in steps of 20 um."""
     controller.mount("sphere")
     geometry = frame.geometry
     centre = geometry.nominal_origin[0] + geometry.nominal_direction[0] * (1e-3 + 5e-3)
@@ -124,7 +124,7 @@ def step_in_front_of_x1(frame: FiveSensorFrame, controller: VirtualController, c
     return np.concatenate([block.values[0] for block in blocks])
 
 
-def test_a_stepped_sphere_is_seen_after_a_lead_in_that_nobody_told() -> None:
+def test_a_stepped_sphere_is_measured_after_an_undeclared_lead_in() -> None:
     with (
         FiveSensorFrame("sim://cframe?seed=3", FrameSettings(rate=1500.0, timeout=10.0)) as frame,
         VirtualController(ADDRESS, CONTROLLER) as controller,
@@ -156,7 +156,7 @@ def test_two_lead_ins_differ_and_a_second_program_waits_for_the_first() -> None:
     assert begins[0] != begins[1]
 
 
-def test_a_sphere_that_is_mounted_but_not_placed_is_not_seen() -> None:
+def test_a_sphere_that_is_mounted_but_not_set_up_is_not_measured() -> None:
     with (
         FiveSensorFrame("sim://cframe?seed=3", FrameSettings(rate=1500.0, timeout=10.0)) as frame,
         VirtualController(ADDRESS, CONTROLLER) as controller,
@@ -184,7 +184,7 @@ def test_each_fault_becomes_a_typed_error(fault: str, error: type[InstrumentErro
     controller.close()
 
 
-def test_split_answers_change_nothing() -> None:
+def test_split_answers_have_no_effect() -> None:
     with VirtualController(f"{ADDRESS}&fault=split", CONTROLLER) as controller:
         assert controller.state()["tool"] == "bar"
 

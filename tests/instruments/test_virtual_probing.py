@@ -1,4 +1,4 @@
-"""The touch probe, the spindle, stops and alarms of the virtual controller, over its wire."""
+"""The touch probe, the spindle, stops and alarms of the virtual controller, over its line."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -38,7 +38,7 @@ def ball(number: int = 0) -> np.ndarray:
 # ---------------------------------------------------------------------- the probe
 
 
-def test_a_probe_trips_where_the_twin_says_and_stands_there(controller: VirtualController, here: VirtualWorld) -> None:
+def test_a_probe_trips_and_stops_at_the_position_of_the_twin(controller: VirtualController, here: VirtualWorld) -> None:
     controller.move_to(ball() + BESIDE)
     begin = controller.state()["time"]
     found = controller.probe(ball(), SLOW)
@@ -52,7 +52,7 @@ def test_a_probe_trips_where_the_twin_says_and_stands_there(controller: VirtualC
     assert state["tool"] == "probe"
 
 
-def test_a_probe_that_meets_nothing_ends_at_its_target(controller: VirtualController) -> None:
+def test_a_probe_without_contact_ends_at_its_target(controller: VirtualController) -> None:
     above = ball() + np.array([0.0, 0.0, 0.05])
     controller.move_to(above)
     begin = controller.state()["time"]
@@ -74,7 +74,7 @@ def test_a_probe_on_a_ball_is_tripped_before_it_moves(controller: VirtualControl
     assert controller.state()["alarms"] == []
 
 
-def test_a_probe_that_runs_into_a_ball_stops_and_raises_an_alarm(controller: VirtualController) -> None:
+def test_a_collision_of_the_probe_with_a_ball_stops_it_and_raises_an_alarm(controller: VirtualController) -> None:
     controller.mount("probe")
     controller.move_to(ball() + BESIDE)
     with pytest.raises(InstrumentError, match="the probe has tripped during a move"):
@@ -88,20 +88,20 @@ def test_a_probe_that_runs_into_a_ball_stops_and_raises_an_alarm(controller: Vir
     assert controller.state()["alarms"] == []
 
 
-def test_without_the_probe_balls_are_in_nobodys_way(controller: VirtualController) -> None:
+def test_without_the_probe_balls_do_not_obstruct(controller: VirtualController) -> None:
     controller.move_to(ball() + BESIDE)
     controller.move_to(ball() - BESIDE)
     assert controller.state()["alarms"] == []
 
 
-def test_more_balls_stand_there_when_asked_for() -> None:
+def test_more_balls_are_set_up_on_request() -> None:
     with VirtualController(f"{ADDRESS}&balls=6", CONTROLLER) as controller:
         sixth = VirtualMachine("gantry", 3).balls_on_table(6).nominal[5]
         controller.move_to(sixth + BESIDE)
         assert controller.probe(sixth, SLOW)["tripped"]
 
 
-def test_a_ball_that_was_pushed_is_met_elsewhere(controller: VirtualController, here: VirtualWorld) -> None:
+def test_a_displaced_ball_is_touched_at_its_new_position(controller: VirtualController, here: VirtualWorld) -> None:
     controller.move_to(ball() + BESIDE)
     before = controller.probe(ball(), SLOW)["position"]
     here.balls = here.balls.moved(0, (50e-6, 0.0, 0.0))
@@ -123,7 +123,7 @@ def test_a_ball_that_was_pushed_is_met_elsewhere(controller: VirtualController, 
         (lambda c: c.spindle(-10.0), "spindle turns at 0 to"),
     ],
 )
-def test_what_cannot_be_done_moves_nothing(
+def test_an_impossible_command_moves_nothing(
     controller: VirtualController, order: Callable[[VirtualController], object], why: str
 ) -> None:
     with pytest.raises(InstrumentError, match=why):
@@ -147,7 +147,9 @@ def test_nothing_is_probed_while_sensors_stream() -> None:
 # ---------------------------------------------------------------------- the spindle
 
 
-def test_the_machine_is_as_warm_as_what_was_commanded_when(controller: VirtualController, here: VirtualWorld) -> None:
+def test_the_temperatures_of_the_machine_follow_the_commands_in_time(
+    controller: VirtualController, here: VirtualWorld
+) -> None:
     controller.start([])
     controller.elapse(600.0)
     controller.spindle(12000.0)
@@ -161,7 +163,7 @@ def test_the_machine_is_as_warm_as_what_was_commanded_when(controller: VirtualCo
     np.testing.assert_array_equal(here.machine.spindle_speed(t), scheduled.spindle_speed(t))
 
 
-def test_balls_seem_to_move_by_what_the_spindle_has_heated(controller: VirtualController, here: VirtualWorld) -> None:
+def test_the_heat_of_the_spindle_displaces_the_balls(controller: VirtualController, here: VirtualWorld) -> None:
     def touch() -> np.ndarray:
         controller.move_to(ball(1) + BESIDE)
         return np.array(controller.probe(ball(1), SLOW)["position"])
@@ -181,7 +183,7 @@ def test_balls_seem_to_move_by_what_the_spindle_has_heated(controller: VirtualCo
 
 def test_the_state_shows_the_spindle_as_it_turns(controller: VirtualController) -> None:
     controller.spindle(15000.0)
-    controller.elapse(0.375)  # half of what it takes to speed up
+    controller.elapse(0.375)  # half of the acceleration time
     state = controller.state()
     assert state["spindle_speed"] == pytest.approx(7500.0, rel=1e-9)
     assert state["commanded_spindle_speed"] == 15000.0
@@ -209,7 +211,7 @@ def test_a_speed_commanded_in_a_stream_changes_no_sample_that_was_made() -> None
     turning, when = session(faster=True)
     still, _ = session(faster=False)
     same = min(int(when * 1500), still.size)
-    # a block that is made after the order is laid out again up to the change: the still reading is good to 0.5 nm
+    # a block computed after the command is computed again up to the change: readings at rest agree to 0.5 nm
     np.testing.assert_allclose(turning[:same], still[:same], atol=1e-9)
     assert np.std(turning[int((when + 1.0) * 1500) :]) > 2 * np.std(still)  # runout
 
@@ -234,17 +236,17 @@ def test_a_stop_leaves_the_axes_where_they_are(controller: VirtualController) ->
     assert controller.state()["position"] == stopped["position"]
     controller.stop(spindle=True)
     assert controller.state()["commanded_spindle_speed"] == 0.0
-    controller.move_to((0.0, 0.0, 0.0))  # a stop is no alarm
+    controller.move_to((0.0, 0.0, 0.0))  # a stop is not an alarm
 
 
-def test_a_stop_before_a_program_has_begun_leaves_all_as_it_was(controller: VirtualController) -> None:
+def test_a_stop_before_a_program_starts_changes_nothing(controller: VirtualController) -> None:
     controller.run_program(PROGRAM)
     controller.stop()
     controller.elapse(60.0)
     assert controller.state()["position"] == [0.0, 0.0, 0.0]
 
 
-def test_stepping_is_stopped_where_it_is() -> None:
+def test_stepping_stops_at_the_present_step() -> None:
     with VirtualController("sim://cframe/c?seed=3", CONTROLLER) as controller:
         controller.mount("sphere")
         controller.run_steps((0.0, 0.0, 0.0), (1, 0, 0), 1e-3, 11, dwell=1.0, travel=0.1)
@@ -311,14 +313,14 @@ def test_an_emergency_stop_in_a_program_stops_axes_and_spindle(controller: Virtu
     controller.stop(spindle=True)  # always allowed
     controller.reset()
     controller.elapse(60.0)
-    assert controller.state()["spindle_speed"] == 0.0  # nothing starts by itself
+    assert controller.state()["spindle_speed"] == 0.0  # nothing starts automatically
     assert controller.state()["position"] == place
 
 
 # ---------------------------------------------------------------------- faults of the probe
 
 
-def test_a_probe_that_never_trips_goes_on_to_the_target() -> None:
+def test_a_probe_that_never_trips_continues_to_the_target() -> None:
     with VirtualController(f"{ADDRESS}&fault=no_trip&fault_at=4&fault_for=2", CONTROLLER) as controller:
         controller.move_to(ball() + BESIDE)
         assert controller.probe(ball(), SLOW)["tripped"]
@@ -328,7 +330,7 @@ def test_a_probe_that_never_trips_goes_on_to_the_target() -> None:
         assert controller.probe(ball(), SLOW)["tripped"]
 
 
-def test_a_probe_that_is_stuck_does_not_set_out() -> None:
+def test_a_stuck_probe_does_not_start() -> None:
     with VirtualController(f"{ADDRESS}&fault=tripped&fault_at=2", CONTROLLER) as controller:
         controller.move_to(ball() + BESIDE)
         for _ in range(2):
@@ -377,14 +379,14 @@ def test_a_program_warms_the_spindle_and_stops_it_to_probe(controller: VirtualCo
     [
         ("M3 S1000\nG31 X100 F100", r"Line 2 .*: the spindle turns at 1000 /min; M5 first"),
         ("M3 S99999", r"Line 1 .*: The spindle turns at 0 to"),
-        ("DPRNT[Y#5062[53]]", "no skip move, G31, has ended yet"),
-        ("G31 X1 F100\nDPRNT[Y#100[53]]", "#100 is not understood; printed are #5061, #5062, #5063"),
-        ("G31 X100", "a move with G31, but no feed"),
+        ("DPRNT[Y#5062[53]]", "expected a skip move, G31, before its position is printed"),
+        ("G31 X1 F100\nDPRNT[Y#100[53]]", "#100 is not supported; supported are #5061, #5062, #5063"),
+        ("G31 X100", "a move with G31 before a feed"),
         ("G31 X1 F100\nG1 X400 Y-720 Z120", "the probe would trip on this path"),
-        ("M3 S1000\nG1 X1", "a move with G1, but no feed"),
+        ("M3 S1000\nG1 X1", "a move with G1 before a feed"),
     ],
 )
-def test_a_program_that_cannot_run_orders_nothing(
+def test_a_program_that_cannot_run_sends_no_commands(
     controller: VirtualController, here: VirtualWorld, lines: str, why: str
 ) -> None:
     with pytest.raises(InstrumentError, match=why):
@@ -395,7 +397,7 @@ def test_a_program_that_cannot_run_orders_nothing(
     assert not controller.state()["running"]
 
 
-def test_a_stopped_program_orders_nothing_more(controller: VirtualController, here: VirtualWorld) -> None:
+def test_a_stopped_program_sends_no_more_commands(controller: VirtualController, here: VirtualWorld) -> None:
     controller.start([Event(0.0, spindle_speed=500.0), Event(300.0, spindle_speed=1000.0)])
     controller.run_program("M3 S2000\nG4 P60\nM3 S3000\nG4 P60\nM30")
     controller.elapse(10.0)
@@ -406,11 +408,11 @@ def test_a_stopped_program_orders_nothing_more(controller: VirtualController, he
     assert controller.state()["commanded_spindle_speed"] == 1000.0  # the schedule is not the program's
 
 
-# ---------------------------------------------------------------------- blocks under way
+# ---------------------------------------------------------------------- blocks in progress
 
 
 class Held:
-    """A channel whose reader does not read: the samples of a block are under way until it is let go."""
+    """A channel whose reader does not read: the samples of a block are in progress until it is released."""
 
     rate, sync, channel, measuring_range = 100.0, "NONE", "held", 10e-3
     start = position = 0
@@ -426,8 +428,8 @@ class Held:
 
 
 @pytest.mark.parametrize("order", ["run_program", "run_steps"])
-def test_no_motion_begins_within_a_block_under_way(order: str) -> None:
-    """At 100 samples/s a block lasts 41 s: what is ordered meanwhile starts after it."""
+def test_no_motion_starts_within_a_block_in_progress(order: str) -> None:
+    """At 100 samples/s a block lasts 41 s; commands during it start after it."""
     here, stream = VirtualWorld("cframe", 5), Held()
     here.mount("sphere")
     here.start_stream(stream)

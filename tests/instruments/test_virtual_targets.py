@@ -23,13 +23,13 @@ ALL = 1.5e-6
 
 
 def expected(here: VirtualWorld, sensor: PointSensor) -> float:
-    """What a sensor reads without noise where the stage is."""
+    """The reading of a sensor without noise at the position of the stage."""
     target = here.stand.target
     assert target is not None
     return float(sensor.still(target, here.path.place([here.time]))[0])
 
 
-def test_a_move_takes_the_time_of_its_way() -> None:
+def test_the_duration_of_a_move_is_that_of_its_path() -> None:
     with VirtualController(f"sim://cframe/c?{SEED}", CONTROLLER) as controller:
         assert controller.move_to([0.03, 0.04, 0.0], feed=0.01) == {"duration": pytest.approx(5.0)}
         assert controller.move_to([0.03, 0.04, 0.2])["duration"] == pytest.approx(0.2 / (20 / 60))  # rapid, 20 m/min
@@ -90,8 +90,8 @@ def test_a_target_that_does_not_exist_is_refused(arguments: tuple[object, ...], 
 
 
 @pytest.mark.parametrize("kind", ["plane", "bar"])
-def test_both_kinds_of_sensor_read_the_same_surface(kind: str) -> None:
-    """One counts from mid-range, the other from the start of a range of its own: 10 mm against 20 mm / 2."""
+def test_both_kinds_of_sensor_measure_the_same_surface(kind: str) -> None:
+    """One measures from mid-range, the other from the start of its range: 10 mm against 20 mm / 2."""
     with (
         VirtualController(f"sim://cframe/c?{SEED}", CONTROLLER) as controller,
         OptoNCDT(f"sim://cframe/lds?{SEED}&range=20", LONG) as opto,
@@ -109,7 +109,7 @@ def test_both_kinds_of_sensor_read_the_same_surface(kind: str) -> None:
             assert from_start == pytest.approx(true + 10e-3, abs=1e-9)
 
 
-def test_before_and_behind_the_range_are_reported_apart_and_a_miss_from_both() -> None:
+def test_before_and_beyond_the_range_and_no_target_are_reported_separately() -> None:
     with (
         VirtualController(f"sim://cframe/c?{SEED}", CONTROLLER) as controller,
         OptoNCDT(f"sim://cframe/a?{SEED}", SLOW) as opto,
@@ -141,8 +141,8 @@ def test_without_a_target_a_sensor_is_one_of_the_frame_again() -> None:
         other.read()
 
 
-def test_a_streaming_sensor_sees_the_stage_move() -> None:
-    """The face leans in Y by 20 deg, the beam does not: the reading goes with y as the plane states."""
+def test_a_streaming_sensor_measures_the_motion_of_the_stage() -> None:
+    """The face is inclined in Y by 20 deg, the beam is not: the reading changes with y as that of the plane."""
     with (
         VirtualController(f"sim://cframe/c?{SEED}", CONTROLLER) as controller,
         OptoNCDT(f"sim://cframe/lds?{SEED}&range=20", LONG) as opto,
@@ -176,7 +176,7 @@ def test_a_streaming_sensor_sees_the_stage_move() -> None:
         assert fitted == pytest.approx(slope, rel=1e-3)  # 0.3 um of speckle over 6.7 mm: 1e-4
 
 
-def test_the_same_orders_give_the_same_readings() -> None:
+def test_the_same_commands_give_the_same_readings() -> None:
     def session() -> list[float]:
         with VirtualController(f"sim://cframe/c?{SEED}", CONTROLLER) as controller:
             here = world("cframe", 3)
@@ -192,7 +192,7 @@ def test_the_same_orders_give_the_same_readings() -> None:
     assert len(set(first)) == len(first)  # and no two have the same noise
 
 
-def test_a_face_that_is_set_anew_stands_a_little_different() -> None:
+def test_resetting_a_face_changes_it_slightly() -> None:
     with VirtualController(f"sim://cframe/c?{SEED}", CONTROLLER) as controller:
         faces = []
         for _ in range(2):
@@ -204,7 +204,7 @@ def test_a_face_that_is_set_anew_stands_a_little_different() -> None:
     assert 0 < turned < np.radians(40 / 3600)  # 5 arcsec in each direction and of both
 
 
-def test_a_target_stays_when_a_schedule_starts_and_the_stage_where_it_is() -> None:
+def test_a_target_and_the_stage_stay_when_a_schedule_starts() -> None:
     with VirtualController(f"sim://cframe/c?{SEED}", CONTROLLER) as controller:
         here = world("cframe", 3)
         controller.set_target("plane", *TILT)

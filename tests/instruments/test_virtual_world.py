@@ -1,4 +1,4 @@
-"""The world behind the simulators: one machine, one clock, for as long as somebody is there."""
+"""The world of the simulators: one machine, one clock, until the last device is closed."""
 
 import itertools
 import threading
@@ -65,7 +65,7 @@ def test_reset_ends_devices_that_were_left_open() -> None:
     sensor.close()
 
 
-def test_the_clock_shows_the_time_that_the_readers_have_seen() -> None:
+def test_the_clock_shows_the_time_that_the_readers_have_reached() -> None:
     with (
         FiveSensorFrame("sim://cframe?seed=3", FRAME) as frame,
         VirtualController("sim://cframe/c?seed=3", CONTROLLER) as controller,
@@ -82,7 +82,7 @@ def test_the_clock_shows_the_time_that_the_readers_have_seen() -> None:
         assert controller.state()["time"] == pytest.approx(60.5, abs=1e-9)
 
 
-def test_the_same_orders_give_the_same_samples() -> None:
+def test_the_same_commands_give_the_same_samples() -> None:
     def session() -> np.ndarray:
         with (
             FiveSensorFrame("sim://cframe?seed=5", FRAME) as frame,
@@ -99,7 +99,7 @@ def test_the_same_orders_give_the_same_samples() -> None:
 
 
 def test_a_schedule_is_kept_whatever_is_buffered() -> None:
-    """The bar is seen to start to turn at 20 s, although the samples were made long before they were read."""
+    """The bar starts to turn at 20 s, although the samples were computed long before they were read."""
     with (
         FiveSensorFrame("sim://cframe?seed=3", FRAME) as frame,
         VirtualController("sim://cframe/c?seed=3", CONTROLLER) as controller,
@@ -111,7 +111,7 @@ def test_a_schedule_is_kept_whatever_is_buffered() -> None:
     assert np.std(turning) > 2 * np.std(still)  # and the runout
 
 
-def test_a_pace_holds_the_clock_to_real_time() -> None:
+def test_with_a_pace_the_clock_follows_real_time() -> None:
     with OptoNCDT("sim://cframe/X1?seed=3&pace=20", SLOW) as sensor:
         sensor.read()
         start = time.monotonic()
@@ -119,7 +119,7 @@ def test_a_pace_holds_the_clock_to_real_time() -> None:
         assert time.monotonic() - start >= 4 / 20 - 0.05
 
 
-def test_sensors_that_are_not_synchronised_may_have_rates_of_their_own() -> None:
+def test_unsynchronised_sensors_may_have_different_rates() -> None:
     fast, slow = OptoSettings(rate=5000.0, timeout=10.0), OptoSettings(rate=2500.0, timeout=10.0)
     with (
         OptoNCDT("sim://cframe/X1?seed=3", fast) as one,
@@ -151,7 +151,7 @@ def test_temperatures_belong_to_the_last_sample_that_was_read() -> None:
 
 
 @pytest.mark.parametrize("order", ["start", "mount", "elapse"])
-def test_what_would_tear_a_stream_apart_is_refused(order: str) -> None:
+def test_commands_that_would_interrupt_a_stream_are_refused(order: str) -> None:
     with (
         FiveSensorFrame("sim://cframe?seed=3", FRAME) as frame,
         VirtualController("sim://cframe/c?seed=3", CONTROLLER) as controller,

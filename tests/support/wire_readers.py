@@ -414,7 +414,7 @@ def shdr_lines(data: bytes) -> None:
                 shdr.pong(found)
                 continue
             for observed in found:
-                memory.note(observed)
+                memory.store(observed)
     each(lambda: None, *(lambda key=key: memory.numbers(key) for key in memory.values))
     memory.reported("FAULT")
 

@@ -1,1 +1,1 @@
-"""Compensators: what writes offsets into a machine."""
+"""Compensators: drivers that write offsets to a machine."""

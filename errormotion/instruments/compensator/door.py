@@ -1,4 +1,4 @@
-"""The last check of an offset before it reaches a machine: armed, three finite numbers, within the limit."""
+"""The last check of an offset before it is sent: the driver is armed, three finite numbers, within the limit."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from errormotion.errors import InstrumentError
 
 ROUNDING = 1e-9
-"""Share of the limit by which an offset may exceed it."""
+"""Fraction of the limit by which an offset may exceed it."""
 
 
 class OffsetDoor:
-    """Lets offsets pass once it is armed.
+    """Checks offsets; refuses all of them while it is not armed.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class OffsetDoor:
         self.limit = 0.0
 
     def arm(self, limit: float) -> None:
-        """Let offsets pass up to a limit of each axis, m.
+        """Permit offsets up to a limit for each axis, m.
 
         Raises
         ------
@@ -42,7 +42,7 @@ class OffsetDoor:
         self.limit = float(limit)
 
     def disarm(self) -> None:
-        """Let nothing pass."""
+        """Refuse all offsets from now on."""
         self.limit = 0.0
 
     def offset(self, values: Sequence[float]) -> tuple[float, float, float]:
@@ -51,10 +51,10 @@ class OffsetDoor:
         Raises
         ------
         InstrumentError
-            It is not armed, or these are not three finite numbers within the limit.
+            The driver is not armed, or the values are not three finite numbers within the limit.
         """
         if not self.limit:
-            raise InstrumentError(f"{self._where} is not armed; it reads only. Nothing was sent")
+            raise InstrumentError(f"{self._where} is not armed; it only reads. Nothing was sent")
         try:
             found = [float(value) for value in values]
         except (TypeError, ValueError, OverflowError):

@@ -1,7 +1,8 @@
 """Compensators for machines under LinuxCNC, through the bridge and ``compensation.tcl`` in its servo thread.
 
-``compensation.tcl`` bounds the offset, limits its change, holds it, and ramps it to zero without a sign of life, also
-when the bridge has ended. The bridge checks each offset once more, and takes them from one client at a time.
+``compensation.tcl`` limits the offset and its rate of change, holds it when required, and ramps it to zero when the
+heartbeat stops, also when the bridge has ended. The bridge checks each offset again, and accepts offsets from one
+client at a time.
 """
 
 from __future__ import annotations
@@ -30,16 +31,16 @@ class LinuxCNCCompensatorSettings(PluginSettings):
 
     token_file: Path = Field(
         default=Path("~/.errormotion/linuxcnc.token"),
-        description="file with the token of the bridge, readable by its user only",
+        description="file with the token of the bridge, which only its user may read",
     )
-    timeout: Time = Field(default=1.0, description="time limit without an answer of the bridge", gt=0, le=10)
+    timeout: Time = Field(default=1.0, description="time limit for an answer of the bridge", gt=0, le=10)
 
 
 class LinuxCNCOffset(Driver):
     """Offsets as external offsets of LinuxCNC (``axis.L.eoffset``).
 
-    Opening and reading change nothing. `arm` asks the bridge for the right to set offsets, which one program at a time
-    has; after a lost connection the next `write` does.
+    Opening and reading change nothing. `arm` requests the right to set offsets from the bridge, which grants it to one
+    program at a time; after a lost connection the next `write` requests it again.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ class LinuxCNCOffset(Driver):
 
     @classmethod
     def conformance(cls) -> CompensatorSubject:
-        """Return what the conformance kit examines: a LinuxCNC of its own, with simulated joints."""
+        """Return the subject of the conformance kit: a separate LinuxCNC with simulated joints."""
         return CompensatorSubject(
             cls,
             address=f"sim://cframe/linuxcnc?seed=3&route={cls.route}&slew=20&linger=60",
@@ -76,22 +77,22 @@ class LinuxCNCOffset(Driver):
         )
 
     def close(self) -> None:
-        """Disconnect and disarm; the offset ramps to zero by the watchdog in the servo thread. Idempotent."""
+        """Disconnect and disarm; the watchdog in the servo thread ramps the offset to zero. Idempotent."""
         self._door.disarm()
         super().close()
 
     def identify(self) -> Identity:
         """Return the machine."""
         details = {"address": self.address, "route": self.route}
-        return codec.decode_identity(self._ask("identify"), self.transport.simulated, details)
+        return codec.decode_identity(self._request("identify"), self.transport.simulated, details)
 
     def arm(self, limit: float) -> None:
-        """Let offsets be written up to a limit of each axis, m; ask the bridge for the right to set them.
+        """Permit offsets up to a limit for each axis, m; request the right to set them from the bridge.
 
         Raises
         ------
         InstrumentError
-            Another program has the right, the bridge gives none, or its limit is below this one.
+            Another program has the right, the bridge refuses it, or its limit is below this one.
         """
         self._door.arm(limit)
         try:
@@ -107,12 +108,12 @@ class LinuxCNCOffset(Driver):
             raise
 
     def read(self) -> Applied:
-        """Return the offset in effect; busy: it is held in the servo thread; fault: LinuxCNC takes none.
+        """Return the offset in effect; busy: it is held in the servo thread; fault: LinuxCNC accepts none.
 
         Raises
         ------
         InstrumentError
-            No answer; the connection is closed, and `open` opens another.
+            No answer; the connection is closed, and `open` opens another one.
         """
         found = self._state()
         fault = found.fault
@@ -121,18 +122,18 @@ class LinuxCNCOffset(Driver):
         return Applied(found.offset, found.busy, fault)
 
     def write(self, offset: Sequence[float]) -> None:
-        """Ask for an offset of X, Y, Z, m; a sign of life for the watchdog.
+        """Set the offset of X, Y, Z, m; also a heartbeat for the watchdog.
 
         Raises
         ------
         InstrumentError
-            Not armed, beyond the limit, not three finite numbers; no answer; or the bridge refuses it: another
-            program compensates, the machine is off, the offset jumps.
+            Not armed, beyond the limit, not three finite numbers; no answer; or the bridge refuses the offset: another
+            program compensates, the machine is off, or the change is too large.
         """
         values, line = self._door.offset(offset), self.transport
         if not self._may_write:
             self._claim(line)
-        self._ask("set_offset", offset=list(values))
+        self._request("set_offset", offset=list(values))
 
     # ------------------------------------------------------------------ connection
 
@@ -141,7 +142,7 @@ class LinuxCNCOffset(Driver):
         self._hello(self.transport, compensate=False)
 
     def _state(self) -> codec.Offset:
-        found = codec.decode_offset(self._ask("offset"))
+        found = codec.decode_offset(self._request("offset"))
         if found.route != self.route:
             raise InstrumentError(
                 f"{self.address}: expected ROUTE = {self.route} in LinuxCNC's INI file for {self.info.id}; found "
@@ -150,19 +151,19 @@ class LinuxCNCOffset(Driver):
         return found
 
     def _claim(self, line: Transport) -> None:
-        given, other = codec.decode_right(self._hello(line, compensate=True))
-        if not given:
+        granted, other = codec.decode_right(self._hello(line, compensate=True))
+        if not granted:
             why = f"another program has it ({other})" if other else "start the bridge with --compensate"
-            raise InstrumentError(f"{self.address} gives no right to set offsets: {why}")
+            raise InstrumentError(f"{self.address} refuses the right to set offsets: {why}")
         self._may_write = True
 
     def _hello(self, line: Transport, *, compensate: bool) -> Any:
         token = "" if line.simulated else read_token(self.settings.token_file, self.address)
         recorded = isinstance(line, RecordingTransport | ReplayTransport)
         client = NAME if recorded else f"{NAME} {id(self):x}"  # a session is replayed by another object
-        return self._ask("hello", token=token, control=False, client=client, compensate=compensate)
+        return self._request("hello", token=token, control=False, client=client, compensate=compensate)
 
-    def _ask(self, op: str, **arguments: Any) -> Any:
+    def _request(self, op: str, **arguments: Any) -> Any:
         """Return the result of a request; after a failure without an answer the connection is closed."""
         line = self.transport
         self._number += 1
@@ -194,7 +195,7 @@ class LinuxCNCOffset(Driver):
 class LinuxCNCFeedback(LinuxCNCOffset):
     """Offsets in the feedback path of LinuxCNC: added to the motors' commands, subtracted from their feedback.
 
-    LinuxCNC does not know them: its positions are those without errors. Otherwise as `LinuxCNCOffset`.
+    The positions that LinuxCNC reports do not contain them. Otherwise as `LinuxCNCOffset`.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(

@@ -1,6 +1,7 @@
-"""``modbus_registers``: offsets in holding registers of a PLC, with a register as sign of life.
+"""``modbus_registers``: offsets in holding registers of a PLC, with a heartbeat register.
 
-The program of the PLC adds the offsets, and must have a watchdog on the heartbeat, a slew limit and a bound of its own.
+The program of the PLC adds the offsets. It must have a watchdog on the heartbeat, a slew limit and its own limit of the
+offset.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from errormotion.instruments.transports.modbus.client import READ_HOLDING
 from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo
 
 MOST_READ, MOST_WRITTEN = 125, 123
-"""Registers of one request."""
+"""Largest number of registers in one request."""
 
 
 class ModbusRegisters(ModbusDriver):
     """Writes offsets to a PLC by Modbus TCP, RTU on a serial line, or RTU through a serial server.
 
-    All registers that are adjacent are written by one request; the heartbeat is written with the last one, so that an
-    offset that was written in part is no sign of life.
+    Adjacent registers are written by one request; the heartbeat is written by the last request, so that it does not
+    change if an offset was written only in part.
 
     Parameters
     ----------
@@ -48,7 +49,7 @@ class ModbusRegisters(ModbusDriver):
 
     @classmethod
     def conformance(cls) -> tuple[CompensatorSubject, ...]:
-        """Return what the conformance kit examines: TCP, and 16 bits on a serial line."""
+        """Return the subject of the conformance kit: TCP, and 16 bits on a serial line."""
         limits = {"timeout": 0.3, "retry": 0.0}
         tcp = CompensatorSubject(cls, settings=limits, dead_address="modbus+tcp://127.0.0.1:9")
         address = f"{tcp.address}&wire=pty&type=i16&scale=1e-8&word_order=little&function=6"
@@ -69,33 +70,33 @@ class ModbusRegisters(ModbusDriver):
         super().close()
 
     def identify(self) -> Identity:
-        """Return the unit; PLCs report no name by their registers."""
+        """Return the address of the unit; PLCs report no name in their registers."""
         self.line.registers(READ_HOLDING, self.settings.heartbeat, 1)
         return self.identity("holding registers")
 
     def arm(self, limit: float) -> None:
-        """Let offsets pass up to a limit of each axis, m; nothing is sent.
+        """Permit offsets up to a limit for each axis, m; nothing is sent.
 
         Raises
         ------
         InstrumentError
-            The registers cannot hold such an offset, or one count is more than the limit.
+            The registers cannot represent this limit, or one count is more than the limit.
         """
         largest, scale = self.settings.largest, self.settings.scale
         if not scale <= limit <= largest:
             raise InstrumentError(
-                f"{self.address}: the registers hold offsets from {scale * 1e6:g} um to {largest * 1e6:g} um; the "
+                f"{self.address}: the registers represent offsets from {scale * 1e6:g} um to {largest * 1e6:g} um; the "
                 f"limit is {limit * 1e6:g} um. Change 'scale' or 'type'"
             )
         self._door.arm(limit)
 
     def read(self) -> Applied:
-        """Return the offset in effect, m, and what the PLC states.
+        """Return the offset in effect, m, and the states of the PLC.
 
         Raises
         ------
         ProtocolError, InstrumentTimeoutError, InstrumentError
-            As of `ModbusLine.registers`.
+            See `ModbusLine.registers`.
         """
         settings = self.settings
         wanted = {first + i: 0 for first, n in settings.states.items() for i in range(n)}
@@ -113,8 +114,8 @@ class ModbusRegisters(ModbusDriver):
         Raises
         ------
         InstrumentError
-            It is not armed, or an offset is beyond the limit or not finite: nothing was sent. Else as of
-            `ModbusLine.write_registers`.
+            The driver is not armed, or an offset is beyond the limit or not finite: nothing was sent. For other errors
+            see `ModbusLine.write_registers`.
         """
         line, settings = self.line, self.settings
         values = self._door.offset(offset)
@@ -143,6 +144,6 @@ class ModbusRegisters(ModbusDriver):
         return found
 
     def _start_session(self) -> None:
-        """Go on from the last heartbeat, so that the first write is a sign of life; check the other registers."""
+        """Continue from the last heartbeat, so that the first write changes it; check the other registers."""
         (self._heartbeat,) = self.line.registers(READ_HOLDING, self.settings.heartbeat, 1)
         self.read()

@@ -1,8 +1,8 @@
 """``offset_file``: offsets in a small JSON file, for a control or another program that reads one.
 
-The file is replaced as a whole at every write. Its reader must ramp to zero when ``number`` has not changed for
-``valid`` seconds; ``examples`` of a reader are in the documentation. If the reader writes a file of its own with the
-offset in effect, `read` reports it.
+Every write replaces the whole file. Its reader must ramp to zero when ``number`` has not changed for ``valid`` seconds;
+the documentation has examples of a reader. If the reader writes the offset in effect to another file, `read` returns
+it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from errormotion.plugins import Applied, CompensatorSubject, Identity, Instrumen
 
 SCHEMA = "errormotion.offset/1"
 LONGEST = 1 << 16
-"""Bytes of a file that is read."""
+"""Longest file that is read, bytes."""
 
 
 class OffsetFileSettings(PluginSettings):
@@ -33,7 +33,7 @@ class OffsetFileSettings(PluginSettings):
 
     valid: Time = Field(default=5.0, gt=0, le=60.0, description="time after which the reader must ramp to zero")
     state: str = Field(
-        default="", description="file that the reader writes, with the offset in effect; default: what was written"
+        default="", description="file that the reader writes, with the offset in effect; default: the written offset"
     )
 
 
@@ -58,7 +58,7 @@ class OffsetFile:
 
     @classmethod
     def conformance(cls) -> CompensatorSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         return CompensatorSubject(cls, dead_address="/nonexistent/offset.json")
 
     def __init__(self, address: str, settings: Any = None) -> None:
@@ -70,12 +70,12 @@ class OffsetFile:
         self._open = False
 
     def open(self) -> None:
-        """Check that the folder is there.
+        """Check that the folder exists.
 
         Raises
         ------
         InstrumentError
-            No folder, or the file is not one of offsets.
+            The folder does not exist, or the file has another content.
         """
         if self._open:
             return
@@ -88,17 +88,17 @@ class OffsetFile:
         self._open = True
 
     def close(self) -> None:
-        """Write nothing further: the file keeps the last offset, whose time to live ends. Idempotent."""
+        """Write nothing further: the file keeps the last offset, which expires after ``valid``. Idempotent."""
         self._open = False
         self._door.disarm()
 
     def identify(self) -> Identity:
-        """Return the file."""
+        """Return the name of the file."""
         self._require_open()
         return Identity("errormotion", "offset file", self.path.name)
 
     def arm(self, limit: float) -> None:
-        """Let offsets be written up to a limit of each axis, m; nothing is written."""
+        """Permit offsets up to a limit for each axis, m; nothing is written."""
         self._require_open()
         self._door.arm(limit)
 
@@ -108,7 +108,7 @@ class OffsetFile:
         source = Path(self.settings.state) if self.settings.state else self.path
         if not source.exists():
             if self.settings.state:
-                raise InstrumentError(f"{source}: expected the state that the reader of offsets writes; found no file")
+                raise InstrumentError(f"{source}: expected a file that the reader of offsets writes; found none")
             return Applied((0.0, 0.0, 0.0))
         found = self._content(source)
         offset = [_number(found.get(axis)) for axis in "XYZ"]
@@ -120,7 +120,7 @@ class OffsetFile:
         Raises
         ------
         InstrumentError
-            It is not armed, an offset is beyond the limit or not finite, or the file cannot be written.
+            The driver is not armed, an offset is beyond the limit or not finite, or the file cannot be written.
         """
         self._require_open()
         values = dict(zip("XYZ", self._door.offset(offset), strict=True))
@@ -150,7 +150,7 @@ class OffsetFile:
             if not isinstance(found, dict) or found.get("schema") != SCHEMA:
                 raise ValueError(f"expected an object with the schema {SCHEMA}")
         except (OSError, ValueError, RecursionError) as error:
-            raise InstrumentError(f"{path}: not a file of offsets: {error}") from None
+            raise InstrumentError(f"{path} is not a file of offsets: {error}") from None
         return found
 
 
@@ -161,4 +161,4 @@ def _number(value: Any) -> float:
 
 def _text(found: dict[str, Any], key: str) -> str:
     value = found.get(key, "")
-    return value[:200] if isinstance(value, str) else f"{key} is no text"
+    return value[:200] if isinstance(value, str) else f"{key} is not a text"

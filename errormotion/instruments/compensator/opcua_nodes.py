@@ -1,7 +1,7 @@
-"""``opcua_nodes``: offsets in nodes of an OPC UA server, with a node as sign of life.
+"""``opcua_nodes``: offsets in nodes of an OPC UA server, with a heartbeat node.
 
-The PLC or the control behind the server adds the offsets. It must have a watchdog on the heartbeat, a slew limit and a
-bound of its own.
+The PLC or the control behind the server adds the offsets. It must have a watchdog on the heartbeat, a slew limit and
+its own limit of the offset.
 """
 
 from __future__ import annotations
@@ -23,31 +23,33 @@ from errormotion.plugins import Applied, CompensatorSubject, Identity, Instrumen
 
 SIGNED = {"SByte": 7, "Int16": 15, "Int32": 31, "Int64": 63}
 UNSIGNED = {"Boolean": 1, "Byte": 8, "UInt16": 16, "UInt32": 32, "UInt64": 64}
-"""Types of whole numbers, and bits of the largest one."""
+"""Integer types, and the number of bits of their largest value."""
 FRACTIONS = ("Float", "Double")
 BEATS = 1 << 15
-"""Values of the heartbeat, unless its type has fewer."""
+"""Number of values of the heartbeat, unless its type has fewer."""
 IDENTITY = {"manufacturer": "i=2263", "model": "i=2261", "firmware": "i=2264"}
-"""Nodes of every server: ManufacturerName, ProductName, SoftwareVersion."""
+"""Nodes that every server has: ManufacturerName, ProductName, SoftwareVersion."""
 
 
 class OpcUaNodesSettings(PluginSettings):
     """Settings of a server with nodes for offsets."""
 
     offset: tuple[str, str, str] = Field(description="ids of the nodes for the offset of X, Y, Z: 'ns=2;s=Offset.X'")
-    heartbeat: str = Field(description="id of the node that changes at each write; a whole number or a Boolean")
+    heartbeat: str = Field(description="id of the node that changes at each write; an integer or a Boolean")
     applied: tuple[str, str, str] | None = Field(
         default=None, description="ids of the nodes with the offset in effect; default: those of `offset`"
     )
-    stop: str = Field(default="", description="id of a node that is not 0 or false while no offsets are taken")
-    busy: str = Field(default="", description="id of a node that is not 0 or false while the offset must not change")
+    stop: str = Field(default="", description="id of a node that is neither 0 nor false while no offsets are accepted")
+    busy: str = Field(
+        default="", description="id of a node that is neither 0 nor false while the offset must not change"
+    )
     scale: Length = Field(default=1e-3, description="offset for the number 1 in a node", gt=0, le=1)
     security: str = Field(
         default="", description="'Basic256Sha256,SignAndEncrypt,client.der,client.pem'; empty: no encryption"
     )
     user: str = Field(default="", description="name of the user; empty: anonymous")
     password_file: str = Field(default="", description="file whose first line is the user's password")
-    timeout: Time = Field(default=1.0, description="time limit of one request", gt=0, le=10)
+    timeout: Time = Field(default=1.0, description="time limit for one request", gt=0, le=10)
 
     @model_validator(mode="after")
     def _different(self) -> Self:
@@ -55,7 +57,7 @@ class OpcUaNodesSettings(PluginSettings):
         if double := next((each for each in ids if ids.count(each) > 1), None):
             raise ValueError(f"the node '{double}' is named twice")
         if not all((*self.offset, self.heartbeat)):
-            raise ValueError("'offset' and 'heartbeat': expected ids of nodes; found an empty text")
+            raise ValueError("'offset' and 'heartbeat': expected ids of nodes; found an empty string")
         return self
 
     @property
@@ -88,7 +90,7 @@ class OpcUaNodes(Driver):
 
     @classmethod
     def conformance(cls) -> CompensatorSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         faults = ("silence", "split", "garbage", "disconnect", "unavailable", "refused")
         return CompensatorSubject(cls, settings={"timeout": 0.8}, faults=faults, dead_address="opc.tcp://127.0.0.1:9")
 
@@ -104,7 +106,7 @@ class OpcUaNodes(Driver):
         super().close()
 
     def identify(self) -> Identity:
-        """Return the product as the server states it."""
+        """Return the product that the server reports."""
         known = {name: _text(each) for name, each in zip(IDENTITY, self._values(IDENTITY.values()), strict=True)}
         return Identity(
             manufacturer=known["manufacturer"],
@@ -116,12 +118,12 @@ class OpcUaNodes(Driver):
         )
 
     def arm(self, limit: float) -> None:
-        """Let offsets pass up to a limit of each axis, m; nothing is sent.
+        """Permit offsets up to a limit for each axis, m; nothing is sent.
 
         Raises
         ------
         InstrumentError
-            A node of whole numbers cannot hold such an offset.
+            A node of integers cannot represent this limit.
         """
         scale = self.settings.scale
         for node, kind in zip(self.settings.offset, self._types, strict=False):
@@ -130,18 +132,18 @@ class OpcUaNodes(Driver):
             largest = ((1 << SIGNED[kind]) - 1) * scale
             if not scale <= limit <= largest:
                 raise InstrumentError(
-                    f"{self.address}: node '{node}' ({kind}) holds offsets from {scale * 1e6:g} um to "
+                    f"{self.address}: node '{node}' ({kind}) represents offsets from {scale * 1e6:g} um to "
                     f"{largest * 1e6:g} um; the limit is {limit * 1e6:g} um. Change 'scale'"
                 )
         self._door.arm(limit)
 
     def read(self) -> Applied:
-        """Return the offset in effect, m, NaN where a value is not good, and what the server states.
+        """Return the offset in effect, m, NaN where the status of a value is not Good, and the states of the server.
 
         Raises
         ------
         InstrumentError
-            The connection is lost, the server refuses, or its answer is none.
+            The connection is lost, the server refuses, or its answer is invalid.
         """
         settings = self.settings
         answers = dict(zip(settings.read, self._values(settings.read), strict=True))
@@ -154,8 +156,8 @@ class OpcUaNodes(Driver):
         Raises
         ------
         InstrumentError
-            It is not armed, or an offset is beyond the limit or not finite: nothing was sent. Else the connection is
-            lost, or the server did not take a value.
+            The driver is not armed, or an offset is beyond the limit or not finite: nothing was sent. Or the connection
+            is lost, or the server did not accept a value.
         """
         line, settings = self.transport, self.settings
         numbers = [self._held(kind, x) for kind, x in zip(self._types, self._door.offset(offset), strict=False)]
@@ -168,10 +170,10 @@ class OpcUaNodes(Driver):
             raise ProtocolError(f"{self.address}: expected {len(nodes)} statuses; found {str(statuses)[:80]}")
         refused = [f"{node}: {str(each)[:60]}" for node, each in zip(nodes, statuses, strict=True) if each != "Good"]
         if refused:
-            raise InstrumentError(f"{self.address}: the server did not take the offset: {', '.join(refused)}")
+            raise InstrumentError(f"{self.address}: the server did not accept the offset: {', '.join(refused)}")
 
     def _held(self, kind: str, offset: float) -> float:
-        """Return an offset, m, as a node of this type holds it, never beyond the limit."""
+        """Return the number that represents an offset, m, in a node of this type, never beyond the limit."""
         scale = self.settings.scale
         if kind in FRACTIONS:
             return offset / scale
@@ -196,7 +198,7 @@ class OpcUaNodes(Driver):
         )
 
     def _start_session(self) -> None:
-        """Check the nodes, and go on from the last heartbeat, so that the first write is a sign of life."""
+        """Check the nodes, and continue from the last heartbeat, so that the first write changes it."""
         settings = self.settings
         nodes = (*settings.offset, settings.heartbeat)
         found = request(self.transport, {"describe": list(nodes)})
@@ -225,17 +227,17 @@ def _number(answer: dict[str, Any]) -> float:
         return math.nan
     try:
         return float(value)
-    except OverflowError:  # a whole number beyond the range of float
+    except OverflowError:  # an integer beyond the range of float
         return math.nan
 
 
 def _state(answers: dict[str, Any], name: str, node: str) -> str:
-    """Return why a state holds; empty where it does not. One that cannot be read holds."""
+    """Return a message if a state is active or cannot be read; else an empty string."""
     if not node:
         return ""
     value = _number(answers[node])
     if math.isnan(value):
-        return f"{name} is not known: {node} has the status {_status(answers[node])}"
+        return f"{name} is unknown: {node} has the status {_status(answers[node])}"
     return f"the server states {name} ({node} is {value:g})" if value else ""
 
 

@@ -1,4 +1,4 @@
-"""Which holding register of a PLC has which part of an offset, and how a number is stored there."""
+"""Assignment of the parts of an offset to holding registers of a PLC, and the format of their numbers."""
 
 from __future__ import annotations
 
@@ -18,23 +18,27 @@ Three = tuple[int, int, int]
 class RegisterSettings(PluginSettings):
     """Settings of a PLC: its registers, counted from 0, and its line."""
 
-    unit: int = Field(default=1, description="address of the PLC, where its URL has none", ge=0, le=255)
+    unit: int = Field(default=1, description="address of the PLC, if its URL states none", ge=0, le=255)
     offset: Three = Field(default=(0, 2, 4), description="first register of the offset of X, Y, Z")
     heartbeat: int = Field(default=6, description="register that is increased by 1 at each write")
     applied: Three | None = Field(
         default=None,
         description="first register of the offset of X, Y, Z in effect, written by the PLC; default: those of `offset`",
     )
-    stop: int | None = Field(default=None, description="register that is not 0 while the PLC takes no offsets")
+    stop: int | None = Field(default=None, description="register that is not 0 while the PLC accepts no offsets")
     busy: int | None = Field(default=None, description="register that is not 0 while the offset must not change")
-    type: Literal["i16", "i32"] = Field(default="i32", description="signed, one or two registers")
-    word_order: Literal["big", "little"] = Field(default="big", description="big: the upper 16 bits come first")
+    type: Literal["i16", "i32"] = Field(default="i32", description="type of a number: signed, in one or two registers")
+    word_order: Literal["big", "little"] = Field(
+        default="big", description="order of two registers; big: the upper 16 bits first"
+    )
     scale: Length = Field(default=1e-9, description="offset for one count", gt=0, le=1e-6)
-    function: Literal[6, 16] = Field(default=16, description="16 writes all registers at once, 6 one by one")
-    timeout: Time = Field(default=0.5, description="time limit of an answer", gt=0, le=10)
-    retry: Time = Field(default=1.0, description="least interval between two attempts to connect again", ge=0)
+    function: Literal[6, 16] = Field(
+        default=16, description="Modbus function for writing: 16 for several registers at once, 6 for one"
+    )
+    timeout: Time = Field(default=0.5, description="time limit for an answer", gt=0, le=10)
+    retry: Time = Field(default=1.0, description="minimum interval between two attempts to connect again", ge=0)
     retries: int = Field(default=1, description="number of repeated requests after a damaged answer", ge=0, le=10)
-    baudrate: int = Field(default=19200, description="of a serial line, where its URL has none", gt=0)
+    baudrate: int = Field(default=19200, description="baud rate of a serial line, if its URL states none", gt=0)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -63,7 +67,7 @@ class RegisterSettings(PluginSettings):
 
     @property
     def largest(self) -> float:
-        """Largest offset that the registers hold, m."""
+        """Largest offset that the registers can represent, m."""
         return float(((1 << (16 * SIZES[self.type] - 1)) - 1) * self.scale)
 
     @property
@@ -74,21 +78,21 @@ class RegisterSettings(PluginSettings):
         return found | {register: 1 for register in (self.stop, self.busy) if register is not None}
 
     def words(self, count: int) -> list[int]:
-        """Return the registers of a number of counts."""
+        """Return the registers that represent a number of counts."""
         size = SIZES[self.type]
         data = struct.pack(">i" if size > 1 else ">h", count)
         found = list(struct.unpack(f">{size}H", data))
         return found if self.word_order == "big" else found[::-1]
 
     def count(self, words: Sequence[int]) -> int:
-        """Return the number of counts in registers."""
+        """Return the number of counts that registers represent."""
         order = list(words) if self.word_order == "big" else list(words)[::-1]
         (found,) = struct.unpack(">i" if len(order) > 1 else ">h", struct.pack(f">{len(order)}H", *order))
         return int(found)
 
 
 def runs(registers: Mapping[int, int], most: int) -> Iterator[tuple[int, list[int]]]:
-    """Yield runs of adjacent registers: the first one and the values, ``most`` at a time.
+    """Yield runs of at most ``most`` adjacent registers: the first one and the values.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """The controller of the virtual machine: JSON lines over TCP.
 
 A request is ``{"id": 1, "op": "mount", "tool": "bar"}``, its answer ``{"id": 1, "ok": true, "result": ...}`` or
-``{"id": 1, "ok": false, "error": "..."}``, each on a line of its own.
+``{"id": 1, "ok": false, "error": "..."}``, each on a separate line.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, Mac
 
 LINE_END = b"\n"
 MOST_DIGITS = 300
-"""Of a whole number."""
+"""Largest number of digits of a whole number."""
 LONGEST_LINE = 1 << 16
 """Longest answer, bytes."""
 
@@ -43,14 +43,14 @@ class Answer(NamedTuple):
 
     @property
     def result(self) -> Any:
-        """The result; InstrumentError where the controller refuses."""
+        """The result; InstrumentError if the controller refuses."""
         if not self.ok:
             raise InstrumentError(f"The controller refuses: {self.content}")
         return self.content
 
 
 def decode_answer(line: bytes, number: int) -> Answer:
-    """Return the answer to a request; ProtocolError where the line is no answer, or that to another request."""
+    """Return the answer to a request; ProtocolError if the line is not an answer, or answers another request."""
     try:
         answer = json.loads(line, parse_int=_whole)
         matches, ok = answer["id"] == number, bool(answer["ok"])
@@ -70,7 +70,7 @@ def _whole(text: str) -> int:
 
 
 def event_fields(event: Any) -> dict[str, Any]:
-    """Return an event (a mapping, or an object with these attributes) as JSON takes it."""
+    """Return an event (a mapping, or an object with these attributes) as an object for JSON."""
     names = ("time", "spindle_speed", "compensation")
     found = event if isinstance(event, Mapping) else {name: getattr(event, name, None) for name in names}
     if found.get("time") is None or set(found) - set(names):
@@ -89,11 +89,11 @@ _READING = ("identify", "state")
 class ControllerSettings(ArmedSettings):
     """Settings of the virtual controller."""
 
-    timeout: Time = Field(default=2.0, description="time limit of an answer", gt=0)
+    timeout: Time = Field(default=2.0, description="time limit for an answer", gt=0)
 
 
 class VirtualController(Driver):
-    """The control of the virtual machine. Without ``arm`` in its settings it reads, and stops the machine.
+    """The control of the virtual machine. Without ``arm`` in the settings the driver only reads, and can stop it.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class VirtualController(Driver):
     @classmethod
     def conformance(cls) -> InstrumentSubject:
         """Return the subject of the conformance kit."""
-        # Faults of the machine show when it moves, not when it is read.
+        # Faults of the machine appear when it moves, not when it is read.
         harmless = ("split", "alarm", "estop", "no_trip", "tripped")
         return InstrumentSubject(cls, "sim://cframe/controller", harmless=harmless)
 
@@ -142,38 +142,37 @@ class VirtualController(Driver):
         self.settings = settings
 
     def bound(self, limits: MachineLimits) -> None:
-        """Hold limits for every order from now on."""
+        """Apply limits to every command from now on."""
         self._door.limits = limits
 
     def read(self) -> dict[str, Any]:
-        """Return the state now."""
+        """Return the present state."""
         return self.state()
 
     def state(self) -> dict[str, Any]:
         """Return the state of the control.
 
-        As every controller: ``time`` (s since the start of the schedule), ``position`` and ``commanded_position`` (X,
-        Y, Z, m), ``spindle_speed`` (1/min, as it turns), ``spindle_load`` (share of that at top speed), ``feed`` (m/s,
-        as it moves; NaN while the sphere is stepped), ``mode`` (``mdi``, or ``automatic`` while a program waits or
+        As for every controller: ``time`` (s since the start of the schedule), ``position`` and ``commanded_position``
+        (X, Y, Z, m), ``spindle_speed`` (actual, 1/min), ``spindle_load`` (fraction of that at top speed), ``feed``
+        (actual, m/s; NaN while the sphere is stepped), ``mode`` (``mdi``, or ``automatic`` while a program waits or
         runs), ``program`` (its title), ``running`` (whether an NC program waits or runs), ``homed``, ``enabled``,
         ``estop``, ``alarms`` (list of str).
 
-
-        Only of this controller: ``commanded_spindle_speed`` (1/min), ``compensation`` (axis to on or off),
-        ``tool``, ``stepping`` (whether a step program waits or runs); ``target`` where one is set (``kind``, and of a
-        plane ``inclination`` and ``rotation``, rad).
+        Only for this controller: ``commanded_spindle_speed`` (1/min), ``compensation`` (axis to on or off), ``tool``,
+        ``stepping`` (whether a step program waits or runs); ``target`` if one is set (``kind``, and for a plane
+        ``inclination`` and ``rotation``, rad).
         """
         return self._facts("state", "time", "position", "running")
 
     def mount(self, tool: str) -> None:
-        """Put ``"bar"``, ``"sphere"`` or ``"probe"`` into the spindle.
+        """Mount ``"bar"``, ``"sphere"`` or ``"probe"`` in the spindle.
 
         The probe is mounted automatically for a probing move, and replaced by the bar before the spindle turns.
         """
         self._change("mount", tool=tool)
 
     def start(self, schedule: Iterable[Any]) -> None:
-        """Start again, cold, at time 0 with a schedule of events.
+        """Restart with a cold machine at time 0, with a schedule of events.
 
         An event has ``time`` (s), and optionally ``spindle_speed`` (1/min) and ``compensation`` (axis to on or off).
         The first sample of the next stream is taken at time 0.
@@ -186,20 +185,20 @@ class VirtualController(Driver):
         self._change("start", schedule=self._events(schedule))
 
     def follow(self, schedule: Iterable[Any], time: float) -> None:
-        """Warm up by a schedule from time 0 on, and set the clock to a time, s, also back.
+        """Warm up by a schedule from time 0 on, and set the clock to a time, s, which may be earlier than now.
 
         From then on `spindle` turns the spindle and does not change the heat, and `start` expects a part of this
-        schedule: several measurements meet one machine in the same state at the same time.
+        schedule: several measurements thus find the machine in the same state at the same time.
 
         Raises
         ------
         InstrumentError
-            A stream is running, alarm, or the machine cannot follow the schedule.
+            A stream is running, the machine is in alarm, or cannot follow the schedule.
         """
         self._change("follow", schedule=self._events(schedule), time=float(time))
 
     def elapse(self, seconds: float) -> None:
-        """Let simulated time pass without samples."""
+        """Advance the simulated time without samples."""
         self._call("elapse", seconds=self._door.duration(seconds))
 
     def run_steps(
@@ -211,31 +210,31 @@ class VirtualController(Driver):
         dwell: float = 1.0,
         travel: float = 0.1,
     ) -> dict[str, Any]:
-        """Step the mounted sphere along a line; returns at once.
+        """Step the mounted sphere along a line; return at once.
 
-        The motion starts a short and unknown time after the next sample. The sphere rests
-        ``dwell`` s at each of ``count`` positions and travels ``travel`` s between two.
+        The motion starts a short and unknown time after the next sample.
 
         Parameters
         ----------
         start : (3,)
-            Commanded centre of the sphere at the first position, m, in the coordinates of the measuring frame. Where
-            the frame stands on the machine is unknown to the driver: of the limits, it holds the length of the way.
+            Commanded centre of the sphere at the first position, m, in the coordinates of the measuring frame. The
+            position of the frame on the machine is unknown to the driver, which therefore only checks the length of the
+            path against the limits.
         direction : (3,)
-            Of the steps.
+            Direction of the steps.
         step : float
-            m.
+            Distance between two positions, m.
         count : int
+            Number of positions.
         dwell, travel : float
-            s.
+            Times at a position and between two positions, s.
 
         Returns
         -------
         dict
             ``duration`` of the motion and ``longest_lead_in`` before it, s.
         """
-        way = [float(step) * (count - 1) * float(u) for u in direction]
-        self._door.extent(way, "steps")
+        self._door.extent([float(step) * (count - 1) * float(u) for u in direction], "steps")
         if not all(math.isfinite(x) for x in start):
             raise InstrumentError(f"Expected a start of three finite numbers; found {start!r}")
         self._door.feed(step / travel if travel > 0 else math.nan)
@@ -251,17 +250,17 @@ class VirtualController(Driver):
         )
 
     def run_program(self, text: str) -> dict[str, Any]:
-        """Run an NC program; returns at once.
+        """Run an NC program; return at once.
 
-        The motion starts a short and unknown time after the order. ``state()["running"]`` states when it is over;
-        simulated time passes by samples or ``elapse`` only.
+        The motion starts a short and unknown time after the command. ``state()["running"]`` is false when it has ended;
+        only samples and ``elapse`` advance the simulated time.
 
         Parameters
         ----------
         text : str
             ISO 6983: G0 and G1 with X, Y, Z (mm) and F (mm/min), G4 P (s), G21, G90, G94, M3 S (1/min) and M5, M30 or
-            M2, and comments; further G31, a move that ends where the probe trips, and DPRNT[...], which prints
-            that position (#5061 to #5063, mm).
+            M2, and comments; also G31, a move that ends where the probe trips, and DPRNT[...], which prints that
+            position (#5061 to #5063, mm).
 
         Returns
         -------
@@ -271,8 +270,8 @@ class VirtualController(Driver):
         Raises
         ------
         InstrumentError
-            Another program runs, a word is unknown or a position out of travel: nothing moves, and the message
-            names the line.
+            Another program runs, a word is unknown or a position is out of travel: nothing moves, and the message
+            states the line.
         """
         check_program(str(text), self._door)
         return self._facts("run_program", "duration", text=str(text))
@@ -280,8 +279,8 @@ class VirtualController(Driver):
     def move_to(self, position: Sequence[float], feed: float | None = None) -> dict[str, Any]:
         """Move the axes in a straight line.
 
-        Simulated time passes by the duration of the move; while sensors stream it passes with their samples, and
-        ``state()["running"]`` states when the move is over.
+        The move advances the simulated time by its duration; while sensors stream, their samples advance it, and
+        ``state()["running"]`` is false when the move has ended.
 
         Parameters
         ----------
@@ -301,12 +300,12 @@ class VirtualController(Driver):
             The position is out of travel, or another motion runs: nothing moves.
         """
         goal, limit = self._door.position(position), self._door.limits.feed
-        held = {} if feed is not None or limit is None else {"feed_limit": limit}
+        extra = {} if feed is not None or limit is None else {"feed_limit": limit}
         feed = None if feed is None else self._door.feed(feed)
-        return self._facts("move_to", "duration", position=goal, feed=feed, **held)
+        return self._facts("move_to", "duration", position=goal, feed=feed, **extra)
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
-        """Move the touch probe in a straight line until it trips; the machine then rests there, or at the target.
+        """Move the touch probe in a straight line until it trips or reaches the target.
 
         Parameters
         ----------
@@ -335,17 +334,17 @@ class VirtualController(Driver):
         return {**found, "position": position}
 
     def spindle(self, speed: float) -> None:
-        """Turn the spindle at a speed in 1/min from now on; 0 stops it.
+        """Turn the spindle at a speed in 1/min; 0 stops it.
 
         Raises
         ------
         InstrumentError
-            The spindle cannot turn that fast, alarm or emergency stop.
+            The speed is too high, or the machine is in alarm or emergency stop.
         """
         self._change("spindle", speed=self._door.speed(speed))
 
     def stop(self, *, spindle: bool = False) -> None:
-        """Abort all motion of the axes, and with ``spindle`` stop the spindle, too; always allowed."""
+        """Abort all motion of the axes, and with ``spindle`` also stop the spindle; always permitted."""
         self._call("stop", spindle=bool(spindle))
 
     def press_estop(self) -> None:
@@ -353,7 +352,7 @@ class VirtualController(Driver):
         self._call("estop")
 
     def reset(self) -> None:
-        """Leave alarm and emergency stop; nothing starts to move by itself."""
+        """Clear alarm and emergency stop; this starts no motion."""
         self._change("reset")
 
     def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
@@ -364,7 +363,7 @@ class VirtualController(Driver):
         kind : {"plane", "bar"} or None
             A face of a sine gauge on a turntable, a check bar, or none: the sensors are then those of the frame.
         inclination, rotation : float, optional
-            Of the gauge and its turntable, rad; for a plane.
+            Angles of the gauge and its turntable, rad; for a plane.
 
         Raises
         ------
@@ -375,7 +374,7 @@ class VirtualController(Driver):
         self._change("set_target", kind=kind, **{name: float(x) for name, x in angles.items() if x is not None})
 
     def set_station(self, position: Sequence[float]) -> None:
-        """Carry the laser tracker to a position in machine coordinates, m, to within some millimetres.
+        """Place the laser tracker at a position in machine coordinates, m, to within some millimetres.
 
         Raises
         ------
@@ -384,23 +383,23 @@ class VirtualController(Driver):
         """
         self._change("set_station", position=[float(x) for x in position])
 
-    def _facts(self, op: str, *needed: str, **arguments: Any) -> dict[str, Any]:
-        """Return the result of a request, a mapping that has the needed keys."""
+    def _facts(self, op: str, *required: str, **arguments: Any) -> dict[str, Any]:
+        """Return the result of a request, a mapping with the required keys."""
         found = self._call(op, **arguments) if op in _READING else self._change(op, **arguments)
-        if not isinstance(found, dict) or (missing := [key for key in needed if key not in found]):
-            what = ", ".join(missing) if isinstance(found, dict) else "everything"
+        if not isinstance(found, dict) or (missing := [key for key in required if key not in found]):
+            what = ", ".join(missing) if isinstance(found, dict) else ", ".join(required)
             raise ProtocolError(f"The answer to '{op}' lacks {what}; found {str(found)[:200]}")
         return found
 
     def _events(self, schedule: Iterable[Any]) -> list[dict[str, Any]]:
-        """Return the events of a schedule, whose spindle speeds are within the limits."""
+        """Return the events of a schedule; InstrumentError unless their spindle speeds are within the limits."""
         events = [event_fields(event) for event in schedule]
         for event in events:
             self._door.speed(event.get("spindle_speed", 0.0))
         return events
 
     def _change(self, op: str, **arguments: Any) -> Any:
-        """Send an order that moves or changes the machine."""
+        """Send a command that moves or changes the machine."""
         words = ", ".join(f"{name} {value}" for name, value in arguments.items())
         self._door.admit(self.settings.arm, f"{op.replace('_', ' ')} {words}")
         return self._call(op, **arguments)
@@ -410,7 +409,7 @@ class VirtualController(Driver):
             self._number += 1
             line.write(encode_request(self._number, op, arguments))
             answer = decode_answer(line.read_until(LINE_END, limit=LONGEST_LINE), self._number)
-        return answer.result  # a refusal is an answer as well: the next request need not wait
+        return answer.result  # after the block: a refusal is a complete answer
 
     def _connect(self) -> Transport:
         self._number = 0

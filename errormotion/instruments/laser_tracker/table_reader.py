@@ -1,4 +1,4 @@
-"""Conversion of exported tables of trackers to lengths by station and target, in SI; all mistakes are reported at once.
+"""Conversion of exported tables of trackers to lengths by station and target, in SI; reports all mistakes at once.
 
 A table has a line of column names with their units, and a line for each measurement, in any order::
 
@@ -6,7 +6,7 @@ A table has a line of column names with their units, and a line for each measure
     S1,1,1523.40712,20.31,1013.2,45
     S1,2,,20.31,1013.2,45
 
-An empty length is a broken beam.
+An empty length means a broken beam.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ AIR = ("temperature", "pressure", "humidity")
 LONGEST_TABLE = 1 << 24
 """Longest table, bytes."""
 MOST_LINES = 100_000
-"""Of a table: its rows take more memory than their bytes."""
+"""Largest number of lines of a table: rows take more memory than their bytes."""
 
-_ENDS, _LONG_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e", (b"\xc2\x85", b"\xe2\x80\xa8", b"\xe2\x80\xa9")  # of a line of text
+_ENDS, _LONG_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e", (b"\xc2\x85", b"\xe2\x80\xa8", b"\xe2\x80\xa9")  # line ends of text
 _MOST_HINTS = 10  # columns for which a name is suggested
 _TITLE = re.compile(r"([^\W\d]\w*(?: \w+)*)\s*(?:[\[(]([^\])]*)[\])]|/\s*(\S.*))?")
 _EMPTY = ("", "NaN", "nan", "-", "---")
@@ -70,13 +70,13 @@ class Readings:
     ----------
     stations, targets : tuple of str
     length : ndarray, (station, target)
-        m; NaN where there is none.
+        m; NaN where missing.
     temperature, pressure, humidity : ndarray, (station, target)
         degC, Pa, %; NaN where unknown.
     missing : mapping of str to int
         Number of missing lengths: ``empty`` (a line without a number) and ``no line``.
     repeated : int
-        Number of lines replaced by, or averaged with, another one of the same station and target.
+        Number of lines replaced by, or averaged with, another line of the same station and target.
     """
 
     stations: tuple[str, ...]
@@ -99,24 +99,24 @@ def read_table(
     path : Path
         UTF-8 text, see the module; separated by tabulator, semicolon or comma, the decimal sign is a point.
     stations : sequence of str, optional
-        The stations in their order; default: those of the table, in its order.
+        Stations in the order of the result; default: those of the table, in its order.
     repeats : {"refuse", "last", "mean"}
         Treatment of a second line for the same station and target.
     least_length : float
-        The longest length must be longer than this, m: detects wrong units.
+        Lower limit of the longest length, m; detects wrong units.
 
     Raises
     ------
     DatasetError
-        The file cannot be read; or all mistakes in it, with line, column, expected and found value.
+        The file cannot be read, or has mistakes; the message lists them with line, column, expected and found value.
     """
-    with suppress(OSError):  # stated by what follows
+    with suppress(OSError):  # `blocks` reports it
         _refuse_long(path)
     _, tables = blocks(path)
     if len(tables) > 1:
         line = tables[1].head[0]
         raise DatasetError(
-            f"{path}, line {line}: expected one table without empty lines; found the start of a second one"
+            f"{path}, line {line}: expected one table without empty lines; found the start of a second table"
         )
     (table,) = tables
     mistakes = Mistakes(path)
@@ -125,11 +125,11 @@ def read_table(
     rows = [(line, texts) for line, texts in table.rows if _whole(line, texts, table, mistakes)]
     if not rows and not mistakes.count:
         mistakes.add(table.head[0], "expected lines of measurements below the column names; found none")
-    values = {name: _numbers(name, place, unit, rows, table, mistakes) for name, (place, unit) in columns.items()}
-    keys = {name: [texts[place] for _, texts in rows] for name, (place, _) in columns.items() if name in KEYS}
+    values = {name: _numbers(name, column, unit, rows, table, mistakes) for name, (column, unit) in columns.items()}
+    keys = {name: [texts[column] for _, texts in rows] for name, (column, _) in columns.items() if name in KEYS}
     names = _names(keys, rows, stations, mistakes)
     mistakes.raise_any()
-    found = _placed(names, keys, values, rows, repeats, mistakes)
+    found = _arranged(names, keys, values, rows, repeats, mistakes)
     mistakes.raise_any()
     _check_length(path, found.length, table.head[1][columns["length"][0]], least_length)
     return found
@@ -150,7 +150,7 @@ def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
     others = {other: name for name, quantity in QUANTITIES.items() for other in quantity.names}
     others |= {other: name for name, them in KEYS.items() for other in them}
     found: dict[str, tuple[int, str]] = {}
-    for place, title in enumerate(titles):
+    for column, title in enumerate(titles):
         match = _TITLE.fullmatch(title)
         name = match[1].lower().replace(" ", "_") if match else ""
         name = others.get(name, name)
@@ -158,9 +158,9 @@ def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
         if name in found:
             mistakes.add(line, f"column '{title}': expected one column for the {name}; found a second one")
         elif name in KEYS:
-            found[name] = (place, "")
+            found[name] = (column, "")
         elif name in QUANTITIES:
-            found[name] = (place, _unit(title, name, unit, line, mistakes))
+            found[name] = (column, _unit(title, name, unit, line, mistakes))
         else:
             near = get_close_matches(name, [*KEYS, *QUANTITIES, *others], n=1) if mistakes.count < _MOST_HINTS else []
             hint = f"; did you mean '{near[0]}'?" if near else ""
@@ -195,15 +195,15 @@ def _whole(line: int, texts: list[str], table: Table, mistakes: Mistakes) -> boo
 
 
 def _numbers(
-    name: str, place: int, unit: str, rows: list[tuple[int, list[str]]], table: Table, mistakes: Mistakes
+    name: str, column: int, unit: str, rows: list[tuple[int, list[str]]], table: Table, mistakes: Mistakes
 ) -> Array:
     """Return the numbers of a column in SI; NaN where missing. Empty for a column of names."""
     if name in KEYS:
         return np.empty(0)
-    quantity, title = QUANTITIES[name], table.head[1][place]
+    quantity, title = QUANTITIES[name], table.head[1][column]
     values = np.full(len(rows), np.nan)
     for k, (line, texts) in enumerate(rows):
-        text = texts[place]
+        text = texts[column]
         if text in _EMPTY:
             continue
         if not NUMBER.fullmatch(text) or not np.isfinite(float(text)):
@@ -216,7 +216,7 @@ def _numbers(
         low, high = (convert(limit, quantity.unit, unit) for limit in (quantity.low, quantity.high))
         mistakes.add(
             rows[k][0],
-            f"column '{title}': expected {low:.6g} to {high:.6g}; found {values[k]:.9g}. Is its unit really {unit}?",
+            f"column '{title}': expected {low:.6g} to {high:.6g}; found {values[k]:.9g}. Check its unit, {unit}",
         )
     return inside
 
@@ -227,7 +227,7 @@ def _names(
     stations: Sequence[str] | None,
     mistakes: Mistakes,
 ) -> dict[str, tuple[str, ...]]:
-    """Return the stations in their order, the targets by number or in the table's order."""
+    """Return the names of stations in their order, and of targets by number or in the table's order."""
     for name, texts in keys.items():
         for (line, _), text in zip(rows, texts, strict=True):
             if not text:
@@ -243,7 +243,7 @@ def _names(
     return found
 
 
-def _placed(
+def _arranged(
     names: dict[str, tuple[str, ...]],
     keys: dict[str, list[str]],
     values: dict[str, Array],
@@ -253,24 +253,24 @@ def _placed(
 ) -> Readings:
     """Return the readings by station and target."""
     shape = len(names["station"]), len(names["target"])
-    places = {name: {text: k for k, text in enumerate(texts)} for name, texts in names.items()}
+    indices = {name: {text: k for k, text in enumerate(texts)} for name, texts in names.items()}
     groups: dict[tuple[int, int], list[int]] = {}
     for k, (station, target) in enumerate(zip(keys["station"], keys["target"], strict=True)):
-        group = groups.setdefault((places["station"][station], places["target"][target]), [])
+        group = groups.setdefault((indices["station"][station], indices["target"][target]), [])
         if group and repeats == "refuse":
             mistakes.add(
                 rows[k][0],
-                f"station '{station}', target '{target}': expected one line; line {rows[group[0]][0]} is another one. "
-                "Remove one, or choose one by 'repeats'",
+                f"station '{station}', target '{target}': expected one line; line {rows[group[0]][0]} is another. "
+                "Remove one, or set 'repeats'",
             )
         group.append(k)
     found = {name: np.full(shape, np.nan) for name in QUANTITIES}
-    for place, group in groups.items():
+    for cell, group in groups.items():
         for name in values.keys() & QUANTITIES.keys():
             taken = values[name][group[-1:] if repeats == "last" else group]
             taken = taken[np.isfinite(taken)]
-            found[name][place] = taken.mean() if taken.size else np.nan
-    empty = sum(not np.isfinite(found["length"][place]) for place in groups)
+            found[name][cell] = taken.mean() if taken.size else np.nan
+    empty = sum(not np.isfinite(found["length"][cell]) for cell in groups)
     missing = {"empty": int(empty), "no line": shape[0] * shape[1] - len(groups)}
     return Readings(
         names["station"],
@@ -283,10 +283,10 @@ def _placed(
 
 def _check_length(path: Path, length: Array, title: str, least: float) -> None:
     if not np.isfinite(length).any():
-        raise DatasetError(f"{path}: column '{title}': expected lengths; found none. Is the table complete?")
+        raise DatasetError(f"{path}: column '{title}': expected lengths; found none. Check that the table is complete")
     longest = float(np.nanmax(np.abs(length)))
     if longest <= least:
         raise DatasetError(
-            f"{path}: column '{title}': the longest length is {longest:.4g} m; check its unit. If it is right, set "
+            f"{path}: column '{title}': the longest length is {longest:.4g} m; check its unit. If it is correct, set "
             f"'least_length' below {least:g} m"
         )

@@ -1,11 +1,10 @@
-"""Exported tables of trackers that publish no wire, as if the tracker measured now."""
+"""Exported tables of trackers without a documented interface, read like a live tracker."""
 
 from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from types import TracebackType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
@@ -14,6 +13,7 @@ from pydantic import Field
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.datasets.units import Length
 from errormotion.errors import DatasetError, InstrumentError, ReplayError
+from errormotion.instruments.driver import Openable
 from errormotion.instruments.laser_tracker.table_reader import AIR, LONGEST_TABLE, Readings, Repeats, read_table
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, PluginSettings
 from errormotion.plugins.readings import Environment
@@ -25,21 +25,21 @@ class TrackerTableSettings(PluginSettings):
     """Settings of ``tracker_table``."""
 
     stations: tuple[str, ...] | None = Field(
-        default=None, description="names of the stations, in their order; default: those of the table"
+        default=None, description="names of the stations in the order of the result; default: those of the table"
     )
     repeats: Repeats = Field(
         default="refuse", description="treatment of a second line for a station and target: refuse, last, or mean"
     )
     least_length: Length = Field(
         default=0.01,
-        description="the longest length must be longer, else the table is refused; detects wrong units; 0: no check",
+        description="lower limit of the longest length, to detect wrong units; 0: no check",
         ge=0,
     )
     noise: Length = Field(default=0.5e-6, description="standard deviation of a length", ge=0)
 
 
-class TrackerTable:
-    """Lengths by station and target from a table that a tracker's own software has exported.
+class TrackerTable(Openable):
+    """Lengths by station and target from a table that the software of a tracker has exported.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class TrackerTable:
         The table: a path, or ``file://path``; ``replay://path`` reads a recording, which is a copy of the table.
     settings : TrackerTableSettings, optional
     record : Path, optional
-        Copy that is written.
+        Copy of the table that is written.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -60,7 +60,7 @@ class TrackerTable:
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         from errormotion.instruments.laser_tracker.table_conformance import length_table
 
         return InstrumentSubject(cls, str(length_table()))
@@ -80,7 +80,7 @@ class TrackerTable:
         Raises
         ------
         InstrumentError
-            There is no such file, or it is not as it should be: every mistake with its line, see `table_reader`.
+            The file does not exist, or has mistakes; the message lists them with their lines, see `table_reader`.
         """
         if self._readings is not None:
             return
@@ -110,26 +110,17 @@ class TrackerTable:
         self._digest, self._readings = hashlib.sha256(data).hexdigest(), readings
 
     def close(self) -> None:
-        """Forget the table; idempotent."""
+        """Discard the table; idempotent."""
         self._readings = None
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def distance_is_displacement(self) -> bool:
-        """Lengths may count from anywhere: the dead path of each station is unknown."""
+        """True: lengths may have any zero, since the dead path of each station is unknown."""
         return True
 
     @property
     def readings(self) -> Readings:
-        """The table; InstrumentError before ``open``."""
+        """Contents of the table; InstrumentError before ``open``."""
         if self._readings is None:
             raise InstrumentError(
                 f"The tracker_table at {self.address} is not open: use it in a 'with' block, or call open() first"
@@ -137,7 +128,7 @@ class TrackerTable:
         return self._readings
 
     def identify(self) -> Identity:
-        """Identify the table by its hash, its stations and targets, and what is missing."""
+        """Return the identity of the table: its hash, its stations and targets, and missing lengths."""
         readings = self.readings
         return Identity(
             manufacturer="table",
@@ -153,11 +144,11 @@ class TrackerTable:
         )
 
     def read(self) -> np.ndarray[Any, Any]:
-        """Return all lengths, m, (station, target); NaN where there is none."""
+        """Return all lengths, m, (station, target); NaN where missing."""
         return self.readings.length.copy()
 
     def environment(self) -> Environment:
-        """Return the mean air of all measurements; NaN where the table has none."""
+        """Return the mean conditions of the air of all measurements; NaN if the table has none."""
         means = []
         for name in AIR:
             values = getattr(self.readings, name)

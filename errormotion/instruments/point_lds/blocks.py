@@ -1,6 +1,7 @@
-"""Blocks of counted values on a data port: a header with a preamble, and frames of 32-bit values behind it.
+"""Blocks of counted values on a data port: a header with a preamble, then frames of 32-bit values.
 
-Some manuals name the preamble ``MEAS``, while others' drivers find it as a little-endian word, ``SAEM``: both are read.
+Some manuals state the preamble ``MEAS``; other drivers read it as a little-endian word, ``SAEM``. Both are
+accepted.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ PREAMBLES = (b"SAEM", b"MEAS")
 PREAMBLE_BYTES = 4
 BYTES_OF_VALUE = 4
 MAX_BLOCK_BYTES = 65536
-"""Longest block: it is one TCP packet."""
+"""Longest block: the size of one TCP packet."""
 
 Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a header states.
+    """Content of a header.
 
     Attributes
     ----------
     counter : int
         Number of the first frame, modulo 2**32.
     frames : int
-        Their number.
+        Number of frames.
     channels : tuple of int
         Numbers of the values of a frame, from 1.
     """
@@ -58,9 +59,9 @@ class Block:
     count : int
         Number of the frames.
     values : ndarray, int64, (frame, channel)
-        As they came; empty where the block is not intact.
+        As received; empty if the block is not intact.
     intact : bool
-        Whether a block, or nothing, follows; else bytes of it have been lost or added.
+        Whether another block or nothing follows; if not, bytes of this block have been lost or added.
     """
 
     counter: int
@@ -78,10 +79,10 @@ class BlockDecoder:
     size : int
         Bytes of a header.
     possible : bytes
-        Regular expression of the ``size`` bytes behind a preamble and up to the end of a header: those that it does not
-        match are none, and are skipped without further examination.
+        Regular expression for the bytes from the end of the preamble to the end of a header; other bytes are not a
+        header and are skipped without further examination.
     parse : callable
-        Takes the bytes and the position of a header; returns what it states, None where it is none.
+        Takes the bytes and the position of a header; returns its content, None if it is not a header.
 
     Attributes
     ----------
@@ -99,12 +100,12 @@ class BlockDecoder:
     def feed(self, data: bytes, *, last: bool = False) -> list[Block]:
         """Return the blocks that are complete.
 
-        A block is returned when the start of the next one is seen, or at once where ``last`` states that none follows.
+        A block is returned when the start of the next one is received, or at once if ``last`` states that none follows.
 
         Raises
         ------
         InstrumentError
-            The header is one of other values than those that are read.
+            The header announces other values than those that are read.
         """
         self._buffer += data
         blocks: list[Block] = []
@@ -117,13 +118,13 @@ class BlockDecoder:
         return blocks
 
     def _next(self, start: int, last: bool) -> tuple[Block | None, int] | None:
-        """Return the block at a position, or None with the position where the search goes on; None: wait for bytes."""
-        buffer, held = self._buffer, len(self._buffer) - start
-        if held < PREAMBLE_BYTES:
+        """Return the block at a position, or None with the position where to search; None if bytes are missing."""
+        buffer, size = self._buffer, len(self._buffer) - start
+        if size < PREAMBLE_BYTES:
             return None
         if buffer[start : start + PREAMBLE_BYTES] not in PREAMBLES:
             return None, self._skip(start)
-        if held < self._size:
+        if size < self._size:
             return None
         header = self._parse(buffer, start)
         if header is None:
@@ -135,7 +136,7 @@ class BlockDecoder:
             return None
         counter, channels, count = header.counter, header.channels, header.frames
         if follows >= PREAMBLE_BYTES and buffer[end : end + PREAMBLE_BYTES] not in PREAMBLES:
-            # the block may end earlier: the search for the next one goes on within it
+            # the block may end earlier: continue the search for the next one within it
             return Block(counter, channels, count, _NOTHING, False), min(self._search(begin), end)
         values = np.frombuffer(bytes(buffer[begin:end]), dtype="<i4").astype(np.int64)
         return Block(counter, channels, count, values.reshape(count, -1)), end
@@ -146,7 +147,7 @@ class BlockDecoder:
         return end
 
     def _search(self, start: int) -> int:
-        """Return the first position from ``start`` on where a header is or may begin."""
+        """Return the first position from ``start`` on where a header starts or may start."""
         found = self._start.search(self._buffer, start)
         return found.start() if found else max(start, len(self._buffer) - PREAMBLE_BYTES + 1)
 

@@ -1,4 +1,4 @@
-"""Readings of a point sensor compensated for its inclination error, with the raw readings."""
+"""Readings of a point sensor, compensated for its inclination error, and the raw readings."""
 
 from __future__ import annotations
 
@@ -32,9 +32,10 @@ class CompensatedSamples(Samples):
     raw : ndarray, float64, (1, n)
         Uncorrected readings, m.
     uncertainty : ndarray, float64, (1, n)
-        Standard uncertainty of ``values`` that comes from the calibration, m.
+        Standard uncertainty of ``values`` due to the calibration, m.
     jacobian : ndarray, float64, (1, n, term)
-        Derivative of ``values`` by the coefficients of the calibration, m: all readings share their covariance.
+        Derivative of ``values`` with respect to the coefficients of the calibration, m; all readings share their
+        covariance.
     """
 
     raw: Array
@@ -45,14 +46,14 @@ class CompensatedSamples(Samples):
 class CompensatedSensor:
     """A point sensor together with the calibration of its inclination error.
 
-    The sensor is open, and is neither opened nor closed here.
+    The sensor must be open; it is neither opened nor closed here.
 
     Parameters
     ----------
     sensor : PointLDS
         A sensor that streams, open.
     calibration : path, name or InclinationCalibration
-        Found by `InclinationCalibration.find`.
+        A path or name is resolved by `InclinationCalibration.find`.
     extrapolate : bool
         Whether tilts and depths beyond the calibrated ones are compensated; refused otherwise.
     allow_other_sensor : bool
@@ -105,7 +106,7 @@ class CompensatedSensor:
         Raises
         ------
         InstrumentError
-            Of the sensor; or an angle is not finite.
+            An error of the sensor, or an angle that is not finite.
         MethodError
             The calibration does not cover this tilt or depth.
         """
@@ -144,7 +145,7 @@ class CompensatedSensor:
 
 def _found(calibration: str | Path | InclinationCalibration) -> InclinationCalibration:
     from errormotion.datasets.calibrations.inclination import (
-        InclinationCalibration,  # reads files: only when one is needed
+        InclinationCalibration,  # slow to import
     )
 
     if isinstance(calibration, InclinationCalibration):

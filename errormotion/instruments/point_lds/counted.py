@@ -1,4 +1,4 @@
-"""Readings in the order of a counter: what drivers share whose devices number the values that they send."""
+"""Readings in the order of a counter, for drivers of devices that number the values that they send."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from errormotion.instruments.point_lds.blocks import Block
 Array = np.ndarray[Any, Any]
 
 MODULUS = 1 << 32
-"""Of the counter."""
+"""Number of values of the counter."""
 GARBLED, LOST = "garbled", "lost"
-"""Reasons of readings that were damaged, and that were not received."""
+"""Reasons for readings that were damaged, and for readings that were not received."""
 
 
 class CountedReadings:
@@ -27,13 +27,13 @@ class CountedReadings:
     Parameters
     ----------
     reasons : tuple of str
-        Why a reading is NaN, by code; `GARBLED` and `LOST` are among them, code 0 is that of a valid reading.
+        Why a reading is NaN, by code; must contain `GARBLED` and `LOST`; code 0 is a valid reading.
     scale : callable
-        Takes values as they came; returns readings, m, and the code of each.
+        Takes values as received; returns readings, m, and the code of each.
     column : callable
-        Takes a block; returns its values that are read.
+        Takes a block; returns the values to be read.
     longest_gap : int
-        Readings: a larger jump of the counter is none that was lost, but another sequence.
+        Largest number of readings that can be lost at once; a larger jump of the counter is an error.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class CountedReadings:
         if gap > self._longest_gap:
             raise ProtocolError(
                 f"The counter of measured values jumps from {self._expected} to {block.counter}; "
-                "was the controller set up by another program?"
+                "check that no other program has set up the controller"
             )
         self._expected = (block.counter + block.count) % MODULUS
         if gap:
@@ -84,11 +84,11 @@ class CountedReadings:
         while filled < size:
             values, count, code = self._parts.popleft()
             used = min(count, size - filled)
-            place = slice(filled, filled + used)
+            part = slice(filled, filled + used)
             if values is None:
-                codes[place] = code
+                codes[part] = code
             else:
-                raws[place] = values[:used]
+                raws[part] = values[:used]
             if used < count:
                 self._parts.appendleft((None if values is None else values[used:], count - used, code))
             filled += used

@@ -1,4 +1,4 @@
-"""Base of drivers of controllers that answer commands on one port and send counted values on another one."""
+"""Base of drivers of controllers that answer commands on one port and send counted values on another port."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ BLOCK_SECONDS = 0.5
 DATA = "data"
 """Name of the data line, and of the parameter of the address that states its port."""
 RANGE_TOLERANCE = 1e-3
-"""Of the range: two statements of it that differ less are the same."""
+"""Relative difference below which two statements of the measuring range agree."""
 
 
 class CountingDriver(Driver):
-    """Base of drivers of displacement sensors whose controller sends numbered values on a line of its own.
+    """Base of drivers of displacement sensors whose controller sends numbered values on a separate line.
 
-    A subclass states ``data_port``, starts and stops the values in ``_start_values`` and ``_stop_values``, makes sure
-    in ``_refresh`` that no earlier value is waiting on the data line, and returns its parts from ``_decoder`` and
-    ``_readings``.
+    A subclass states ``data_port``, starts and stops the values in ``_start_values`` and ``_stop_values``, ensures in
+    ``_refresh`` that no earlier value is waiting on the data line, and returns decoder and readings from ``_decoder``
+    and ``_readings``.
 
     Attributes
     ----------
     no_value : str
-        Reason of the last reading where it is NaN; else empty.
+        Why the last reading is NaN; empty if it is valid.
     """
 
     data_port: ClassVar[int]
     no_value: str = ""
     _rate = float("nan")
-    _stale = False  # whether the data line may hold earlier values
+    _stale = False  # whether earlier values may wait on the data line
     _streaming = False
     _failed = False
 
     @property
     def rate(self) -> float:
-        """Readings per second of a stream, as the controller states it; NaN before it was opened."""
+        """Readings per second of a stream, as the controller states it; NaN before ``open``."""
         return self._rate
 
     @property
@@ -70,7 +70,7 @@ class CountingDriver(Driver):
         Yields
         ------
         Samples
-            ``values`` (1, block) in m; ``invalid`` counts the NaN by their reason, ``dropped`` those that are lost.
+            ``values`` (1, block) in m; ``invalid`` counts the NaN by reason, ``dropped`` the lost readings.
 
         Raises
         ------
@@ -115,7 +115,7 @@ class CountingDriver(Driver):
             until = time.monotonic() + limit
 
     def _next_blocks(self, limit: float) -> list[Block]:
-        """Return the next blocks of the data line, where no more are to come."""
+        """Return the next blocks of the data line, after which none follow."""
         decoder = self._decoder()
         until = time.monotonic() + limit
         while True:
@@ -123,7 +123,7 @@ class CountingDriver(Driver):
             if blocks := decoder.feed(data, last=True):
                 return blocks
 
-    # ------------------------------------------------------------------ of a device
+    # ------------------------------------------------------------------ by the device
 
     @abstractmethod
     def _decoder(self) -> BlockDecoder:
@@ -131,19 +131,19 @@ class CountingDriver(Driver):
 
     @abstractmethod
     def _readings(self) -> CountedReadings:
-        """Return what collects the readings; InstrumentError where the controller has not been set up."""
+        """Return an empty collection of readings; InstrumentError if the controller has not been set up."""
 
     @abstractmethod
     def _start_values(self) -> None:
-        """Let the controller send values all the time."""
+        """Make the controller send values continuously."""
 
     @abstractmethod
     def _stop_values(self) -> None:
-        """Let it send none."""
+        """Make the controller stop sending values."""
 
     @abstractmethod
     def _refresh(self) -> bool:
-        """Make sure that the next values on the data line are new ones; return whether it was opened again."""
+        """Ensure that the next values on the data line are new ones; return whether it was opened again."""
 
     # ------------------------------------------------------------------ the line
 
@@ -170,7 +170,7 @@ class CountingDriver(Driver):
 
 
 def check_range(stated: float | None, found: float, where: str, remedy: str) -> None:
-    """Compare the range of the settings, m, with that of the controller; InstrumentError where they differ."""
+    """Compare the range of the settings, m, with that of the controller; InstrumentError if they differ."""
     if stated is not None and abs(stated - found) > RANGE_TOLERANCE * found:
         raise InstrumentError(
             f"The setting 'measuring_range' is {stated * 1e3:g} mm; the controller states {found * 1e3:g} mm{where}. "

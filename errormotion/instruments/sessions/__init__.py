@@ -1,1 +1,1 @@
-"""Short sessions with an instrument: recorded with what was read, repeated from the recording, and compared."""
+"""Short sessions with an instrument: recorded with their readings, repeated from the recording, and compared."""

@@ -1,4 +1,4 @@
-"""Masking of a serial number in a recording: in received and sent bytes, and in its note."""
+"""Masking of a serial number in a recording: in received and sent bytes, and in the note."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from errormotion.instruments.transports.recording import (
 )
 
 SHORTEST = 3
-"""Characters; a shorter serial number stands in other data as well."""
+"""Shortest word that is masked, characters; a shorter one may occur in other data by chance."""
 MASK_DIGIT, MASK_LETTER = "1", "X"
-"""Of the same length as text; a number of ones is a number as well, and fits where the serial number did."""
+"""Characters of a mask, which is as long as the word; a number of ones is also a number, so that it is accepted in its
+place."""
 _WORD = re.compile(r"[^\W_]+")
 
 
@@ -31,7 +32,7 @@ def masked_text(text: str, words: Sequence[str]) -> str:
 
 
 def words_of(serial: str) -> list[str]:
-    """Return the words of a serial number that have digits, the longest first, without short ones, such as a channel.
+    """Return the words of a serial number that contain digits, the longest first, without short ones.
 
     Raises
     ------
@@ -49,23 +50,23 @@ def words_of(serial: str) -> list[str]:
 
 
 def mask(path: Path, words: Sequence[str], early: Mapping[Path, int]) -> int:
-    """Mask words of a serial number in all files of a recording; return in how many places they stood on the wire.
+    """Mask words of a serial number in all files of a recording; return their number of occurrences on the wire.
 
-    A word is looked for as text, and, where it is an integer of at least 2^16, as four bytes in the first frames,
-    whose number ``early`` states for each file. Checksums of the protocol are not corrected: whether the driver accepts
-    the masked recording shows when it is played.
+    A word is searched as text, and, if it is an integer of at least 2^16, as four bytes in the first frames, whose
+    number ``early`` states for each file. Checksums of the protocol are not corrected: replay the masked recording to
+    check that the driver accepts it.
     """
     found = 0
     for part in parts_of(path):
         frames, first = read_recording(part)[1], early.get(part, 0)
         for word in words:
             for old, new in _forms(word):
-                frames, places = _replaced(frames, old, new)
-                found += places
+                frames, count = _replaced(frames, old, new)
+                found += count
             for old, new in _integers(word):
-                changed, places = _replaced(frames[:first], old, new)
+                changed, count = _replaced(frames[:first], old, new)
                 frames = [*changed, *frames[first:]]
-                found += places
+                found += count
         rewrite(part, frames)
     if (note := read_note(path)) is not None:
         add_note(path, _masked_note(note, words))
@@ -73,7 +74,7 @@ def mask(path: Path, words: Sequence[str], early: Mapping[Path, int]) -> int:
 
 
 def holds(path: Path, words: Sequence[str]) -> bool:
-    """Whether any of these words stands in the text or in the bytes of a recording."""
+    """Whether any of these words occurs in the text or in the bytes of a recording."""
     texts = [part.read_text(encoding="utf-8") for part in {path, *parts_of(path)}]
     heads = ["\n".join(text.splitlines()[:2]) for text in texts]
     if any(word in head for word in words for head in heads):
@@ -102,12 +103,12 @@ def _integers(word: str) -> list[tuple[bytes, bytes]]:
 
 
 def _replaced(frames: Sequence[tuple[str, bytes]], old: bytes, new: bytes) -> tuple[list[tuple[str, bytes]], int]:
-    """Replace bytes by others of the same number, also across the frames of one direction."""
-    places = 0
+    """Replace bytes by as many others, also across frames of one direction; return frames and occurrences."""
+    count = 0
     streams: dict[str, bytes] = {}
     for direction in ("W", "R"):
         data = b"".join(each for way, each in frames if way == direction)
-        places += data.count(old)
+        count += data.count(old)
         streams[direction] = data.replace(old, new)
     at = {"W": 0, "R": 0}
     changed: list[tuple[str, bytes]] = []
@@ -115,7 +116,7 @@ def _replaced(frames: Sequence[tuple[str, bytes]], old: bytes, new: bytes) -> tu
         start = at[direction]
         at[direction] += len(data)
         changed.append((direction, streams[direction][start : at[direction]]))
-    return changed, places
+    return changed, count
 
 
 def _masked_note(value: Any, words: Sequence[str]) -> Any:

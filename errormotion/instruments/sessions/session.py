@@ -1,4 +1,4 @@
-"""One short session: open, identify, read, stream for a while, close; live, or again from its recording."""
+"""One short session: open, identify, read, stream for some seconds, close; live, or repeated from its recording."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from errormotion.instruments.transports.recording import EndOfRecordingError
 FIRST_READINGS = 3
 MOST_READINGS = 1000
 INTERVAL = 0.2
-"""Least time between two readings of an instrument without a stream, s."""
+"""Interval between two readings of an instrument without a stream, s."""
 SHOWN = 8
-"""Numbers of a reading that are kept as they are."""
+"""Number of values at the start of a reading that are stored."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What was read, in a few numbers; ``sha256`` is the hash of all values as float64.
+    """Summary of what was read; ``sha256`` is the hash of all values as float64.
 
     Attributes
     ----------
     count : int
-        Number of readings, or of the blocks of a stream.
+        Number of readings, or of blocks of a stream.
     values : int
         Number of all values.
     unknown : int
@@ -54,19 +54,19 @@ class Summary:
 
 @dataclass
 class Session:
-    """What a session gave.
+    """Result of a session.
 
     Attributes
     ----------
     identity : dict
-        The instrument's; empty before it has stated it.
+        Identity of the instrument; empty before the instrument has reported it.
     readings, stream : Summary
     step : str
-        Where an error ended it: open, identify, readings, stream or close; else empty.
+        Step in which an error ended the session: open, identify, readings, stream or close; empty without an error.
     error : str
-        Class of this error.
+        Class of the error.
     message : str
-        Its message.
+        Message of the error.
     ended : bool
         Whether the error is the end of a recording.
     """
@@ -80,14 +80,14 @@ class Session:
     ended: bool = False
 
     def record(self) -> dict[str, Any]:
-        """Return the session as JSON takes it."""
+        """Return the session as an object for JSON."""
         found = asdict(self)
         del found["ended"]
         return found
 
 
 class _Counter:
-    """Sums up readings or blocks."""
+    """Accumulates the summary of readings or blocks."""
 
     def __init__(self) -> None:
         self._hash, self._count, self._values, self._unknown, self._dropped = hashlib.sha256(), 0, 0, 0, 0
@@ -109,12 +109,12 @@ class _Counter:
         return Summary(self._count, self._values, self._unknown, self._dropped, self._first, self._last, sha256)
 
 
-def live(driver: Any, seconds: float, full: Callable[[], bool], identified: Callable[[], None]) -> Session:
-    """Go through a session of about ``seconds`` s; it ends earlier when ``full()`` is true.
+def run_live(driver: Any, seconds: float, full: Callable[[], bool], identified: Callable[[], None]) -> Session:
+    """Run a session of about ``seconds`` s; it ends earlier when ``full()`` is true.
 
-    ``identified()`` is called when the instrument has stated its identity.
+    ``identified()`` is called when the instrument has reported its identity.
 
-    An instrument without a stream is read again and again, at most `MOST_READINGS` times.
+    An instrument without a stream is read repeatedly, at most `MOST_READINGS` times.
     """
     streams, start = _streams(driver), math.nan
 
@@ -124,7 +124,7 @@ def live(driver: Any, seconds: float, full: Callable[[], bool], identified: Call
     def readings(count: int) -> bool:
         nonlocal start
         if not count:
-            start = time.monotonic()  # opened: some devices need minutes for that
+            start = time.monotonic()  # now the device is open, which may take minutes
         if count < FIRST_READINGS:
             return True
         if streams or count >= MOST_READINGS or not more():
@@ -135,11 +135,11 @@ def live(driver: Any, seconds: float, full: Callable[[], bool], identified: Call
     def blocks(count: int) -> bool:
         return streams and (count < 1 or more())
 
-    return _go_through(driver, readings, blocks, identified)
+    return _run(driver, readings, blocks, identified)
 
 
-def repeated(driver: Any, session: Mapping[str, Any]) -> Session:
-    """Go through the session that a note describes once more.
+def repeat(driver: Any, session: Mapping[str, Any]) -> Session:
+    """Repeat the session that a note describes.
 
     Raises
     ------
@@ -153,19 +153,19 @@ def repeated(driver: Any, session: Mapping[str, Any]) -> Session:
         raise ReplayError("The note of the recording describes no session; record it again") from None
     readings += step == "readings"
     blocks += step == "stream"
-    return _go_through(driver, lambda count: count < readings, lambda count: count < blocks, lambda: None)
+    return _run(driver, lambda count: count < readings, lambda count: count < blocks, lambda: None)
 
 
 def differences(recorded: Mapping[str, Any], again: Session) -> list[str]:
-    """Return in which steps a repeated session differs from the recorded one, one sentence each; empty: in none."""
+    """Return the differences between a repeated session and the recorded one, one sentence for each; empty: none."""
     found: list[str] = []
     if again.step != recorded.get("step") or not _same_error(recorded, again):
         before = f"{recorded.get('error')} in the step '{recorded.get('step')}'" if recorded.get("step") else "no error"
         now = f"{again.error} in the step '{again.step}': {again.message}" if again.step else "no error"
         found.append(f"expected {before}; found {now}")
-    who, who_again = (_who(identity) for identity in (recorded.get("identity"), again.identity))
-    if who != who_again:
-        found.append(f"expected the identity {who}; found {who_again}")
+    identity, identity_again = (_core(each) for each in (recorded.get("identity"), again.identity))
+    if identity != identity_again:
+        found.append(f"expected the identity {identity}; found {identity_again}")
     for name, summary in (("readings", again.readings), ("stream", again.stream)):
         before_, now_ = recorded.get(name), _as_json(summary)
         if before_ != now_:
@@ -173,7 +173,7 @@ def differences(recorded: Mapping[str, Any], again: Session) -> list[str]:
     return found
 
 
-def _who(identity: Any) -> dict[str, Any]:
+def _core(identity: Any) -> dict[str, Any]:
     """Return an identity without details, such as its address."""
     return {k: v for k, v in identity.items() if k != "details"} if isinstance(identity, Mapping) else {}
 
@@ -183,12 +183,12 @@ def _as_json(summary: Summary) -> dict[str, Any]:
 
 
 def _same_error(recorded: Mapping[str, Any], again: Session) -> bool:
-    """Whether both ended alike; after a timeout, a replay ends in the same step, but later frames come at once."""
+    """Whether both ended alike; after a timeout, a replay ends in the same step, but later frames arrive at once."""
     timed_out = recorded.get("error") == InstrumentTimeoutError.__name__
     return recorded.get("error") == again.error or (timed_out and (again.ended or again.error != ReplayError.__name__))
 
 
-def _go_through(
+def _run(
     driver: Any, readings: Callable[[int], bool], blocks: Callable[[int], bool], identified: Callable[[], None]
 ) -> Session:
     session, read, streamed = Session(), _Counter(), _Counter()
@@ -237,7 +237,7 @@ def _streams(driver: Any) -> bool:
 
 
 def _numbers(reading: Any) -> Iterator[float]:
-    """Yield all numbers of a reading, in order; None counts as NaN, text is left out."""
+    """Yield all numbers of a reading, in order; None counts as NaN, text is omitted."""
     if isinstance(reading, Mapping):
         for value in reading.values():
             yield from _numbers(value)
@@ -255,7 +255,7 @@ def _numbers(reading: Any) -> Iterator[float]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value of an identity as JSON takes it."""
+    """Return a value of an identity as an object for JSON."""
     if isinstance(value, Mapping):
         return {str(key): _plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

@@ -1,11 +1,11 @@
-"""Wire simulators: devices with the real protocols over real sockets and ptys, which read the truth from the twin.
+"""Simulators: devices with the real protocols over real sockets and ptys, which read the truth from the twin.
 
-All ``sim://`` addresses with one machine name and seed share one `VirtualWorld`, that is one machine and one clock. The
-name is ``cframe``, ``gantry``, or ``machine`` for the machine that the bench file describes.
-``world("cframe", seed=3)`` returns it, so that a test can compare with the truth.
+All ``sim://`` addresses with the same machine name and seed share one `VirtualWorld`, that is one machine and one
+clock. The name is ``cframe``, ``gantry``, or ``machine`` for the machine that the bench file describes.
+``world("cframe", seed=3)`` returns the world, so that tests can compare with the truth.
 
 Parameters of every address: ``seed`` (0), ``pace`` (simulated seconds per second; default: as fast as the readers
-read), ``warm`` (1; 0 = the sensors were switched on just now), ``wire`` (``tcp`` or ``pty``), and the fault menu of
+read), ``warm`` (1; 0: the sensors have just been switched on), ``wire`` (``tcp`` or ``pty``), and the faults of
 `simulators.faults`.
 """
 
@@ -26,7 +26,7 @@ def world(machine: str = "cframe", seed: int = 0, *, warm: bool = True) -> Virtu
 
 
 def in_steps(machine: str = "cframe", seed: int = 0, *, step: float = 1e-4) -> Callable[[int], None]:
-    """Return what moves the X axis to its n-th step of so many m, so that readings differ from one another."""
+    """Return a function that moves the X axis to its n-th position, ``step`` m apart, so that readings differ."""
 
     def move(number: int) -> None:
         world(machine, seed).move_to((step * (number + 1), 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Base of simulated devices: world, connection, fault, and answers by line."""
+"""Bases of simulated devices: world, connection, fault, and answers by line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SimulatedDevice:
     line_end : bytes
         End of a request.
     default_name : str
-        Name of the device where the address has none.
+        Name of the device, if the address has none.
     every : int
         Default period of faults.
 
@@ -65,7 +65,7 @@ class SimulatedDevice:
     """Whether ``drop`` and ``disconnect`` count answers; else samples."""
 
     def close(self) -> None:
-        """End the device; with the last one of its world the world ends."""
+        """End the device; the last device of a world also ends the world."""
         self._late.close()
         self._server.close()
         self.world.detach(self)
@@ -74,7 +74,7 @@ class SimulatedDevice:
         """Record the number of samples of the running stream that the reader has received."""
 
     def connection_opened(self) -> None:
-        """Forget an unfinished request of the previous connection."""
+        """Discard an incomplete request of the previous connection."""
         self._buffer = b""
 
     def answer(self, request: bytes) -> bytes:
@@ -82,7 +82,7 @@ class SimulatedDevice:
         raise NotImplementedError
 
     def reply(self, data: bytes) -> None:
-        """Send an answer, with the fault that is due."""
+        """Send an answer, with the fault that applies to it."""
         number, fault = self._answers, self.fault
         self._answers += 1
         if (fault.kind == "silence" and self._silent()) or (fault.hits("drop", number) and self.drops_answers):
@@ -92,13 +92,7 @@ class SimulatedDevice:
             return
         if fault.hits("garbage", number):
             data = stray_bytes(self._rng) + data
-        if fault.kind == "late" and number == fault.at:
-            self._late.hold(self._server, data, self.fault.delay)
-            return
-        with self._server.lock:
-            self._late.release(self._server)
-            for piece in fault.pieces(data):
-                self._server.send(piece)
+        self._late.send(self._server, fault, number, data)
 
     def _silent(self) -> bool:
         return self._answers > self.fault.at

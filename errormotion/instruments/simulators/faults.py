@@ -6,11 +6,11 @@
 * ``split``: all data arrive in pieces of a few bytes
 * ``garbage``: stray bytes between valid ones
 * ``checksum``: wrong checksums, where the protocol has one
-* ``out_of_range``: nothing to measure
+* ``out_of_range``: no target in the range
 * ``drop``: samples, or answers, are missing
-* ``disconnect``: the connection breaks; it can be opened again
-* ``late``: one answer, number ``fault_at``, is held back for ``late_by`` s, and in any case until the next answer,
-  which it precedes (without ``late_by``: until then); it is lost with its connection
+* ``disconnect``: the connection is lost; it can be opened again
+* ``late``: one answer, number ``fault_at``, is delayed by ``late_by`` s, at most until the next answer, which it
+  precedes (without ``late_by``: until then); it is lost with its connection
 
 ``fault_at`` is the first sample (of a stream) or answer (of others) with the fault; default 0. ``silence`` without
 ``fault_at`` starts before the first answer. ``fault_every`` is the period of ``garbage`` and ``drop``, ``fault_for``
@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -38,17 +39,17 @@ class Fault:
     Attributes
     ----------
     kind : str
-        Empty: none.
+        Type of the fault; empty: none.
     at : int
         First sample or answer with the fault.
     every : int
-        Period.
+        Period of the fault.
     length : int
-        Number of samples; 0 = no limit.
+        Number of samples; 0: no limit.
     from_the_start : bool
         Whether ``fault_at`` is not given.
     delay : float
-        Time for which ``late`` holds an answer back, s; infinite: until the next answer.
+        Delay of an answer by ``late``, s; infinite: until the next answer.
     """
 
     kind: str = ""
@@ -59,13 +60,21 @@ class Fault:
     delay: float = math.inf
 
     def hits(self, kind: str, number: int) -> bool:
-        """Whether a sample or answer of this number has this fault."""
+        """Whether a sample or answer with this number has this fault."""
         if kind != self.kind or number < self.at:
             return False
         return (number - self.at) % self.every == 0
 
+    def affects(self, kind: str, number: Any) -> Any:
+        """Whether a sample or answer, or each of an array, is among the ``length`` ones with this fault."""
+        return (kind == self.kind) & (number >= self.at) & ((self.length == 0) | (number < self.at + self.length))
+
+    def suppresses(self, number: int) -> bool:
+        """Whether an answer with this number is not sent: silence, or a missing answer."""
+        return (self.kind == "silence" and number >= self.at) or self.hits("drop", number)
+
     def pieces(self, data: bytes) -> Iterator[bytes]:
-        """Yield the pieces that are sent: all data, or with ``split`` 1 to 7 bytes at first, later 1009 bytes.
+        """Yield the pieces to be sent: all data, or with ``split`` first pieces of 1 to 7 bytes, later of 1009 bytes.
 
         1009 is a prime, so that pieces do not coincide with frames.
         """
@@ -80,19 +89,19 @@ class Fault:
 
 
 def parse_fault(address: Address, offered: tuple[str, ...], *, every: int = 1) -> Fault:
-    """Return the fault that an address requests.
+    """Return the fault that an address states.
 
     Raises
     ------
     InstrumentError
-        Unknown, or not offered by this device.
+        The fault is unknown, or not offered by this device.
     """
     kind = address.params.get("fault", "")
     if not kind:
         return Fault()
     if kind not in offered:
-        why = "this device has no such fault" if kind in FAULTS else "unknown fault"
-        raise InstrumentError(f"'fault={kind}' in '{address.url}': {why}; choose from {', '.join(offered)}")
+        why = "this device does not have this fault" if kind in FAULTS else "unknown fault"
+        raise InstrumentError(f"'fault={kind}' in '{address.url}': {why}; expected one of {', '.join(offered)}")
     return Fault(
         kind,
         at=int(address.number("fault_at", 0)),

@@ -1,4 +1,4 @@
-"""What simulated Modbus devices have in common: framing, unit, requests and damaged answers."""
+"""Base of simulated Modbus devices: framing, unit, requests and damaged answers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _UNIT_POSITION = {"tcp": 6, "rtu": 0}  # position of the unit in a frame
 
 
 class SimulatedModbusDevice(SimulatedDevice):
-    """A device that answers requests once its ``_device`` is made.
+    """A device that answers requests with its ``_device``.
 
     Parameters of the address: ``framing`` (``tcp`` or ``rtu``; default by ``wire``), ``unit`` (1).
     """
@@ -28,17 +28,17 @@ class SimulatedModbusDevice(SimulatedDevice):
     @property
     def driver_url(self) -> str:
         """Address of the device in a bench file."""
-        scheme, _, place = self.url.partition("://")
+        scheme, _, location = self.url.partition("://")
         kind = "rtu" if scheme == "serial" else "tcp" if self._framing == "tcp" else "rtu-tcp"
-        return f"modbus+{kind}://{place}?unit={self._unit}"
+        return f"modbus+{kind}://{location}?unit={self._unit}"
 
     def reply(self, data: bytes) -> None:
-        """Send an answer, damaged where that is due."""
+        """Send an answer, with the fault that applies to it."""
         if self.fault.hits("checksum", self._answers):
             data = data[:-1] + bytes((data[-1] ^ 1,))
         elif self.fault.hits("unit", self._answers):
-            place = _UNIT_POSITION[self._framing]
-            data = data[:place] + bytes((data[place] ^ 2,)) + data[place + 1 :]
+            k = _UNIT_POSITION[self._framing]
+            data = data[:k] + bytes((data[k] ^ 2,)) + data[k + 1 :]
             if self._framing == "rtu":
                 data = data[:-2] + checksum(data[:-2])
         elif self.fault.hits("short", self._answers):
@@ -46,7 +46,7 @@ class SimulatedModbusDevice(SimulatedDevice):
         super().reply(data)
 
     def connection_opened(self) -> None:
-        """Forget the incomplete request of the connection before."""
+        """Discard an incomplete request of the previous connection."""
         super().connection_opened()
         if self._device is not None:
             self._device.reset()

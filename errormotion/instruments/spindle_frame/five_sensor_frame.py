@@ -10,12 +10,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
 from errormotion.errors import InstrumentError
+from errormotion.instruments.driver import Openable
 from errormotion.instruments.point_lds.optoncdt.driver import BLOCK_SECONDS, OptoNCDT
 from errormotion.instruments.point_lds.optoncdt.settings import OptoSettings, SensorSettings
 from errormotion.instruments.spindle_frame import sampling
@@ -29,15 +29,15 @@ WARM_UP = 2 * 3600.0
 """Time until a sensor is stable after it was switched on, s: it drifts by 10.5 um (Geiselhart et al. 2025)."""
 
 
-class FiveSensorFrame:
+class FiveSensorFrame(Openable):
     """Five point sensors X1 X2 Y1 Y2 Z in a frame around a bar.
 
     Parameters
     ----------
     address : str
-        Of the frame as a whole, where the settings do not give one for each sensor: ``sim://cframe?seed=3`` stands for
+        Address of the whole frame, unless the settings state one for each sensor: ``sim://cframe?seed=3`` stands for
         ``sim://cframe/X1?seed=3`` and so on; ``tcp://host:4001?X2=4002&Y1=4003&Y2=4004&Z=4005`` for the ports of one
-        serial server, X1 at the first one; ``replay://session.rec`` is a recording of all five.
+        serial server, X1 at the first port; ``replay://session.rec`` is a recording of all five.
     settings : FrameSettings, optional
     record : Path, optional
         ``session.rec`` names the recordings of the sensors, which lie beside it: ``session.X1.rec`` and so on.
@@ -55,7 +55,7 @@ class FiveSensorFrame:
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         return InstrumentSubject(cls, "sim://cframe?seed=3")
 
     def __init__(self, address: str = "", settings: FrameSettings | None = None, *, record: Path | None = None) -> None:
@@ -111,7 +111,7 @@ class FiveSensorFrame:
         Raises
         ------
         InstrumentError
-            A channel does not answer; names it.
+            A channel does not answer; the message names it.
         """
         if self._sensors:
             return
@@ -148,20 +148,7 @@ class FiveSensorFrame:
         if errors:
             raise errors[0]
 
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.close()
-            return
-        with suppress(InstrumentError):  # the first error states the cause
-            self.close()
-
-    # ------------------------------------------------------------------ asking
+    # ------------------------------------------------------------------ state
 
     def identify(self) -> Identity:
         """Query all sensors for their identity."""
@@ -180,7 +167,7 @@ class FiveSensorFrame:
         )
 
     def configure(self, settings: FrameSettings) -> None:
-        """Send other settings to all sensors; their addresses stay."""
+        """Send other settings to all sensors; their addresses do not change."""
         for name, sensor in self._open_sensors().items():
             sensor.configure(self._choice(name, settings)[1])
         self.settings = settings
@@ -208,7 +195,7 @@ class FiveSensorFrame:
         Parameters
         ----------
         channels : sequence of str, optional
-            Which channels, in this order; default: all five.
+            Channels, in this order; default: all five.
         block : int, optional
             Samples in a block; default: half a second.
 
@@ -221,16 +208,16 @@ class FiveSensorFrame:
         Raises
         ------
         InstrumentTimeoutError
-            A channel stalls; names it.
+            A channel sends no data; the message names it.
         InstrumentError
-            Unknown channel, not open, a connection breaks; names the channel.
+            Unknown channel, frame not open, or a connection is lost; the message names the channel.
         """
         names = self.channels if channels is None else tuple(channels)
         sensors = self._open_sensors()
         if not names or len(set(names)) < len(names) or any(name not in sensors for name in names):
             raise InstrumentError(f"Expected some of the channels {', '.join(CHANNELS)}, each once; found {names}")
         if self._streaming:
-            raise InstrumentError("The frame is streaming already; leave that stream first")
+            raise InstrumentError("The frame is already streaming; close that stream first")
         size = block or max(1, round(BLOCK_SECONDS * self.rate))
         return self._stream({name: sensors[name] for name in names}, size)
 

@@ -1,8 +1,8 @@
 """Samples of several point sensors at the same instants.
 
-Synchronised sensors sample on their own clock. The first one is the master of the others: they are started first, and
-it last, so that sample 0 is the same instant for all. Other sensors are read at the same time, by one thread each, at
-instants of this computer's clock.
+Synchronised sensors sample on their own clock. The first one is the master: it is started after the others, so that
+sample 0 is the same instant for all. Other sensors are read simultaneously, by one thread each, at instants of this
+computer's clock.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def synchronised(sensors: Mapping[str, Any], size: int, rate: float) -> Iterator
 
 
 def stop(sensors: Sequence[Any]) -> None:
-    """Stop synchronised sensors, the master first; none is held back by a full queue meanwhile."""
+    """Stop synchronised sensors, the master first; a full queue does not delay any of them."""
     for sensor in sensors:
         sensor.drain()
     end = time.monotonic() + STOP_TIMEOUT
@@ -60,12 +60,12 @@ def stop(sensors: Sequence[Any]) -> None:
 def polled(sensors: Mapping[str, Any], size: int, rate: float) -> Iterator[Samples]:
     """Yield blocks of readings, ``values`` (channel, size), m, of any point sensors.
 
-    An instant at which the readings before it are still under way is lost: NaN in all channels, and counted.
+    An instant at which the preceding readings are not complete is lost: NaN in all channels, and counted.
 
     Raises
     ------
     InstrumentError
-        Of a sensor; names its channel.
+        An error of a sensor; the message names its channel.
     """
     with ThreadPoolExecutor(len(sensors), thread_name_prefix="frame") as pool:
         start, number = time.monotonic(), 0
@@ -88,7 +88,7 @@ def polled(sensors: Mapping[str, Any], size: int, rate: float) -> Iterator[Sampl
 
 
 def _read(item: tuple[str, Any]) -> tuple[float, str]:
-    """Return one reading of a channel, m, and why there is none."""
+    """Return one reading of a channel, m, and the reason if it is NaN."""
     name, sensor = item
     try:
         value = float(sensor.read())

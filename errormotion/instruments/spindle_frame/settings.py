@@ -18,14 +18,14 @@ from errormotion.instruments.transports import parse_address
 
 KIND = "point_lds"
 HIGHEST_POLLING_RATE = 1e3
-"""Of sensors that are read one by one, Hz."""
+"""Highest rate of sensors that are read one by one, Hz."""
 CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 Vector = tuple[float, float, float]
-Place = tuple[Length, Length, Length]
+Point = tuple[Length, Length, Length]
 
-# Beams as drawn, mid-range on a bar of 10 mm diameter along z that ends at z = 0, levels at 10 mm and 50 mm.
+# Nominal beams, mid-range on a bar of 10 mm diameter along z that ends at z = 0, levels at 10 mm and 50 mm.
 _STANDOFF, _L1, _L2 = 6e-3, 10e-3, 50e-3
-NOMINAL_ORIGIN: dict[str, Place] = {
+NOMINAL_ORIGIN: dict[str, Point] = {
     "X1": (_STANDOFF, 0.0, _L1),
     "X2": (_STANDOFF, 0.0, _L2),
     "Y1": (0.0, _STANDOFF, _L1),
@@ -44,7 +44,7 @@ NOMINAL_DIRECTION: dict[str, Vector] = {
 class FrameSettings(SensorSettings):
     """Settings of the frame.
 
-    Without ``sensors`` the channels are five optoNCDT sensors, all with the settings that the frame shares with them.
+    Without ``sensors`` the channels are five optoNCDT sensors, all with the settings of the frame.
     """
 
     sensors: dict[str, dict[str, Any]] = Field(
@@ -54,27 +54,28 @@ class FrameSettings(SensorSettings):
 
     range: Length = Field(default=2e-3, description="measuring range of the sensors")
     addresses: dict[str, str] = Field(
-        default_factory=dict, description="URL of each sensor; default: made from the frame's own address"
+        default_factory=dict, description="URL of each sensor; default: derived from the address of the frame"
     )
-    origin: dict[str, Place] = Field(
-        default_factory=lambda: dict(NOMINAL_ORIGIN), description="beam origins as drawn (x, y, z)"
+    origin: dict[str, Point] = Field(
+        default_factory=lambda: dict(NOMINAL_ORIGIN), description="nominal origins of the beams (x, y, z)"
     )
     direction: dict[str, Vector] = Field(
-        default_factory=lambda: dict(NOMINAL_DIRECTION), description="beam directions as drawn (x, y, z)"
+        default_factory=lambda: dict(NOMINAL_DIRECTION), description="nominal directions of the beams (x, y, z)"
     )
-    machine_position: Place = Field(
+    machine_position: Point = Field(
         default=(0.0, 0.0, 0.0),
         description="machine coordinates (X, Y, Z) of the origin of the frame, for the limits of the bench",
     )
     bar_radius: Length = Field(default=5e-3, description="calibrated radius of the bar", gt=0)
     levels: tuple[Length, Length] = Field(default=(_L1, _L2), description="z of the levels L1 and L2")
     expansion: tuple[Expansion, Expansion, Expansion] = Field(
-        default=(2.1e-6, 2.4e-6, 1.3e-6), description="how the frame carries the X, Y and Z sensors away per kelvin"
+        default=(2.1e-6, 2.4e-6, 1.3e-6), description="displacement of the X, Y and Z sensors per kelvin of the frame"
     )
     frame_temperature: str = Field(default="frame", description="name of the thermometer channel on the frame")
-    reference_temperature: Temperature = Field(default=20.0, description="temperature at which the geometry holds")
+    reference_temperature: Temperature = Field(default=20.0, description="temperature at which the geometry is valid")
     powered_since: datetime | None = Field(
-        default=None, description="when the sensors were switched on, for sensors that do not report it; with time zone"
+        default=None,
+        description="time with time zone at which the sensors were switched on, for sensors that do not report it",
     )
 
     @field_validator("addresses", "sensors", "origin", "direction")
@@ -116,12 +117,12 @@ class FrameSettings(SensorSettings):
         return checked
 
     def sensor(self, name: str) -> tuple[Any, Any]:
-        """Return the driver of a channel's sensor and its settings, where ``sensors`` states them."""
+        """Return the driver and the settings of a channel's sensor, as ``sensors`` states them."""
         driver = _driver(self.sensors[name])
         return driver, driver.Settings(**_own(self.sensors[name]))
 
     def _check_model(self) -> None:
-        """Check the shared settings against the sensors' model; those of ``sensors`` have been checked."""
+        """Check the shared settings against the sensors' model; those in ``sensors`` have already been checked."""
         if not self.sensors:
             super()._check_model()
         elif self.addresses:
@@ -149,12 +150,12 @@ class FrameSettings(SensorSettings):
     def _plausible(self) -> Self:
         if not 0.1e-3 <= self.bar_radius <= 0.1:
             raise ValueError(
-                f"a bar radius between 0.1 mm and 100 mm was expected; found {self.bar_radius * 1e3:g} mm. "
-                "From Python, lengths are in m"
+                f"expected a bar radius between 0.1 mm and 100 mm; found {self.bar_radius * 1e3:g} mm. "
+                "In Python, lengths are in m"
             )
         for name, direction in self.direction.items():
             if not abs(np.linalg.norm(direction) - 1) < 1e-3:
-                raise ValueError(f"the direction of {name} must be a unit vector; found {direction}")
+                raise ValueError(f"expected a unit vector as the direction of {name}; found {direction}")
         if self.powered_since is not None and self.powered_since.tzinfo is None:
             raise ValueError("powered_since needs a time zone, such as 2025-03-01T08:00:00+01:00")
         return self

@@ -1,4 +1,4 @@
-"""The inputs of a CiA 404 node: which objects it has for each, in which unit, and which of them it sends."""
+"""Inputs of a CiA 404 node: their objects, their units, and the PDOs that contain them."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _MISSING = (NO_OBJECT, NO_SUBINDEX)
 
 @dataclass(frozen=True)
 class Input:
-    """Where an input is, and what its number means.
+    """Location of an input, and the meaning of its number.
 
     Attributes
     ----------
     number : Number
     subindex : int
-        0 where the object has no subindices.
+        0 if the object has no subindices.
     scale : Scale
     status : tuple of int, or None
-        Index and subindex of its status; None where it has none.
+        Index and subindex of its status; None if it has none.
     """
 
     number: Number
@@ -43,30 +43,30 @@ def find_inputs(
     ----------
     node : CanNode
     subindices : sequence of int
-        Of the inputs.
+        Subindices of the inputs.
     numbers : iterable of Number
-        Forms of the value that are asked for, in order.
+        Formats of the value that are tried, in order.
     unit : int or None
-        Code of the unit; None: what the node states.
+        Code of the unit; None: as stated by the node.
     digits : int or None
-        Decimal digits of whole numbers; None: what the node states.
+        Decimal digits of whole numbers; None: as stated by the node.
 
     Raises
     ------
     InstrumentError
-        The node has no such input, or states no unit or no digits where none are given.
+        The node has no such input, or neither the node nor the settings state unit or digits.
     """
     forms = tuple(numbers)
     return [_find(node, subindex, forms, unit, digits) for subindex in subindices]
 
 
 def find_pdos(node: CanNode, inputs: Sequence[Input]) -> list[TransmitPdo]:
-    """Return the PDOs that a node sends at SYNC or at an interval and that have values or states of these inputs.
+    """Return the PDOs with values or states of these inputs that a node sends at SYNC or at an interval.
 
     Raises
     ------
     InstrumentError
-        None of the values is sent in that way.
+        None of the values is sent in this way.
     """
     sent = [pdo for pdo in node.transmit_pdos() if pdo.cyclic or pdo.timed]
     values = {(each.number.index, each.subindex) for each in inputs}
@@ -77,7 +77,7 @@ def find_pdos(node: CanNode, inputs: Sequence[Input]) -> list[TransmitPdo]:
             f"{', '.join(f'0x{index:04X}:{subindex}' for index, subindex in sorted(values))} with the maker's tool, "
             "with a transmission type of 1 to 240 or an event timer, or set transfer = 'sdo'"
         )
-    return [pdo for pdo in sent if any(pdo.place(*place) for place in values | states)]
+    return [pdo for pdo in sent if any(pdo.place(*entry) for entry in values | states)]
 
 
 def _find(node: CanNode, subindex: int, numbers: Sequence[Number], unit: int | None, digits: int | None) -> Input:
@@ -99,11 +99,11 @@ def _find(node: CanNode, subindex: int, numbers: Sequence[Number], unit: int | N
 
 
 def _value(node: CanNode, subindex: int, numbers: Sequence[Number]) -> tuple[Number, int]:
-    """Return the first form of the value that the node has, and its subindex."""
+    """Return the first format of the value that the node has, and its subindex."""
     for number in numbers:
         if _has(node, number.index, subindex):
             return number, subindex
-    for number in numbers:  # an object without subindices is that of the first input
+    for number in numbers:  # an object without subindices belongs to the first input
         if subindex == 1 and _has(node, number.index, 0) and len(node.upload(number.index, 0)) == number.size:
             return number, 0
     asked = " or ".join(f"0x{number.index:04X}:{subindex}" for number in numbers)
@@ -114,7 +114,7 @@ def _value(node: CanNode, subindex: int, numbers: Sequence[Number]) -> tuple[Num
 
 
 def _status(node: CanNode, subindex: int) -> tuple[int, int] | None:
-    """Return where the status of an input is: with its subindex, or one without subindices for all inputs."""
+    """Return index and subindex of the status of an input, or of one status for all inputs; None without a status."""
     if _has(node, STATUS, subindex):
         return STATUS, subindex
     if not _has(node, STATUS, 1) and _has(node, STATUS, 0):
@@ -123,7 +123,7 @@ def _status(node: CanNode, subindex: int) -> tuple[int, int] | None:
 
 
 def _entry(node: CanNode, index: int, subindex: int, size: int) -> int | None:
-    """Return an entry of an input, or the one without subindices; None where the node has neither."""
+    """Return an entry of an input, or the one without subindices; None if the node has neither."""
     for at in (subindex, 0):
         if at == 0 and _has(node, index, 1):  # the number of entries
             return None

@@ -29,45 +29,45 @@ from errormotion.instruments.transports.can.pdo import TransmitPdo
 from errormotion.instruments.transports.can.sdo import SdoRefusal
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
-#: SDO abort codes of an input that has no value just now: hardware error, device state, no data.
+#: SDO abort codes of an input without a value at present: hardware error, device state, no data.
 NO_VALUE = frozenset((0x06060000, 0x08000020, 0x08000021, 0x08000022, 0x08000024))
 _UNITS = {"degC": CELSIUS, "K": KELVIN, "degF": FAHRENHEIT}
 _LATENESS = 1.5
-"""Largest interval between two PDOs of a timer, in its own intervals."""
+"""Largest interval between two PDOs that are sent by a timer, as a multiple of its interval."""
 
 
 class CanSettings(ThermometerSettings):
     """Settings of a CiA 404 thermometer."""
 
     inputs: tuple[int, ...] = Field(
-        default=(), description="subindex of each channel; default: from 1 on, in their order"
+        default=(), description="subindex of each channel; default: 1, 2, ... in their order"
     )
-    node: int = Field(default=1, description="node number, where the URL has none", ge=1, le=127)
+    node: int = Field(default=1, description="node number, if the URL states none", ge=1, le=127)
     unit: Literal["as stated", "degC", "K", "degF"] = Field(
-        default="as stated", description="unit of the values; 'as stated': what object 0x6131 states"
+        default="as stated", description="unit of the values; 'as stated': the one in object 0x6131"
     )
     number: Literal["as found", "float", "integer 32", "integer 16"] = Field(
         default="as found",
-        description="form of the values: object 0x6130, 0x9130 or 0x7130; 'as found': the first that the node has",
+        description="format of the values: object 0x6130, 0x9130 or 0x7130; 'as found': the first one of the node",
     )
     digits: int | None = Field(
         default=None,
-        description="decimal digits of whole numbers; default: what object 0x6132 states",
+        description="decimal digits of whole numbers; default: as stated in object 0x6132",
         ge=0,
         le=MOST_DIGITS,
     )
     transfer: Literal["sdo", "pdo"] = Field(
         default="sdo",
-        description="'pdo': inputs that the node sends at SYNC or at an interval are received, the others read by SDO",
+        description="'pdo': receive inputs that are sent at SYNC or at an interval, and request the others by SDO",
     )
     sync: bool = Field(
-        default=False, description="send SYNC for each reading by PDO, which every node on the bus receives"
+        default=False, description="whether each reading by PDO sends a SYNC, which every node on the bus receives"
     )
     start: bool = Field(
-        default=False, description="send the node to OPERATIONAL when it is opened, and after a boot-up"
+        default=False, description="whether the node is set to OPERATIONAL when it is opened, and after a boot-up"
     )
-    timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
-    retry: Time = Field(default=1.0, description="least interval between two attempts to open a lost bus", ge=0)
+    timeout: Time = Field(default=1.0, description="time limit for an answer", gt=0)
+    retry: Time = Field(default=1.0, description="minimum interval between two attempts to open a lost bus again", ge=0)
 
     @model_validator(mode="after")
     def _one_each(self) -> Self:
@@ -110,7 +110,7 @@ class CanTemperature(Thermometer):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         return InstrumentSubject(cls, "sim://cframe?seed=3")
 
     @property
@@ -128,11 +128,11 @@ class CanTemperature(Thermometer):
 
     @property
     def emergency(self) -> int:
-        """Code of the node's last emergency message; 0: none, or it is over."""
+        """Code of the node's last emergency message; 0: none, or the emergency has ended."""
         return self.node.emergency
 
     def identify(self) -> Identity:
-        """Return the identity from the profile, name and numbers of the node.
+        """Check the profile of the node and return its identity.
 
         Raises
         ------
@@ -186,11 +186,11 @@ class CanTemperature(Thermometer):
         return wanted.scale.celsius(value), flag_of(status, value)
 
     def _entry(self, index: int, subindex: int, frames: Mapping[int, bytes]) -> bytes:
-        """Return an entry as the node has sent it, or from its object dictionary."""
+        """Return an entry from a received PDO, or from the object dictionary of the node."""
         for pdo in self._pdos:
-            place = pdo.place(index, subindex)
-            if place is not None:
-                return place.data(frames[pdo.identifier])
+            field = pdo.place(index, subindex)
+            if field is not None:
+                return field.data(frames[pdo.identifier])
         return self.node.upload(index, subindex)
 
     def _frames(self) -> dict[int, bytes]:
@@ -205,7 +205,7 @@ class CanTemperature(Thermometer):
         )
 
     def _prepare(self) -> None:
-        """Start the node where that is set, and read once what does not change: inputs, units, PDOs."""
+        """Start the node if this is set, and read the inputs, units and PDOs, which do not change later."""
         node, settings = self.node, self.settings
         boots = node.boots
         if settings.start:

@@ -1,7 +1,7 @@
 """CiA 404, measuring devices: the objects of an analogue input, the meaning of its unit and its status.
 
-A node has one of the objects of the process value, or several: a float, or a whole number with a number of decimal
-digits. The documents of each statement are on the page of the device.
+A node has one or several of the objects of the process value: a float, or a whole number with a number of decimal
+digits. The documentation of the device states the sources.
 """
 
 from __future__ import annotations
@@ -15,16 +15,15 @@ from errormotion.instruments.thermometer.sensors import FAULTY, GOOD, OUT_OF_RAN
 
 DEVICE_TYPE, NAME, IDENTITY = 0x1000, 0x1008, 0x1018
 UNIT = 0x6131
-"""Physical unit: prefix, numerator, denominator, reserved, a byte each from the top (CiA 303-2)."""
+"""Physical unit: prefix, numerator, denominator, reserved; one byte each, most significant byte first (CiA 303-2)."""
 DIGITS = 0x6132
 """Number of decimal digits of a process value that is a whole number."""
 STATUS = 0x6150
 PROFILE = 404
 CELSIUS, KELVIN = 0x002D0000, 0x00050000
-FAHRENHEIT = 0x00AC0000  # an assumption: from memory of CiA 303-2
+FAHRENHEIT = 0x00AC0000  # assumption: CiA 303-2, from memory
 FAULTY_SENSOR, OVER, UNDER = 1, 2, 4
-"""Bits of the status: sensor faulty or missing, above its range, below it; beyond the range the first one may be set
-too."""
+"""Bits of the status: sensor faulty or missing (also with one of the others), above its range, below its range."""
 MOST_DIGITS = 9
 LONGEST_NUMBER = 4  # bytes
 _ZEROS = {CELSIUS: (0.0, 1.0), KELVIN: (273.15, 1.0), FAHRENHEIT: (32.0, 5 / 9)}
@@ -33,16 +32,16 @@ _ZEROS = {CELSIUS: (0.0, 1.0), KELVIN: (273.15, 1.0), FAHRENHEIT: (32.0, 5 / 9)}
 
 @dataclass(frozen=True)
 class Number:
-    """A form of the process value.
+    """A format of the process value.
 
     Attributes
     ----------
     index : int
-        Its object.
+        Index of its object.
     form : str
-        As of `struct`.
+        Format of `struct`.
     whole : bool
-        Whether it has decimal digits, in another object.
+        Whether another object has its number of decimal digits.
     """
 
     index: int
@@ -57,7 +56,7 @@ class Number:
     def decode(self, data: bytes) -> float:
         """Return the number; ProtocolError for another number of bytes.
 
-        A node that does not state the size of its entries sends 4 bytes for a number of 2.
+        A node that does not state the size of its entries sends 4 bytes for a number of 2 bytes.
         """
         if len(data) not in (self.size, LONGEST_NUMBER):
             what = f"{'a whole number' if self.whole else 'a float'} of {self.size} bytes"
@@ -71,12 +70,12 @@ NUMBERS = {
     "integer 32": Number(0x9130, "<i", whole=True),
     "integer 16": Number(0x7130, "<h", whole=True),
 }
-"""In the order in which a node is asked for them."""
+"""Formats in the order in which they are tried."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How a number becomes degC: (number x 10^exponent - zero) x factor.
+    """Conversion of a number to degC: (number x 10^exponent - zero) x factor.
 
     Attributes
     ----------
@@ -98,7 +97,7 @@ class Scale:
 
 
 def scale_of(unit: int, digits: int = 0) -> Scale:
-    """Return how numbers in a unit become degC; ``digits`` is the number of decimal digits of a whole number.
+    """Return the conversion of a unit to degC; ``digits`` is the number of decimal digits of a whole number.
 
     Raises
     ------

@@ -12,15 +12,13 @@ from pydantic import Field
 
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, ProtocolError
-from errormotion.instruments.thermometer.sensors import GOOD, OPEN, Thermometer, ThermometerSettings
-from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.reconnecting import open_reconnecting
+from errormotion.instruments.thermometer.sensors import GOOD, OPEN, LineThermometer, ThermometerSettings
 from errormotion.plugins import Identity, InstrumentInfo
 
 LINE_END = b"\r"
 MAX_LINE_BYTES = 512
 MAX_LATE_LINES = 16
-OPEN_SENSOR = 9999.0  # degC: this absolute value and more means an open or overrun input
+OPEN_SENSOR = 9999.0  # degC: absolute values from here on mean an open or overrun input
 UNDER_RANGE = "-0000"  # the code of an ADAM for the same
 _VALUE = re.compile(r"[+-]\d+(?:\.\d+)?| {7}")  # blanks: a disabled channel
 _CONFIGURATION = re.compile(r"([0-9A-F]{2})[0-9A-F]{2}([0-9A-F]{2})")  # type, baud rate, data format
@@ -37,17 +35,17 @@ def checksum(text: str) -> str:
 
 
 def encode(text: str, *, with_checksum: bool = False) -> bytes:
-    """Return a request or answer as bytes, with its end."""
+    """Return a request or answer as bytes, with its line end."""
     return (text + (checksum(text) if with_checksum else "")).encode("ascii") + LINE_END
 
 
 def decode(line: bytes, *, with_checksum: bool = False) -> str:
-    """Return the text of an answer without its checksum and end.
+    """Return the text of an answer without its checksum and line end.
 
     Raises
     ------
     ProtocolError
-        Not ASCII, or a wrong checksum.
+        The answer is not ASCII, or its checksum is wrong.
     """
     try:
         text = line.removesuffix(LINE_END).decode("ascii")
@@ -69,7 +67,7 @@ def parse_temperatures(text: str) -> list[float | None]:
     Raises
     ------
     ProtocolError
-        Anything else.
+        The answer has another format.
     """
     values = _VALUE.findall(text)
     if not text.startswith(">") or not values or ">" + "".join(values) != text:
@@ -84,7 +82,7 @@ def _temperature(value: str) -> float | None:
 
 
 def check_configuration(text: str) -> None:
-    """Check that a module measures temperatures and states them in degC.
+    """Check that a module measures temperatures and reports them in degC.
 
     Parameters
     ----------
@@ -94,9 +92,9 @@ def check_configuration(text: str) -> None:
     Raises
     ------
     InstrumentError
-        A range of voltage or current, or another format than engineering units.
+        The module has a range of voltage or current, or another format than engineering units.
     ProtocolError
-        No configuration.
+        The text is not a configuration.
     """
     found = _CONFIGURATION.fullmatch(text)
     if found is None:
@@ -108,7 +106,7 @@ def check_configuration(text: str) -> None:
         )
     if form := _FORMATS.get(data_format & 3):
         raise InstrumentError(
-            f"The module writes {form} (data format {found[2]}); expected engineering units: set bits 1 and 0 of the "
+            f"The module reports {form} (data format {found[2]}); expected engineering units: set bits 1 and 0 of the "
             "data format to 00"
         )
 
@@ -121,12 +119,12 @@ class DconSettings(ThermometerSettings):
 
     unit: int = Field(default=1, description="address of the module on its line", ge=0, le=255)
     checksum: bool = Field(default=False, description="whether the module is set to use checksums")
-    baudrate: int = Field(default=9600, description="of a serial line", gt=0)
-    timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
-    retry: Time = Field(default=1.0, description="least interval between two attempts to connect again", ge=0)
+    baudrate: int = Field(default=9600, description="baud rate of a serial line", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit for an answer", gt=0)
+    retry: Time = Field(default=1.0, description="minimum interval between two attempts to connect again", ge=0)
 
 
-class DconTemperature(Thermometer):
+class DconTemperature(LineThermometer):
     """A DCON thermocouple module: ``#AA`` requests all inputs.
 
     Parameters
@@ -173,7 +171,7 @@ class DconTemperature(Thermometer):
         readings = dict(zip(self.channels, found, strict=False))
         if disabled := [name for name, value in readings.items() if value is None]:
             raise ProtocolError(
-                f"The channels of {', '.join(disabled)} are disabled in the module; enable them, or name fewer channels"
+                f"The channels of {', '.join(disabled)} are disabled in the module; enable or omit them"
             )
         return {
             name: (value, OPEN if value != value else GOOD) for name, value in readings.items() if value is not None
@@ -196,7 +194,7 @@ class DconTemperature(Thermometer):
         return answer.removeprefix(expected)
 
     def resynchronise(self) -> None:
-        """Discard late answers; those that are later still come before the answer that states the name.
+        """Discard late answers; even later ones precede the answer with the name of the module.
 
         Raises
         ------
@@ -210,16 +208,6 @@ class DconTemperature(Thermometer):
             if line.read_until(LINE_END, limit=MAX_LINE_BYTES).startswith(start):
                 return
         raise ProtocolError(f"{self.address}: expected an answer that starts with {start!r}; found other lines")
-
-    def _connect(self) -> Transport:
-        return open_reconnecting(
-            self.address,
-            simulator=self.info.simulator,
-            record=self._record,
-            timeout=self.settings.timeout,
-            retry=self.settings.retry,
-            baudrate=self.settings.baudrate,
-        )
 
     def _start_session(self) -> None:
         self.identify()

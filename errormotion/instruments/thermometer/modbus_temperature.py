@@ -35,7 +35,7 @@ class ModbusTemperature(ModbusDriver, Thermometer):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines: readings that differ from one another."""
+        """Return the subject of the conformance kit, whose readings differ."""
         return InstrumentSubject(cls, "sim://cframe?seed=3&noise=1")
 
     @property

@@ -28,7 +28,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "S": (500.0, 1750.0),
     "B": (500.0, 1800.0),
 }
-#: Register maps: the settings that a name stands for.
+#: Register maps: the default settings for each name.
 MAPS: Mapping[str, Mapping[str, Any]] = {
     "custom": {},
     "adam-6018": {"function": 3, "first": 0, "type": "u16", "open_codes": (65535,)},
@@ -47,31 +47,35 @@ class ModbusSettings(ThermometerSettings):
         default="custom", description="register map with the defaults of the other settings"
     )
     thermocouples: tuple[Thermocouple, ...] = Field(
-        default=("K",), description="types, one for all channels or one for each; scale of an ADAM-6018", min_length=1
+        default=("K",),
+        description="types, one for all channels or one for each; they determine the scale of an ADAM-6018",
+        min_length=1,
     )
-    unit: int = Field(default=1, description="address of the device, where its URL has none", ge=0, le=255)
+    unit: int = Field(default=1, description="address of the device, if its URL states none", ge=0, le=255)
     function: Literal[3, 4] = Field(default=3, description="3 reads holding registers, 4 input registers")
     first: int = Field(default=0, description="register of the first channel, from 0", ge=0, le=65535)
     stride: int | None = Field(
-        default=None, description="registers from channel to channel; default: the size of the type", ge=1
+        default=None,
+        description="number of registers from one channel to the next; default: the size of the type",
+        ge=1,
     )
     registers: tuple[int, ...] = Field(
-        default=(), description="register of each channel, where they are not evenly spaced"
+        default=(), description="register of each channel, if they are not evenly spaced"
     )
     most: int = Field(default=125, description="largest number of registers in one request", ge=2, le=125)
-    type: Kind = Field(default="i16", description="u16, i16, u32, i32 or f32")
-    word_order: Order = Field(default="big", description="big: the upper 16 bits come first")
-    byte_order: Order = Field(default="big", description="order of the two bytes of a register; big in the standard")
+    type: Kind = Field(default="i16", description="type of a number: u16, i16, u32, i32 or f32")
+    word_order: Order = Field(default="big", description="order of two registers; big: the upper 16 bits first")
+    byte_order: Order = Field(default="big", description="order of the two bytes of a register; the standard has big")
     scale: float | tuple[float, ...] = Field(default=1.0, description="degC for one count; one for all or for each")
     offset: float | tuple[float, ...] = Field(default=0.0, description="degC at the count 0; one for all or for each")
     open_codes: tuple[int, ...] = Field(default=(), description="counts that mean an open sensor")
-    open_from: int | None = Field(default=None, description="this count and more mean an open sensor")
+    open_from: int | None = Field(default=None, description="counts from this one on mean an open sensor")
     shorted_codes: tuple[int, ...] = Field(default=(), description="counts that mean a shorted sensor")
     lowest: Temperature = Field(default=-273.15, description="temperatures below are out of range")
     highest: Temperature = Field(default=2500.0, description="temperatures above are out of range")
-    baudrate: int = Field(default=9600, description="of a serial line, where its URL has none", gt=0)
-    timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
-    retry: Time = Field(default=1.0, description="least interval between two attempts to connect again", ge=0)
+    baudrate: int = Field(default=9600, description="baud rate of a serial line, if its URL states none", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit for an answer", gt=0)
+    retry: Time = Field(default=1.0, description="minimum interval between two attempts to connect again", ge=0)
     retries: int = Field(default=1, description="number of repeated requests after a damaged answer", ge=0, le=10)
 
     @model_validator(mode="before")
@@ -102,7 +106,7 @@ class ModbusSettings(ThermometerSettings):
                 raise ValueError(f"'{name}': expected one, or one for each of the {n} channels; found {len(value)}")
         size = SIZES[self.type]
         if self.stride is not None and self.stride < size:
-            raise ValueError(f"'stride': a {self.type} fills {size} registers; found {self.stride}")
+            raise ValueError(f"'stride': a {self.type} needs {size} registers; found {self.stride}")
         if max(self.addresses) + size > 1 << 16:
             raise ValueError(f"expected registers up to 65535; the last channel starts at {max(self.addresses)}")
         return self
@@ -142,11 +146,11 @@ class ModbusSettings(ThermometerSettings):
             return math.nan, OPEN
         value = round(
             _each(self.scale, channel) * number + _each(self.offset, channel), 9
-        )  # 19.7, no 19.700000000000003
+        )  # 19.7, not 19.700000000000003
         return value, GOOD if self.lowest <= value <= self.highest else OUT_OF_RANGE
 
     def words(self, channel: int, temperature: float) -> list[int]:
-        """Return the registers of a temperature (degC)."""
+        """Return the registers that represent a temperature (degC)."""
         number = (temperature - _each(self.offset, channel)) / _each(self.scale, channel)
         return encode_number(number, self.type, self.word_order, self.byte_order)
 
@@ -166,7 +170,7 @@ def decode_number(words: Sequence[int], kind: Kind, word_order: Order = "big", b
 
 
 def encode_number(number: float, kind: Kind, word_order: Order = "big", byte_order: Order = "big") -> list[int]:
-    """Return the registers of a number; integers are limited to the range of their type."""
+    """Return the registers that represent a number; integers are limited to the range of their type."""
     if kind != "f32":
         bits = 16 * SIZES[kind]
         low, high = (0, (1 << bits) - 1) if kind[0] == "u" else (-(1 << bits - 1), (1 << bits - 1) - 1)

@@ -1,16 +1,18 @@
-"""Base of thermometers: named sensors with positions on the machine, and a flag for each missing temperature."""
+"""Bases of thermometers: named sensors with positions on the machine, and a flag for each missing temperature."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Self
+from typing import Any, Self
 
 from pydantic import Field, model_validator
 
 from errormotion.datasets.units import Length
 from errormotion.errors import InstrumentError
 from errormotion.instruments.driver import Driver
+from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.reconnecting import open_reconnecting
 from errormotion.plugins import PluginSettings
 
 Position = tuple[Length, Length, Length]
@@ -27,17 +29,20 @@ class ThermometerSettings(PluginSettings):
 
     channels: tuple[str, ...] = Field(
         default=("frame", "ambient", "spindle_front", "spindle_rear", "column"),
-        description="names of the inputs, from the first one on",
+        description="names of the inputs, starting at the first one",
         min_length=1,
     )
     places: dict[str, Position] = Field(
-        default_factory=dict, description="positions of sensors on the machine: name to X, Y, Z; as far as known"
+        default_factory=dict,
+        description="positions of sensors on the machine: name to X, Y, Z; unknown ones are omitted",
     )
 
     @model_validator(mode="after")
     def _names(self) -> Self:
         if double := {name for name in self.channels if self.channels.count(name) > 1}:
-            raise ValueError(f"'channels' has {', '.join(sorted(double))} twice; each sensor needs its own name")
+            raise ValueError(
+                f"'channels' has {', '.join(sorted(double))} twice; expected a different name for each sensor"
+            )
         if unknown := [name for name in self.places if name not in self.channels]:
             raise ValueError(
                 f"'places' has {', '.join(unknown)}; expected names of the channels {', '.join(self.channels)}"
@@ -51,8 +56,9 @@ class Thermometer(Driver):
     Attributes
     ----------
     flags : dict of str to str
-        Of the last reading: empty for a good temperature, else ``open``, ``shorted``, ``faulty`` (one of the two),
-        ``out of range``, ``no answer`` (all of them, when `read` has failed), or ``not read`` before the first reading.
+        Flag of each channel in the last reading: empty for a valid temperature, else ``open``, ``shorted``, ``faulty``
+        (either of the two), ``out of range``, ``no answer`` (all channels, after `read` failed), or ``not read`` before
+        the first reading.
     """
 
     settings: ThermometerSettings
@@ -65,7 +71,7 @@ class Thermometer(Driver):
 
     @property
     def places(self) -> dict[str, tuple[float, float, float] | None]:
-        """Position of each sensor on the machine, m; None where unknown."""
+        """Position of each sensor on the machine, m; None if unknown."""
         return {name: self.settings.places.get(name) for name in self.channels}
 
     @property
@@ -80,12 +86,12 @@ class Thermometer(Driver):
         super().open()
 
     def read(self) -> dict[str, float]:
-        """Return the temperatures now, degC by channel; NaN where missing, with the reason in `flags`.
+        """Return the present temperatures, degC by channel; NaN if missing, with the reason in `flags`.
 
         Raises
         ------
         InstrumentError
-            No answer, or an invalid one; after a lost connection the next call connects again.
+            No answer or an invalid one; after a lost connection the next call connects again.
         """
         try:
             found = self._measure()
@@ -98,3 +104,21 @@ class Thermometer(Driver):
     def _measure(self) -> Mapping[str, tuple[float, str]]:
         """Return temperature (degC) and flag of each channel, in their order."""
         raise NotImplementedError
+
+
+class LineThermometer(Thermometer):
+    """Base of thermometers on one line, serial or TCP, that is opened again after it was lost.
+
+    Settings called ``timeout`` (s), ``retry`` (s) and ``baudrate`` apply to the line.
+    """
+
+    def _connect(self) -> Transport:
+        settings: Any = self.settings
+        return open_reconnecting(
+            self.address,
+            simulator=self.info.simulator,
+            record=self._record,
+            timeout=settings.timeout,
+            retry=settings.retry,
+            baudrate=settings.baudrate,
+        )

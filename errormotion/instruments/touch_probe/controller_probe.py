@@ -6,18 +6,18 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from errormotion import plugins
-from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.datasets.units import Length, Time, Velocity
 from errormotion.errors import InstrumentError, PluginError
 from errormotion.instruments.door import ArmedSettings, Door
-from errormotion.instruments.touch_probe.settings import ProbeSettings, corrected, refuse_unmapped
+from errormotion.instruments.driver import Openable
+from errormotion.instruments.touch_probe.probe import Probe, corrected, refuse_unmapped
+from errormotion.instruments.touch_probe.settings import ProbeSettings
 from errormotion.instruments.touch_probe.touching import (
     NO_TRIP,
     NOT_MADE,
@@ -29,7 +29,7 @@ from errormotion.instruments.touch_probe.touching import (
 )
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, MachineLimits, Touch
 
-_SAME = 1e-6  # m: below it no move is made, and controllers refuse to probe
+_SAME = 1e-6  # m: shorter moves are not made, and controllers refuse to probe them
 
 
 class ControllerProbeSettings(ArmedSettings, ProbeSettings):
@@ -63,11 +63,11 @@ class ControllerProbeSettings(ArmedSettings, ProbeSettings):
         return Strategy(**{name: getattr(self, name) for name in Strategy.__dataclass_fields__})
 
 
-class ControllerProbe:
+class ControllerProbe(Probe, Openable):
     """A touch probe at a controller.
 
     Between touches the tip rises by the clearance, moves across and down; all these are probing moves, which stop on
-    contact. After an error nothing moves; the earlier contacts have been delivered.
+    contact. After an error nothing moves; contacts made before it have been returned.
 
     Parameters
     ----------
@@ -80,22 +80,23 @@ class ControllerProbe:
     Attributes
     ----------
     last : Contact or None
-        The last one.
+        The last contact.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
         id="controller_probe",
         kind="touch_probe",
-        summary="Touch probe that a controller moves and reads, with slow repeats and wrong triggers found",
+        summary="Touch probe that a controller moves and reads, with slow repeats and detection of false triggers",
         status="simulated_only",
         simulator="errormotion.instruments.simulators.controller.virtual:SimulatedController",
     )
     Settings: ClassVar[type[ControllerProbeSettings]] = ControllerProbeSettings
+    settings: ControllerProbeSettings
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
         """Return the subject of the conformance kit."""
-        # Faults of the machine show when it moves, not when it is read.
+        # Faults of the machine appear when it moves, not when it is read.
         harmless = ("split", "alarm", "estop", "no_trip", "tripped")
         return InstrumentSubject(cls, "sim://cframe/controller", harmless=harmless)
 
@@ -104,11 +105,8 @@ class ControllerProbe:
     ) -> None:
         self.address = address
         self.settings = ControllerProbeSettings() if settings is None else settings
-        self.last: Contact | None = None
         self._record = record
         self._control: Any = None
-        self._map: PretravelMap | None = None
-        self._contacts = 0
         self._door = Door(self.info.id, address)
 
     # ------------------------------------------------------------------ opening and closing
@@ -148,19 +146,6 @@ class ControllerProbe:
         if control is not None:
             control.close()
 
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.close()
-            return
-        with suppress(InstrumentError):  # the first error states the cause
-            self.close()
-
     @property
     def control(self) -> Any:
         """The controller, opened; InstrumentError before ``open``."""
@@ -172,46 +157,26 @@ class ControllerProbe:
 
     # ------------------------------------------------------------------ state
 
-    @property
-    def tip_radius(self) -> float:
-        """Radius of the tip, m."""
-        return self.settings.tip_radius
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of one touch, m; NaN where unknown."""
-        return self.settings.touch_noise
-
-    @property
-    def pretravel(self) -> PretravelMap | None:
-        """The map that corrects contacts; None without one."""
-        return self._map
-
     def identify(self) -> Identity:
         """Return the identity of the controller."""
-        whose: Identity = self.control.identify()
+        control: Identity = self.control.identify()
         return replace(
-            whose,
-            model=f"{whose.model} touch probe",
-            details={**whose.details, "controller": self.settings.controller, "tip_radius": self.tip_radius},
+            control,
+            model=f"{control.model} touch probe",
+            details={**control.details, "controller": self.settings.controller, "tip_radius": self.tip_radius},
         )
 
     def bound(self, limits: MachineLimits) -> None:
-        """Hold limits for every move from now on; the controller holds them for each single order."""
+        """Apply limits to every move from now on; the controller applies them to each command."""
         self._door.limits = limits
         if self._control is not None and hasattr(self._control, "bound"):
             self._control.bound(limits)
 
-    def configure(self, settings: ControllerProbeSettings) -> None:
-        """Use other settings from now on; those of the connection hold for the next one."""
-        self._map = settings.pretravel_map()
-        self.settings = settings
-
     def read(self) -> dict[str, Any]:
         """Return the position of the tip and the result of the last touch.
 
-        ``position`` (m) and ``time`` (s) now, by the controller; ``contacts``, the number of good ones since the driver
-        was made; ``contact`` (m; NaN without one) and ``flag`` of the last touch.
+        ``position`` (m) and ``time`` (s), as the controller reports them; ``contacts``, the number of valid contacts
+        since the driver was created; ``contact`` (m; NaN without one) and ``flag`` of the last touch.
         """
         state = self.control.state()
         return {
@@ -228,16 +193,16 @@ class ControllerProbe:
         """Make touches one after another and yield the result of each, in order.
 
         A contact is the position of the tip when the probe tripped; with a pre-travel map, for touches along the
-        normal, the position when it met the surface. After a touch without a contact the rest of the item's touches are
-        ``not made``; after two such items in succession the probe is assumed to be defective. A probe that is tripped
-        at the start, and remains so, yields a contact with its flag and then raises.
+        normal, the position when the tip met the surface. After a touch without a contact the remaining touches of the
+        item are ``not made``; after two such items in succession the probe is assumed to be defective. A probe that is
+        tripped at the start, and remains so, yields a contact with its flag and then raises.
 
         Raises
         ------
         InstrumentError
             Touches from a direction that the pre-travel map does not cover, alarm, emergency stop, a lost connection,
-            an obstacle, a probe that never trips or remains tripped. All motion has been stopped, as far as the
-            controller is connected.
+            an obstacle, a probe that never trips or remains tripped. All motion has been stopped, unless the connection
+            is lost.
         """
         touches = list(touches)
         self._door.admit(self.settings.arm, f"{len(touches)} touches")
@@ -246,31 +211,32 @@ class ControllerProbe:
         missed: list[int] = []  # items without a contact since the last contact
         for number, touch in enumerate(touches):
             if touch.item in missed:
-                yield self._kept(Contact(NOWHERE, float(self.control.state()["time"]), NOT_MADE))
+                yield self._keep(Contact(NOWHERE, float(self.control.state()["time"]), NOT_MADE))
                 continue
             try:
-                contact = self._made(touches, number)
+                contact = self._touch(touches, number)
             except InstrumentError as error:
                 self._stop()
                 what = f"Touch {number + 1} of {len(touches)} (item {touch.item}): {error}"
                 if isinstance(error, StuckError):
-                    yield self._kept(Contact(NOWHERE, self._time(), TRIPPED))
+                    yield self._keep(Contact(NOWHERE, self._time(), TRIPPED))
                 raise type(error)(what) from error
             except BaseException:  # an interruption must not leave the machine moving
                 self._stop()
                 raise
             missed = [*missed, touch.item] if contact.flag == NO_TRIP else []
-            yield self._kept(contact)
+            yield self._keep(contact)
             if len(missed) > 1:
                 self._stop()
                 raise InstrumentError(
                     f"Touch {number + 1} of {len(touches)}: the probe did not trip on items {missed[0]} and "
-                    f"{missed[1]}, one after the other. Is it connected and switched on? All motion has been stopped"
+                    f"{missed[1]} in succession. Check that it is connected and switched on. All motion has been "
+                    "stopped"
                 )
         if touches:
             self._leave(touches)
 
-    def _made(self, touches: Sequence[Touch], number: int) -> Contact:
+    def _touch(self, touches: Sequence[Touch], number: int) -> Contact:
         touch = touches[number]
         toucher = Toucher(self.control, self.settings.strategy)
         for position in self._path(touches, number):
@@ -317,11 +283,6 @@ class ControllerProbe:
                 else "not enabled"
             )
             raise InstrumentError(f"The machine at {self.address} is {what}; nothing was moved")
-
-    def _kept(self, contact: Contact) -> Contact:
-        self.last = contact
-        self._contacts += not contact.flag
-        return contact
 
     def _time(self) -> float:
         try:

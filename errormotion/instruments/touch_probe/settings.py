@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from pydantic import Field
 
 from errormotion.datasets.calibrations.owner import compare
 from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.datasets.files.folders import folders_beside
 from errormotion.datasets.units import Length
-from errormotion.errors import InstrumentError
-from errormotion.plugins import Contact, PluginSettings, Touch
+from errormotion.plugins import PluginSettings
 
 log = logging.getLogger(__name__)
 
@@ -57,36 +53,3 @@ class ProbeSettings(PluginSettings):
         for note in compare(self.pretravel, found.serial_number, self.serial_number, allow_other_sensor=allowed):
             log.warning(note)
         return found
-
-
-def _normals(touches: Sequence[Touch]) -> list[tuple[float, ...]]:
-    """Return the normals of surfaces that are touched along them."""
-    return [tuple(float(x) for x in np.subtract(touch.start, touch.target)) for touch in touches]
-
-
-def refuse_unmapped(pretravel: PretravelMap | None, touches: Sequence[Touch]) -> None:
-    """Refuse touches from directions that the pre-travel map does not cover.
-
-    Raises
-    ------
-    InstrumentError
-        For the first of them.
-    """
-    if pretravel is None or not touches:
-        return
-    unknown = np.flatnonzero(~pretravel.supported(_normals(touches)))
-    if unknown.size:
-        first = touches[int(unknown[0])]
-        raise InstrumentError(
-            f"The pre-travel map has no touches near the direction of touch {int(unknown[0]) + 1} (item {first.item}); "
-            f"it does not cover {unknown.size} of {len(touches)} touches. Calibrate the probe in these directions, "
-            "or use no map"
-        )
-
-
-def corrected(pretravel: PretravelMap | None, touch: Touch, contact: Contact) -> Contact:
-    """Return a contact at the position where the tip met the surface; unchanged without a map or with a flag."""
-    if pretravel is None or contact.flag:
-        return contact
-    x, y, z = (float(value) for value in pretravel.met([contact.position], _normals([touch]))[0])
-    return replace(contact, position=(x, y, z))

@@ -32,7 +32,7 @@ class Prober(Protocol):
         """Move in a straight line until the probe trips."""
 
     def elapse(self, seconds: float) -> None:
-        """Let time pass."""
+        """Wait."""
 
     def stop(self) -> None:
         """Abort all motion."""
@@ -44,7 +44,7 @@ class StuckError(InstrumentError):
 
 @dataclass(frozen=True)
 class Strategy:
-    """How a touch is made; lengths in m, feeds in m/s, times in s.
+    """Parameters of a touch; lengths in m, feeds in m/s, times in s.
 
     Attributes
     ----------
@@ -100,14 +100,14 @@ class Toucher:
         StuckError
             The probe is tripped before it moves.
         InstrumentError
-            The probe tripped on the path: the machine rests there.
+            The probe tripped on the path; the machine has stopped there.
         """
         found = self._probe(position, self._how.approach_feed)
         if found is not None:
             x, y, z = 1e3 * np.asarray(found["position"], dtype=float)
             raise InstrumentError(
                 f"the probe tripped at X {x:.3f} Y {y:.3f} Z {z:.3f} mm, where its path should be free; the machine "
-                "rests there. Remove the obstacle, or raise the clearance"
+                "has stopped there. Remove the obstacle, or increase the clearance"
             )
 
     def touch(self, touch: Touch) -> Contact:
@@ -133,7 +133,7 @@ class Toucher:
                 break
             slow = self._slow(fast, start, direction, length)
             if slow:
-                return self._judged(fast, slow, start, direction)
+                return self._evaluate(fast, slow, start, direction)
             origin = start  # no slow contact: a false trip
             self._control.move_to(origin.tolist(), self._how.approach_feed)
         self._control.move_to(start.tolist(), self._how.approach_feed)
@@ -167,7 +167,7 @@ class Toucher:
             found.append((distance, float(tripped["time"])))
         return found
 
-    def _judged(self, fast: float, slow: Sequence[tuple[float, float]], start: Array, direction: Array) -> Contact:
+    def _evaluate(self, fast: float, slow: Sequence[tuple[float, float]], start: Array, direction: Array) -> Contact:
         """Return the contact of slow touches, with the tip back at the start."""
         distances, times = np.array(slow).T
         self._control.move_to(start.tolist(), self._how.approach_feed)
@@ -190,7 +190,7 @@ class Toucher:
         return along
 
     def _probe(self, target: Array, feed: float) -> dict[str, Any] | None:
-        """Move until the probe trips; wait for a stuck one; None where it does not trip."""
+        """Move until the probe trips; wait for a stuck one; None if it does not trip."""
         for attempt in range(1 + self._how.attempts):
             try:
                 found = self._control.probe(target.tolist(), feed)

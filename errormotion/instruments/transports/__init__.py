@@ -7,10 +7,10 @@ Only this package uses ``serial`` and ``socket``.
 * ``serial:///dev/ttyUSB0?baudrate=921600`` a serial line, 8N1
 * ``tcp://host:port`` a TCP connection; `transports.lines` opens several to one device
 * ``unix:///run/device.sock`` a Unix socket of this computer; ``unix://~/device.sock``
-* ``sim://machine/device?seed=3`` a simulated device, behind a real TCP connection or pty of its own
+* ``sim://machine/device?seed=3`` a simulated device, with a real TCP connection or pty
 * ``replay://session.rec`` a recorded session, played back strictly
 
-Buses have modules of their own: `transports.modbus` (``modbus+tcp``, ``modbus+rtu``, ``modbus+rtu-tcp``) and
+Buses have separate modules: `transports.modbus` (``modbus+tcp``, ``modbus+rtu``, ``modbus+rtu-tcp``) and
 `transports.can` (``can``). A line that is opened again after it was lost is in `transports.reconnecting`.
 """
 
@@ -37,7 +37,7 @@ def open_transport(
     timeout: float = 1.0,
     baudrate: int | None = None,
 ) -> Transport:
-    """Open the transport that an address names.
+    """Open the transport for an address.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def open_transport(
     recorder : Recorder or path, optional
         File or recorder to which every frame of the session is written.
     timeout : float
-        Time limit of a read without data, s.
+        Time limit for a read without data, s.
     baudrate : int, optional
         Baud rate of a serial line; that of the address takes precedence.
 
@@ -95,14 +95,14 @@ def open_transport(
 
 
 def load_simulator(name: str | None, url: str) -> Callable[[Address], Any]:
-    """Return what starts the simulator called ``module:Class`` at an address; InstrumentError where there is none."""
+    """Return a function that starts the simulator ``module:Class`` at an address; InstrumentError without one."""
     if name is None:
-        raise InstrumentError(f"This instrument has no simulator; found '{url}', expected the address of a device")
+        raise InstrumentError(f"This instrument has no simulator: expected the address of a device; found '{url}'")
     module, _, attribute = name.partition(":")
     try:
         simulator = getattr(import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise InstrumentError(f"The simulator '{name}' behind '{url}' does not load: {error}") from error
+        raise InstrumentError(f"The simulator '{name}' for '{url}' does not load: {error}") from error
 
     def start(address: Address) -> Any:
         from errormotion.instruments.transports.loopback.serving import placed

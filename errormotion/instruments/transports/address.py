@@ -1,4 +1,4 @@
-"""Addresses of devices: URLs. The provenance of results contains them, so that simulated data are marked as such."""
+"""Addresses of devices: URLs. The provenance of results contains them, which identifies simulated data."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 from errormotion.errors import InstrumentError
 
 BYTES = ("serial", "tcp", "unix", "sim", "replay")
-"""Schemes of a plain stream of bytes; the others are buses with frames of their own."""
+"""Schemes of a plain stream of bytes; the others are buses with frames."""
 MODBUS = ("modbus+tcp", "modbus+rtu", "modbus+rtu-tcp")
 CAN = "can"
 HTTP = "http"
@@ -37,7 +37,7 @@ class Address:
     Attributes
     ----------
     url : str
-        As written.
+        The complete address.
     scheme : str
         One of ``SCHEMES``.
     host : str
@@ -68,12 +68,12 @@ class Address:
             raise InstrumentError(f"'{name}' in '{self.url}': expected a number; found '{text}'") from None
 
     def line(self, name: str, default: int) -> Address:
-        """Return the address of a further TCP line of the same device, at the port that the parameter ``name`` gives.
+        """Return the address of a further TCP line of the same device, at the port in the parameter ``name``.
 
         Raises
         ------
         InstrumentError
-            The parameter is no port number.
+            The parameter is not a port number.
         """
         port = float(self.number(name, default))
         if not (port.is_integer() and 0 < port < 1 << 16):
@@ -88,7 +88,7 @@ class Address:
         return int(value)
 
     def with_path(self, path: str) -> str:
-        """Return the URL with another path, its parameters kept."""
+        """Return the URL with another path and the same parameters."""
         query = f"?{urlencode(self.params)}" if self.params else ""
         return f"{self.scheme}://{self.host}/{path}{query}"
 
@@ -99,7 +99,7 @@ def parse_address(url: str) -> Address:
     Raises
     ------
     InstrumentError
-        No known scheme, no host, port or path where one is needed, a parameter without value.
+        Unknown scheme, a required host, port or path is missing, or a parameter has no value.
     """
     scheme, mark, rest = url.partition("://")
     if not mark or scheme not in SCHEMES:

@@ -10,7 +10,7 @@ from errormotion.errors import InstrumentTimeoutError, ProtocolError
 CHUNK = 65536
 """Largest number of bytes read at once, as by the reader of a stream."""
 PIECE = 16384
-"""Largest number of bytes read at once unless a number is stated: a decoder is done with so many within 10 ms."""
+"""Largest number of bytes read at once by default: a decoder processes them within 10 ms."""
 
 
 class Transport(ABC):
@@ -21,10 +21,10 @@ class Transport(ABC):
     url : str
         The address.
     timeout : float
-        Time limit of a read without data, s.
+        Time limit for a read without data, s.
     flow_control : bool
-        Whether the device waits, or reports lost data, while nothing is read here. A serial line has no flow control:
-        bytes are lost without notice.
+        Whether the device waits, or reports lost data, while the driver does not read. A serial line has no flow
+        control: bytes are lost without notice.
     simulated : bool
         Whether a simulator is at the other end.
     reconnects : bool
@@ -41,7 +41,7 @@ class Transport(ABC):
         self._rest = b""
 
     def write(self, data: bytes) -> None:
-        """Send bytes; InstrumentError when the connection is lost."""
+        """Send bytes; InstrumentError if the connection is lost."""
         self._send(data)
 
     def read(self, max_bytes: int = PIECE, timeout: float | None = None) -> bytes:
@@ -50,7 +50,7 @@ class Transport(ABC):
         Raises
         ------
         InstrumentTimeoutError
-            No data for ``timeout`` (default: the transport's own) seconds.
+            No data for ``timeout`` s (default: ``timeout`` of the transport).
         InstrumentError
             The connection is lost.
         """
@@ -71,10 +71,10 @@ class Transport(ABC):
         """
         allowed = self.timeout if timeout is None else timeout
         end, data, searched = time.monotonic() + allowed, bytearray(), 0
-        while (place := data.find(terminator, searched)) < 0:
+        while (found := data.find(terminator, searched)) < 0:
             if len(data) >= limit:
                 start = bytes(data[:32])
-                raise ProtocolError(f"{self.url}: {len(data)} bytes without {terminator!r}; they start {start!r}")
+                raise ProtocolError(f"{self.url}: {len(data)} bytes without {terminator!r}; they start with {start!r}")
             searched = max(len(data) - len(terminator) + 1, 0)
             try:
                 data += self.read(limit, timeout=max(end - time.monotonic(), 0.0))
@@ -84,9 +84,9 @@ class Transport(ABC):
                     f"{self.url}: expected an answer that ends in {terminator!r} within {allowed:g} s; "
                     f"received {received}"
                 ) from None
-        place += len(terminator)
-        self._rest = bytes(data[place:]) + self._rest
-        return bytes(data[:place])
+        end_of_line = found + len(terminator)
+        self._rest = bytes(data[end_of_line:]) + self._rest
+        return bytes(data[:end_of_line])
 
     def read_exactly(self, size: int, timeout: float | None = None) -> bytes:
         """Return exactly ``size`` bytes.
@@ -94,7 +94,7 @@ class Transport(ABC):
         Raises
         ------
         InstrumentTimeoutError
-            Fewer within the time limit; the message states their number.
+            Fewer bytes within the time limit; the message states their number.
         """
         allowed = self.timeout if timeout is None else timeout
         end, data = time.monotonic() + allowed, b""
@@ -110,15 +110,15 @@ class Transport(ABC):
     def reopen(self) -> bool:
         """Open another connection to the same device: a late answer is lost with the old one.
 
-        Returns whether there is another connection; False for a line that has none, such as a serial line.
-        InstrumentError where the device cannot be reached.
+        Return whether another connection was opened; False for a line without connections, such as a serial line.
+        InstrumentError if the device cannot be reached.
         """
         return False
 
     def report_delivered(self, samples: int) -> None:  # noqa: B027 - without effect for most transports
         """Report the number of samples of the running stream that the caller has received.
 
-        Without effect for a real device; a virtual clock counts the time that its reader has received.
+        This has no effect for a real device; a virtual clock advances with the samples that its reader has received.
         """
 
     @abstractmethod

@@ -49,7 +49,7 @@ class ManyLines(Transport):
         return self._first.read(max_bytes, timeout)
 
     def reopen(self) -> bool:
-        """Open another connection in place of the first line; the others stay as they are."""
+        """Open the connection of the first line again; the others remain open."""
         self._rest = b""
         return self._first.reopen()
 
@@ -78,18 +78,18 @@ def open_lines(
     Parameters
     ----------
     url : str
-        ``tcp://host:port``, where a parameter ``name=port`` states of a further line; ``sim://``; ``replay://``.
+        ``tcp://host:port``, with ``name=port`` for the port of a further line; ``sim://``; ``replay://``.
     further : mapping of str to int
         Further lines by name, with the default port.
     simulator, timeout
-        As in `open_transport`.
+        See `open_transport`.
     record : Path, optional
         List of the recordings of all lines, which are written beside it.
 
     Raises
     ------
     InstrumentError
-        Another scheme, no device at one of the ports, a recording that exists already.
+        Another scheme, no device at one of the ports, or the recording already exists.
     """
     address = parse_address(url)
     lines: dict[str, Transport] = {}
@@ -125,7 +125,7 @@ def _opened(
             for name in (COMMAND, *further):
                 if name not in recordings:
                     raise ReplayError(
-                        f"The recording {address.path} has no line '{name}'; was another device recorded?"
+                        f"The recording {address.path} has no line '{name}'; check the type of the device"
                     )
                 yield name, ReplayTransport(recordings[name], timeout=timeout)
         case _:

@@ -1,7 +1,7 @@
-"""Connections that are opened again after they were lost: one policy for all transports.
+"""Connections that are opened again after they were lost, in the same way for all transports.
 
-The exchange in which a connection is lost fails. The next exchange opens another connection, but two attempts are at
-least an interval apart; until then every exchange fails with the reason of the loss.
+The exchange in which a connection is lost fails. The next exchange opens another connection, but with a minimum
+interval between two attempts; until then every exchange fails with the reason of the loss.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ Connection = TypeVar("Connection")
 
 
 class Reopened(Generic[Connection]):
-    """One connection, opened again after it was lost.
+    """A connection that is opened again after it was lost.
 
     Parameters
     ----------
     url : str
-        For messages.
+        Address, for messages.
     connect : callable
         Opens a connection, or raises InstrumentError.
     interval : float
-        Least time between two attempts to connect, s.
+        Minimum interval between two attempts to connect, s.
 
     Attributes
     ----------
     connection : Connection or None
         The open connection; None while it is lost, or closed.
     reason : str
-        Why the connection was lost; empty while there is one.
+        Why the connection was lost; empty while it is open.
     """
 
     def __init__(self, url: str, connect: Callable[[], Connection], interval: float) -> None:
@@ -44,12 +44,12 @@ class Reopened(Generic[Connection]):
         self._closed = False
 
     def get(self) -> Connection:
-        """Return the connection; open one where it was lost.
+        """Return the connection; open one if it was lost.
 
         Raises
         ------
         InstrumentError
-                It is closed, it cannot be opened, or the interval since the last attempt has not passed.
+            The connection is closed or cannot be opened, or the interval since the last attempt has not passed.
         """
         if self._closed:
             raise InstrumentError(f"The connection to {self.url} is closed")
@@ -68,12 +68,12 @@ class Reopened(Generic[Connection]):
         return self.connection
 
     def drop(self, reason: str) -> Connection | None:
-        """Drop the connection, so that `get` opens another one; return it, to be closed."""
+        """Drop the connection, so that `get` opens another one; return it for closing."""
         lost, self.connection, self.reason = self.connection, None, reason
         return lost
 
     def close(self) -> Connection | None:
-        """Open no further connection; return the present one, to be closed."""
+        """Open no further connection; return the present one for closing."""
         self._closed = True
         last, self.connection = self.connection, None
         return last

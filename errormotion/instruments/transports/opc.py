@@ -1,8 +1,7 @@
-"""OPC UA as an exchange of lines: a request as JSON goes out, an answer as JSON comes back.
+"""OPC UA as an exchange of lines: requests and answers in JSON.
 
-The binary protocol, with its sequence numbers, nonces and encryption, is that of the package asyncua. What is recorded
-and played back are the requests and answers of this module, so that a recorded session can be read by a person and
-replayed without a server::
+The package asyncua implements the binary protocol with its sequence numbers, nonces and encryption. Recordings contain
+the requests and answers of this module, so that they are readable and can be replayed without a server::
 
     {"read": ["ns=2;s=/Channel/Spindle/actSpeed[u1,1]"]}
     [{"value": 12000.0, "status": "Good", "time": "2026-03-01T12:00:00+00:00"}]
@@ -38,13 +37,13 @@ if TYPE_CHECKING:
     from asyncua.client.client import Client
 
 MOST_NODES = 1000
-"""Nodes in one request or answer."""
+"""Largest number of nodes in one request or answer."""
 MOST_ELEMENTS = 64
-"""Elements of an array; more are not read."""
+"""Largest number of elements of an array that are read."""
 MOST_TEXT = 4096
-"""Characters of a text; more are cut off."""
+"""Largest number of characters of a text; the rest is cut off."""
 DROP_TIMEOUT = 0.5
-"""Time limit of the farewell to a server, s."""
+"""Time limit for disconnecting from a server, s."""
 WRITABLE = 2
 """Bit of an access level: the present value can be written."""
 MOST_BYTES = 16 << 20
@@ -55,7 +54,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Credentials:
-    """How a client proves who it is; all empty: anonymous and unencrypted.
+    """Credentials of a client; all empty: anonymous and unencrypted.
 
     Attributes
     ----------
@@ -76,7 +75,7 @@ class Credentials:
         Raises
         ------
         InstrumentError
-            There is no such file, or no line of text in it.
+            The file does not exist, or has no line of text.
         """
         if not password_file:
             return cls(security, user)
@@ -90,7 +89,7 @@ class Credentials:
 
 
 class OpcUaTransport(Transport):
-    """A session with an OPC UA server, opened again at the next request after it was lost.
+    """A session with an OPC UA server; after a loss the next request opens it again.
 
     Parameters
     ----------
@@ -98,9 +97,9 @@ class OpcUaTransport(Transport):
         ``opc.tcp://host:4840/path`` or ``sim://``.
     credentials : Credentials
     timeout : float
-        Time limit of one request, s.
+        Time limit for one request, s.
     simulator : str, optional
-        ``module:Class`` of the simulator behind ``sim://``.
+        ``module:Class`` of the simulator for ``sim://``.
 
     Raises
     ------
@@ -114,10 +113,10 @@ class OpcUaTransport(Transport):
         if address.scheme not in (OPC, "sim"):
             raise InstrumentError(f"Expected an address such as opc.tcp://192.168.0.5:4840; found '{url}'")
         try:
-            import asyncua  # noqa: F401 - an extra
+            import asyncua  # noqa: F401 - an optional dependency
         except ImportError:
             raise InstrumentError("OPC UA needs the package asyncua: pip install asyncua") from None
-        logging.getLogger("asyncua").setLevel(logging.ERROR)  # its warnings concern what no user can change
+        logging.getLogger("asyncua").setLevel(logging.ERROR)  # users cannot act on its warnings
         self.simulated = address.scheme == "sim"
         self._device: Any = None
         self._server = url
@@ -141,9 +140,9 @@ class OpcUaTransport(Transport):
         request = json.loads(data)
         self._answer = json.dumps(self._wait(self._handle(request))).encode("ascii") + b"\n"
 
-    def _receive(self, max_bytes: int, timeout: float) -> bytes:  # noqa: ARG002 - the answer came with the request
+    def _receive(self, max_bytes: int, timeout: float) -> bytes:  # noqa: ARG002 - the answer was received with the request
         if not self._answer:
-            raise InstrumentTimeoutError(f"{self.url}: no request, no answer")
+            raise InstrumentTimeoutError(f"{self.url}: no answer, since no request was sent")
         data, self._answer = self._answer[:max_bytes], self._answer[max_bytes:]
         return data
 
@@ -162,7 +161,7 @@ class OpcUaTransport(Transport):
     # ------------------------------------------------------------------ in the thread of the session
 
     def _wait(self, work: Coroutine[Any, Any, Result]) -> Result:
-        """Run a coroutine in the thread of the session; its errors are those of an instrument."""
+        """Run a coroutine in the thread of the session; convert its errors to InstrumentError."""
         from asyncua.ua.uaerrors import UaError, UaStatusCodeError
 
         try:
@@ -178,7 +177,7 @@ class OpcUaTransport(Transport):
             self._drop()
             reason = str(error) or type(error).__name__
             raise InstrumentError(f"The connection to {self.url} is lost: {reason}") from None
-        except Exception as error:  # noqa: BLE001 - whatever the package raises for damaged bytes
+        except Exception as error:  # noqa: BLE001 - the package raises various errors for damaged bytes
             self._drop()
             raise ProtocolError(f"{self.url}: not an answer of an OPC UA server: {error!r}") from None
 
@@ -232,7 +231,7 @@ class OpcUaTransport(Transport):
 
 
 async def _ended() -> None:
-    """Cancel what still runs in the thread, such as a connection that was not completed."""
+    """Cancel the tasks that still run in the thread, such as an incomplete connection."""
     running = asyncio.all_tasks() - {asyncio.current_task()}
     for task in running:
         task.cancel()
@@ -250,7 +249,7 @@ async def _browse(client: Client, node: str) -> list[dict[str, Any]]:
 
 
 async def _read(client: Client, nodes: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the values of nodes; of a node that cannot be read its status only."""
+    """Return the values of nodes; for a node that cannot be read only its status."""
     values = await client.read_attributes([_node(client, node) for node in nodes])
     return [_plain(each) for each in values]
 
@@ -273,7 +272,7 @@ async def _describe(client: Client, nodes: Sequence[str]) -> list[dict[str, Any]
 
 
 async def _write(client: Client, values: Sequence[tuple[str, str, Any]]) -> list[str]:
-    """Write values by one request; return the status of each. Neither status nor times are sent with them."""
+    """Write values by one request, without status and time; return the status of each."""
     from asyncua import ua
 
     nodes = [_node(client, node).nodeid for node, _, _ in values]
@@ -297,16 +296,16 @@ def _plain(value: ua.DataValue) -> dict[str, Any]:
     status = value.StatusCode
     good = status is None or status.is_good()
     time = value.SourceTimestamp or value.ServerTimestamp
-    held = value.Value.Value if good and value.Value is not None else None
+    content = value.Value.Value if good and value.Value is not None else None
     return {
-        "value": plain(held),
+        "value": plain(content),
         "status": "Good" if good or status is None else text(status.name),
         "time": time.isoformat() if isinstance(time, datetime) else None,
     }
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON has it: numbers, texts, lists of them, engineering units; None for anything else."""
+    """Return a value for JSON: numbers, texts, lists of them, engineering units; None for anything else."""
     from asyncua import ua
 
     if isinstance(value, bool | int | float) or value is None:
@@ -337,7 +336,7 @@ def open_session(
     Raises
     ------
     InstrumentError, ReplayError
-        As of `OpcUaTransport`; a recording that exists already, or that cannot be played.
+        See `OpcUaTransport`; or the recording already exists or cannot be replayed.
     """
     address = parse_address(url)
     if address.scheme == "replay":
@@ -358,7 +357,7 @@ def request(line: Transport, content: Mapping[str, Any]) -> Any:
     Raises
     ------
     InstrumentError
-        As of `OpcUaTransport`.
+        See `OpcUaTransport`.
     ProtocolError
         The answer is not JSON.
     """

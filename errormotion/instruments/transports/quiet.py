@@ -1,4 +1,4 @@
-"""A line without unread bytes: what is done ahead of a request, so that the next bytes are its answer."""
+"""Discarding of unread bytes before a request, so that the next bytes are its answer."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.transports.base import CHUNK, Transport
 
 MOST_STRAY_BYTES = 1 << 20
-"""More unread bytes than this are no late answer: the device sends without a request."""
+"""Largest number of unread bytes that can be late answers; with more, the device sends without a request."""
 MOST_INTERVALS = 10
-"""A line that is not quiet after this many times the interval is given up."""
+"""Time after which a line that is not quiet is an error, as a multiple of the interval."""
 
 
 def discard_input(line: Transport) -> bytes:
-    """Discard and return the unread bytes of a line, such as late answers; detect a connection that was lost."""
+    """Discard and return the unread bytes of a line, such as late answers; detect a lost connection."""
     old = b""
     with suppress(InstrumentError):  # a timeout is expected; the next write opens a lost connection again
         while len(old) < MOST_STRAY_BYTES and (data := line.read(CHUNK, timeout=0.0)):
@@ -24,7 +24,7 @@ def discard_input(line: Transport) -> bytes:
 
 
 def await_quiet(line: Transport, interval: float, since: float | None = None) -> int:
-    """Discard what arrives until nothing has arrived for an interval; return the number of discarded bytes.
+    """Discard input until none has arrived for an interval; return the number of discarded bytes.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def await_quiet(line: Transport, interval: float, since: float | None = None) ->
     interval : float
         Time without data, s.
     since : float, optional
-        Start of the interval, of time.monotonic(); default: now. Unread bytes start the interval again.
+        Start of the interval by time.monotonic(); default: now. Unread bytes restart the interval.
 
     Raises
     ------

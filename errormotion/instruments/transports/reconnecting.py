@@ -16,7 +16,7 @@ from errormotion.instruments.transports.recording import Recorder, ReplayTranspo
 class ReconnectingTransport(Transport):
     """A transport whose connection is opened again after it was lost; see `transports.lost`.
 
-    A connection that was closed while it was not in use is detected by `quiet.discard_input`, ahead of a request.
+    `quiet.discard_input` before a request detects a connection that was closed while it was not in use.
 
     Parameters
     ----------
@@ -24,15 +24,15 @@ class ReconnectingTransport(Transport):
     connect : callable
         Opens a connection, or raises InstrumentError.
     timeout : float
-        Time limit of a read without data, s.
+        Time limit for a read without data, s.
     retry : float
-        Least time between two attempts to connect, s.
+        Minimum interval between two attempts to connect, s.
     simulated : bool
     end : callable, optional
-        Called when this is closed.
+        Called when the transport is closed.
     recorder : Recorder, optional
-        Records the frames of all connections, and those that were not sent without a connection: in a replay the same
-        exchanges fail.
+        Records the frames of all connections, and those that could not be sent without a connection, so that the same
+        exchanges fail in a replay.
     """
 
     reconnects = True
@@ -73,13 +73,13 @@ class ReconnectingTransport(Transport):
 
     def _opened(self) -> Transport:
         line = self._connect()
-        line.url = self.url  # messages state the address of the bench file
+        line.url = self.url  # messages state the address in the bench file
         self.flow_control = line.flow_control
         return line
 
     def _send(self, data: bytes) -> None:
         if self._recorder is not None:
-            self._recorder.frame("W", data)  # before it goes out: the answer must not overtake it
+            self._recorder.frame("W", data)  # before sending, so that the answer is recorded after it
         line = self._line.get()
         try:
             line.write(data)
@@ -138,11 +138,11 @@ def open_reconnecting(
     url : str or Address
         ``serial://``, ``tcp://``, ``sim://`` or ``replay://``.
     simulator, timeout, baudrate
-        As in `open_transport`.
+        See `open_transport`.
     record : Path, optional
         File to which the frames of all connections are recorded.
     retry : float
-        Least time between two attempts to connect, s.
+        Minimum interval between two attempts to connect, s.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Recording of a session and strict playback.
+"""Recording of a session and strict replay.
 
 A recording is a text file: a header line with the address, then one line per frame::
 
@@ -11,11 +11,11 @@ A recording is a text file: a header line with the address, then one line per fr
 bytes in hexadecimal. The checksum is the CRC-32 of direction and bytes, chained over all frames: changed bytes and
 missing or moved frames are detected.
 
-After the header there may be a line ``NOTE`` with a JSON object, which states the instrument and what was done with it;
-the format is then ``errormotion-session/2``.
+After the header there may be a line ``NOTE`` with a JSON object, which states the instrument and the session; the
+format is then ``errormotion-session/2``.
 
-In playback each write must be the next recorded one, byte for byte; a frame that followed a write is returned only
-after that write; and at the end no frame may remain. Everything else is a `ReplayError`.
+In a replay each write must equal the next recorded one, byte for byte; a frame that followed a write is returned only
+after that write; and at the end no frame may remain. Otherwise a `ReplayError` is raised.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ WITH_NOTE = {FORMAT: "errormotion-session/2", INDEX_FORMAT: "errormotion-session
 NOTE = "NOTE "
 MOST_NOTE_BYTES = 1 << 20
 MOST_PARTS = 64
-"""Recordings in a list."""
+"""Largest number of recordings in a list."""
 MOST_INDEX = MOST_NOTE_BYTES + (1 << 16)
-"""Bytes of a list of recordings."""
+"""Largest size of a list of recordings, bytes."""
 
 
 class EndOfRecordingError(ReplayError):
@@ -51,7 +51,7 @@ class EndOfRecordingError(ReplayError):
 
 
 class Recorder:
-    """Writes the frames of one session to a new file; InstrumentError where the file exists or cannot be created."""
+    """Writes the frames of one session to a new file; InstrumentError if the file exists or cannot be created."""
 
     def __init__(self, path: Path | str, address: str) -> None:
         self._start = time.monotonic()
@@ -63,7 +63,7 @@ class Recorder:
                 "x", buffering=1, encoding="ascii", errors="backslashreplace"
             )
         except FileExistsError:
-            raise InstrumentError(f"The recording {path} exists already; choose another file or remove it") from None
+            raise InstrumentError(f"The recording {path} already exists; choose another file or remove it") from None
         except OSError as error:
             raise InstrumentError(f"The recording {path} cannot be created: {error.strerror}") from None
         self._file.write(f"{FORMAT} {datetime.now(UTC).isoformat(timespec='seconds')} {address}\n")
@@ -96,7 +96,7 @@ class RecordingTransport(Transport):
         self.simulated = inner.simulated
 
     def _send(self, data: bytes) -> None:
-        self._recorder.frame("W", data)  # before it goes out: the answer must not overtake it
+        self._recorder.frame("W", data)  # before sending, so that the answer is recorded after it
         self._inner.write(data)
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
@@ -110,7 +110,7 @@ class RecordingTransport(Transport):
         return self._inner.reopen()
 
     def report_delivered(self, samples: int) -> None:
-        """Report the reader's progress."""
+        """Report the number of samples that the caller has received."""
         self._inner.report_delivered(samples)
 
     def close(self) -> None:
@@ -125,7 +125,7 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
     Raises
     ------
     ReplayError
-        No such file, not a recording, a changed byte, a missing end; with the line number.
+        The file does not exist, is not a recording, was changed or has no end; the message states the line.
     """
     try:
         require_regular(path)
@@ -139,7 +139,9 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
         raise ReplayError(f"{path} is not a recording: expected a first line '{FORMAT} TIME ADDRESS'")
     first = 1 + _has_note(lines)
     if len(lines) < 2 or not lines[-1].startswith("END "):
-        raise ReplayError(f"The recording {path} is cut off: its last line should start with 'END'; record it again")
+        raise ReplayError(
+            f"The recording {path} is incomplete: expected a last line that starts with 'END'; record it again"
+        )
     frames: list[tuple[str, bytes]] = []
     crc = 0
     for number, line in enumerate(lines[first:-1], start=first + 1):
@@ -147,10 +149,10 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
             direction, _, check, text = line.split(" ")
             data = bytes.fromhex(text)
             crc = crc32(direction.encode() + data, crc)
-            right = direction in ("W", "R") and check == f"{crc:08x}"
+            valid = direction in ("W", "R") and check == f"{crc:08x}"
         except ValueError:
-            right = False
-        if not right:
+            valid = False
+        if not valid:
             raise ReplayError(f"{path}, line {number}: this frame was changed after the recording (wrong checksum)")
         frames.append((direction, data))
     if lines[-1] != f"END {len(frames)} {crc:08x}":
@@ -159,13 +161,13 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
 
 
 class ReplayTransport(Transport):
-    """Plays a recorded session back; see the module for the conditions.
+    """Replays a recorded session; see the module for the conditions.
 
     Attributes
     ----------
     longest_wait : float
-        Longest time for which a read waits for a write, s. Where bytes were changed on purpose, it is short: an answer
-        that is missing does not come.
+        Longest time for which a read waits for a write, s; short in tests that change bytes, where an answer may be
+        missing.
     """
 
     longest_wait: ClassVar[float] = math.inf
@@ -175,7 +177,7 @@ class ReplayTransport(Transport):
         self.recorded_address, frames = read_recording(path)
         self.simulated = self.recorded_address.startswith("sim://")
         self._writes = deque(data for direction, data in frames if direction == "W")
-        self._reads: deque[tuple[int, bytes]] = deque()  # (writes that come before, bytes)
+        self._reads: deque[tuple[int, bytes]] = deque()  # (number of writes before, bytes)
         before = 0
         for direction, data in frames:
             if direction == "W":
@@ -244,9 +246,9 @@ class ReplayTransport(Transport):
 
 
 def write_index(path: Path, parts: Sequence[str]) -> dict[str, Path]:
-    """Write the recording of an instrument with several transports: a list of their files, which are beside it.
+    """Write the recording of an instrument with several transports: a list of their files in the same folder.
 
-    Returns the path for each part. Raises InstrumentError where the file exists or cannot be created.
+    Return the path for each part. InstrumentError if the file exists or cannot be created.
     """
     files = {part: path.with_name(f"{path.stem}.{part}{path.suffix}") for part in parts}
     try:
@@ -258,7 +260,7 @@ def write_index(path: Path, parts: Sequence[str]) -> dict[str, Path]:
 
 
 def read_index(path: Path) -> dict[str, Path]:
-    """Return the recordings that a list names, by part; ReplayError where it is not such a list."""
+    """Return the recordings in a list, by part; ReplayError if it is not such a list."""
     try:
         if (size := require_regular(path).st_size) > MOST_INDEX:
             raise ReplayError(f"{path}: expected a list of recordings of at most {MOST_INDEX} bytes; found {size}")
@@ -274,7 +276,7 @@ def read_index(path: Path) -> dict[str, Path]:
     try:
         return {part: path.with_name(name) for part, _, name in pairs}
     except ValueError:
-        raise ReplayError(f"{path}: expected names of files beside the list; found a path") from None
+        raise ReplayError(f"{path}: expected names of files in the folder of the list; found a path") from None
 
 
 def _is_name(text: str) -> bool:
@@ -282,7 +284,7 @@ def _is_name(text: str) -> bool:
 
 
 def parts_of(path: Path, levels: int = 2) -> list[Path]:
-    """Return the files of a recording that have frames: itself, or those that it names, and those that these name."""
+    """Return the files of a recording that have frames: the file, or those that it lists, directly or indirectly."""
     try:
         require_regular(path)
         with path.open(encoding="utf-8", errors="replace") as file:
@@ -295,19 +297,21 @@ def parts_of(path: Path, levels: int = 2) -> list[Path]:
 
 
 def add_note(path: Path, note: Mapping[str, Any]) -> None:
-    """Write a note into a recording, or a list of recordings; it replaces an earlier one."""
+    """Write a note to a recording, or a list of recordings; it replaces an earlier one."""
     lines = path.read_text(encoding="utf-8").splitlines()
     word, _, rest = lines[0].partition(" ")
     word = WITH_NOTE.get(word, word)
     text = NOTE + json.dumps(note, allow_nan=False)
     if len(text) > MOST_NOTE_BYTES:
-        raise InstrumentError(f"The note of the recording {path} has {len(text)} bytes; at most {MOST_NOTE_BYTES}")
+        raise InstrumentError(
+            f"The note of the recording {path} has {len(text)} bytes; expected at most {MOST_NOTE_BYTES}"
+        )
     head = f"{word} {rest}".rstrip()
     path.write_text("\n".join([head, text, *lines[1 + _has_note(lines) :]]) + "\n", encoding="utf-8")
 
 
 def read_note(path: Path) -> dict[str, Any] | None:
-    """Return the note of a recording; None without one. ReplayError where it cannot be read."""
+    """Return the note of a recording; None without one. ReplayError if it cannot be read."""
     try:
         require_regular(path)
         with path.open(encoding="utf-8") as file:
@@ -319,7 +323,7 @@ def read_note(path: Path) -> dict[str, Any] | None:
     except (OSError, ValueError, RecursionError) as error:
         raise ReplayError(f"The note of the recording {path} cannot be read: {error}") from None
     if note is not None and not isinstance(note, dict):
-        raise ReplayError(f"The note of the recording {path} is no JSON object")
+        raise ReplayError(f"The note of the recording {path} is not a JSON object")
     return note
 
 
@@ -328,7 +332,7 @@ def _has_note(lines: Sequence[str]) -> bool:
 
 
 def rewrite(path: Path, frames: Sequence[tuple[str, bytes]]) -> None:
-    """Replace the frames of a recording by others of the same number; address, times and note stay."""
+    """Replace the frames of a recording by as many others; address, times and note are unchanged."""
     lines = path.read_text(encoding="ascii").splitlines()
     first = 1 + _has_note(lines)
     crc, changed = 0, lines[:first]

@@ -1,4 +1,4 @@
-"""A serial line, 8N1 where the address states nothing else."""
+"""A serial line, by default 8N1."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DEFAULT_BAUDRATE = 9600
 
 
 class SerialTransport(Transport):
-    """A serial line: 8 data bits, no parity, one stop bit; or as ``parity=E``, ``parity=O``, ``stopbits=2`` state."""
+    """A serial line: 8 data bits, no parity, one stop bit, unless ``parity=E``, ``parity=O`` or ``stopbits=2``."""
 
     flow_control = False
 
@@ -49,7 +49,7 @@ class SerialTransport(Transport):
             data: bytes = port.read(1)
             if data and max_bytes > 1 and (waiting := port.in_waiting):
                 data += port.read(min(waiting, max_bytes - 1))
-        except (OSError, TypeError) as error:  # TypeError: pyserial's, when the port is closed meanwhile
+        except (OSError, TypeError) as error:  # TypeError: from pyserial if the port is closed during the read
             raise InstrumentError(f"The serial line {self.url} is lost: {error}") from None
         if not data:
             raise InstrumentTimeoutError(f"{self.url} sent no data for {timeout:g} s")

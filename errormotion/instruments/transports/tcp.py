@@ -1,4 +1,4 @@
-"""A TCP connection, or one to a Unix socket."""
+"""Connections to TCP and Unix sockets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from errormotion.instruments.transports.base import Transport
 class TcpTransport(Transport):
     """A TCP connection to a device or a serial server.
 
-    ``receive_buffer`` (bytes) limits the data that the system holds for a slow reader; default: the system's limit.
+    ``receive_buffer`` (bytes) limits the data that the system buffers for a slow reader; default: the limit of the
+    system.
     """
 
     _family = socket.AF_INET

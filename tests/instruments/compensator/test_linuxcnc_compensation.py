@@ -70,7 +70,7 @@ def compensator(machine: Machine) -> Iterator[LinuxCNCOffset]:
 
 
 def follow(compensator: LinuxCNCOffset, x: float, seconds: float = 5.0) -> float:
-    """Have the offset of X follow in small steps until it is x, or the time is over; return it, um."""
+    """Move the offset of X in small steps until it is x or the time limit is reached; return it, um."""
     end, step = time.monotonic() + seconds, 0.4 * SLEW * WATCHDOG
     while True:
         now = compensator.read().offset[0] * 1e6
@@ -80,7 +80,7 @@ def follow(compensator: LinuxCNCOffset, x: float, seconds: float = 5.0) -> float
         time.sleep(0.05)
 
 
-def test_it_goes_to_the_limit_at_the_slew_limit_and_no_further(machine: Machine, compensator: LinuxCNCOffset) -> None:
+def test_it_moves_to_the_limit_at_the_slew_limit_and_no_further(machine: Machine, compensator: LinuxCNCOffset) -> None:
     assert follow(compensator, LIMIT) == pytest.approx(LIMIT, abs=0.1)
     with pytest.raises(InstrumentError, match="beyond the limit of 20 um"):
         compensator.write([20.1e-6, 0.0, 0.0])
@@ -100,7 +100,7 @@ def test_positions_are_those_without_the_offset(machine: Machine, compensator: L
 
 
 @one_route
-def test_the_servo_thread_bounds_what_did_not_pass_the_bridge(machine: Machine) -> None:
+def test_the_servo_thread_limits_offsets_that_did_not_pass_the_bridge(machine: Machine) -> None:
     machine.hal("setp errormotion-source-x.in1 -1000")
     end, sign = time.monotonic() + 1.5 * LIMIT / SLEW, 0
     while time.monotonic() < end:
@@ -115,17 +115,17 @@ def test_the_servo_thread_bounds_what_did_not_pass_the_bridge(machine: Machine) 
 
 @one_route
 def test_a_jump_is_refused(compensator: LinuxCNCOffset) -> None:
-    with pytest.raises(InstrumentError, match="is a jump of 15 um; the slew limit allows 11 um"):
+    with pytest.raises(InstrumentError, match="is a change of 15 um; the slew limit permits 11 um"):
         compensator.write([15e-6, 0.0, 0.0])
 
 
 @one_route
-def test_unarmed_and_without_a_write_nothing_is_asked_for(machine: Machine) -> None:
+def test_without_arming_or_a_write_nothing_is_requested(machine: Machine) -> None:
     until(lambda: machine.pins("errormotion-alive.out") == [0.0])
     with machine.compensator() as unarmed, machine.compensator() as other:
         with pytest.raises(InstrumentError, match="is not armed; it reads only"):
             unarmed.write([1e-6, 0.0, 0.0])
-        other.arm(LIMIT * 1e-6)  # the right is free
+        other.arm(LIMIT * 1e-6)  # the right is released
         for _ in range(5):
             assert other.read().offset == pytest.approx((0.0, 0.0, 0.0), abs=1e-10)
     assert machine.pins("errormotion-alive.time-left", "errormotion-alive.out") == [0.0, 0.0]
@@ -174,7 +174,7 @@ def test_a_compensator_of_the_other_route_is_refused(machine: Machine) -> None:
         driver.read()
 
 
-def test_a_killed_program_is_followed_by_zero_and_another_one_goes_on_from_there(machine: Machine) -> None:
+def test_a_killed_program_is_followed_by_zero_and_another_one_continues(machine: Machine) -> None:
     kind = type(machine.compensator()).__name__
     program = subprocess.Popen([sys.executable, "-c", FOLLOWER, kind, machine.address, str(machine.token)])
     try:
@@ -237,7 +237,7 @@ def test_after_an_emergency_stop_nothing_moves_and_the_offset_is_zero(
     machine.control.enable()
     time.sleep(0.2)
     assert machine.pins("J0_mux.out")[0] == pytest.approx(15e-3, abs=1e-4)  # mm: the motor
-    assert machine.control.state()["position"][0] == pytest.approx(15e-6, abs=1e-7)  # and LinuxCNC knows it
+    assert machine.control.state()["position"][0] == pytest.approx(15e-6, abs=1e-7)  # as reported by LinuxCNC
     assert machine.record().drive_moved < 1e-4
 
 
@@ -275,7 +275,7 @@ def test_nothing_changes_while_the_machine_must_not_be_disturbed(
     while compensator.read().busy != busy:
         assert time.monotonic() < end, (compensator.read(), machine.control.state())
         compensator.write([4e-6, 0.0, 0.0])
-    time.sleep(0.05)  # LinuxCNC's planner comes to rest
+    time.sleep(0.05)  # LinuxCNC's planner stops
     machine.watch()
     for _ in range(8):
         compensator.write([12e-6, 0.0, 0.0])
@@ -290,10 +290,10 @@ def test_nothing_changes_while_the_machine_must_not_be_disturbed(
 
 
 @one_route
-def test_an_end_of_travel_does_not_add_up(machine: Machine, compensator: LinuxCNCOffset) -> None:
+def test_overtravel_does_not_accumulate(machine: Machine, compensator: LinuxCNCOffset) -> None:
     machine.control.move_to([TRAVEL, 0.0, 0.0])
     machine.watch()
-    for _ in range(10):  # LinuxCNC's planner gets no further
+    for _ in range(10):  # LinuxCNC's planner cannot move further
         compensator.write([10e-6, 0.0, 0.0])
         time.sleep(0.05)
     assert compensator.read().busy == "LinuxCNC limits the offset at an end of travel"
@@ -301,7 +301,7 @@ def test_an_end_of_travel_does_not_add_up(machine: Machine, compensator: LinuxCN
     follow(compensator, 10.0)
     assert machine.offset() == pytest.approx(10.0, abs=0.1)
     machine.control.move_to([TRAVEL, 0.0, 0.0])
-    until(lambda: machine.offset() == 0)  # by the watchdog, there as well
+    until(lambda: machine.offset() == 0)  # by the watchdog, here as well
     machine.control.move_to([TRAVEL - 0.01, 0.0, 0.0])
     machine.watch()
     follow(compensator, 10.0)

@@ -1,4 +1,4 @@
-"""The machine's part bounds offset and change at every instant, and ramps to zero without a sign of life."""
+"""The machine's part bounds offset and change at every instant, and ramps to zero without a heartbeat."""
 
 import math
 
@@ -16,7 +16,7 @@ def part() -> MachinePart:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_whatever_it_is_told_it_stays_within_its_limits(seed: int) -> None:
+def test_for_any_commands_it_stays_within_its_limits(seed: int) -> None:
     rng = np.random.default_rng(seed)
     machine = part()
     before = np.array(machine.offset)
@@ -36,7 +36,7 @@ def test_whatever_it_is_told_it_stays_within_its_limits(seed: int) -> None:
         before = now
 
 
-def test_it_follows_while_it_is_told_and_returns_when_it_is_not() -> None:
+def test_it_follows_commands_and_returns_without_them() -> None:
     machine = part()
     machine.order((4e-6, 0.0, -1e-6))
     course = []
@@ -56,7 +56,7 @@ def test_one_long_interval_is_the_sum_of_short_ones() -> None:
     assert short.offset == pytest.approx(long.offset, abs=1e-15)
 
 
-def test_after_a_stop_a_new_sign_of_life_is_needed() -> None:
+def test_after_a_stop_a_new_heartbeat_is_needed() -> None:
     machine = part()
     machine.order((4e-6, 0.0, 0.0))
     machine.elapse(2.0)

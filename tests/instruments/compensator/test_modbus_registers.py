@@ -1,4 +1,4 @@
-"""Offsets in registers: published frames, a server and a client of others, a killed program."""
+"""Offsets in registers: published frames, a foreign server and client, a killed program."""
 
 import asyncio
 import signal
@@ -67,7 +67,7 @@ def test_no_other_number_of_registers_is_written(function: int, count: int) -> N
         codec.encode_write("tcp", 1, function, 0, [0] * count)
 
 
-# ---------------------------------------------------------------------- a server of others
+# ---------------------------------------------------------------------- a foreign server
 
 
 @contextmanager
@@ -104,7 +104,7 @@ def served() -> Iterator[int]:
     ],
     ids=["i32", "little", "i16", "one by one", "apart"],
 )
-def test_a_server_of_others_gets_the_offset(settings: dict, words: list[int]) -> None:
+def test_a_foreign_server_receives_the_offset(settings: dict, words: list[int]) -> None:
     with served() as port:
         settings = {"unit": UNIT, "timeout": 5.0, **settings}
         compensator = ModbusRegisters(f"modbus+tcp://127.0.0.1:{port}", RegisterSettings(**settings))
@@ -143,7 +143,7 @@ def test_registers_that_do_not_exist_are_named_when_it_is_opened() -> None:
             compensator.open()
 
 
-def test_the_heartbeat_goes_on_from_that_of_the_plc_and_wraps() -> None:
+def test_the_heartbeat_continues_from_that_of_the_plc_and_wraps() -> None:
     with served() as port, ModbusTcpClient("127.0.0.1", port=port, timeout=5.0) as client:
         client.write_register(6, 65534, device_id=UNIT)
         beats = []
@@ -172,7 +172,7 @@ def connected(query: str) -> Iterator[tuple[SimulatedPlc, ModbusRegisters]]:
             yield device, compensator
 
 
-def test_a_client_of_others_writes_to_the_simulated_plc() -> None:
+def test_a_foreign_client_writes_to_the_simulated_plc() -> None:
     with plc("clock=0&slew=1e-6&watchdog=2") as device:
         place = parse_address(device.url)
         with ModbusTcpClient("127.0.0.1", port=place.port, timeout=5.0) as client:
@@ -187,7 +187,7 @@ def test_a_client_of_others_writes_to_the_simulated_plc() -> None:
 
 
 def test_the_heartbeat_is_written_with_the_last_register() -> None:
-    """An offset of which a part was written is no sign of life."""
+    """A partly written offset is not a heartbeat."""
     written: list[tuple[int, int]] = []
     with connected("clock=0") as (_, compensator):
         compensator.line.write_registers = (  # type: ignore[method-assign]
@@ -202,7 +202,7 @@ def test_the_heartbeat_is_written_with_the_last_register() -> None:
 
 def test_a_limit_that_the_registers_cannot_hold_is_refused() -> None:
     with connected("clock=0&type=i16&scale=1e-9") as (_, compensator):
-        with pytest.raises(InstrumentError, match=r"hold offsets from 0.001 um to 32.767 um; the limit is 50 um"):
+        with pytest.raises(InstrumentError, match=r"represent offsets from 0.001 um to 32.767 um; the limit is 50 um"):
             compensator.arm(50e-6)
         with pytest.raises(InstrumentError, match="is not armed"):
             compensator.write((0.0, 0.0, 0.0))
@@ -223,7 +223,7 @@ def test_after_a_lost_connection_it_connects_again() -> None:
         compensator.arm(LIMIT)
         compensator.write((1e-6, 0.0, 0.0))
         device._server.disconnect()
-        for _ in range(20):  # the loss is noticed now or at the next request
+        for _ in range(20):  # the loss is detected now or at the next request
             try:
                 compensator.open()
                 compensator.write((1e-6, 0.0, 0.0))
@@ -248,7 +248,7 @@ def test_after_a_lost_connection_it_connects_again() -> None:
         ({"scale": 0.0}, "greater than 0"),
     ],
 )
-def test_registers_that_cannot_be_are_refused(settings: dict, message: str) -> None:
+def test_invalid_registers_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         RegisterSettings(**settings)
 

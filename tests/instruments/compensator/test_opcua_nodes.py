@@ -1,4 +1,4 @@
-"""Offsets in nodes: the server of the package asyncua with all its standard nodes takes them, or says why not."""
+"""Offsets in nodes: the server of the package asyncua with all its standard nodes accepts them, or states a reason."""
 
 import asyncio
 import math
@@ -27,7 +27,7 @@ GIVEN: dict[str, Any] = {"offset": (X, Y, Z), "heartbeat": BEAT, "timeout": 5.0}
 
 
 class Control:
-    """A server in a thread of its own."""
+    """A server in its own thread."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
@@ -104,7 +104,7 @@ def made(control: Control, **more: Any) -> OpcUaNodes:
     return OpcUaNodes(control.url, OpcUaNodesSettings(**{**GIVEN, **more}))
 
 
-def test_the_server_gets_the_offset_in_its_unit(control: Control) -> None:
+def test_the_server_receives_the_offset_in_its_unit(control: Control) -> None:
     with made(control) as compensator:
         compensator.arm(LIMIT)
         compensator.write(OFFSET)
@@ -117,7 +117,7 @@ def test_the_server_gets_the_offset_in_its_unit(control: Control) -> None:
         assert control.value(BEAT).Value.Value == 9
 
 
-def test_the_heartbeat_goes_on_after_a_restart(control: Control) -> None:
+def test_the_heartbeat_continues_after_a_restart(control: Control) -> None:
     for expected in (8, 9):
         with made(control) as compensator:
             compensator.arm(LIMIT)
@@ -151,7 +151,7 @@ def test_the_heartbeat_fits_its_type(control: Control, kind: ua.VariantType, fir
     assert found == beats
 
 
-def test_whole_numbers_are_rounded_within_the_limit(control: Control) -> None:
+def test_integers_are_rounded_within_the_limit(control: Control) -> None:
     async def add() -> None:
         for axis in "XYZ":
             node = ua.NodeId.from_string(f"ns=2;s=Whole.{axis}")
@@ -166,7 +166,9 @@ def test_whole_numbers_are_rounded_within_the_limit(control: Control) -> None:
         assert [control.value(node).Value.Value for node in nodes] == [28, -28, 1]
     with (
         made(control, offset=nodes, scale=1e-9) as compensator,
-        pytest.raises(InstrumentError, match=r"\(Int16\) holds offsets from 0.001 um to 32.767 um; the limit is 50 um"),
+        pytest.raises(
+            InstrumentError, match=r"\(Int16\) represents offsets from 0.001 um to 32.767 um; the limit is 50 um"
+        ),
     ):
         compensator.arm(LIMIT)
 
@@ -192,7 +194,7 @@ def test_nodes_that_cannot_be_used_are_named_when_it_is_opened(
     assert control.value(BEAT).Value.Value == 7
 
 
-def test_what_is_not_known_is_not_zero(control: Control) -> None:
+def test_unknown_values_are_not_zero(control: Control) -> None:
     with made(control, stop=STOP) as compensator:
         assert compensator.read().fault == ""
         control.set(STOP, 2, ua.VariantType.Byte)
@@ -200,16 +202,16 @@ def test_what_is_not_known_is_not_zero(control: Control) -> None:
         control.spoil(STOP)
         control.spoil(Y)
         found = compensator.read()
-        assert found.fault == "stop is not known: ns=2;s=Stop has the status BadNoCommunication"
+        assert found.fault == "stop is unknown: ns=2;s=Stop has the status BadNoCommunication"
         assert (found.offset[0], found.offset[2]) == (0.0, 0.0)
         assert math.isnan(found.offset[1])
 
 
-def test_a_node_that_is_not_taken_is_named(control: Control) -> None:
+def test_an_unusable_node_is_named(control: Control) -> None:
     with made(control) as compensator:
         compensator.arm(LIMIT)
-        compensator._types[0] = "Float"  # the server wants a Double
-        with pytest.raises(InstrumentError, match=r"did not take the offset: ns=2;s=Offset.X: BadTypeMismatch$"):
+        compensator._types[0] = "Float"  # the server requires a Double
+        with pytest.raises(InstrumentError, match=r"did not accept the offset: ns=2;s=Offset.X: BadTypeMismatch$"):
             compensator.write(OFFSET)
 
 
@@ -240,9 +242,7 @@ ANSWERS: list[Any] = [None, 3, {}, [], ["Good"], [None] * 4, [{}] * 4, [{"value"
 
 
 @pytest.mark.parametrize("answer", ANSWERS, ids=range(len(ANSWERS)))
-def test_whatever_is_answered_only_typed_errors_come_out(
-    control: Control, answer: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_any_answer_only_raises_typed_errors(control: Control, answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     with made(control, stop=STOP) as compensator:
         compensator.arm(LIMIT)
         monkeypatch.setattr(opcua_nodes, "request", lambda line, content: answer)
@@ -264,12 +264,12 @@ def test_whatever_is_answered_only_typed_errors_come_out(
     [
         ({"offset": (X, X, Z)}, "Offset.X' is named twice"),
         ({"stop": BEAT}, "Beat' is named twice"),
-        ({"heartbeat": ""}, "found an empty text"),
+        ({"heartbeat": ""}, "found an empty string"),
         ({"scale": 0.0}, "greater than 0"),
         ({"offset": (X, Y)}, "Field required"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(settings: dict[str, Any], message: str) -> None:
+def test_invalid_settings_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         OpcUaNodesSettings(**{**GIVEN, **settings})
 

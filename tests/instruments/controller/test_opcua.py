@@ -20,7 +20,7 @@ MM, RPM, PERCENT, MM_MIN = ("MMT", "mm"), ("RPM", "r/min"), ("P1", "%"), ("H81",
 
 
 class Cnc:
-    """A server on a free port, in a thread of its own; ``build`` adds its nodes."""
+    """A server on a free port, in its own thread; ``build`` adds its nodes."""
 
     def __init__(self, build):
         with socket.socket() as free:
@@ -129,7 +129,7 @@ async def plain_nodes(cnc):
 
 @pytest.fixture(scope="module", autouse=True)
 def shared():
-    """Servers that several tests read; one that is stopped or changed for good is a server of its own."""
+    """Servers shared by tests that only read; tests that stop or change a server use their own."""
     made = {build: Cnc(build) for build in (cnc_model, two_spindles, plain_nodes)}
     yield made.__getitem__
     for cnc in made.values():
@@ -178,12 +178,12 @@ def test_a_value_with_a_bad_status_is_unknown_and_named(own):
     assert state["unavailable"] == ["position", "spindle_speed", "estop"]
 
 
-def test_with_the_simulated_control_all_quantities_of_the_model_are_known():
+def test_the_simulated_control_has_all_quantities_of_the_model():
     with OpcUa("sim://cframe/opcua?seed=3") as cnc:
         state = cnc.state()
     assert state["homed"] is True  # IsReferenced of every axis, OPC 40502, Table 14
     assert state["program"] == ""
-    assert state["unavailable"] == ["estop"]  # that no program is selected is known
+    assert state["unavailable"] == ["estop"]  # it is known that no program is selected
 
 
 def test_a_program_that_waits_is_running(shared):
@@ -232,7 +232,7 @@ def test_the_encoder_of_the_motor_is_read_where_the_settings_say_so(shared):
 
 def test_several_spindles_need_a_name(shared):
     url = shared(two_spindles).url
-    with pytest.raises(InstrumentError, match="several: spindle S1, S2; name one"):
+    with pytest.raises(InstrumentError, match="several: spindle S1, S2; state one"):
         OpcUa(url).open()
     with OpcUa(url, OpcUaSettings(spindle="S2")) as cnc:
         assert cnc.state()["spindle_speed"] == pytest.approx(12000)
@@ -241,7 +241,7 @@ def test_several_spindles_need_a_name(shared):
 
 
 def test_a_server_without_the_model_needs_nodes(shared):
-    with pytest.raises(InstrumentError, match=r"no object CncInterface .* name its nodes"):
+    with pytest.raises(InstrumentError, match=r"no object CncInterface .* state nodes"):
         OpcUa(shared(plain_nodes).url).open()
 
 
@@ -296,7 +296,7 @@ def test_a_server_that_was_restarted_is_read_again(own):
         assert cnc.state()["position"] == before
 
 
-def test_a_port_without_a_server_is_an_error_and_leaves_nothing():
+def test_a_port_without_a_server_is_an_error_and_leaves_nothing_open():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -307,7 +307,7 @@ def test_a_port_without_a_server_is_an_error_and_leaves_nothing():
 
 
 @pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", b"ACKF\x08\x00\x00\x00", b"\xff" * 4096])
-def test_something_else_at_the_port_is_an_error_within_the_timeout(answer):
+def test_another_service_at_the_port_is_an_error_within_the_timeout(answer):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         held = []
 
@@ -350,6 +350,6 @@ def test_settings_are_checked(settings, message):
         OpcUaSettings(**settings)
 
 
-def test_a_password_comes_from_a_file(tmp_path):
+def test_a_password_is_read_from_a_file(tmp_path):
     with pytest.raises(InstrumentError, match=r"password_file .*missing\.txt"):
         OpcUa("opc.tcp://127.0.0.1:1", OpcUaSettings(user="lab", password_file=str(tmp_path / "missing.txt"))).open()

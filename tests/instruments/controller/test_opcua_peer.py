@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(not INSTALLED, reason="needs Node.js and 'npm ci
 
 @pytest.fixture(scope="module", autouse=True)
 def server():
-    """The address of a server in a process of its own."""
+    """The address of a server in a separate process."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

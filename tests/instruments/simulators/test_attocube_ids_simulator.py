@@ -1,4 +1,4 @@
-"""The simulated IDS3010, byte by byte over a socket, against what is published of real ones."""
+"""The simulated IDS3010, byte by byte over a socket, against published exchanges."""
 
 import json
 import socket
@@ -17,7 +17,7 @@ SYSTEM, DISPLACEMENT = "com.attocube.ids.system.", "com.attocube.ids.displacemen
 
 @contextmanager
 def line(query: str) -> Iterator[Any]:
-    """Give a function that sends bytes and returns the reply."""
+    """Yield a function that sends bytes and returns the reply."""
     device = SimulatedIds(parse_address(f"sim://cframe/ids?seed=5&{query}"))
     place = parse_address(device.url)
     try:

@@ -1,4 +1,4 @@
-"""The simulated CANopen thermometer, read at its wire by the package canopen and by frames written by hand."""
+"""The simulated CANopen thermometer, read by the package canopen and with manually written frames."""
 
 import math
 import struct
@@ -15,8 +15,8 @@ from errormotion.instruments.simulators.thermometer.canopen_node import Simulate
 from errormotion.instruments.transports.address import parse_address
 
 NODE = 5
-WAIT = 2.0  # s, for a frame that is to come
-QUIET = 0.2  # s, without a frame that is not to come
+WAIT = 2.0  # s, for an expected frame
+QUIET = 0.2  # s, without an unexpected frame
 NOT_THERE = {"object": 0x06020000, "subindex": 0x06090011}
 
 
@@ -150,7 +150,7 @@ def test_a_prefix_scales_the_value():
         ({"fault": "abort", "code": "0x08000000"}, 0x6150, 2, 0x08000000),
     ],
 )
-def test_what_a_node_does_not_have_is_refused_with_the_code(params, index, subindex, code):
+def test_missing_objects_of_a_node_are_refused_with_the_code(params, index, subindex, code):
     with network(**params) as (_, node, _):
         assert aborted(lambda: node.sdo.upload(index, subindex)) == code
 
@@ -173,7 +173,7 @@ def test_what_a_node_does_not_have_is_refused_with_the_code(params, index, subin
         (0x6132, 9, bytes(1), 0x06090011),
     ],
 )
-def test_what_a_node_does_not_take_is_refused_with_the_code(index, subindex, data, code):
+def test_invalid_values_for_a_node_are_refused_with_the_code(index, subindex, data, code):
     with network() as (_, node, _):
         assert aborted(lambda: node.sdo.download(index, subindex, data)) == code
         assert number(node, 0x1001, 0, "B") == 0  # it still answers
@@ -203,7 +203,7 @@ def test_autozero_needs_its_signature():
 
 
 def test_frames_of_a_segmented_upload():
-    """As Nanotec's N5 manual prints one (p. 113): seven bytes a segment, then the toggle bit, 5 unused and the end."""
+    """As in Nanotec's N5 manual (p. 113): seven bytes per segment, then the toggle bit, 5 unused bits and the end."""
     with raw() as ask:
         assert ask("40 0a 10 00 00 00 00 00") == "41 0a 10 00 06 00 00 00"
         assert ask("60 00 00 00 00 00 00 00") == "03 31 2e 30 32 2e 33 00"
@@ -230,7 +230,7 @@ def test_frames_of_expedited_transfers():
     ("first", "then", "answer"),
     [
         ("40 08 10 00 00 00 00 00", "70 00 00 00 00 00 00 00", "80 08 10 00 00 00 03 05"),  # toggle
-        (None, "60 00 00 00 00 00 00 00", "80 00 00 00 01 00 04 05"),  # no transfer runs
+        (None, "60 00 00 00 00 00 00 00", "80 00 00 00 01 00 04 05"),  # no transfer is running
         (None, "00 01 02 03 04 05 06 07", "80 00 00 00 01 00 04 05"),
         (None, "a0 08 10 00 7f 00 00 00", "80 08 10 00 01 00 04 05"),  # block transfer
         (None, "e0 08 10 00 00 00 00 00", "80 00 00 00 01 00 04 05"),
@@ -358,7 +358,7 @@ def test_an_emergency_announces_a_broken_sensor():
         assert until(seen, lambda i, data: (i, data) == (0x080 + NODE, bytes.fromhex("30 50 21 00 00 00 00 00")))
 
 
-def test_a_node_that_was_without_power_boots():
+def test_a_node_boots_after_a_loss_of_power():
     with network(fault="unplugged", fault_at=1, unplugged_for=0.3, heartbeat=0.05) as (_, node, seen):
         node.sdo.RESPONSE_TIMEOUT, node.sdo.MAX_RETRIES = QUIET / 2, 1
         node.sdo.upload(0x1000, 0)
@@ -371,7 +371,7 @@ def test_a_node_that_was_without_power_boots():
 def test_a_late_answer_precedes_the_next_one() -> None:
     with raw(fault="late") as ask:
         assert ask("40 00 10 00 00 00 00 00", wait=QUIET) is None
-        assert ask("40 01 10 00 00 00 00 00") == "43 00 10 00 94 01 02 00"  # of the request before
+        assert ask("40 01 10 00 00 00 00 00") == "43 00 10 00 94 01 02 00"  # of the previous request
     with raw(fault="late", late_by=0.1) as ask:
         assert ask("40 00 10 00 00 00 00 00") == "43 00 10 00 94 01 02 00"
 
@@ -383,10 +383,10 @@ def test_unknown_variants_are_refused(wrong):
 
 
 @pytest.mark.parametrize("delay", [{}, {"late_by": 0.15}])
-def test_a_late_answer_comes_before_the_next_one_or_after_its_delay(delay):
+def test_a_late_answer_is_sent_before_the_next_one_or_after_its_delay(delay):
     with raw(fault="late", fault_at=0, pdo="none", **delay) as ask:
         assert ask("40 00 10 00 00 00 00 00", wait=0.05) is None
         first = ask("40 18 10 00 00 00 00 00")
         second = ask("40 01 10 00 00 00 00 00")
-    assert first.startswith("43 00 10 00")  # the device type, that was asked for first
+    assert first.startswith("43 00 10 00")  # the device type, which was requested first
     assert second.startswith("4f 18 10 00")

@@ -1,13 +1,11 @@
-"""The simulated capaNCDT 6200 at the wire: what the manuals print, what it refuses, and the blocks that it sends."""
+"""The simulated capaNCDT 6200 on its lines: dialogues of the manuals, refusals, and blocks."""
 
-import socket
 import struct
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from data_port_client import DataPortClient
 from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError
@@ -19,27 +17,16 @@ FULL_SCALE = 0xFFFFFF
 HEADER = struct.Struct("<4sIIQIHHI")
 
 
-class Client:
-    """Two sockets, as a program of the maker's would open them."""
-
+class Client(DataPortClient):
     def __init__(self, device: SimulatedCapaNCDT) -> None:
-        self.device = device
-        self.commands = connect(device.url)
+        super().__init__(device)
         self.greeting = self.line()
-        self.data: socket.socket | None = None
-        self.rest = b""
-
-    def send(self, text: str) -> None:
-        self.commands.sendall(text.encode("latin-1"))
 
     def line(self) -> str:
-        line = b""
-        while not line.endswith(b"\r\n"):
-            line += self.commands.recv(1)
-        return line.decode("latin-1").removesuffix("\r\n")
+        return self.text(b"\r\n")
 
     def ask(self, command: str) -> str:
-        """Send a command without its dollar, and return what follows its echo."""
+        """Send a command without its dollar; return the text after its echo."""
         self.send(f"${command}\r")
         line = self.line()
         assert line.startswith(f"${command}")
@@ -48,49 +35,16 @@ class Client:
     def block(self) -> tuple[int, list[int], np.ndarray]:
         """Return counter, channels and frames of the next block."""
         if self.data is None:
-            self.data = connect(self.device.urls["data"])
+            self.open_data()
         preamble, _, serial, field, status, width, count, counter = HEADER.unpack(self.exactly(HEADER.size))
         assert (preamble, serial, status) == (b"SAEM", self.device.serial, 0)
         channels = [channel + 1 for channel in range(32) if field >> 2 * channel & 3 == 1]
         assert width == 4 * len(channels)
         return counter, channels, np.frombuffer(self.exactly(width * count), "<i4").reshape(count, -1)
 
-    def exactly(self, size: int) -> bytes:
-        assert self.data is not None
-        while len(self.rest) < size:
-            self.rest += self.data.recv(65536)
-        data, self.rest = self.rest[:size], self.rest[size:]
-        return data
 
-    def quiet(self) -> bool:
-        """Read until no values arrive; return whether none came at all."""
-        assert self.data is not None
-        self.data.settimeout(0.3)
-        came, self.rest = bool(self.rest), b""
-        try:
-            while self.data.recv(1 << 20):
-                came = True
-        except TimeoutError:
-            self.data.settimeout(5.0)
-        return not came
-
-
-def connect(url: str) -> socket.socket:
-    host, port = url.removeprefix("tcp://").split(":")
-    return socket.create_connection((host, int(port)), timeout=5.0)
-
-
-@contextmanager
-def simulated(parameters: str = "", name: str = "X1") -> Iterator[Client]:
-    device = SimulatedCapaNCDT(parse_address(f"sim://cframe/{name}?seed=3{parameters}"))
-    client = Client(device)
-    try:
-        yield client
-    finally:
-        client.commands.close()
-        if client.data is not None:
-            client.data.close()
-        device.close()
+def simulated(parameters: str = "", name: str = "X1") -> Client:
+    return Client(SimulatedCapaNCDT(parse_address(f"sim://cframe/{name}?seed=3{parameters}")))
 
 
 # ---------------------------------------------------------------------- commands
@@ -107,7 +61,7 @@ def test_commands_by_the_documents(vector: Vector) -> None:
 def test_a_mathematical_function_is_shown_in_the_status_of_its_channel() -> None:
     with simulated("&beams=X1,,Y1,Z") as client:
         assert client.ask("SMF3:+000000,+1.0,+0.0,+0.0,+0.0") == ",OK"
-        assert client.ask("CHS") == "1,0,2,1OK"  # as 6200 p. 63 prints it
+        assert client.ask("CHS") == "1,0,2,1OK"  # as in 6200 p. 63
         assert client.ask("GMF3") == ":+000000,+1.0,+0.0,+0.0,+0.0OK"
         assert client.ask("CMF3") == "OK"
         assert client.ask("CHS") == "1,0,1,1OK"
@@ -128,7 +82,7 @@ def test_every_character_is_echoed_before_the_command_is_ended() -> None:
         assert client.line() == "DT6220;V1.2a;8010079OK"
 
 
-def test_a_command_that_is_not_ended_times_out_and_is_forgotten() -> None:
+def test_an_incomplete_command_times_out_and_is_discarded() -> None:
     with simulated("&time_limit=0.1") as client:
         client.send("$VE")
         assert client.line() == "$VE$TIMEOUT"
@@ -136,7 +90,7 @@ def test_a_command_that_is_not_ended_times_out_and_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize("command", ["sti?", "ST", "STIx", "STI", "STI0", "STI-5", "LIN", "CHI5", "COI1", "", "AVN1"])
-def test_what_the_grammar_does_not_have_is_refused(command: str) -> None:
+def test_invalid_grammar_is_refused(command: str) -> None:
     with simulated() as client:
         answer = client.ask(command)
         assert answer in ("$UNKNOWN COMMAND", "$WRONG PARAMETER")
@@ -164,14 +118,14 @@ def test_the_data_port_is_the_one_that_listens() -> None:
         assert client.device.urls["data"].endswith(f":{client.device.port}")
 
 
-def test_a_password_is_asked_for_where_one_is_set() -> None:
+def test_a_password_is_requested_if_one_is_set() -> None:
     with simulated("&password=abc") as client:
         assert client.ask("LGI") == "$WRONG PASSWORD"
         assert client.ask("LGIabc") == "OK"
         assert client.ask("LGO") == "OK"
 
 
-def test_settings_of_an_earlier_user_are_left_and_wrong_ones_refused() -> None:
+def test_settings_of_an_earlier_user_are_kept_and_wrong_ones_refused() -> None:
     with simulated("&left=TRG1;AVT3;AVN8;STI9600") as client:
         assert client.ask("STS") == "STI9600;AVT3;AVN8;CHS1,0,0,0;TRG1OK"
     with pytest.raises(InstrumentError, match=r"left=AVN9.*WRONG PARAMETER"):
@@ -179,7 +133,7 @@ def test_settings_of_an_earlier_user_are_left_and_wrong_ones_refused() -> None:
 
 
 @pytest.mark.parametrize("wrong", ["beams=,", "beams=X1,X2,Y1,Y2,Z", "ranges=1,2", "ranges=0", "ranges=x"])
-def test_parameters_that_are_no_controller_are_refused(wrong: str) -> None:
+def test_invalid_parameters_of_a_controller_are_refused(wrong: str) -> None:
     with pytest.raises(InstrumentError, match="invalid parameters of a controller"):
         SimulatedCapaNCDT(parse_address(f"sim://cframe/X1?{wrong}"))
 
@@ -198,7 +152,7 @@ def test_values_are_those_of_the_virtual_machine() -> None:
     np.testing.assert_allclose(frames / FULL_SCALE * 2e-3, truth, rtol=0, atol=2e-3 / FULL_SCALE / 2 * 1.001)
 
 
-def test_an_empty_place_has_no_value() -> None:
+def test_an_empty_field_has_no_value() -> None:
     with simulated("&beams=X1,,Z") as client:
         _, channels, frames = client.block()
     assert channels == [1, 3]
@@ -210,7 +164,7 @@ def test_beyond_the_range_of_a_sensor_the_value_stays_at_its_end() -> None:
         assert (client.block()[2] == FULL_SCALE).all()
 
 
-def test_a_mathematical_function_takes_the_place_of_its_channel_and_may_be_negative() -> None:
+def test_a_mathematical_function_replaces_its_channel_and_may_be_negative() -> None:
     with simulated("&beams=X1,Y1") as client:
         client.ask("SMF2:+000000,+0.0,-1.0,+0.0,+0.0")
         client.ask("SMF4:+1FFFFF,+0.0,+0.0,+0.0,+0.0")
@@ -222,7 +176,7 @@ def test_a_mathematical_function_takes_the_place_of_its_channel_and_may_be_negat
 
 def test_in_the_trigger_modes_one_frame_is_sent_for_each_request() -> None:
     with simulated("&beams=X1,Y1&left=TRG1") as client:
-        client.data = connect(client.device.urls["data"])
+        client.open_data()
         assert client.quiet()
         counters = []
         for _ in range(3):
@@ -276,7 +230,7 @@ def test_missing_frames_show_in_the_counter() -> None:
     assert blocks[1][0] == ends[0] + 1
 
 
-def test_nothing_to_measure_is_the_end_of_the_range() -> None:
+def test_a_missing_target_is_the_end_of_the_range() -> None:
     with simulated("&fault=out_of_range&fault_at=10&fault_for=5") as client:
         values = client.block()[2][:, 0]
     assert np.flatnonzero(values == FULL_SCALE).tolist() == [10, 11, 12, 13, 14]

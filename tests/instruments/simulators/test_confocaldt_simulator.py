@@ -1,6 +1,5 @@
-"""The simulated confocalDT 24x1 at the wire: what the manual prints, what it refuses, and the blocks that it sends."""
+"""The simulated confocalDT 24x1 on its lines: dialogues of the manual, refusals, and blocks."""
 
-import socket
 import struct
 import time
 from collections.abc import Iterator
@@ -8,6 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from data_port_client import DataPortClient
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators import world
@@ -18,81 +18,25 @@ HEADER = struct.Struct("<4sIIIIHHI")
 NO_PEAK = 0x7FFFFFFB
 
 
-class Client:
-    """Two sockets, as a program of the maker's would open them."""
-
-    def __init__(self, device: SimulatedConfocal) -> None:
-        self.device = device
-        self.commands = connect(device.url)
-        self.data: socket.socket | None = None
-        self.rest = b""
-
-    def send(self, text: str) -> None:
-        self.commands.sendall(text.encode("latin-1"))
-
+class Client(DataPortClient):
     def answer(self) -> str:
-        """Return what comes before the next prompt."""
-        data = b""
-        while not data.endswith(b"\r\n->"):
-            data += self.commands.recv(1)
-        return data.decode("latin-1").removesuffix("\r\n->")
+        """Return the text before the next prompt."""
+        return self.text(b"\r\n->")
 
     def ask(self, command: str) -> str:
         self.send(command + "\n")
         return self.answer()
 
-    def open_data(self) -> None:
-        if self.data is not None:
-            self.data.close()
-            self.rest = b""
-        self.data = connect(self.device.urls["data"])
-
     def block(self) -> tuple[int, tuple[int, int], np.ndarray]:
         """Return counter, flags and frames of the next block."""
-        assert self.data is not None
         preamble, article, serial, first, second, width, count, counter = HEADER.unpack(self.exactly(HEADER.size))
         assert (preamble, article, serial) == (b"SAEM", 2418004, self.device.serial)
         return counter, (first, second), np.frombuffer(self.exactly(width * count), "<i4").reshape(count, -1)
 
-    def exactly(self, size: int) -> bytes:
-        assert self.data is not None
-        while len(self.rest) < size:
-            piece = self.data.recv(65536)
-            if not piece:
-                raise ConnectionError("closed")
-            self.rest += piece
-        data, self.rest = self.rest[:size], self.rest[size:]
-        return data
 
-    def quiet(self) -> bool:
-        """Read until no values arrive; return whether none came at all."""
-        assert self.data is not None
-        self.data.settimeout(0.3)
-        came, self.rest = bool(self.rest), b""
-        try:
-            while self.data.recv(1 << 20):
-                came = True
-        except TimeoutError:
-            self.data.settimeout(5.0)
-        return not came
-
-
-def connect(url: str) -> socket.socket:
-    host, port = url.removeprefix("tcp://").split(":")
-    return socket.create_connection((host, int(port)), timeout=5.0)
-
-
-@contextmanager
-def simulated(parameters: str = "", left: str = "ECHO OFF") -> Iterator[Client]:
-    device = SimulatedConfocal(parse_address(f"sim://cframe/X1?seed=3&left={left.replace(' ', '%20')}{parameters}"))
-    client = Client(device)
-    try:
-        yield client
-    finally:
-        client.commands.close()
-        if client.data is not None:
-            client.data.close()
-        device.close()
+def simulated(parameters: str = "", left: str = "ECHO OFF") -> Client:
+    left = left.replace(" ", "%20")
+    return Client(SimulatedConfocal(parse_address(f"sim://cframe/X1?seed=3&left={left}{parameters}")))
 
 
 @contextmanager
@@ -127,7 +71,7 @@ def streaming(parameters: str = "", left: str = "ECHO OFF") -> Iterator[Client]:
         ("", ""),
     ],
 )
-def test_what_the_manual_has_is_answered(command: str, answer: str) -> None:
+def test_commands_of_the_manual_are_answered(command: str, answer: str) -> None:
     with simulated("&range=3") as client:
         assert client.ask(command) == answer
 
@@ -165,7 +109,7 @@ def test_what_the_manual_has_is_answered(command: str, answer: str) -> None:
         (300 * "X", "E11"),
     ],
 )
-def test_what_the_manual_does_not_have_is_refused(command: str, error: str) -> None:
+def test_commands_that_are_not_in_the_manual_are_refused(command: str, error: str) -> None:
     with simulated("&range=3") as client:
         assert client.ask(command).startswith(error + " ")
         assert client.ask("OUTPUT") == "OUTPUT NONE"
@@ -219,7 +163,7 @@ def test_values_are_those_of_the_virtual_machine() -> None:
     np.testing.assert_allclose(frames[:, 0] * 1e-9, truth, rtol=0, atol=0.501e-9)
 
 
-def test_further_values_have_the_places_of_the_manual() -> None:
+def test_further_values_have_the_positions_of_the_manual() -> None:
     chosen = "OUTADD_ETH STATE INTENSITY TIMESTAMP COUNTER ENC1 MEASRATE SHUTTER;OUTSTATISTIC_ETH MAX MIN"
     with streaming(left=f"ECHO OFF;MEASRATE 2.5;{chosen}") as client:
         counter, (first, second), frames = client.block()
@@ -272,7 +216,7 @@ def test_averages_smooth() -> None:
     assert max(spreads[kind] for kind in spreads if kind != "NONE") < spreads["NONE"] / 2
 
 
-def test_reduction_leaves_values_out() -> None:
+def test_reduction_omits_values() -> None:
     with streaming(left="ECHO OFF;OUTADD_ETH COUNTER;OUTREDUCE 10") as client:
         frames = np.concatenate([client.block()[2] for _ in range(3)])
     assert (np.diff(frames[:, 0]) == 10).all()
@@ -297,7 +241,7 @@ def test_missing_frames_show_in_the_counter() -> None:
     assert blocks[1][0] == blocks[0][0] + 101
 
 
-def test_nothing_to_measure_is_no_peak() -> None:
+def test_a_missing_target_is_no_peak() -> None:
     with streaming("&fault=out_of_range&fault_at=10&fault_for=5", "ECHO OFF;OUTADD_ETH STATE") as client:
         frames = client.block()[2]
     assert np.flatnonzero(frames[:, 0] == NO_PEAK).tolist() == [10, 11, 12, 13, 14]

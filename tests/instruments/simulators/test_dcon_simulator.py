@@ -1,4 +1,4 @@
-"""The simulated DCON module: the makers' printed dialogues, its grammar, other units of the bus, faults."""
+"""The simulated DCON module: the makers' documented dialogues, its grammar, other units of the bus, faults."""
 
 import socket
 import time
@@ -12,11 +12,11 @@ from wire_vectors import Vector, vectors
 from errormotion.errors import InstrumentError
 from errormotion.instruments import simulators
 from errormotion.instruments.simulators.thermometer.dcon import LONGEST_LINE, SimulatedDcon
-from errormotion.instruments.simulators.thermometer.dcon_module import SPANS, Module, sum_of_characters, written
+from errormotion.instruments.simulators.thermometer.dcon_module import SPANS, Module, format_reading, sum_of_characters
 from errormotion.instruments.transports import parse_address
 
 DEVICE = "dcon_temperature"
-QUIET = 0.1  # s in which a module that answers would have answered
+QUIET = 0.1  # s, longer than the answer time of a module
 
 
 class Bench:
@@ -31,11 +31,11 @@ class Bench:
         return self.module.answer(line.encode("latin-1"))
 
 
-# ------------------------------------------------------------------ what the makers print
+# ------------------------------------------------------------------ documented dialogues
 
 
 @pytest.mark.parametrize("vector", vectors(DEVICE, "dialogue"), ids=str)
-def test_printed_dialogues(vector: Vector) -> None:
+def test_documented_dialogues(vector: Vector) -> None:
     bench = Bench(**vector.expected.get("settings", {}))
     for line in vector.expected.get("before", []):
         if line.startswith("wait"):
@@ -46,14 +46,14 @@ def test_printed_dialogues(vector: Vector) -> None:
 
 
 @pytest.mark.parametrize("vector", vectors(DEVICE, "written"), ids=str)
-def test_printed_readings(vector: Vector) -> None:
+def test_documented_readings(vector: Vector) -> None:
     expected = dict(vector.expected)
     span = SPANS[expected["model"]][expected["type_code"]]
-    assert written(expected["value"], span, expected["form"], expected["model"]) == vector.data.decode()
+    assert format_reading(expected["value"], span, expected["form"], expected["model"]) == vector.data.decode()
 
 
 @pytest.mark.parametrize("vector", vectors(DEVICE, "checked line"), ids=str)
-def test_printed_checksums(vector: Vector) -> None:
+def test_documented_checksums(vector: Vector) -> None:
     line = vector.data.decode().rstrip("\r")
     assert sum_of_characters(line[:-2]) == line[-2:]
 
@@ -154,7 +154,7 @@ def test_lower_case_addresses_are_not_understood():
         "%01021006GG",
     ],
 )
-def test_what_cannot_be_obeyed_is_refused_and_changes_nothing(line):
+def test_invalid_commands_are_refused_and_have_no_effect(line):
     bench = Bench()
     before = [bench.ask(each) for each in ("$012", "$016", "$01M", "$013", "~010", "~012")]
     assert bench.ask(line) == "?01"
@@ -177,7 +177,7 @@ def test_formats_and_disabled_channels():
     assert bench.ask("#01") == ">066606E17FFFFEF6" + " " * 16
     assert bench.ask("$01500") == "!01"
     assert bench.ask("#01") == ">" + " " * 32
-    assert bench.ask("#010") == ">0666"  # one channel is read whether it is enabled or not
+    assert bench.ask("#010") == ">0666"  # a single channel is read even if it is disabled
 
 
 def test_a_wrong_or_missing_checksum_has_no_answer():
@@ -188,7 +188,7 @@ def test_a_wrong_or_missing_checksum_has_no_answer():
     assert bench.ask("#019" + sum_of_characters("#019")) == "?01" + sum_of_characters("?01")
 
 
-def test_init_makes_a_module_known_and_lets_its_line_be_changed():
+def test_init_identifies_a_module_and_permits_changes_of_its_line():
     bench = Bench(address=7, form=0x40, grounded=True)
     assert bench.ask("#070") is None
     assert bench.ask("#000") == ">+020.00"
@@ -196,14 +196,14 @@ def test_init_makes_a_module_known_and_lets_its_line_be_changed():
     assert (bench.ask("$092"), bench.ask("$002")) == (None, "!09100A00")  # until the next power on
 
 
-def test_the_new_address_holds_at_once():
+def test_the_new_address_applies_immediately():
     bench = Bench()
     assert bench.ask("%01021006 0") == "?01"
     assert bench.ask("%01FF100600") == "!FF"
     assert (bench.ask("$01M"), bench.ask("$FFM")) == (None, "!FF7018")
 
 
-def test_host_ok_keeps_the_watchdog_from_its_timeout():
+def test_host_ok_prevents_the_watchdog_timeout():
     bench = Bench()
     assert bench.ask("~013101") == "!01"
     assert bench.ask("~010") == "!0180"
@@ -212,7 +212,7 @@ def test_host_ok_keeps_the_watchdog_from_its_timeout():
         assert bench.ask("~**") is None
     assert bench.ask("~010") == "!0180"
     bench.time += 0.08
-    assert bench.ask("#010") == ">+020.00"  # other requests are no sign of the host
+    assert bench.ask("#010") == ">+020.00"  # other requests do not reset the watchdog
     bench.time += 0.08
     assert bench.ask("~010") == "!0104"
     assert bench.ask("~**") is None
@@ -241,12 +241,12 @@ def test_lines_of_the_alphabet_are_silence_or_an_answer(line, checked):
         assert not checked or sum_of_characters(answer[:-2]) == answer[-2:]
 
 
-# ------------------------------------------------------------------ at its wire
+# ------------------------------------------------------------------ on its line
 
 
 @pytest.fixture
 def module():
-    """Open a module; the result asks it."""
+    """Open a module; return a function that sends a request."""
     made = []
 
     def module(**params):
@@ -298,7 +298,7 @@ def test_only_the_addressed_unit_answers(module):
     assert ask(b"$05M\r") == b"!057018\r"
 
 
-def test_requests_may_come_in_pieces_and_together(module):
+def test_requests_may_be_split_or_joined(module):
     ask = module()
     assert ask.silent(b"$0") == b""
     assert ask(b"1M\r") == b"!017018\r"
@@ -314,7 +314,7 @@ def test_a_line_without_end_is_bounded(module):
     assert ask(b"$01M\r") == b"!017018\r"
 
 
-def test_checksum_fault_spoils_the_sum_only(module):
+def test_the_checksum_fault_only_changes_the_sum(module):
     ask = module(checksum=1, fault="checksum")
     answer = ask(b"$01M" + sum_of_characters("$01M").encode() + b"\r").decode().rstrip("\r")
     assert answer[:-2] == "!017018"

@@ -1,4 +1,4 @@
-"""The simulated printer port: what the makers print, the grammar of DPRNT, control codes, flow control, late lines."""
+"""The simulated printer port: documented lines, the grammar of DPRNT, control codes, flow control, late lines."""
 
 import math
 import socket
@@ -19,7 +19,7 @@ from errormotion.instruments.simulators.virtual_world.printing import in_iso_cod
 from errormotion.instruments.transports import parse_address
 
 DEVICE = "dprnt"
-QUIET = 0.15  # s in which a line would have come
+QUIET = 0.15  # s, longer than the delay of a line
 DC1, DC2, DC3, DC4 = b"\x11", b"\x12", b"\x13", b"\x14"
 
 
@@ -27,11 +27,11 @@ def text(template, value=1.5436, control="haas", zeros="blank"):
     return parse_block(template, lambda _: value).text(control, zeros)
 
 
-# ------------------------------------------------------------------ what the makers print
+# ------------------------------------------------------------------ documented lines
 
 
 @pytest.mark.parametrize("vector", vectors(DEVICE, "printed"), ids=str)
-def test_printed_lines(vector: Vector) -> None:
+def test_documented_lines(vector: Vector) -> None:
     expected = vector.expected
     block = parse_block(expected["template"], lambda name: expected["values"][name])
     assert block.text(expected["control"]) + "\r" == vector.data.decode()
@@ -39,7 +39,7 @@ def test_printed_lines(vector: Vector) -> None:
 
 @pytest.mark.parametrize("vector", vectors(DEVICE, "refused"), ids=str)
 def test_formats_that_are_not_legal(vector: Vector) -> None:
-    with pytest.raises(InstrumentError, match="expected 1 to 8 places"):
+    with pytest.raises(InstrumentError, match="expected 1 to 8 digits"):
         text(vector.data.decode())
 
 
@@ -48,8 +48,8 @@ def test_characters_in_iso_code(vector: Vector) -> None:
     assert in_iso_code(vector.expected["text"].encode()) == vector.data
 
 
-# From memory of FANUC's manuals, as docs/reference/devices/dprnt.md states: blanks for zeros and a place for the sign,
-# or neither; digits above the stated places are cut.
+# From memory of FANUC's manuals, as docs/reference/devices/dprnt.md states: blanks for zeros and a column for the sign,
+# or neither; digits above the stated ones are cut.
 @pytest.mark.parametrize(
     ("template", "value", "blank", "none"),
     [
@@ -97,7 +97,7 @@ def test_other_blocks_are_refused(template, why):
         text(template)
 
 
-def test_stars_are_spaces_and_spaces_in_a_format_do_not_count():
+def test_stars_are_spaces_and_spaces_in_a_format_are_ignored():
     assert text("A**B #1 [ 14 ]*-/+9") == "A  B 1.5436 -/+9"
 
 
@@ -120,7 +120,7 @@ def test_any_template_is_a_block_or_refused(template):
     assert set(block.text()) <= set("ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789+-/. ")
 
 
-# ------------------------------------------------------------------ at its wire
+# ------------------------------------------------------------------ on its line
 
 
 @pytest.fixture(autouse=True)
@@ -150,7 +150,7 @@ def run(here, *lines, opened=True):
 
 
 def received(line, count=None):
-    """Return what comes until ``count`` bytes are there, or until nothing has come for a while."""
+    """Return bytes until there are ``count``, or until none has arrived for a while."""
     found = b""
     line.settimeout(5.0 if count else QUIET)
     while count is None or len(found) < count:
@@ -175,7 +175,7 @@ def received(line, count=None):
         ({"code": "iso"}, DC2 + b"A\nB\n" + DC4),
     ],
 )
-def test_lines_stand_between_the_codes_of_the_port(params, expected):
+def test_lines_are_between_the_codes_of_the_port(params, expected):
     with port(**params) as (line, here):
         run(here, "A", "B")
         assert received(line, len(expected)) == expected
@@ -203,7 +203,7 @@ def test_a_fanuc_port_that_is_not_open_prints_nothing_and_a_haas_port_is_always_
 
 
 @pytest.mark.parametrize("stop", [DC3, b"\x93"])
-def test_dc3_stops_the_port_and_dc1_lets_it_go_on(stop):
+def test_dc3_stops_the_port_and_dc1_restarts_it(stop):
     with port() as (line, here):
         line.sendall(b"ignored" + stop)
         time.sleep(QUIET)
@@ -213,7 +213,7 @@ def test_dc3_stops_the_port_and_dc1_lets_it_go_on(stop):
         assert received(line, 6) == DC2 + b"A\nB\n" + DC4
 
 
-def test_a_late_line_comes_after_its_time_or_before_the_next_one():
+def test_a_late_line_is_sent_after_its_delay_or_before_the_next_one():
     with port(fault="late", fault_at=1) as (line, here):
         run(here, "A", "B")
         assert received(line, 4) == DC2 + b"A\n" + DC4
@@ -239,7 +239,7 @@ def test_a_late_line_is_lost_with_its_connection():
             assert received(other, 4) == DC2 + b"B\n" + DC4
 
 
-def test_silence_and_drop_concern_lines():
+def test_silence_and_drop_affect_lines():
     with port(fault="silence") as (line, here):
         run(here, "A")
         assert received(line) == b""
@@ -249,9 +249,9 @@ def test_silence_and_drop_concern_lines():
         assert received(line, 4) == DC2 + b"B\n" + DC4
 
 
-def test_an_illegal_block_stops_the_program_ahead_of_its_start():
+def test_an_invalid_block_stops_the_program_before_its_start():
     with port() as (line, here):
-        with pytest.raises(InstrumentError, match=r"Line 2 .*expected 1 to 8 places in all; found 9"):
+        with pytest.raises(InstrumentError, match=r"Line 2 .*expected 1 to 8 digits in all; found 9"):
             here.run_program("POPEN\nDPRNT[T#3001[81]]\nPCLOS\nM30")
         here.elapse(10.0)
         assert received(line) == b""

@@ -1,4 +1,4 @@
-"""The simulated LJ-X8000A at its wire, by the bytes that the maker's Linux library sends and the places it reads.
+"""The simulated LJ-X8000A on its lines, with the bytes that the maker's Linux library sends and the positions it reads.
 
 Source of the sequences: LJX8_IF_Linux.cpp, LJXA_ACQ.cpp and ProfileDataConvert.cpp of the maker's library 1.0.0; of the
 return codes: the maker's sample application for LJ-X8000A.
@@ -21,7 +21,7 @@ MAGIC = 0xFFFFFFFF
 
 
 class MakersClient:
-    """The calls of the maker's library that the tests need, with a socket as the library has it."""
+    """The calls of the maker's library that the tests use, with a socket as in the library."""
 
     def __init__(self, device: SimulatedLJX) -> None:
         self.device = device
@@ -40,13 +40,13 @@ class MakersClient:
         self.control = self._connect(self.device.url)
 
     def raw(self, frame: bytes) -> bytes:
-        """Send bytes; return the reply whose length stands in its first four bytes."""
+        """Send bytes; return the reply, whose first four bytes are its length."""
         self.control.sendall(frame)
         head = exactly(self.control, 4)
         return head + exactly(self.control, struct.unpack("<I", head)[0])
 
     def command(self, data: bytes) -> bytes:
-        """What myAnyCommand does; the reply, checked as far as every reply is alike."""
+        """The call myAnyCommand: return the reply after the checks common to all replies."""
         frame = struct.pack("<I4sII", 16 + len(data) - 4, bytes.fromhex("0300F000"), 0, len(data)) + data
         answer = self.raw(frame)
         assert struct.unpack_from("<I", answer, 12)[0] == len(answer) - 16
@@ -54,7 +54,7 @@ class MakersClient:
         return answer
 
     def code(self, data: bytes) -> int:
-        """Return what the library returns: 0x8000 and the code, or 0."""
+        """Return the result of the library: 0x8000 plus the code, or 0."""
         code = self.command(data)[17]
         return 0x8000 + code if code else 0
 
@@ -64,7 +64,7 @@ class MakersClient:
         return answer
 
     def open_stream(self) -> socket.socket:
-        """What InitializeHighSpeedDataCommunication does: a further connection, the one before stays open."""
+        """The call InitializeHighSpeedDataCommunication: another connection; the previous one stays open."""
         self.streams.append(self._connect(self.device.urls["stream"]))
         return self.streams[-1]
 
@@ -105,7 +105,7 @@ def stream_words(points: int, intensity: bool) -> int:
 
 
 def unpacked(profile: bytes, points: int, intensity: bool) -> tuple[list[int], list[int]]:
-    """Return heights (steps, signed) and intensities, one bit field after the other."""
+    """Return heights (steps, signed) and intensities of successive bit fields."""
     bits = int.from_bytes(profile[24:], "little")
     raws = [bits >> 20 * k & 0xFFFFF for k in range(points)]
     light = []
@@ -120,7 +120,7 @@ def setting(kind: int, category: int, item: int) -> bytes:
 
 
 def set_setting(level: int, target: bytes, value: bytes) -> bytes:
-    """What SetSetting sends: 20 kB whatever the size of the setting."""
+    """The bytes of SetSetting: 20 kB, whatever the size of the setting."""
     return bytes([0x32, 0, 0, 0, level, 0, 0, 0]) + target + value.ljust(20 * 1024, b"\0")
 
 
@@ -142,7 +142,7 @@ def test_get_error_is_answered_byte_by_byte() -> None:
         assert answer == bytes.fromhex("1C00000003 00F000 00000000 10000000 0400000000000000 00000000 00000000")
 
 
-def test_models_and_serial_numbers_lie_where_the_library_reads_them() -> None:
+def test_models_and_serial_numbers_are_where_the_library_reads_them() -> None:
     with client() as peer:
         answer = peer.single(0x06)
         assert answer[28] == 2
@@ -167,7 +167,7 @@ def test_commands_with_parameters_refuse_to_be_sent_without(opcode: int) -> None
         assert peer.code(bytes([opcode, 0, 0, 0])) == 0x8032
 
 
-def test_what_is_no_command_of_the_model_is_refused() -> None:
+def test_commands_of_other_models_are_refused() -> None:
     with client() as peer:
         assert peer.code(bytes([0x07, 0, 0, 0])) == 0x8031
         older = peer.raw(bytes.fromhex("1000000001 00F000 00000000 04000000 04000000"))
@@ -190,7 +190,7 @@ def test_programs_change_and_a_wrong_number_is_a_wrong_parameter() -> None:
         assert peer.single(0x65)[24] == 15
 
 
-def test_settings_are_set_got_reflected_and_initialised() -> None:
+def test_settings_are_written_read_reflected_and_initialised() -> None:
     with client() as peer:
         sampling = setting(0x10, 0x00, 0x02)
         answer = peer.command(set_setting(1, sampling, bytes([3, 0, 0, 0])))
@@ -212,7 +212,7 @@ def test_settings_are_set_got_reflected_and_initialised() -> None:
 
 
 @pytest.mark.parametrize(("kind", "size"), [(0x01, 60), (0x02, 20), (0x1F, 10980)])
-def test_whole_blocks_of_settings_have_the_sizes_of_the_makers_sample(kind: int, size: int) -> None:
+def test_blocks_of_settings_have_the_sizes_of_the_makers_sample(kind: int, size: int) -> None:
     with client() as peer:
         block = bytes(k % 251 for k in range(size))
         assert peer.code(set_setting(1, setting(kind, 0xFF, 0), block)) == 0
@@ -235,7 +235,7 @@ def test_levels_types_and_values_out_of_range_are_refused(data: bytes) -> None:
         assert peer.code(data) == 0x8042
 
 
-def test_pitch_timer_and_laser_keep_what_is_set() -> None:
+def test_pitch_timer_and_laser_keep_their_settings() -> None:
     with client() as peer:
         assert peer.code(struct.pack("<II", 0x36, 2500)) == 0
         assert struct.unpack_from("<I", peer.single(0x37), 28)[0] == 2500
@@ -246,7 +246,7 @@ def test_pitch_timer_and_laser_keep_what_is_set() -> None:
         assert peer.code(struct.pack("<II", 0x2A, 2)) == 0x8042
 
 
-def test_saving_shows_as_access_to_the_memory_and_refuses_the_restart() -> None:
+def test_saving_is_reported_as_access_to_the_memory_and_prevents_a_restart() -> None:
     with client() as peer:
         assert peer.code(set_setting(2, setting(0x10, 0, 2), bytes([4]))) == 0
         deadline = time.monotonic() + 5
@@ -258,7 +258,7 @@ def test_saving_shows_as_access_to_the_memory_and_refuses_the_restart() -> None:
         assert peer.command(get_setting(1, setting(0x10, 0, 2)))[28] == 4
 
 
-def test_the_restart_forgets_what_was_not_saved() -> None:
+def test_the_restart_discards_unsaved_settings() -> None:
     with client() as peer:
         assert peer.code(set_setting(1, setting(0x10, 0, 2), bytes([4]))) == 0
         assert peer.code(bytes([0x02, 0, 0, 0])) == 0
@@ -298,7 +298,7 @@ def ends_with_notice(line: socket.socket, size: int) -> bool:
         exactly(line, size - 8)
 
 
-def test_each_acquisition_has_a_connection_of_its_own_and_the_one_before_stays_open() -> None:
+def test_each_acquisition_has_its_own_connection_and_the_previous_one_stays_open() -> None:
     with client("&points=64") as peer:
         size = 4 * stream_words(64, False)
         for k in range(4):
@@ -307,7 +307,7 @@ def test_each_acquisition_has_a_connection_of_its_own_and_the_one_before_stays_o
             assert peer.code(bytes([0xA0, 0, 0, 0, 0x47, 0, 0, 0]) + start) == 0
             exactly(line, 10 * size)
             peer.single(0x48)
-            if k % 2:  # else nobody reads on, as where a client gives up
+            if k % 2:  # otherwise the client stops reading, as after a time limit
                 assert ends_with_notice(line, size)
 
 
@@ -330,7 +330,7 @@ def test_a_stream_starts_only_prepared_connected_and_once() -> None:
         assert peer.code(bytes([0x39, 0, 0, 0, 1, 0, 0, 0])) == 0x8041
 
 
-def test_profiles_are_fetched_where_batch_measurement_is_off() -> None:
+def test_profiles_are_fetched_if_batch_measurement_is_off() -> None:
     with client("&points=300&intensity=1") as peer:
         assert peer.code(bytes([0x22, 0, 0, 0])) == 0x8080
         assert peer.code(get_batch(0, 0, 0, 1)) == 0x8081
@@ -393,7 +393,7 @@ def test_the_trigger_by_command_needs_the_external_trigger_mode() -> None:
         assert peer.code(bytes([0x21, 0, 0, 0])) == 0x8080
 
 
-def test_a_late_answer_comes_ahead_of_the_next_one() -> None:
+def test_a_late_answer_is_sent_before_the_next_one() -> None:
     with client("&fault=late&fault_at=1") as maker:
         maker.single(0x06)
         maker.control.sendall(struct.pack("<I4sII", 16, bytes.fromhex("0300F000"), 0, 4) + bytes([0x04, 0, 0, 0]))

@@ -1,4 +1,4 @@
-"""The simulated LK-G5000 and LK-G3000 at their wire, with the lines that manuals print and clients of others send."""
+"""The simulated LK-G5000 and LK-G3000 on their line, with lines of manuals and of foreign clients."""
 
 from __future__ import annotations
 
@@ -87,21 +87,21 @@ def line(controller: str = "LK-G5000", more: str = "&readings=-1.2345") -> Itera
 
 
 @pytest.mark.parametrize("vector", vectors("keyence_lk", "value"), ids=str)
-def test_values_are_written_as_the_manual_prints_them(vector: Vector) -> None:
+def test_values_are_formatted_as_in_the_manual(vector: Vector) -> None:
     decimals, value = vector.expected["decimals"], vector.expected["value"]
     display = next(k for k, (_, places) in enumerate(DISPLAYS) if places == decimals)
     assert value_text(value * DISPLAYS[display][0], display) == vector.data.decode()
 
 
 @pytest.mark.parametrize("vector", vectors("keyence_lk", "no value"), ids=str)
-def test_what_is_no_value_is_written_as_the_manual_prints_it(vector: Vector) -> None:
+def test_missing_values_are_formatted_as_in_the_manual(vector: Vector) -> None:
     reading = {"no value": "nan", "over range": "-99", "under range": "99"}[vector.expected["reason"]]
     with line(more=f"&readings={reading}") as terminal:
         assert terminal.ask("MS,01") == f"MS,01,{vector.data.decode()}"
 
 
 @pytest.mark.parametrize("vector", vectors("keyence_lk", "answer"), ids=str)
-def test_answers_are_those_that_clients_of_others_read(vector: Vector) -> None:
+def test_answers_are_those_that_foreign_clients_read(vector: Vector) -> None:
     expected = vector.expected
     display = next(k for k, (_, places) in enumerate(DISPLAYS) if places == expected["decimals"])
     with line(expected["controller"], f"&readings={-expected['value']}&display={display}") as terminal:
@@ -109,7 +109,7 @@ def test_answers_are_those_that_clients_of_others_read(vector: Vector) -> None:
 
 
 @pytest.mark.parametrize("vector", vectors("keyence_lk", "error"), ids=str)
-def test_mistakes_are_answered_by_their_errors(vector: Vector) -> None:
+def test_mistakes_are_answered_with_their_errors(vector: Vector) -> None:
     with line(vector.expected["controller"]) as terminal:
         if vector.expected["mode"] == "communication":
             assert terminal.ask("Q0") == "Q0"
@@ -181,7 +181,7 @@ def test_data_are_stored_and_fetched() -> None:
     "text",
     SETTINGS,
 )
-def test_every_setting_that_clients_of_others_request_is_answered_in_the_communication_mode_only(text: str) -> None:
+def test_every_setting_that_foreign_clients_request_is_only_answered_in_the_communication_mode(text: str) -> None:
     with line() as terminal:
         assert terminal.ask(f"SR,{text}") == "ER,SR,51"
         assert terminal.ask("Q0") == "Q0"
@@ -219,7 +219,7 @@ def test_program_and_panel_are_switched() -> None:
         assert terminal.ask("KL") == "ER,KL,61"
 
 
-def test_the_older_series_has_commands_of_its_own() -> None:
+def test_the_older_series_has_its_own_commands() -> None:
     with line("LK-G3000", "&readings=-1.2345&output=2") as terminal:
         assert terminal.ask("M0") == "M0,XXXXXXXX,+01.2345"
         assert terminal.ask("M2") == "M2,+01.2345"

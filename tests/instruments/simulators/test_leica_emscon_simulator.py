@@ -1,4 +1,4 @@
-"""The simulated emScon server at its wire: packets are written and read here after the header, not by a codec."""
+"""The simulated emScon server on its line: packets are written and read here from the header, not with a codec."""
 
 import math
 import os
@@ -38,7 +38,7 @@ SET_MODE, SET_TIME_MODE, GET_AIR, SET_AIR, BIRD_BATH, BIRD_BATH2, GO, FIND = 24,
 
 @dataclass
 class Client:
-    """A client at the wire: the replies it asked for, and all other packets by their order."""
+    """A client: the requested replies, and all other packets in their order."""
 
     line: socket.socket
     others: list[tuple[int, bytes]] = field(default_factory=list)
@@ -100,7 +100,7 @@ Made = list[SimulatedEmScon | socket.socket]
 
 @pytest.fixture
 def made() -> Iterator[Made]:
-    """What is closed after the test."""
+    """Resources that are closed after the test."""
     found: Made = []
     yield found
     clear(found)
@@ -192,7 +192,7 @@ def test_golden_vectors(vector: Vector) -> None:
             assert size == 8 + size_of(RESULTS[kind])
 
 
-def test_what_is_no_command_is_refused(made: Made) -> None:
+def test_unknown_commands_are_refused(made: Made) -> None:
     _, client = tracker(made)
     for number in (50, 64, 141, 999, -1):
         assert client.ask(number) == (NOT_IMPLEMENTED, b"")
@@ -208,7 +208,7 @@ def test_what_is_no_command_is_refused(made: Made) -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e308])
 @pytest.mark.parametrize("system", [0, 4, 7])
-def test_numbers_that_are_none_are_wrong_parameters(made: Made, value: float, system: int) -> None:
+def test_nan_and_infinity_are_wrong_parameters(made: Made, value: float, system: int) -> None:
     _, client = tracker(made)
     assert client.ask(SET_CS, "i", system)[0] == OK
     assert client.ask(GO, "3di", value, 1.0, value, 0)[0] == WRONG
@@ -310,7 +310,7 @@ def test_a_coordinate_system_that_does_not_exist_is_a_wrong_parameter(made: Made
     distance=st.floats(0.1, 80.0),
     system=st.integers(0, SYSTEMS - 1),
 )
-def test_coordinates_come_back(azimuth: float, zenith: float, distance: float, system: int) -> None:
+def test_coordinates_round_trip(azimuth: float, zenith: float, distance: float, system: int) -> None:
     there = (azimuth, zenith, distance)
     assert from_system(to_system(there, system), system) == pytest.approx(there, rel=1e-9, abs=1e-9)
 
@@ -362,7 +362,7 @@ def test_a_continuous_measurement_ends_after_the_number_of_points(made: Made, nu
         assert client.ask(STATUS)[0] == OK
 
 
-def test_without_a_number_it_goes_on_until_it_is_stopped_and_the_server_is_busy(made: Made) -> None:
+def test_without_a_number_it_continues_until_it_is_stopped_and_the_server_is_busy(made: Made) -> None:
     _, client = tracker(made, "pace=1")
     client.ask(SET_MODE, "i", 1)
     client.ask(SET_TIME_MODE, "4i", 10, 0, 0, 1)
@@ -381,7 +381,7 @@ def test_without_a_number_it_goes_on_until_it_is_stopped_and_the_server_is_busy(
     assert client.ask(2) == (OK, struct.pack("<i", 2))
 
 
-def test_a_client_that_leaves_ends_its_measurement(made: Made) -> None:
+def test_a_client_that_disconnects_ends_its_measurement(made: Made) -> None:
     device, client = tracker(made, "pace=1")
     client.ask(SET_MODE, "i", 1)
     client.ask(SET_TIME_MODE, "4i", 10, 0, 0, 0)
@@ -437,7 +437,7 @@ def test_by_distance_a_reflector_at_rest_gives_one_point(made: Made) -> None:
     assert len(points(client)) == 1
 
 
-def test_extended_statistics_bring_longer_packets(made: Made) -> None:
+def test_extended_statistics_have_longer_packets(made: Made) -> None:
     _, client = tracker(made)
     assert client.ask(80, "2i", 1, 1)[0] == OK
     assert client.ask(START)[0] == OK
@@ -500,7 +500,7 @@ def test_changes_are_reported_unless_they_are_switched_off(made: Made) -> None:
     assert client.ask(47, "9i", *settings[:8], 2)[0] == 48
 
 
-def test_coordinates_that_it_cannot_turn_are_refused_and_not_ignored(made: Made) -> None:
+def test_coordinates_that_it_cannot_transform_are_refused_and_not_ignored(made: Made) -> None:
     _, client = tracker(made)
     assert client.ask(12, "6d", 1.0, 0, 0, 0, 0, 0)[0] == OK
     assert struct.unpack("<6d", client.ask(13)[1])[0] == 1.0
@@ -509,7 +509,7 @@ def test_coordinates_that_it_cannot_turn_are_refused_and_not_ignored(made: Made)
     assert client.ask(47, "9i", *settings)[0] == NOT_IMPLEMENTED
 
 
-# ------------------------------------------------------------------ a client of another origin
+# ------------------------------------------------------------------ a foreign client
 
 CLIENT = """
 import logging, sys
@@ -542,7 +542,7 @@ connection.disconnect()
 
 
 @pytest.mark.slow
-def test_a_client_of_another_origin_works_in_mmhg_and_rectangular_coordinates(made: Made) -> None:
+def test_a_foreign_client_uses_mmhg_and_rectangular_coordinates(made: Made) -> None:
     pytest.importorskip("CESAPI", reason="the package CESAPI, another implementation, is not installed")
     device = SimulatedEmScon(parse_address(f"sim://cframe/tracker?seed=3&tracker=AT4xx&{EXACT}"))
     made.append(device)

@@ -1,4 +1,4 @@
-"""The simulated total station at its wire: requests are written and replies read here, not by a codec."""
+"""The simulated total station on its line: requests are written and replies read here, not with a codec."""
 
 import math
 import socket
@@ -23,7 +23,7 @@ Made = list[SimulatedGeoComStation | socket.socket]
 
 
 class Client:
-    """A client at the wire."""
+    """A client."""
 
     def __init__(self, line: socket.socket) -> None:
         self.line = line
@@ -65,7 +65,7 @@ class Client:
 
 @pytest.fixture
 def made() -> Iterator[Made]:
-    """What is closed after the test."""
+    """Resources that are closed after the test."""
     found: Made = []
     yield found
     while found:
@@ -85,7 +85,7 @@ def station(made: Made, parameters: str = "") -> tuple[SimulatedGeoComStation, C
 
 
 def truth(device: SimulatedGeoComStation) -> np.ndarray:
-    """The reflector as the station sees it: azimuth, zenith angle, distance."""
+    """The reflector relative to the station: azimuth, zenith angle, distance."""
     return device.scene.seen(np.array([device.world.time]))[0]
 
 
@@ -142,7 +142,7 @@ def test_understands_the_requests_of_the_vectors(vector: Vector) -> None:
     assert list(found.values) == vector.expected["parameters"]
 
 
-def test_every_call_refuses_a_parameter_too_many(made: Made) -> None:
+def test_every_call_refuses_an_excess_parameter(made: Made) -> None:
     _, client = station(made)
     for number, (_, types) in CALLS.items():
         values = ",".join(["1"] * (len(types) + 1))
@@ -261,13 +261,13 @@ def test_prism_constant_and_air_change_the_distance(made: Made) -> None:
     assert client.measure()[2] == pytest.approx(true, abs=1e-6)
     assert client.ask(2028, 6.58e-7, 950.0, 30.0, 25.0)[0] == OK
     ppm = client.numbers(2151)[0]
-    assert ppm == pytest.approx(34, abs=2)  # the user manual's chart: 0.3 ppm a mbar, 1 ppm a kelvin
+    assert ppm == pytest.approx(34, abs=2)  # the user manual's chart: 0.3 ppm per mbar, 1 ppm per kelvin
     assert client.measure()[2] == pytest.approx((true - 0.0175) * (1 + 1e-6 * ppm) + 0.0175, abs=1e-6)
     assert client.ask(2028, 6.58e-7, 95000.0, 30.0, 25.0)[0] == IVPARAM
     assert client.ask(17008, 11)[0] == IVPARAM
 
 
-def test_the_correction_of_the_air_is_nothing_at_the_reference() -> None:
+def test_the_correction_of_the_air_is_zero_at_the_reference() -> None:
     assert abs(atmospheric_ppm(1013.25, 12.0, 8.55)) < 0.2
     assert atmospheric_ppm(1013.25, 13.0, 9.5) == pytest.approx(1.0, abs=0.2)
 
@@ -311,7 +311,7 @@ def test_both_faces_read_the_same_reflector(made: Made) -> None:
     assert second[2] == pytest.approx(first[2], abs=1e-6)
 
 
-def test_turned_away_it_has_no_distance_until_it_aims(made: Made) -> None:
+def test_after_turning_away_it_has_no_distance_until_it_aims(made: Made) -> None:
     _, client = station(made)
     horizontal, zenith, distance = client.measure()
     assert client.ask(9027, horizontal + 0.01, zenith, 0, 0, 0)[0] == OK
@@ -339,7 +339,7 @@ def test_lock_needs_its_mode_and_aiming_the_recognition(made: Made) -> None:
 # ------------------------------------------------------------------ faults
 
 
-def test_a_broken_beam_ends_the_lock_and_can_be_taken_up_again(made: Made) -> None:
+def test_a_broken_beam_ends_the_lock_and_can_be_locked_again(made: Made) -> None:
     _, client = station(made, "fault=beam_broken&fault_at=1&fault_for=1")
     client.measure()
     client.ask(2008, 1, 1)
@@ -361,7 +361,7 @@ def test_a_late_answer_precedes_the_next_with_its_own_transaction(made: Made) ->
 @pytest.mark.parametrize(
     ("fault", "reply"), [("refuse", "%R1P,0,4:4"), ("refuse&code=14", "%R1P,0,4:14"), ("link_error", "%R1P,3080,4:0")]
 )
-def test_refuses_where_it_is_told_to(made: Made, fault: str, reply: str) -> None:
+def test_refuses_if_so_set(made: Made, fault: str, reply: str) -> None:
     _, client = station(made, f"fault={fault}&fault_at=1&fault_for=1")
     client.ask(0)
     assert client.raw("%R1Q,0,4:") == reply
@@ -373,10 +373,10 @@ def test_split_and_garbage(made: Made) -> None:
     assert client.ask(5003) == (OK, ["364123"])
 
 
-# ------------------------------------------------------------------ a client of another origin
+# ------------------------------------------------------------------ a foreign client
 
 
-def test_geocompy_measures_with_it(made: Made) -> None:
+def test_geocompy_measures_with_the_simulator(made: Made) -> None:
     communication = pytest.importorskip("geocompy.communication")
     geo = pytest.importorskip("geocompy.geo")
     device, client = station(made)

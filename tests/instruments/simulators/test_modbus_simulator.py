@@ -1,4 +1,4 @@
-"""The simulated Modbus thermometer at its wire: pieces, pipelined requests, refusals, other units, broken headers."""
+"""The simulated Modbus thermometer on its line: pieces, pipelined requests, refusals, other units, broken headers."""
 
 import os
 import socket
@@ -95,7 +95,7 @@ def test_however_requests_are_split_or_joined_each_is_answered_once(data: st.Dat
 
 
 @given(st.lists(st.binary(max_size=300), max_size=10), st.sampled_from(["tcp", "rtu"]))
-def test_whatever_bytes_come_little_is_kept_and_answers_are_frames(pieces: list[bytes], framing: str) -> None:
+def test_for_any_bytes_little_is_kept_and_answers_are_frames(pieces: list[bytes], framing: str) -> None:
     device = server(framing=framing)
     for piece in pieces:
         for answer in device.receive(piece):
@@ -171,7 +171,7 @@ def test_numbers_in_registers(value: float, kind: str, expected: list[int]) -> N
 
 @contextmanager
 def connected(device: SimulatedModbus) -> Iterator[tuple[Callable[[bytes], None], Callable[[int], bytes]]]:
-    """Give functions to write to the device and to read an exact number of bytes from it."""
+    """Yield functions to write to the device and to read an exact number of bytes from it."""
     place = parse_address(device.url)
     if device.url.startswith("tcp"):
         with socket.create_connection((place.host, place.port), timeout=TIMEOUT) as line:
@@ -262,7 +262,7 @@ def test_a_connection_with_an_impossible_header_is_closed_and_the_next_one_is_se
             write(b"GET / HTTP/1.1\r\n\r\n")
             assert read(1) == b""
         with connected(device) as (write, read):
-            write(mbap(READ)[:4])  # an incomplete request, then the client leaves
+            write(mbap(READ)[:4])  # an incomplete request, then the client disconnects
         with connected(device) as (write, read):
             write(mbap(READ))
             assert len(read(11)) == 11

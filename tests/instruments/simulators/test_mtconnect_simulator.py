@@ -1,4 +1,4 @@
-"""The simulated MTConnect agent at the wire: what it answers and what it refuses."""
+"""The simulated MTConnect agent on its line: answers and refusals."""
 
 import http.client
 import socket
@@ -56,7 +56,7 @@ class Client:
 
 
 def plain(document: Element) -> Element:
-    """Take the namespaces out, after a check that the root has the right one."""
+    """Remove the namespaces after a check of the root."""
     kind = document.tag.rpartition("}")[2]
     assert document.tag.startswith(f"{{urn:mtconnect.org:{kind}:")
     for each in document.iter():
@@ -163,7 +163,7 @@ def test_a_data_item_is_unavailable_before_its_first_value() -> None:
     assert set(values(first).values()) == {"UNAVAILABLE", "Unavailable"}
 
 
-def test_samples_go_on_at_the_next_sequence() -> None:
+def test_samples_continue_at_the_next_sequence() -> None:
     with agent() as client:
         current = client.read("/current")
         after = int(header(current)["nextSequence"])
@@ -237,7 +237,7 @@ def test_current_without_the_next_sequence() -> None:
         ("//Devices/Device[@name='cframe']/DataItems", {"avail"}),
     ],
 )
-def test_paths_choose_data_items(path: str, chosen: set[str]) -> None:
+def test_paths_select_data_items(path: str, chosen: set[str]) -> None:
     with agent() as client:
         assert set(values(client.read("/current", path=path))) == chosen
 
@@ -262,7 +262,7 @@ def test_paths_that_cannot_be_read_are_refused(path: str) -> None:
             assert path in text
 
 
-def test_devices_are_asked_for_by_name_or_uuid() -> None:
+def test_devices_are_requested_by_name_or_uuid() -> None:
     with agent("style=okuma") as client:
         both = client.read("/probe").find("Devices")
         assert both is not None
@@ -299,13 +299,13 @@ def test_devices_are_asked_for_by_name_or_uuid() -> None:
         ("1.3", "/nobody/probe", {}, (200, "NO_DEVICE")),
     ],
 )
-def test_what_an_agent_refuses(version: str, path: str, query: dict[str, str], expected: tuple[int, str]) -> None:
+def test_refusals_of_an_agent(version: str, path: str, query: dict[str, str], expected: tuple[int, str]) -> None:
     with agent(f"version={version}") as client:
         names = {"from_" if name == "from" else name: value for name, value in query.items()}
         assert client.error(path, **names)[:2] == expected
 
 
-def test_words_of_range_errors_name_the_bounds() -> None:
+def test_texts_of_range_errors_state_the_bounds() -> None:
     with agent("version=2.0&buffer=131") as client:
         assert client.error("/sample", count=0)[2] == "'count' must not be zero(0)"
         assert client.error("/sample", count=132)[2] == "'count' must be less than 132"
@@ -448,7 +448,7 @@ class Stream:
 
 
 @pytest.mark.parametrize(("style", "kind"), [("own", "x-mixed-replace"), ("okuma", "mixed")])
-def test_a_stream_has_parts_with_what_is_new(style: str, kind: str) -> None:
+def test_the_parts_of_a_stream_contain_new_observations(style: str, kind: str) -> None:
     with agent(f"style={style}") as client, Stream(client.place, "/sample?interval=10&count=1000") as stream:
         assert stream.head["Content-Type"].startswith(f"multipart/{kind};")
         assert stream.head["Transfer-Encoding"] == "chunked"
@@ -461,7 +461,7 @@ def test_a_stream_has_parts_with_what_is_new(style: str, kind: str) -> None:
         assert sequences(second)[0] == int(header(first)["nextSequence"])
 
 
-def test_a_stream_without_news_sends_heartbeats() -> None:
+def test_a_stream_without_changes_sends_heartbeats() -> None:
     with agent() as client:
         after = header(client.read("/current"))["nextSequence"]
         with Stream(client.place, f"/sample?interval=5&heartbeat=50&from={after}") as stream:
@@ -501,7 +501,7 @@ def test_a_stream_is_cut_by_a_restart_and_by_a_broken_connection(fault: str) -> 
 # ---------------------------------------------------------------------- the ring
 
 
-def test_the_ring_rebuilds_every_state_that_it_keeps() -> None:
+def test_the_ring_restores_every_state_that_it_keeps() -> None:
     ring = Buffer(5)
     for k in range(1, 21):
         ring.add("ab"[k % 2], "t", str(k))

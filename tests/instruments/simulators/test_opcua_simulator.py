@@ -1,4 +1,4 @@
-"""The simulated OPC UA server at the wire, with the client of asyncua."""
+"""The simulated OPC UA server, with the client of asyncua."""
 
 import asyncio
 import socket
@@ -33,7 +33,7 @@ def server(query=""):
 
 
 def ask(url, work, **client):
-    """Return what a coroutine finds with a connected client."""
+    """Return the result of a coroutine with a connected client."""
 
     async def session():
         connected = Client(url, timeout=TIMEOUT)
@@ -110,7 +110,7 @@ def test_values_follow_the_machine_in_the_units_of_a_control():
     assert {status for _, status in resting} == {"Good"}
     assert [value for value, _ in resting] == pytest.approx([10.0, 10.0, 0.0, True, 3000.0, 1, 1, 0.0, 0, 1])
     assert 10.0 < moving[0][0] < 20.0
-    assert moving[2] == (None, "BadNoData")  # where the motion ends is not known
+    assert moving[2] == (None, "BadNoData")  # the end of the motion is unknown
     assert [value for value, _ in moving[7:]] == pytest.approx([300.0, 1, 2])
 
 
@@ -285,7 +285,7 @@ def test_browsing_a_sinumerik_shows_paths_without_index_or_unit():
     assert not [each for each in shown if "[" in each or "Units" in each]
 
 
-# ---------------------------------------------------------------------- faults and life
+# ---------------------------------------------------------------------- faults and life cycle
 
 
 def hello(url):
@@ -304,21 +304,21 @@ def received(line, size):
     return data
 
 
-def test_an_acknowledge_comes_whole_or_in_pieces():
+def test_an_acknowledgement_is_received_whole_or_in_pieces():
     for query in ("", "fault=split"):
         with server(query) as device, hello(device.url) as line:
             answer = received(line, 28)
         assert struct.unpack_from("<4sI", answer) == (b"ACKF", 28)
 
 
-def test_a_silent_server_accepts_and_says_nothing():
+def test_a_silent_server_accepts_and_does_not_answer():
     with server("fault=silence") as device, hello(device.url) as line:
         line.settimeout(0.3)
         with pytest.raises(TimeoutError):
             line.recv(1)
 
 
-def test_a_late_message_comes_later():
+def test_a_late_message_is_delayed():
     with server("fault=late&late_by=0.4") as device, hello(device.url) as line:
         line.settimeout(0.1)
         with pytest.raises(TimeoutError):
@@ -327,13 +327,13 @@ def test_a_late_message_comes_later():
         assert received(line, 28)[:4] == b"ACKF"
 
 
-def test_stray_bytes_come_ahead_of_a_message():
+def test_stray_bytes_precede_a_message():
     with server("fault=garbage") as device, hello(device.url) as line:
         answer = received(line, 29)
     assert 0 < answer.index(b"ACKF") <= 5
 
 
-def test_a_connection_breaks_and_another_one_breaks_too():
+def test_two_connections_break_in_succession():
     with server("fault=disconnect") as device:
         for _ in range(2):
             with hello(device.url) as line:
@@ -364,7 +364,7 @@ def test_after_a_restart_it_is_the_same_machine_at_the_same_port():
                 time.sleep(0.05)
 
 
-def test_it_listens_where_it_is_told_and_says_when_it_cannot():
+def test_it_listens_at_the_stated_address_and_reports_if_it_cannot():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -379,9 +379,9 @@ def test_it_listens_where_it_is_told_and_says_when_it_cannot():
 
 
 @pytest.mark.parametrize("query", ["style=other", "units=none", "fault=checksum"])
-def test_what_it_does_not_know_is_refused(query):
+def test_unknown_parameters_are_refused(query):
     before = threading.active_count()
-    with pytest.raises(InstrumentError, match=r"found|choose"), server(query):
+    with pytest.raises(InstrumentError, match=r"found|expected one of"), server(query):
         pass
     assert threading.active_count() == before
 

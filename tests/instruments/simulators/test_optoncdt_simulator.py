@@ -1,4 +1,4 @@
-"""The simulated optoNCDT at its wire, against what the maker's manuals print."""
+"""The simulated optoNCDT on its line, against the maker's manuals."""
 
 import re
 import select
@@ -18,7 +18,7 @@ PROMPT = b"\r\n->"
 
 
 class Terminal:
-    """A terminal at the sensor's line."""
+    """A terminal on the sensor's line."""
 
     def __init__(self, parameters: str = "", device: str = "X1") -> None:
         self.device = SimulatedOptoNCDT(parse_address(f"sim://cframe/{device}?{parameters or 'seed=0'}"))
@@ -45,7 +45,7 @@ class Terminal:
         return data
 
     def silence(self) -> bytes:
-        """Return what comes until nothing comes for a while."""
+        """Return bytes until none has arrived for a while."""
         data = b""
         while select.select([self.line], [], [], 0.2)[0]:
             data += self.line.recv(4096)
@@ -88,7 +88,7 @@ def old(*settings: str) -> pytest.MarkDecorator:
 # ---------------------------------------------------------------------- answers
 
 
-def test_with_echo_on_as_delivered_the_command_comes_before_its_answer(terminals: list[Terminal]) -> None:
+def test_with_echo_on_as_delivered_the_command_precedes_its_answer(terminals: list[Terminal]) -> None:
     terminals.append(Terminal())
     ask = terminals[0].ask
     assert ask("MEASRATE 10") == "MEASRATE 10 ok"
@@ -100,7 +100,7 @@ def test_with_echo_on_as_delivered_the_command_comes_before_its_answer(terminals
 
 
 @pytest.mark.parametrize("vector", vectors("optoncdt", "getinfo"), ids=str)
-def test_getinfo_is_what_the_manual_prints(vector: Vector, terminals: list[Terminal]) -> None:
+def test_getinfo_agrees_with_the_manual(vector: Vector, terminals: list[Terminal]) -> None:
     model = vector.expected["name"].split("-")[0]
     terminals.append(Terminal(f"model={model}&range={vector.expected['range_mm']}"))
     answer = terminals[0].send(b"GETINFO\r\n")
@@ -125,7 +125,7 @@ def test_an_answer_can_be_sent_back_as_a_command(terminal: Terminal) -> None:
             assert terminal.ask(setting) == "", setting
 
 
-# ---------------------------------------------------------------------- what is refused
+# ---------------------------------------------------------------------- refusals
 
 UNKNOWN, PARAMETER, COUNT, RANGE, ACCESS = "E01", "E02", "E03", "E05", "E06"
 
@@ -214,7 +214,7 @@ def test_newer_sensors_of_the_1420_measure_at_8_khz(terminal: Terminal) -> None:
 
 
 @pytest.mark.parametrize("terminal", ["user=USER&password=abc"], indirect=True)
-def test_settings_need_the_level_professional(terminals: list[Terminal], terminal: Terminal) -> None:
+def test_changes_of_settings_need_the_level_professional(terminals: list[Terminal], terminal: Terminal) -> None:
     assert terminal.ask("GETUSERLEVEL") == "GETUSERLEVEL USER"
     assert terminal.ask("MEASRATE 10").startswith(ACCESS)
     assert terminal.ask("OUTPUT RS422").startswith(ACCESS)
@@ -267,7 +267,7 @@ def distances(terminal: Terminal, count: int = 50) -> np.ndarray:
     return (raws * 1.02 / 65520 - 0.01) * 2.0
 
 
-def test_the_stream_starts_behind_the_answer_and_goes_on_while_commands_are_answered(terminal: Terminal) -> None:
+def test_the_stream_starts_after_the_answer_and_continues_while_commands_are_answered(terminal: Terminal) -> None:
     distances(terminal)
     terminal.line.sendall(b"GETINFO\r\n")
     data = b""
@@ -289,7 +289,7 @@ def test_the_stream_ends_with_output_none(terminal: Terminal) -> None:
 
 
 @pytest.mark.parametrize("terminal", ["left=OUTADD_RS422+COUNTER+TIMESTAMP;OUTSTATISTIC_RS422+MAX"], indirect=True)
-def test_what_an_earlier_user_left_on_is_listed_and_sent(terminal: Terminal) -> None:
+def test_outputs_of_an_earlier_user_are_listed_and_sent(terminal: Terminal) -> None:
     assert terminal.ask("GETOUTINFO_RS422") == "GETOUTINFO_RS422 COUNTER TIMESTAMP DIST1 MAX"
     assert terminal.ask("MEASRATE 10") == ""
     assert terminal.ask("RESETCNT TIMESTAMP MEASCNT") == ""
@@ -312,7 +312,7 @@ def test_the_1420_sends_the_distance_first_and_its_time_stamp_in_two_words(termi
     assert list(high * 65536 + low) == [50 * n for n in range(2000)]  # 2 kHz in steps of 10 us
 
 
-def test_the_counter_goes_on_from_stream_to_stream_until_it_is_reset(terminal: Terminal) -> None:
+def test_the_counter_continues_between_streams_until_it_is_reset(terminal: Terminal) -> None:
     terminal.ask("OUTADD_RS422 COUNTER")
     starts = []
     for reset in (False, False, True):
@@ -393,11 +393,11 @@ def test_without_laser_there_is_no_distance(terminal: Terminal) -> None:
     assert terminal.ask("MASTERMV MASTER 0") == "E32 Timeout"
 
 
-def test_a_software_trigger_lets_its_number_of_values_through(terminal: Terminal) -> None:
+def test_a_software_trigger_sends_its_number_of_values(terminal: Terminal) -> None:
     assert terminal.ask("TRIGGER SOFTWARE TERMOFF") == ""
     assert terminal.ask("TRIGGERCOUNT 7") == ""
     assert terminal.ask("OUTPUT RS422") == ""
-    assert terminal.ask("OUTPUT") == "OUTPUT RS422"  # nothing came between
+    assert terminal.ask("OUTPUT") == "OUTPUT RS422"  # nothing in between
     terminal.line.sendall(b"TRIGGERSW\r\n")
     data = terminal.read(len(PROMPT) + 21)
     assert data.startswith(PROMPT) or data.endswith(PROMPT)

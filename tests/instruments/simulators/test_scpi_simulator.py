@@ -1,4 +1,4 @@
-"""The simulated data acquisition unit at the wire: grammar, refusals, formats, and a client of others."""
+"""The simulated data acquisition unit on its line: grammar, refusals, formats, and a foreign client."""
 
 import socket
 from urllib.parse import urlsplit
@@ -12,7 +12,7 @@ from errormotion.instruments.transports import parse_address
 
 @pytest.fixture
 def unit():
-    """Open a unit; the result asks it."""
+    """Open a unit; return a function that sends a command."""
     made = []
 
     def unit(**params):
@@ -72,7 +72,7 @@ def test_long_and_short_forms_in_any_case_are_the_same(unit):
         ("FETC?", '-230,"Data stale"'),
     ],
 )
-def test_what_the_unit_refuses_is_in_its_queue_once(unit, line, error):
+def test_refused_commands_are_in_the_queue_once(unit, line, error):
     ask = unit()
     assert ask(line, "SYST:ERR?") == error
     assert ask("SYST:ERR?") == NO_ERROR
@@ -82,7 +82,7 @@ def test_a_query_that_is_refused_has_no_answer(unit):
     assert unit()("NONSENSE?", "*IDN?").startswith("HEWLETT-PACKARD,34970A,")
 
 
-def test_a_command_continues_the_path_of_the_one_before(unit):
+def test_a_command_continues_the_path_of_the_previous_one(unit):
     ask = unit()
     assert ask("ROUT:SCAN (@101);SCAN:SIZE?;:SYST:ERR?") == f"+1;{NO_ERROR}"
     assert ask("SENS:TEMP:NPLC 10,(@101);NPLC? (@101)") == "+1.00000000E+01"
@@ -109,7 +109,7 @@ def test_a_scan_reads_the_sensors_of_the_machine_in_its_units(unit):
     assert ask("FORM:READ:UNIT ON;CHAN ON", "FETC?").split(",")[1] == "101"
 
 
-def test_a_client_of_others_reads_it(unit):
+def test_a_foreign_client_reads_it(unit):
     pyvisa = pytest.importorskip("pyvisa", reason="the package pyvisa, another client, is not installed")
     pytest.importorskip("pyvisa_py", reason="the package pyvisa-py, another client, is not installed")
     device = SimulatedScpiUnit(parse_address("sim://cframe/visa?noise=0"))

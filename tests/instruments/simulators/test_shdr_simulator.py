@@ -1,4 +1,4 @@
-"""The simulated SHDR adapter at the wire."""
+"""The simulated SHDR adapter on its line."""
 
 import re
 import socket
@@ -85,7 +85,7 @@ def test_the_present_state_is_sent_after_the_connection() -> None:
     assert seen["S2speed"] == "UNAVAILABLE"
 
 
-def test_changes_follow_and_only_they() -> None:
+def test_only_changes_follow() -> None:
     with connected() as line:
         line.until("p1offsets|")
         line.until("CoolantSystem1_cond")
@@ -116,7 +116,7 @@ def test_a_condition_has_six_fields_after_the_time() -> None:
     assert fault.split("|")[1:] == ["system", "FAULT", "1104", "", "", "the machine is in alarm"]
 
 
-def test_series_data_sets_and_tables_have_lines_of_their_own() -> None:
+def test_series_data_sets_and_tables_have_their_own_lines() -> None:
     with connected("series=1") as line:
         series = line.until("Xseries")[-1].split("|")
         variables = line.until("morevars")[-1].split("|")
@@ -145,7 +145,7 @@ def test_ping_is_answered_with_the_heartbeat() -> None:
         assert line.until("* PONG")[-1] == "* PONG 2500"
 
 
-def test_an_unfinished_line_ends_with_its_connection() -> None:
+def test_an_incomplete_line_ends_with_its_connection() -> None:
     with adapter() as device:
         first = Line(device)
         first.until("avail|")
@@ -227,7 +227,7 @@ def test_faults_of_lines() -> None:
         assert len(lines) == 3
 
 
-def test_a_late_line_comes_before_the_next_one_or_when_its_time_is_over() -> None:
+def test_a_late_line_is_sent_before_the_next_one_or_after_its_delay() -> None:
     with connected() as sound:
         expected = [sound.next() for _ in range(4)]
     for late in ("", "&late_by=0.2"):
@@ -238,7 +238,7 @@ def test_a_late_line_comes_before_the_next_one_or_when_its_time_is_over() -> Non
             line = Line(device)
             while device._server.connection is None or line.next() == "":
                 pass
-            time.sleep(0.2)  # what it says by itself is over
+            time.sleep(0.2)  # after its unrequested lines
             device.fault = parse_fault(
                 parse_address(f"sim://cframe?fault=late&fault_at={device._lines}{late}"), device.faults
             )

@@ -16,7 +16,7 @@ from errormotion.cli import options
 from errormotion.cli.output import show, show_json
 from errormotion.errors import BenchError, InstrumentError, ReplayError
 from errormotion.instruments.sessions.masking import holds, mask, words_of
-from errormotion.instruments.sessions.session import Session, differences, live, repeated
+from errormotion.instruments.sessions.session import Session, differences, repeat, run_live
 from errormotion.instruments.simulators.virtual_world.described import describe
 from errormotion.instruments.transports.recording import add_note, parts_of, read_note, read_recording
 
@@ -36,7 +36,7 @@ def record(bench: Path, name: str, duration: str, out: Path | None, mask_serial:
     if path.exists():
         raise InstrumentError(f"The recording {path} exists already; choose another file or remove it")
     early: dict[Path, int] = {}  # number of frames before the identity was known
-    session = live(
+    session = run_live(
         instrument.driver(instrument.address, instrument.settings, record=path),
         seconds,
         lambda: sum(each.stat().st_size for each in _files(path)) > MAX_RECORDING,
@@ -114,7 +114,7 @@ def _played(path: Path) -> tuple[dict[str, Any], Session, list[str]]:
         raise ReplayError(
             f"The settings in the recording {path} are not those of '{note['plugin']}': {error}"
         ) from None
-    session = repeated(cls(f"replay://{path}", settings), note["session"])
+    session = repeat(cls(f"replay://{path}", settings), note["session"])
     return note, session, differences(note["session"], session)
 
 

@@ -1,4 +1,4 @@
-"""Machines under LinuxCNC: the driver here, and the bridge that runs beside LinuxCNC."""
+"""Machines under LinuxCNC: the driver, and the bridge that runs on the computer of LinuxCNC."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from errormotion.instruments.controller.linuxcnc.settings import LinuxCNCSetting
 #: The program that is copied to the machine.
 BRIDGE = Path(__file__).with_name("bridge.py")
 
-#: The realtime part of a compensation, which LinuxCNC loads.
+#: The realtime part of a compensation, loaded by LinuxCNC.
 COMPENSATION = Path(__file__).with_name("compensation.tcl")
 
 __all__ = ["BRIDGE", "COMPENSATION", "LinuxCNC", "LinuxCNCSettings"]

@@ -1,20 +1,21 @@
 #!/usr/bin/python3
 """Connects LinuxCNC with other programs: JSON lines on a Unix socket, or on a port of this computer.
 
-LinuxCNC's Python module works only in the Python of the system, beside LinuxCNC. This file therefore runs there, as the
-``DISPLAY`` of an INI file or as an ``APP`` beside another display, and needs only that Python. It is copied to the
-machine as one file and imports nothing of this package: it is therefore not divided into modules. A request is
-``{"id": 1, "op": "move_to", "position": [0.1, 0, 0]}``, its answer ``{"id": 1, "ok": true, "result": ...}`` or
-``{"id": 1, "ok": false, "error": "..."}``. While an order runs, ``{"id": 1, "beat": 7, "time": 3.2}`` is sent five
-times a second. Lengths are in m, speeds in m/s, those of spindles in 1/min, times in s since the bridge started;
-what is unknown is null. Positions are those of the machine (G53), without any offset of work, tool or compensation.
+LinuxCNC's Python module works only in the system's Python, on the computer of LinuxCNC. This file therefore runs there,
+as the ``DISPLAY`` of an INI file or as an ``APP`` in addition to another display, and needs only that Python. It is
+copied to the machine as a single file and imports nothing of this package: it is therefore not divided into modules. A
+request is ``{"id": 1, "op": "move_to", "position": [0.1, 0, 0]}``, its answer ``{"id": 1, "ok": true, "result": ...}``
+or ``{"id": 1, "ok": false, "error": "..."}``. While an operation runs, ``{"id": 1, "beat": 7, "time": 3.2}`` is sent
+five times a second. Lengths are in m, speeds in m/s, spindle speeds in 1/min, times in s since the start of the bridge;
+unknown values are null. Positions are in machine coordinates (G53), without any offset of work, tool or compensation.
 
 The first request of a connection is ``{"id": 0, "op": "hello", "token": "...", "control": true, "client": "NAME"}``
-with the token in a file that only the user can read. A connection whose first line is anything else, or that sends a
-line that is not a request, is closed. One client (one NAME) at a time controls the machine; the others read, and may
-stop it. One order at a time moves the machine. An order or program ends with the connection of its client: if that is
-lost, the bridge aborts the motion. No request can end the bridge. A bridge with ``--compensate`` lets one client, which
-says ``"compensate": true`` in its first request, set the offset of ``compensation.tcl``, and nothing else thereby.
+with the token from a file that only the user can read. A connection with another first line, or with a line that is not
+a request, is closed. One client (one NAME) at a time controls the machine; the others can read, and stop it. One
+operation at a time moves the machine. An operation or program ends with the connection of its client: if this is lost,
+the bridge aborts the motion. No request can end the bridge. A bridge with ``--compensate`` permits one client, which
+states ``"compensate": true`` in its first request, to set the offset of ``compensation.tcl``; this includes no other
+right.
 """
 
 from __future__ import annotations
@@ -42,46 +43,46 @@ from typing import Any
 PROTOCOL = 2
 FOLDER = "~/.errormotion"
 SOCKET, TOKEN = f"{FOLDER}/linuxcnc.sock", f"{FOLDER}/linuxcnc.token"
-POLL_INTERVAL = 0.01  # s between two checks of an order
+POLL_INTERVAL = 0.01  # s between two checks of an operation
 BEAT_INTERVAL = 0.2  # s
-ACCEPT_TIMEOUT = 5.0  # s for LinuxCNC to accept an order
+ACCEPT_TIMEOUT = 5.0  # s for LinuxCNC to accept a command
 START_TIMEOUT = 30.0  # s for LinuxCNC to start
-REST_TIMEOUT = 0.5  # s for a machine without orders to come to rest
+REST_TIMEOUT = 0.5  # s for an idle machine to come to rest
 CHANGE_TIMEOUT = 1.0  # s for a change of state or mode
-ATTEMPTS = 3  # to send a command that LinuxCNC may have lost or ignored
+ATTEMPTS = 3  # number of times a command is sent that LinuxCNC may have lost or ignored
 TEXT_TIMEOUT = 0.3  # s for the text of an error to arrive
 HELLO_TIMEOUT = 5.0  # s from a connection to its first request
 POSITION_TOLERANCE = 1e-6  # m between goal and final position
 MAX_CLIENTS = 64
 MAX_STRANGERS = 16  # connections without a valid first request
-STRANGER_TIME = 0.2  # s that each of them has at least, however many wait
+STRANGER_TIME = 0.2  # s that each of them has at least, independent of their number
 MAX_REQUEST_BYTES = 1 << 16  # of one line
 MAX_PROGRAM_BYTES = 1 << 24  # of all parts
 MAX_UNREAD_BYTES = 1 << 18  # of answers to one client
-MAX_WAITING = 16  # requests of one client that wait for their turn
-LINES_AT_ONCE = 4  # of one client that are taken before the others' turn
-CLOSE_TIMEOUT = 1.0  # s for the last answer to leave
-MAX_TASKS = 16  # requests of one client that are being answered
+MAX_WAITING = 16  # requests of one client that wait
+LINES_AT_ONCE = 4  # lines of one client that are processed before those of other clients
+CLOSE_TIMEOUT = 1.0  # s for the last answer to be sent
+MAX_TASKS = 16  # requests of one client that are in progress
 MAX_NAME = 64  # characters of an id or a name
 MAX_TEXT = 500  # characters of an error text
 MIN_TOKEN = 32  # characters
-SIGN_INTERVAL = 0.02  # s between two signs of life, of several servo cycles
-THREAD_INTERVAL = 0.02  # s between two looks whether a thread is cut
+SIGN_INTERVAL = 0.02  # s between two changes of the heartbeat; several servo cycles
+THREAD_INTERVAL = 0.02  # s between two checks whether a thread is cut
 PROBING = 5  # motion.motion-type
 OFFSET_TOLERANCE = 1e-6  # m between LinuxCNC's offset and the one that was set
-MAX_FEED = 10.0  # m/s, where LinuxCNC states no limit
-MAX_SPINDLE = 1e6  # 1/min, where LinuxCNC states no limit
+MAX_FEED = 10.0  # m/s, if LinuxCNC states no limit
+MAX_SPINDLE = 1e6  # 1/min, if LinuxCNC states no limit
 AXES = "XYZ"
-MODAL_CODES = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order restores
+MODAL_CODES = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an operation restores
 ORDER_MODES = "G21 G90 G94"  # mm, absolute, mm/min
 
 
 class RefusedError(Exception):
-    """LinuxCNC or the bridge refuses an order."""
+    """LinuxCNC or the bridge refuses an operation."""
 
 
 def parse_request(line: bytes) -> tuple[Any, str, dict[str, Any]]:
-    """Return id, operation and arguments of a line; ValueError where it is not a request."""
+    """Return id, operation and arguments of a line; ValueError if it is not a request."""
     if len(line) > MAX_REQUEST_BYTES:
         raise ValueError("the line is too long")
     try:
@@ -97,14 +98,14 @@ def parse_request(line: bytes) -> tuple[Any, str, dict[str, Any]]:
 
 
 def _no_number(text: str) -> None:
-    raise ValueError(f"{text} is no number")
+    raise ValueError(f"{text} is not a number")
 
 
 class Client(asyncio.Protocol):
     """One connection.
 
-    Lines are taken apart as they arrive. A stop is carried out at once; all other requests wait for their turn, and a
-    client with too many waiting requests is not read from.
+    Lines are processed as they arrive. A stop is executed at once; all other requests are queued, and no further lines
+    are read from a client with too many queued requests.
     """
 
     def __init__(self, bridge: Bridge) -> None:
@@ -113,11 +114,11 @@ class Client(asyncio.Protocol):
         self.greeted = self.control = self.compensate = self.gone = False
         self.name = ""
         self.since = time.monotonic()
-        self.program: list[str] = []  # parts of a program that are here already
+        self.program: list[str] = []  # parts of a program received so far
         self.program_size = 0
         self.tasks: set[asyncio.Task[None]] = set()
         self._buffer = bytearray()
-        self._reading = False  # whether further lines are taken in a moment
+        self._reading = False  # whether further lines will be processed soon
         self._waiting: deque[tuple[Any, str, dict[str, Any]]] = deque()
         self._serving: asyncio.Task[None] | None = None
         self._deadline: asyncio.TimerHandle | None = None
@@ -129,11 +130,11 @@ class Client(asyncio.Protocol):
         self.bridge.arrived(self)
 
     def connection_lost(self, exc: Any) -> None:  # noqa: ARG002
-        """End what the client has started."""
+        """End the operations of the client."""
         self._forget()
 
     def data_received(self, data: bytes) -> None:
-        """Take the lines apart; close at the first thing that is not a request."""
+        """Process the lines; close the connection at the first line that is not a request."""
         self._buffer += data
         if len(self._buffer) > MAX_REQUEST_BYTES:
             self.transport.pause_reading()
@@ -141,7 +142,7 @@ class Client(asyncio.Protocol):
             self._read()
 
     def _read(self) -> None:
-        """Take some lines; the rest follows after what others have sent."""
+        """Process some lines; the rest follows after the lines of other clients."""
         self._reading = False
         for _ in range(LINES_AT_ONCE):
             if self.gone or not self._buffer or len(self._waiting) >= MAX_WAITING:
@@ -174,7 +175,7 @@ class Client(asyncio.Protocol):
         elif not self.greeted:
             self.end("expected 'hello' with the token first")
         elif op in ("stop", "estop"):
-            self.bridge.begin(self, number, op, arguments)  # ahead of all waiting requests
+            self.bridge.begin(self, number, op, arguments)  # before all queued requests
         else:
             self._waiting.append((number, op, arguments))
             if len(self._waiting) >= MAX_WAITING:
@@ -183,7 +184,7 @@ class Client(asyncio.Protocol):
                 self._serving = asyncio.ensure_future(self._serve())
 
     def discard_program(self) -> None:
-        """Forget the parts of a program."""
+        """Discard the parts of a program."""
         self.program.clear()
         self.program_size = 0
 
@@ -194,12 +195,12 @@ class Client(asyncio.Protocol):
             self._deadline.cancel()
 
     async def _serve(self) -> None:
-        """Carry out the waiting requests; all clients take turns."""
+        """Execute the queued requests; all clients take turns."""
         while self._waiting:
             async with self.bridge.turn:
                 number, op, arguments = self._waiting.popleft()
                 done = self.bridge.begin(self, number, op, arguments)
-                await asyncio.sleep(0)  # what has arrived meanwhile is read before the next turn
+                await asyncio.sleep(0)  # data received meanwhile are read before the next turn
             if done is not None and op in self.bridge.in_order:
                 await asyncio.wait([done])
             if not self._reading and not self.gone:
@@ -215,7 +216,7 @@ class Client(asyncio.Protocol):
             self.transport.abort()
 
     def end(self, why: str = "") -> None:
-        """Close the connection; nothing more is read from it."""
+        """Close the connection; nothing further is read from it."""
         if self.gone:
             return
         if why:
@@ -236,10 +237,10 @@ class Client(asyncio.Protocol):
 
 
 class Sender(asyncio.Protocol):
-    """Sends commands to LinuxCNC from a process of its own.
+    """Sends commands to LinuxCNC from a separate process.
 
-    LinuxCNC's module waits until a command is accepted, 10 to 100 ms, and holds up the whole process. There is one
-    process for orders and one for stops, so that a stop waits for nothing. To be made before any thread or socket.
+    LinuxCNC's module waits until a command is accepted, 10 to 100 ms, and blocks the process. There is one process for
+    operations and one for stops, so that a stop is never delayed. Senders must be created before any thread or socket.
     """
 
     def __init__(self) -> None:
@@ -262,11 +263,11 @@ class Sender(asyncio.Protocol):
         await asyncio.get_running_loop().create_connection(lambda: self, sock=self._line)
 
     def connection_made(self, transport: Any) -> None:
-        """Keep the connection."""
+        """Store the connection."""
         self._transport = transport
 
     def data_received(self, data: bytes) -> None:
-        """Take the results of commands, in their order."""
+        """Process the results of commands, in their order."""
         *lines, self._buffer = (self._buffer + data).split(b"\n")
         for line in lines:
             number, error = json.loads(line)
@@ -279,7 +280,7 @@ class Sender(asyncio.Protocol):
                 done.set_result(number)
 
     def connection_lost(self, exc: Any) -> None:  # noqa: ARG002
-        """Fail all commands under way."""
+        """Set an error for all commands in progress."""
         self._transport = None
         while self._sent:
             done = self._sent.popleft()
@@ -288,9 +289,9 @@ class Sender(asyncio.Protocol):
         self.when_lost()
 
     def send(self, name: str, *arguments: Any) -> asyncio.Future[int]:
-        """Send a command at once; the result is its serial number, when LinuxCNC has accepted it."""
+        """Send a command at once; the result is its serial number, once LinuxCNC has accepted it."""
         done: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        done.add_done_callback(lambda each: each.cancelled() or each.exception())  # also where nobody waits for it
+        done.add_done_callback(lambda each: each.cancelled() or each.exception())  # also if its result is not used
         if self._transport is None:
             done.set_exception(RefusedError(_NO_SENDER))
         else:
@@ -316,14 +317,14 @@ def _obey(line: socket.socket) -> None:
 
                     command = linuxcnc.command()
                 getattr(command, name)(*arguments)
-            except Exception as found:  # noqa: BLE001 - the order fails with it
+            except Exception as found:  # noqa: BLE001 - reported as the error of the operation
                 error = f"{type(found).__name__}: {found}"
             file.write(json.dumps([getattr(command, "serial", 0), error]).encode() + b"\n")
             file.flush()
 
 
 class Job:
-    """The running order, its client, and the reason of an abort."""
+    """The running operation, its client, and the reason of an abort."""
 
     def __init__(self, client: Client, what: str) -> None:
         self.client = client
@@ -332,10 +333,10 @@ class Job:
 
 
 class Offsets:
-    """The offset of ``compensation.tcl``: what is asked for, what is in effect, and why it may not change.
+    """The offset of ``compensation.tcl``: requested and effective values, and why it must not change.
 
-    Limit, slew limit, hold and watchdog are in the servo thread, and act without this process. What is set here is
-    checked once more.
+    Limit, slew limit, hold and watchdog are in the servo thread, and work without this process. Offsets are also
+    checked here.
 
     Parameters
     ----------
@@ -345,11 +346,11 @@ class Offsets:
 
     def __init__(self, hal: Any) -> None:
         self.hal = hal
-        self._signed = -math.inf  # time of the last sign of life
+        self._signed = -math.inf  # time of the last change of the heartbeat
 
     @property
     def route(self) -> str:
-        """``external``, ``feedback``, or empty where ``compensation.tcl`` is not loaded."""
+        """``external``, ``feedback``, or empty if ``compensation.tcl`` is not loaded."""
         for route, pin in (("external", "errormotion-counts-x.out"), ("feedback", "errormotion-limit-x.out")):
             with contextlib.suppress(Exception):
                 self.hal.get_value(pin)
@@ -357,14 +358,14 @@ class Offsets:
         return ""
 
     def state(self, unit: float) -> dict[str, Any]:
-        """Return limits and offset in m, and why the offset stays as it is, for lengths in a unit in m."""
+        """Return limits and offset, m, and why the offset must not change; ``unit`` is LinuxCNC's unit of length, m."""
         route = self.route
         if not route:
-            raise RefusedError("LinuxCNC has not loaded compensation.tcl; name it in the INI file")
+            raise RefusedError("LinuxCNC has not loaded compensation.tcl; add it to the INI file")
         before = self._three("errormotion-limit-{}.out")
         offset, asked = before, before
         if route == "external":
-            # The servo thread goes on meanwhile: both are compared with what was planned before and after.
+            # The servo thread runs meanwhile: both are compared with the values planned before and after.
             offset, asked = self._three("axis.{}.eoffset"), self._three("axis.{}.eoffset-request")
         planned = [before, self._three("errormotion-limit-{}.out")]
         return {
@@ -379,7 +380,7 @@ class Offsets:
         }
 
     def set(self, offset: Any, unit: float) -> None:
-        """Ask for an offset, m, and give a sign of life."""
+        """Set the requested offset, m, and change the heartbeat."""
         state = self.state(unit)
         if not isinstance(offset, list) or len(offset) != len(AXES):
             raise RefusedError(f"expected an offset of X, Y, Z in m; found {str(offset)[:MAX_NAME]}")
@@ -394,17 +395,17 @@ class Offsets:
                 )
             if abs(x - now) > most:
                 raise RefusedError(
-                    f"{axis} {1e6 * x:g} um is a jump of {1e6 * abs(x - now):.3g} um; the slew limit allows "
+                    f"{axis} {1e6 * x:g} um is a change of {1e6 * abs(x - now):.3g} um; the slew limit permits "
                     f"{1e6 * most:.3g} um until the watchdog acts"
                 )
         for each, x in zip("xyz", goal):  # noqa: B905
             self.hal.set_p(f"errormotion-source-{each}.in1", repr(x / unit))
-        if time.monotonic() - self._signed > SIGN_INTERVAL:  # two changes in one servo cycle would be none
+        if time.monotonic() - self._signed > SIGN_INTERVAL:  # two changes in one servo cycle would cancel each other
             self._signed = time.monotonic()
             self.hal.set_p("errormotion-sign.in0", str(int(not self._get("errormotion-sign.in0"))))
 
     def hold(self) -> None:
-        """Hold the offset for the next half second: a thread is being cut."""
+        """Hold the offset for the next half second, while a thread is cut."""
         self.hal.set_p("errormotion-thread.in", str(int(not self._get("errormotion-thread.in"))))
 
     def spindle_leads(self) -> bool:
@@ -435,14 +436,14 @@ class Offsets:
             return "the machine is not homed"
         if wrong > OFFSET_TOLERANCE:
             return (
-                f"LinuxCNC has an external offset that is {1e6 * wrong:.3g} um off the one that was set here: another "
+                f"LinuxCNC has an external offset that differs by {1e6 * wrong:.3g} um from the one set here: another "
                 "program, or an end of travel; switch the machine off and on"
             )
         return ""
 
 
 def _distance(values: list[float], bounds: list[list[float]]) -> float:
-    """Return by how much a value is farthest outside of its two bounds; 0 within them."""
+    """Return the largest distance of a value from the interval between its two bounds; 0 within it."""
     first, second = bounds
     return max(max(min(a, b) - x, x - max(a, b), 0.0) for x, a, b in zip(values, first, second))  # noqa: B905
 
@@ -455,17 +456,17 @@ class Bridge:
     linuxcnc, hal : module
         LinuxCNC's two Python modules.
     orders, stops : Sender
-        What sends commands to LinuxCNC.
+        Processes that send commands to LinuxCNC.
     programs : Path
-        Folder for the programs that clients pass on.
+        Folder for the programs of clients.
     pins : tuple of str
         Prefixes of the HAL pins that clients may set.
     load : str
-        HAL pin with the load of the spindle, as a fraction of the rated one; empty where there is none.
+        HAL pin with the load of the spindle, as a fraction of the rated load; empty: none.
     compensates : bool
-        Whether a client may set the offset of ``compensation.tcl``.
+        Whether one client may set the offset of ``compensation.tcl``.
     token : str
-        The first request of a client must have it.
+        Token that the first request of a client must contain.
     """
 
     def __init__(
@@ -498,14 +499,10 @@ class Bridge:
         self.job: Job | None = None
         self.program: Job | None = None
         self.outcome: dict[str, Any] | RefusedError = {"duration": 0.0}  # of the last program
-        self._probed_with = [
-            0.0,
-            0.0,
-            0.0,
-        ]  # external offset of the last probing, m; held in the servo thread meanwhile
+        self._probed_with = [0.0, 0.0, 0.0]  # external offset of the last probing, m; held during it
         self._written = 0
         self._stops = 0
-        self._stopping: dict[str, asyncio.Future[int]] = {}  # stops under way, which further ones join
+        self._stopping: dict[str, asyncio.Future[int]] = {}  # stops in progress, which further ones join
         self._began = time.monotonic()
         reads = (self.identify, self.state, self.elapse, self.finish, self.stop, self.estop, self.offset)
         changes = (self.reset, self.set_pins, self.program_part)
@@ -515,7 +512,9 @@ class Bridge:
         self._waits, self._orders = {"elapse", "finish"}, {each.__name__ for each in moves}
         self._reads = {each.__name__ for each in reads}
         self._of_client = {"elapse", "finish", "program_part", "run_program"}
-        self.in_order = {*self._work} - self._waits - self._orders  # answered before the client's next request begins
+        self.in_order = (
+            {*self._work} - self._waits - self._orders
+        )  # answered before the next request of the client starts
 
     async def await_linuxcnc(self) -> None:
         """Wait until LinuxCNC has started or START_TIMEOUT has passed; until then its state is invalid."""
@@ -534,7 +533,7 @@ class Bridge:
         self.clients[client] = None
 
     def crowded(self) -> bool:
-        """Whether so many strangers have just arrived that the next one has to wait until their time is over."""
+        """Whether so many new connections without a valid request exist that the next one has to wait."""
         strangers = self._strangers()
         return len(strangers) >= MAX_STRANGERS and time.monotonic() - strangers[0].since < STRANGER_TIME
 
@@ -542,17 +541,17 @@ class Bridge:
         return [each for each in self.clients if not each.greeted]
 
     def left(self, client: Client) -> None:
-        """Forget a connection, and end its motions."""
+        """Remove a connection, and end its motions."""
         if client in self.clients:
             del self.clients[client]
             self._end_jobs("the connection of its client is lost", client)
 
     def greet(self, client: Client, number: Any, arguments: dict[str, Any]) -> None:
-        """Accept a client that has the token; give it control of the machine where nobody else has it."""
+        """Accept a client with the token; grant it control of the machine if no other client has it."""
         token, name = arguments.get("token"), arguments.get("client", "")
         given = token.encode("utf-8", "replace") if isinstance(token, str) else b""
         if not hmac.compare_digest(given, self._token):
-            client.end("the token is not that of this bridge")
+            client.end("the token is not valid for this bridge")
             return
         if not isinstance(name, str) or len(name) > MAX_NAME or not isinstance(arguments.get("control"), bool):
             client.end(f"expected 'control', true or false, and a name of at most {MAX_NAME} characters as 'client'")
@@ -561,7 +560,7 @@ class Bridge:
             client.end("expected 'compensate', true or false")
             return
         if not client.greeted and sum(each.greeted for each in self.clients) >= MAX_CLIENTS:
-            client.end(f"{MAX_CLIENTS} clients are connected already")
+            client.end(f"{MAX_CLIENTS} clients are already connected")
             return
         client.welcome()
         client.name, client.control, client.compensate = name, False, False
@@ -580,7 +579,7 @@ class Bridge:
         client.send({"id": number, "ok": True, "result": result, "time": self.time})
 
     def begin(self, client: Client, number: Any, op: str, arguments: dict[str, Any]) -> asyncio.Task[None] | None:
-        """Begin a request; return the task that answers it, None where it is answered."""
+        """Start a request; return the task that answers it, None if it has been answered."""
         work = self._work.get(op)
         if work is None:
             client.send(self._failure(number, f"unknown operation: {op}"))
@@ -589,11 +588,13 @@ class Bridge:
         elif op not in self._reads and op != "set_offset" and not client.control:
             client.send(
                 self._failure(
-                    number, "this client only reads: another one controls the machine, or it did not ask for control"
+                    number, "this client only reads: another one controls the machine, or it did not request control"
                 )
             )
         elif len(client.tasks) >= MAX_TASKS:
-            client.send(self._failure(number, f"{MAX_TASKS} requests of this client are being answered; wait for one"))
+            client.send(
+                self._failure(number, f"{MAX_TASKS} requests of this client are in progress; wait for an answer")
+            )
         elif op in self._orders and (busy := self.job or self.program):
             client.send(self._failure(number, f"the machine is busy: {busy.what}"))
         else:
@@ -608,7 +609,7 @@ class Bridge:
     def _no_compensation(self) -> str:
         if not self.compensates:
             return "the bridge was started without --compensate"
-        return "this client does not compensate: another one does, or it did not ask for it"
+        return "this client does not compensate: another one does, or it did not request the right"
 
     def _in_background(self, client: Client, work: Any) -> asyncio.Task[None]:
         task: asyncio.Task[None] = asyncio.ensure_future(work)
@@ -626,7 +627,7 @@ class Bridge:
             await self._abort_motion()
         if self.program is None:
             await self._rest()
-        self.job = None  # before the answer, which the next order may follow at once
+        self.job = None  # before the answer, which the next operation may follow at once
         client.send(answer)
 
     async def _wait(self, client: Client, number: Any, work: Callable[[], Any]) -> None:
@@ -662,10 +663,10 @@ class Bridge:
 
     @property
     def time(self) -> float:
-        """Seconds since the bridge started."""
+        """Time since the start of the bridge, s."""
         return time.monotonic() - self._began
 
-    def _look(self) -> None:
+    def _poll_state(self) -> None:
         """Read the state and the texts of errors."""
         self.stat.poll()
         while (message := self.errors.poll()) is not None:
@@ -676,19 +677,19 @@ class Bridge:
 
     @property
     def _unit(self) -> float:
-        """Metres in the INI file's unit of length."""
+        """Unit of length of the INI file, m."""
         per_millimetre = float(self.stat.linear_units)
         if not per_millimetre > 0:
             raise RefusedError("LinuxCNC is still starting")
         return 1e-3 / per_millimetre
 
-    def _metres(self, places: Any) -> list[float]:
-        return [self._unit * float(x) for x in places[:3]]
+    def _metres(self, values: Any) -> list[float]:
+        return [self._unit * float(x) for x in values[:3]]
 
-    def _place(self, position: Any) -> list[float]:
-        """Return a position of LinuxCNC, m, without the external offset, which LinuxCNC adds to what was commanded.
+    def _without_offset(self, position: Any) -> list[float]:
+        """Return a position of LinuxCNC, m, without the external offset, which LinuxCNC adds to the commanded position.
 
-        The offset may have changed since the state was read. LinuxCNC takes it off its command in the servo cycle.
+        The offset may have changed since the state was read. LinuxCNC subtracts it from its command in the servo cycle.
         """
         place = self._metres(position)
         with contextlib.suppress(Exception):  # LinuxCNC 2.7 has no external offset
@@ -704,8 +705,8 @@ class Bridge:
         return [0.0, 0.0, 0.0]
 
     async def identify(self) -> dict[str, Any]:
-        """Identify the version of LinuxCNC, the machine's name and its INI file."""
-        self._look()
+        """Return the version of LinuxCNC, the name of the machine, and its INI file."""
+        self._poll_state()
         ini = str(self.stat.ini_filename)
         machine = self.cnc.ini(ini).find("EMC", "MACHINE") if ini else None
         return {
@@ -722,13 +723,13 @@ class Bridge:
 
     async def state(self) -> dict[str, Any]:
         """Return the state of the machine."""
-        self._look()
+        self._poll_state()
         s = self.stat
         modes = {self.cnc.MODE_MANUAL: "manual", self.cnc.MODE_MDI: "mdi", self.cnc.MODE_AUTO: "automatic"}
         return {
             "time": self.time,
-            "position": self._place(s.actual_position),
-            "commanded_position": self._place(s.position),
+            "position": self._without_offset(s.actual_position),
+            "commanded_position": self._without_offset(s.position),
             "spindle_speed": self._spindle_speed(),
             "spindle_commanded": float(s.spindle[0]["speed"]),
             "spindle_load": self._pin(self.load),
@@ -744,7 +745,7 @@ class Bridge:
         }
 
     def _spindle_speed(self) -> float:
-        """Return the measured speed where HAL has an encoder, else the commanded one; 1/min."""
+        """Return the measured speed if HAL has an encoder, else the commanded speed; 1/min."""
         pin = "spindle.0.speed-in"
         with contextlib.suppress(Exception):
             if self.hal.pin_has_writer(pin):
@@ -754,7 +755,7 @@ class Bridge:
     def _pin(self, name: str) -> float | None:
         try:
             value = float(self.hal.get_value(name)) if name else math.nan
-        except Exception:  # noqa: BLE001 - of a pin that is not there nothing is known
+        except Exception:  # noqa: BLE001 - the value of a missing pin is unknown
             return None
         return value if math.isfinite(value) else None
 
@@ -766,10 +767,10 @@ class Bridge:
         s = self.stat
         return bool(s.interp_state == self.cnc.INTERP_IDLE and s.queue == 0 and s.inpos)
 
-    # ------------------------------------------------------------------ orders
+    # ------------------------------------------------------------------ operations
 
     async def estop(self) -> None:
-        """Send the e-stop to LinuxCNC, which takes some 0.1 s; its state shows when it is in e-stop."""
+        """Send the e-stop to LinuxCNC, which takes about 0.1 s; its state reports when it is in e-stop."""
         self._end_jobs("e-stop", None, abort=False)
         if "estop" not in self._stopping:
             sent = self.stops.send("state", self.cnc.STATE_ESTOP)
@@ -787,24 +788,24 @@ class Bridge:
         return self._serial
 
     def _abort(self) -> asyncio.Future[int]:
-        """Send an abort at once, unless one is under way; return when LinuxCNC accepts it."""
+        """Send an abort at once, unless one is in progress; return a future of its acceptance by LinuxCNC."""
         return self._stopping.get("abort") or self._under_way("abort", self.stops.send("abort"))
 
     def _under_way(self, what: str, stop: asyncio.Future[int]) -> asyncio.Future[int]:
-        """Register a stop, which further ones of its kind join, and for which the next order waits."""
+        """Register a stop, which further ones of its type join, and for which the next operation waits."""
         self._stopping[what] = stop
         stop.add_done_callback(lambda _: self._stopping.pop(what, None))
         return stop
 
     async def _stopped(self) -> None:
-        """Wait until LinuxCNC has accepted the stops under way."""
+        """Wait until LinuxCNC has accepted the stops in progress."""
         while self._stopping:
             await asyncio.wait(list(self._stopping.values()))
 
     async def reset(self) -> None:
-        """Release the e-stop and clear the alarms; the machine stays off."""
+        """Release the e-stop and clear the alarms; the machine remains off."""
         await self._stopped()
-        self._look()
+        self._poll_state()
         if self.stat.task_state == self.cnc.STATE_ESTOP:
             await self._send("state", self.cnc.STATE_ESTOP_RESET)
             if not await self._becomes(lambda: self.stat.task_state != self.cnc.STATE_ESTOP):
@@ -812,7 +813,7 @@ class Bridge:
         self.alarms.clear()
 
     async def stop(self, spindle: bool = False) -> None:
-        """Abort everything; LinuxCNC's abort stops the spindle as well."""
+        """Abort all motion; LinuxCNC's abort also stops the spindle."""
         self._stops += 1
         self._end_jobs("it was stopped", None, abort=False)
         accepted = self._abort()
@@ -821,28 +822,28 @@ class Bridge:
         self._serial = max(self._serial, await asyncio.shield(accepted))
         await self._settle("abort")
         until = time.monotonic() + ACCEPT_TIMEOUT
-        while (self.job or self.program) and time.monotonic() < until:  # an order that was sent meanwhile
+        while (self.job or self.program) and time.monotonic() < until:  # an operation that was started meanwhile
             await asyncio.sleep(POLL_INTERVAL)
         await self._rest()
 
     async def enable(self) -> None:
         """Switch the machine on."""
         await self._stopped()
-        self._look()
+        self._poll_state()
         if self.stat.task_state == self.cnc.STATE_ESTOP:
             raise RefusedError("the machine is in e-stop; reset it first")
-        for _ in range(ATTEMPTS):  # LinuxCNC ignores the first one while its e-stop is being released
+        for _ in range(ATTEMPTS):  # LinuxCNC ignores the first one while the e-stop is being released
             await self._send("state", self.cnc.STATE_ON)
             if await self._becomes(lambda: self.stat.task_state in (self.cnc.STATE_ON, self.cnc.STATE_ESTOP)):
                 break
             if self.job is not None and self.job.ended_by:
                 raise RefusedError(f"enable was aborted: {self.job.ended_by}")
         if self.stat.task_state != self.cnc.STATE_ON:
-            raise RefusedError(f"the machine stays off{await self._texts()}")
+            raise RefusedError(f"the machine remains off{await self._texts()}")
 
     async def home(self) -> None:
         """Home all joints; return when all are homed."""
-        await self._demand(homed=False)
+        await self._require_ready(homed=False)
         await self._mode(self.cnc.MODE_MANUAL)
         await self._send("teleop_enable", 0)
         await self._settle("joint mode")
@@ -858,11 +859,11 @@ class Bridge:
         await self._settle("world mode")
 
     async def move_to(self, position: Any, feed: Any = None, feed_limit: Any = None) -> dict[str, Any]:
-        """Move in a straight line, at a feed in m/s or in rapid; return when the machine is there.
+        """Move in a straight line, at a feed in m/s or in rapid; return when the machine has arrived.
 
-        A rapid move that would exceed ``feed_limit``, m/s, has that feed.
+        A rapid move that would exceed ``feed_limit``, m/s, is made at this feed.
         """
-        await self._demand()
+        await self._require_ready()
         goal, words = self._goal(position), "G0"
         if feed is not None:
             words = f"G1 {self._feed(feed)}"
@@ -875,26 +876,26 @@ class Bridge:
 
     async def probe(self, target: Any, feed: Any) -> dict[str, Any]:
         """Move in a straight line until the probe trips, and return its position."""
-        await self._demand()
+        await self._require_ready()
         goal, words = self._goal(target), f"G38.3 {self._feed(feed)}"
         if self.stat.probe_val:
             raise RefusedError("the probe is tripped before it moves")
-        if math.dist(goal, self._place(self.stat.position)) < POSITION_TOLERANCE:
-            raise RefusedError("the probe is at the target already")
+        if math.dist(goal, self._without_offset(self.stat.position)) < POSITION_TOLERANCE:
+            raise RefusedError("the probe is already at the target")
         if self.stat.spindle[0]["direction"]:
             raise RefusedError("the spindle turns; stop it before the machine probes")
         self._probed_with = self._external()
         await self._mdi(f"{words} {_axis_words(self._in_work_frame(goal))}")
         if self.stat.probe_tripped:
             found = self._metres(self.stat.probed_position)
-            place = [x - offset for x, offset in zip(found, self._probed_with)]  # noqa: B905
-            return {"tripped": True, "position": place, "time": self.time}
+            position = [x - offset for x, offset in zip(found, self._probed_with)]  # noqa: B905
+            return {"tripped": True, "position": position, "time": self.time}
         await self._require_arrival(goal)
         return {"tripped": False, "position": None, "time": self.time}
 
     async def spindle(self, speed: Any) -> None:
-        """Turn the spindle at a speed in 1/min, backwards where it is negative; 0 stops it."""
-        await self._demand(homed=False)
+        """Turn the spindle at a speed in 1/min, negative for reverse, 0 to stop it."""
+        await self._require_ready(homed=False)
         number, most = _number(speed, "spindle speed in /min"), self._fastest_spindle(speed)
         if abs(number) > most:
             raise RefusedError(f"expected a spindle speed of at most {most:g} /min; found {number:g} /min")
@@ -903,7 +904,7 @@ class Bridge:
             raise RefusedError(f"the spindle does not turn{await self._texts()}")
 
     async def program_part(self, client: Client, text: Any) -> None:
-        """Take a part of a long program; `run_program` has the last one. An empty part discards the earlier ones."""
+        """Store a part of a long program; `run_program` receives the last one. An empty part discards earlier ones."""
         if not isinstance(text, str):
             raise RefusedError("expected the text of a part of a program")
         if not text:
@@ -915,13 +916,13 @@ class Bridge:
             raise RefusedError(f"expected a program of at most {MAX_PROGRAM_BYTES} bytes")
 
     async def run_program(self, client: Client, text: Any, machine_coordinates: Any = False) -> dict[str, Any]:
-        """Run an NC program, after its earlier parts; return when it has started.
+        """Run an NC program, with the parts received before; return when it has started.
 
-        With ``machine_coordinates`` it is refused while an offset of work or tool, or a rotation, is in force.
+        With ``machine_coordinates`` it is refused while an offset of work or tool, or a rotation, is in effect.
         """
         parts = client.program.copy()
         client.discard_program()
-        await self._demand()
+        await self._require_ready()
         if not isinstance(text, str):
             raise RefusedError("expected the text of a program")
         text = "".join([*parts, text])
@@ -930,7 +931,7 @@ class Bridge:
         s = self.stat
         if machine_coordinates and any([*s.g5x_offset, *s.g92_offset, *s.tool_offset, s.rotation_xy]):
             raise RefusedError(
-                "an offset of work or tool is in force: the program would not run in machine coordinates"
+                "an offset of work or tool is in effect: the program would not run in machine coordinates"
             )
         self._written += 1
         file = self.programs / f"errormotion-{self._written}.ngc"
@@ -975,7 +976,7 @@ class Bridge:
         return self.outcome
 
     async def elapse(self, client: Client, seconds: Any) -> None:
-        """Let time pass."""
+        """Wait."""
         until, stops = time.monotonic() + _number(seconds, "a time in s", least=0.0), self._stops
         while (left := until - time.monotonic()) > 0 and not client.gone:
             if self._stops != stops:
@@ -994,14 +995,14 @@ class Bridge:
     # ------------------------------------------------------------------ compensation
 
     async def offset(self) -> dict[str, Any]:
-        """Return the offset in effect, its limits, and why it does not change."""
-        self._look()
+        """Return the offset in effect, its limits, and why it must not change."""
+        self._poll_state()
         holder = next((each.name for each in self.clients if each.compensate), None)
         return {**self.offsets.state(self._unit), "by": holder}
 
     async def set_offset(self, offset: Any) -> None:
-        """Ask for an offset of X, Y, Z in m; each request is a sign of life for the watchdog in the servo thread."""
-        self._look()
+        """Set the offset of X, Y, Z, m; each request is also a heartbeat for the watchdog in the servo thread."""
+        self._poll_state()
         self.offsets.set(offset, self._unit)
 
     async def watch_threads(self) -> None:
@@ -1012,12 +1013,12 @@ class Bridge:
                     self.offsets.hold()
             await asyncio.sleep(THREAD_INTERVAL)
 
-    # ------------------------------------------------------------------ steps of orders
+    # ------------------------------------------------------------------ steps of operations
 
-    async def _demand(self, *, homed: bool = True) -> None:
-        """Refuse unless the machine is ready for an order."""
+    async def _require_ready(self, *, homed: bool = True) -> None:
+        """Refuse unless the machine is ready for an operation."""
         await self._stopped()
-        self._look()
+        self._poll_state()
         await self._rest(REST_TIMEOUT)
         if self.stat.task_state == self.cnc.STATE_ESTOP:
             raise RefusedError("the machine is in e-stop; reset it, and enable it again")
@@ -1026,7 +1027,7 @@ class Bridge:
         if homed and not self._homed():
             raise RefusedError("the machine is not homed; home it first")
         if not self._idle():
-            raise RefusedError("the machine is busy with a motion that this bridge has not ordered")
+            raise RefusedError("the machine is busy with a motion that this bridge has not started")
 
     def _goal(self, position: Any) -> list[float]:
         if not isinstance(position, list) or len(position) != 3:
@@ -1038,7 +1039,7 @@ class Bridge:
         return goal
 
     def _feed(self, feed: Any) -> str:
-        """Return the word of a feed in m/s, at most that of the INI file."""
+        """Return the F word for a feed in m/s; refuse more than the feed of the INI file."""
         speed, most = _number(feed, "a feed in m/s"), self._fastest()
         if not 0 < speed <= most * (1 + 1e-6):
             raise RefusedError(f"expected a feed above 0 and at most {most:g} m/s; found {feed!r}")
@@ -1060,11 +1061,11 @@ class Bridge:
             return stated if 0 < stated < MAX_SPINDLE else MAX_SPINDLE
         return MAX_SPINDLE
 
-    def _in_work_frame(self, place: list[float]) -> list[float]:
-        """Return a position of the machine in the coordinates in force: G54, G92 and the tool's offset."""
+    def _in_work_frame(self, position: list[float]) -> list[float]:
+        """Return a machine position in the coordinates in effect: G54, G92 and tool offset."""
         s = self.stat
         work, extra, tool = (self._metres(offset) for offset in (s.g5x_offset, s.g92_offset, s.tool_offset))
-        x, y, z = (p - w - t for p, w, t in zip(place, work, tool))  # noqa: B905
+        x, y, z = (p - w - t for p, w, t in zip(position, work, tool))  # noqa: B905
         angle = -math.radians(s.rotation_xy)
         x, y = x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
         return [x - extra[0], y - extra[1], z - extra[2]]
@@ -1096,38 +1097,38 @@ class Bridge:
             await asyncio.sleep(POLL_INTERVAL)
 
     async def _ended(self, job: Job | None) -> bool:
-        """Whether LinuxCNC has finished the last order; RefusedError where it was aborted."""
-        self._look()
+        """Whether LinuxCNC has finished the last operation; RefusedError if it was aborted."""
+        self._poll_state()
         if job is not None and job.ended_by:
             raise RefusedError(f"{job.what} was aborted: {job.ended_by}")
         if self.stat.task_state != self.cnc.STATE_ON:
             what = "e-stop" if self.stat.task_state == self.cnc.STATE_ESTOP else "the machine was switched off"
-            raise RefusedError(f"{job.what if job else 'order'} was aborted: {what}{await self._texts()}")
-        taken = self.stat.echo_serial_number >= self._serial and self.stat.state != self.cnc.RCS_EXEC
-        return taken and self._idle()
+            raise RefusedError(f"{job.what if job else 'operation'} was aborted: {what}{await self._texts()}")
+        accepted = self.stat.echo_serial_number >= self._serial and self.stat.state != self.cnc.RCS_EXEC
+        return accepted and self._idle()
 
     async def _poll(self) -> None:
         await asyncio.sleep(POLL_INTERVAL)
         await self._ended(self.job)
 
     async def _settle(self, what: str, *, running: bool = False) -> None:
-        """Wait until LinuxCNC has accepted an order and, unless ``running``, carried it out."""
+        """Wait until LinuxCNC has accepted a command and, unless ``running``, executed it."""
         until = time.monotonic() + ACCEPT_TIMEOUT
         while True:
-            self._look()
+            self._poll_state()
             done = running or self.stat.state != self.cnc.RCS_EXEC
             if self.stat.echo_serial_number >= self._serial and done:
                 return
             if time.monotonic() > until:
-                self._abort()  # an order that is not accepted now must not be carried out later
+                self._abort()  # a command that is not accepted now must not be executed later
                 raise RefusedError(f"LinuxCNC does not respond: {what} took more than {ACCEPT_TIMEOUT:g} s")
             await asyncio.sleep(POLL_INTERVAL / 2)
 
     async def _abort_motion(self) -> None:
-        """Abort all motion after a failed order, also one that has overtaken the stop which ended it."""
+        """Abort all motion after a failed operation, also of a command that LinuxCNC received after the stop."""
         await self._stopped()
         with contextlib.suppress(Exception):
-            self._look()
+            self._poll_state()
             if self._idle() and not (self.job and self.job.ended_by):
                 return
         self._abort()
@@ -1138,38 +1139,38 @@ class Bridge:
         self._serial = max(self._serial, await self.orders.send(name, *arguments))
 
     async def _rest(self, limit: float = ACCEPT_TIMEOUT) -> None:
-        """Wait until nothing moves, at most ``limit`` s."""
+        """Wait until the machine is at rest, at most ``limit`` s."""
         until = time.monotonic() + limit
         with contextlib.suppress(Exception):  # LinuxCNC has ended: nothing moves
             while not self._idle() and time.monotonic() < until:
                 await asyncio.sleep(POLL_INTERVAL)
-                self._look()
+                self._poll_state()
 
     async def _becomes(self, condition: Callable[[], bool]) -> bool:
-        """Wait for a condition, at most CHANGE_TIMEOUT; return whether it holds."""
+        """Wait for a condition, at most CHANGE_TIMEOUT; return whether it is true."""
         until = time.monotonic() + CHANGE_TIMEOUT
         while True:
-            self._look()
+            self._poll_state()
             if condition() or time.monotonic() > until:
                 return condition()
             await asyncio.sleep(POLL_INTERVAL)
 
     async def _require_arrival(self, goal: list[float]) -> None:
-        place = self._place(self.stat.position)
-        if math.dist(goal, place) > POSITION_TOLERANCE:
-            found = ", ".join(f"{1e3 * x:.4f}" for x in place)
+        position = self._without_offset(self.stat.position)
+        if math.dist(goal, position) > POSITION_TOLERANCE:
+            found = ", ".join(f"{1e3 * x:.4f}" for x in position)
             raise RefusedError(f"the machine has stopped before its goal, at {found} mm{await self._texts()}")
 
     async def _texts(self) -> str:
-        """Return the error texts of LinuxCNC, to be appended to a message."""
+        """Return the error texts of LinuxCNC, for the end of a message."""
         until = time.monotonic() + TEXT_TIMEOUT
         while not self.alarms and time.monotonic() < until:
             await asyncio.sleep(POLL_INTERVAL)
-            self._look()
+            self._poll_state()
         return f": {'; '.join(self.alarms)}" if self.alarms else ""
 
     def _end_jobs(self, why: str, client: Client | None, *, abort: bool = True) -> None:
-        """Abort order and program, of all clients or of one."""
+        """Abort operation and program, of all clients or of one."""
         ended = [job for job in (self.job, self.program) if job and client in (None, job.client)]
         for job in ended:
             job.ended_by = job.ended_by or why
@@ -1187,23 +1188,23 @@ def _number(value: Any, what: str, least: float = -math.inf) -> float:
     return number
 
 
-def _axis_words(place: list[float]) -> str:
-    return " ".join(f"{axis}{1e3 * x:.7f}" for axis, x in zip(AXES, place))  # noqa: B905
+def _axis_words(position: list[float]) -> str:
+    return " ".join(f"{axis}{1e3 * x:.7f}" for axis, x in zip(AXES, position))  # noqa: B905
 
 
 # ---------------------------------------------------------------------- socket and token
 
 
 def own_folder(path: Path) -> None:
-    """Make the folder of a file, for its user only; PermissionError where others can write into it."""
+    """Create the folder of a file, for its user only; PermissionError if others can write to it."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     found = path.parent.stat()
     if found.st_uid not in (os.getuid(), 0) or found.st_mode & 0o022:
-        raise PermissionError(f"{path.parent}: expected a folder into which only its user can write; chmod 700 it")
+        raise PermissionError(f"{path.parent}: expected a folder that only its user can write to; use chmod 700")
 
 
 def own_token(path: Path) -> str:
-    """Return the token in a file that only its user can read; it is made where there is none.
+    """Return the token in a file that only its user can read; create it if it does not exist.
 
     Raises
     ------
@@ -1218,7 +1219,7 @@ def own_token(path: Path) -> str:
         try:
             with os.fdopen(handle, "w") as file:
                 file.write(secrets.token_hex(32) + "\n")
-            with contextlib.suppress(FileExistsError):  # another bridge was faster
+            with contextlib.suppress(FileExistsError):  # another bridge has created it
                 os.link(part, path)
         finally:
             os.unlink(part)
@@ -1227,8 +1228,8 @@ def own_token(path: Path) -> str:
         found = os.fstat(handle)
         if not stat.S_ISREG(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
             raise PermissionError(
-                f"{path}: expected a file of this user that nobody else can read (mode 0600); remove it, and the "
-                "bridge makes another one"
+                f"{path}: expected a file of this user that no other user can read (mode 0600); remove it, and the "
+                "bridge creates another one"
             )
         token = file.read(4096).strip()
     if len(token) < MIN_TOKEN:
@@ -1237,7 +1238,7 @@ def own_token(path: Path) -> str:
 
 
 def unix_socket(path: Path) -> socket.socket:
-    """Return a listening socket that only its user can connect to; OSError where another bridge listens there."""
+    """Return a listening socket for its user only; OSError if another bridge listens there."""
     own_folder(path)
     if path.exists():
         if not stat.S_ISSOCK(path.lstat().st_mode):
@@ -1259,7 +1260,7 @@ def unix_socket(path: Path) -> socket.socket:
 
 
 async def admit(bridge: Bridge, line: socket.socket) -> None:
-    """Accept connections one by one: a flood of them delays neither the clients nor who comes after it for long."""
+    """Accept connections one by one, so that many of them delay neither the clients nor later connections for long."""
     loop = asyncio.get_running_loop()
     while True:
         while bridge.crowded():
@@ -1267,12 +1268,12 @@ async def admit(bridge: Bridge, line: socket.socket) -> None:
         try:
             connection, _ = await loop.sock_accept(line)
             await loop.connect_accepted_socket(lambda: Client(bridge), connection)
-        except OSError:  # lost already, or too many open files
+        except OSError:  # already lost, or too many open files
             await asyncio.sleep(POLL_INTERVAL)
 
 
 async def run(make: Callable[[], Bridge], line: socket.socket, announce: Path | None, idle: float) -> None:
-    """Serve until this process is ended, or no client has been connected for ``idle`` s."""
+    """Serve until this process is terminated, or no client has been connected for ``idle`` s."""
     bridge, ended = make(), asyncio.Event()
     for sender in (bridge.orders, bridge.stops):
         await sender.connect(ended.set)  # a bridge that cannot stop the machine ends
@@ -1283,7 +1284,7 @@ async def run(make: Callable[[], Bridge], line: socket.socket, announce: Path | 
     watch = asyncio.ensure_future(bridge.watch_threads()) if bridge.compensates else None
     line.setblocking(False)
     line.listen(MAX_CLIENTS)
-    door = asyncio.ensure_future(admit(bridge, line))
+    accepting = asyncio.ensure_future(admit(bridge, line))
     name = line.getsockname()
     where = {"socket": name} if isinstance(name, str) else {"port": name[1]}
     print(f"errormotion's bridge listens on {name if isinstance(name, str) else f'127.0.0.1:{name[1]}'}", flush=True)
@@ -1299,12 +1300,12 @@ async def run(make: Callable[[], Bridge], line: socket.socket, announce: Path | 
             last_client = time.monotonic()
     if watch is not None:
         watch.cancel()
-    door.cancel()
+    accepting.cancel()
     line.close()
 
 
 def _component(hal: Any) -> Any:
-    """Return a component of HAL; the name of a bridge that was killed stays taken until LinuxCNC ends."""
+    """Return a component of HAL; the name of a bridge that was killed remains in use until LinuxCNC ends."""
     try:
         return hal.component("errormotion-bridge")
     except Exception:  # noqa: BLE001 - of LinuxCNC's module
@@ -1312,20 +1313,20 @@ def _component(hal: Any) -> Any:
 
 
 def main(words: list[str]) -> int:
-    """Run beside LinuxCNC."""
+    """Run the bridge."""
     parser = argparse.ArgumentParser(prog="bridge.py", description="JSON lines between LinuxCNC and errormotion")
     parser.add_argument("-ini", metavar="FILE", help="passed by LinuxCNC to its display; ignored")
     parser.add_argument("--socket", type=Path, default=Path(SOCKET), help=f"Unix socket; default {SOCKET}")
-    parser.add_argument("--port", type=int, help="port of 127.0.0.1 in place of the socket; 0: any free port")
+    parser.add_argument("--port", type=int, help="port of 127.0.0.1 instead of the socket; 0: any free port")
     parser.add_argument("--token", type=Path, default=Path(TOKEN), help=f"file with the token; default {TOKEN}")
-    parser.add_argument("--announce", type=Path, help="file to which socket or port, and process, are written")
+    parser.add_argument("--announce", type=Path, help="file for the socket or port, and the process id")
     parser.add_argument(
         "--idle", type=float, default=math.inf, help="time without a client after which the bridge ends, s"
     )
-    parser.add_argument("--pins", default="", help="prefixes of the HAL pins that clients may set, with commas between")
+    parser.add_argument("--pins", default="", help="prefixes of the HAL pins that clients may set, separated by commas")
     parser.add_argument("--load-pin", default="", help="HAL pin with the load of the spindle, 1 = rated")
     parser.add_argument(
-        "--compensate", action="store_true", help="allow one client to set the offset of compensation.tcl"
+        "--compensate", action="store_true", help="permit one client to set the offset of compensation.tcl"
     )
     options = parser.parse_args(words)
     path = options.socket.expanduser()
@@ -1334,12 +1335,12 @@ def main(words: list[str]) -> int:
         token = own_token(options.token.expanduser())
         line = unix_socket(path) if options.port is None else socket.create_server(("127.0.0.1", options.port))
     except (OSError, ValueError) as error:
-        print(f"errormotion's bridge does not start: {error}", file=sys.stderr)
+        print(f"errormotion's bridge cannot start: {error}", file=sys.stderr)
         return 1
     import hal
     import linuxcnc
 
-    component = _component(hal)  # so that LinuxCNC ends this process with the others
+    component = _component(hal)  # LinuxCNC then ends this process with the others
     component.ready()
     try:
         with tempfile.TemporaryDirectory(prefix="errormotion-") as folder:

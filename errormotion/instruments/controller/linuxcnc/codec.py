@@ -15,16 +15,16 @@ LINE_END = b"\n"
 LONGEST_LINE = 1 << 16
 """Longest line of the bridge, and of a request, bytes."""
 MOST_DIGITS = 300
-"""Of a whole number."""
+"""Largest number of digits of a whole number."""
 PROTOCOL = 2
 PART = 1 << 12
-"""Longest part of a program in a request, characters: at most twelve bytes each."""
+"""Longest part of a program in a request, characters; each has at most twelve bytes."""
 MODES = ("manual", "mdi", "automatic", "")
 
 
 @dataclass(frozen=True)
 class Beat:
-    """A sign of life while an order runs."""
+    """A heartbeat while a command runs."""
 
     number: int
     time: float
@@ -32,7 +32,7 @@ class Beat:
 
 @dataclass(frozen=True)
 class Answer:
-    """Answer to a request: a result, or a refusal with a text."""
+    """Answer to a request: a result, or the text of a refusal."""
 
     number: Any
     ok: bool
@@ -49,13 +49,14 @@ class Offset:
     route : str
         ``external`` or ``feedback``.
     offset : tuple of float
-        Of X, Y, Z in effect, m.
+        Offset of X, Y, Z in effect, m.
     limit, slew, watchdog : float
-        Largest offset, m, its fastest change, m/s, and the time without a request after which it goes to zero, s.
+        Largest offset, m, its largest rate of change, m/s, and the time without a request after which it ramps to zero,
+        s.
     busy, fault : str
-        Why the offset does not change, and why none is taken; empty: it does, one is.
+        Why the offset must not change, and why none is accepted; empty if it may change, or is accepted.
     by : str
-        The client that may set it; empty: none.
+        The client that has the right to set it; empty: none.
     """
 
     route: str
@@ -69,7 +70,7 @@ class Offset:
 
 
 def encode_request(number: int, op: str, arguments: Mapping[str, Any]) -> bytes:
-    """Return a request as bytes; InstrumentError where it holds NaN or infinity."""
+    """Return a request as bytes; InstrumentError if it is too long, or contains NaN or infinity."""
     try:
         request = json.dumps({"id": number, "op": op, **arguments}, allow_nan=False).encode() + LINE_END
     except ValueError:
@@ -80,17 +81,17 @@ def encode_request(number: int, op: str, arguments: Mapping[str, Any]) -> bytes:
 
 
 def parts_of(program: str) -> list[str]:
-    """Return a program in parts, each short enough for a request; at least one."""
+    """Return the parts of a program, each short enough for a request; at least one."""
     return [program[k : k + PART] for k in range(0, len(program), PART)] or [""]
 
 
 def decode_welcome(result: Any) -> tuple[bool, str]:
-    """Return whether the bridge gives control of the machine, and who else has it.
+    """Return whether the bridge grants control of the machine, and the other client that has it.
 
     Raises
     ------
     ProtocolError
-        Another protocol, or no answer to a first request.
+        Another protocol, or not the answer to a first request.
     """
     try:
         if result["protocol"] != PROTOCOL:
@@ -104,7 +105,7 @@ def decode_welcome(result: Any) -> tuple[bool, str]:
 
 
 def decode_identity(facts: Any, simulated: bool, details: Mapping[str, Any], *more: str) -> Identity:
-    """Return the identity of a machine, ``more`` facts among its details; ProtocolError where one is missing."""
+    """Return the identity of a machine, with ``more`` facts in its details; ProtocolError if one is missing."""
     try:
         return Identity(
             manufacturer=str(facts["manufacturer"]),
@@ -119,7 +120,7 @@ def decode_identity(facts: Any, simulated: bool, details: Mapping[str, Any], *mo
 
 
 def decode_right(result: Any) -> tuple[bool, str]:
-    """Return whether the bridge gives the right to set offsets, and who else has it; ProtocolError where it is old."""
+    """Return whether the bridge grants the right to set offsets, and the other client that has it."""
     decode_welcome(result)
     try:
         return _switch(result, "compensate"), str(result["compensated_by"] or "")[:64]
@@ -130,7 +131,7 @@ def decode_right(result: Any) -> tuple[bool, str]:
 
 
 def decode_offset(result: Any) -> Offset:
-    """Return the offset of a compensation; ProtocolError where a value is missing or not finite."""
+    """Return the offset of a compensation; ProtocolError if a value is missing or not finite."""
     try:
         x, y, z = (_finite(each) for each in result["offset"])
         limit, slew, watchdog = (_known(result, name) for name in ("limit", "slew", "watchdog"))
@@ -146,7 +147,7 @@ def decode(line: bytes) -> Answer | Beat:
     Raises
     ------
     ProtocolError
-        Neither an answer nor a sign of life.
+        The line is neither an answer nor a heartbeat.
     """
     try:
         message = json.loads(line, parse_int=_whole)
@@ -193,7 +194,7 @@ def decode_state(result: Any) -> dict[str, Any]:
 
 
 def decode_touch(result: Any) -> dict[str, Any]:
-    """Return ``tripped``, ``position`` (m, or None) and ``time`` of a touch; ProtocolError where they are missing."""
+    """Return ``tripped``, ``position`` (m, or None) and ``time`` of a touch; ProtocolError if they are missing."""
     try:
         tripped = _switch(result, "tripped")
         position = _position(result["position"]) if tripped else None

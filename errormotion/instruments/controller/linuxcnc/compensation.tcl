@@ -1,19 +1,19 @@
-# Compensation by errormotion, in the servo thread of LinuxCNC: limit, slew limit, hold and watchdog. The last HALFILE.
+# Compensation by errormotion, in the servo thread of LinuxCNC: limit, slew limit, hold, watchdog. Must be the last HALFILE.
 #
-#   [HAL]          TWOPASS = ON                so that other files may load the same components
+#   [HAL]          TWOPASS = ON                so that other files can load the same components
 #                  HALFILE = compensation.tcl
 #   [ERRORMOTION]  ROUTE = external            or feedback, see below
 #                  LIMIT = 0.05                largest offset of an axis, machine units
-#                  SLEW = 0.001                fastest change of an axis, machine units/s
-#                  WATCHDOG = 5                s without a sign of life after which the offset goes to zero
+#                  SLEW = 0.001                largest rate of change of an axis, machine units/s
+#                  WATCHDOG = 5                time without a heartbeat after which the offset ramps to zero, s
 #                  HOLD = motion.digital-out-00   optional: while this pin is true, the offset does not change
 #
-# request (set by the bridge) -> source: zero unless alive and ready -> limit: bounded, no faster than SLEW -> offset
+# request (set by the bridge) -> source: zero unless alive and ready -> limit: LIMIT and SLEW -> offset
 #
 # external: the offset is an external offset of LinuxCNC (axis.L.eoffset). Each axis needs
-#           [AXIS_L] OFFSET_AV_RATIO = SLEW / MAX_VELOCITY, rounded down: its planner keeps the slew limit, too.
+#           [AXIS_L] OFFSET_AV_RATIO = SLEW / MAX_VELOCITY, rounded down: its planner then also observes the slew limit.
 # feedback: the offset is added to joint.N.motor-pos-cmd and subtracted from joint.N.motor-pos-fb. The signals of these
-#           pins are cut open here; only for machines whose joints are their axes (trivkins).
+#           pins are interrupted here; only for machines whose joints are their axes (trivkins).
 
 source [file join $::env(HALLIB_DIR) hal_procs_lib.tcl]
 
@@ -36,13 +36,13 @@ proc errormotion_names {parts} {
 
 # Connect a pin that other files may have connected already.
 proc errormotion_join_pin {pin args} {
-    if {![connection_info of $pin]} { return -code error "compensation.tcl: there is no pin $pin" }
+    if {![connection_info of $pin]} { return -code error "compensation.tcl: expected a pin $pin; found none" }
     set signal [expr {$of(signame) == "" ? "errormotion-$pin" : $of(signame)}]
     net $signal $pin
     foreach target $args { net $signal => $target }
 }
 
-# Cut a pin of motion from its signal, and connect it with another pin; return the signal.
+# Disconnect a pin of motion from its signal, and connect it to another pin; return the signal.
 proc errormotion_cut {pin other} {
     if {![connection_info of $pin] || $of(signame) == ""} {
         return -code error "compensation.tcl: expected a signal at $pin; found none. Is this the last HALFILE?"
@@ -69,7 +69,7 @@ proc errormotion_components {route} {
     }
 }
 
-# request -> source -> limit; the watchdog, and what holds the offset.
+# request -> source -> limit; the watchdog, and the hold of the offset.
 proc errormotion_guard {} {
     set slew [errormotion_setting SLEW]
     set limit [errormotion_setting LIMIT]
@@ -88,7 +88,7 @@ proc errormotion_guard {} {
     net errormotion-is-on => errormotion-held.in1
     net errormotion-is-on => errormotion-off.in
 
-    # What was asked for before the machine was switched off does not come back when it is switched on.
+    # A request from before the machine was switched off has no effect when it is switched on again.
     setp errormotion-asked.data 1
     net errormotion-sign => errormotion-asked.clk
     net errormotion-is-off errormotion-off.out => errormotion-asked.reset
@@ -96,7 +96,7 @@ proc errormotion_guard {} {
     net errormotion-is-fresh errormotion-fresh.out => errormotion-ready.in0
 
     # Hold while the machine probes (motion type 5), while a thread is cut (and 0.5 s after the last change of
-    # errormotion-thread.in, by the bridge), and while the program says so; only while the machine is on.
+    # errormotion-thread.in, by the bridge), and while the pin HOLD is true; only while the machine is on.
     errormotion_join_pin motion.motion-type errormotion-motion.sel
     net errormotion-probes errormotion-motion.out5 => errormotion-hold-1.in0
     net errormotion-threads errormotion-thread.out => errormotion-hold-1.in1
@@ -124,7 +124,7 @@ proc errormotion_guard {} {
 }
 
 # LinuxCNC sums up the changes of eoffset-counts, only while the machine is on and homed, and sets its offset to zero
-# when the machine goes off. The offset here goes to zero in that cycle, too: the motors are off, nothing moves.
+# when the machine is switched off. The offset here is also set to zero in this cycle: the motors are off.
 proc errormotion_external {} {
     foreach letter {x y z} {
         errormotion_planner [string toupper $letter]
@@ -139,7 +139,7 @@ proc errormotion_external {} {
     foreach each [errormotion_names {scale counts}] { addf $each servo-thread }
 }
 
-# Without this, LinuxCNC's planner would be faster than SLEW where it restores an offset after an end of travel; a
+# Otherwise LinuxCNC's planner would be faster than SLEW when it restores an offset after an end of travel; a
 # slower one would not follow.
 proc errormotion_planner {axis} {
     upvar #0 AXIS_$axis section
@@ -162,7 +162,7 @@ proc errormotion_joints {part} {
     return $found
 }
 
-# The command gets the offset before the drives do: its function runs right after motion-controller.
+# The offset is added before the drives read the command: its function runs directly after motion-controller.
 proc errormotion_feedback {} {
     thread_info threads
     set position [expr {$threads(servo-thread,motion-controller) + 1}]

@@ -1,4 +1,4 @@
-"""Driver of a machine under LinuxCNC, through the bridge that runs beside it."""
+"""Driver of a machine under LinuxCNC, through the bridge on its computer."""
 
 from __future__ import annotations
 
@@ -24,21 +24,20 @@ from errormotion.instruments.transports.recording import Recorder, RecordingTran
 from errormotion.plugins import Identity, InstrumentInfo, MachineLimits, lazy
 
 ESTOP_TIMEOUT = 2.0  # s
-ESTOP_INTERVAL = 0.01  # s between two looks at the state
+ESTOP_INTERVAL = 0.01  # s between two queries of the state
 NAME = f"errormotion {os.getpid()} {secrets.token_hex(8)}"
-"""Name of this process at a bridge; all of its connections share the control of a machine."""
+"""Name of this process for a bridge; all its connections share the control of a machine."""
 
 
 class LinuxCNC(Driver):
     """A machine under LinuxCNC.
 
-    Positions are those of the machine's own coordinates (G53) in m, independent of the offsets of work and tool.
+    Positions are in machine coordinates (G53), m, independent of the offsets of work and tool.
 
-    Without ``arm`` in its settings the driver reads the state, and may stop the machine.
+    Without ``arm`` in the settings the driver only reads the state, and can stop the machine.
 
-    An order is sent once. If the connection breaks or no answer arrives, an InstrumentError is raised, the bridge
-    aborts the motion, and nothing is repeated; the next call connects again. `stop` may be
-    called from another thread.
+    A command is sent once. If the connection is lost or no answer arrives, an InstrumentError is raised, the bridge
+    aborts the motion, and nothing is repeated; the next call connects again. `stop` may be called from another thread.
 
     Parameters
     ----------
@@ -77,29 +76,29 @@ class LinuxCNC(Driver):
         return codec.decode_identity(facts, self.transport.simulated, {"address": self.address}, "travel")
 
     def configure(self, settings: LinuxCNCSettings) -> None:
-        """Use other settings from now on; ``arm`` and the token hold for the next connection."""
+        """Use other settings from now on; ``arm`` and the token take effect with the next connection."""
         self.settings = settings
 
     def bound(self, limits: MachineLimits) -> None:
-        """Hold limits for every order from now on."""
+        """Apply limits to every command from now on."""
         self._door.limits = limits
 
     def read(self) -> dict[str, Any]:
-        """Return the state now."""
+        """Return the present state."""
         return self.state()
 
     def state(self) -> dict[str, Any]:
         """Return the state of the machine.
 
-        ``time`` (s since the bridge started; of the virtual world where simulated), ``position`` (X, Y, Z as measured,
-        m), ``commanded_position`` (m), ``spindle_speed`` (1/min; as measured, where HAL has an encoder),
-        ``spindle_load`` (1 = rated; NaN unless the bridge has its HAL pin), ``feed`` (m/s), ``mode``
-        (``manual``, ``mdi``, ``automatic``), ``program`` (name of the file, or empty), ``running``, ``homed``,
-        ``enabled``, ``estop``, ``alarms`` (LinuxCNC's error texts since the last order or `reset`).
+        ``time`` (s since the start of the bridge, or of the virtual world if simulated), ``position`` (X, Y, Z as
+        measured, m), ``commanded_position`` (m), ``spindle_speed`` (1/min; as measured, if HAL has an encoder),
+        ``spindle_load`` (1 = rated; NaN unless the bridge has its HAL pin), ``feed`` (m/s), ``mode`` (``manual``,
+        ``mdi``, ``automatic``), ``program`` (name of the file, or empty), ``running``, ``homed``, ``enabled``,
+        ``estop``, ``alarms`` (LinuxCNC's error texts since the last command or `reset`).
         """
         return codec.decode_state(self._query("state"))
 
-    # ------------------------------------------------------------------ orders
+    # ------------------------------------------------------------------ commands
 
     def reset(self) -> None:
         """Release the e-stop and clear the alarms; then `enable`."""
@@ -111,7 +110,7 @@ class LinuxCNC(Driver):
         Raises
         ------
         InstrumentError
-            E-stop, or the machine stays off.
+            LinuxCNC is in e-stop, or the machine remains off.
         """
         self._change("enable")
 
@@ -123,7 +122,7 @@ class LinuxCNC(Driver):
         InstrumentError
             LinuxCNC is not in e-stop after ESTOP_TIMEOUT.
         """
-        self._order("estop")
+        self._send("estop")
         until = time.monotonic() + ESTOP_TIMEOUT
         while not self.state()["estop"]:
             if time.monotonic() > until:
@@ -135,7 +134,7 @@ class LinuxCNC(Driver):
         self._change("home")
 
     def move_to(self, position: Sequence[float], feed: float | None = None) -> dict[str, Any]:
-        """Move in a straight line; return when the machine is there.
+        """Move in a straight line; return when the machine has arrived.
 
         Parameters
         ----------
@@ -152,16 +151,16 @@ class LinuxCNC(Driver):
         Raises
         ------
         InstrumentError
-            Not homed, off or in e-stop, out of travel; stopped, an error of LinuxCNC or a lost connection during the
-            move. The message contains the text of LinuxCNC.
+            The machine is not homed, off or in e-stop, the position is out of travel; or a stop, an error of LinuxCNC
+            or a lost connection ended the move. The message contains the text of LinuxCNC.
         """
         goal, limit = self._door.position(position), self._door.limits.feed
-        held = {} if feed is not None or limit is None else {"feed_limit": limit}
+        extra = {} if feed is not None or limit is None else {"feed_limit": limit}
         feed = None if feed is None else self._door.feed(feed)
-        return dict(self._change("move_to", position=goal, feed=feed, **held))
+        return dict(self._change("move_to", position=goal, feed=feed, **extra))
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
-        """Move in a straight line until the probe trips; return when the machine rests.
+        """Move in a straight line until the probe trips; return when the machine is at rest.
 
         LinuxCNC latches the position in the servo cycle in which it detects the trip: up to one cycle of travel, 1 ms x
         feed, after the contact, plus the delay of the probe's signal (`LinuxCNCSettings.trip_delay`).
@@ -182,7 +181,7 @@ class LinuxCNC(Driver):
         Raises
         ------
         InstrumentError
-            The probe is tripped before it moves; and what `move_to` raises.
+            The probe is tripped before it moves; for other errors see `move_to`.
         """
         goal, feed = self._door.position(target, "target"), self._door.feed(feed)
         start = self.state()["commanded_position"] if self.settings.trip_delay else goal
@@ -194,7 +193,7 @@ class LinuxCNC(Driver):
         return touch
 
     def spindle(self, speed: float) -> None:
-        """Turn the spindle at a speed in 1/min, backwards where it is negative; 0 stops it. Returns at once."""
+        """Turn the spindle at a speed in 1/min, negative for reverse, 0 to stop it; return at once."""
         self._change("spindle", speed=self._door.speed(speed))
 
     def stop(self, spindle: bool = False) -> None:
@@ -204,18 +203,18 @@ class LinuxCNC(Driver):
         """
         if self._exchange_lock.acquire(blocking=False):
             self._exchange_lock.release()
-            self._order("stop", spindle=bool(spindle))
+            self._send("stop", spindle=bool(spindle))
             return
         self._number += 1
         self._unawaited.add(self._number)
         self.transport.write(codec.encode_request(self._number, "stop", {"spindle": bool(spindle)}))
 
     def elapse(self, seconds: float) -> None:
-        """Let time pass; `stop` ends it with an InstrumentError. A simulation skips it, unless a program runs."""
-        self._order("elapse", seconds=self._door.duration(seconds))
+        """Wait; `stop` ends this with an InstrumentError. A simulation skips the time, unless a program runs."""
+        self._send("elapse", seconds=self._door.duration(seconds))
 
     def run_program(self, text: str) -> dict[str, Any]:
-        """Run an NC program; return when it has started. ``state()["running"]`` states whether it runs, `finish` waits.
+        """Run an NC program; return when it has started. ``state()["running"]`` states whether it runs; `finish` waits.
 
         The program ends with the connection: LinuxCNC aborts when the driver is closed.
 
@@ -225,13 +224,13 @@ class LinuxCNC(Driver):
             ``program``, the name of its file, and ``longest_lead_in``, 0 s.
         """
         check_program(str(text), self._door)
-        held = {"machine_coordinates": True} if self._door.limits.spans else {}
+        extra = {"machine_coordinates": True} if self._door.limits.spans else {}
         *parts, last = codec.parts_of(str(text))
         for number, part in enumerate(parts):
             if number == 0:
                 self._change("program_part", text="")
             self._change("program_part", text=part)
-        return dict(self._change("run_program", text=last, **held))
+        return dict(self._change("run_program", text=last, **extra))
 
     def finish(self) -> dict[str, Any]:
         """Wait for the end of the program.
@@ -244,34 +243,34 @@ class LinuxCNC(Driver):
         Raises
         ------
         InstrumentError
-            It ended early; the message contains the text of LinuxCNC.
+            The program ended early; the message contains the text of LinuxCNC.
         """
-        return dict(self._order("finish"))
+        return dict(self._send("finish"))
 
     # ------------------------------------------------------------------ connection
 
     def _query(self, op: str) -> Any:
-        """Send a request, and once more over a new connection if it breaks."""
+        """Send a request; if the connection is lost, repeat it once over a new one."""
         try:
-            return self._order(op)
+            return self._send(op)
         except InstrumentTimeoutError:
             raise
         except InstrumentError:
             if not (self._lost and self._may_reconnect):
                 raise
-            return self._order(op)
+            return self._send(op)
 
     @property
     def _may_reconnect(self) -> bool:
         return self._record is None and not self.address.startswith("replay://")
 
     def _change(self, op: str, **arguments: Any) -> Any:
-        """Send an order that moves or changes the machine."""
+        """Send a command that moves or changes the machine."""
         words = ", ".join(f"{name} {value}" for name, value in arguments.items())
         self._door.admit(self.settings.arm, f"{op.replace('_', ' ')} {words}")
-        return self._order(op, **arguments)
+        return self._send(op, **arguments)
 
-    def _order(self, op: str, **arguments: Any) -> Any:
+    def _send(self, op: str, **arguments: Any) -> Any:
         """Send a request, once, and wait for its answer."""
         with self._exchange_lock:
             line = self.transport
@@ -284,8 +283,8 @@ class LinuxCNC(Driver):
                 answer = self._await(line, self._number)
             except InstrumentError as error:
                 self._cut(line)
-                raise type(error)(f"{error}; during the order '{op.replace('_', ' ')}'") from None
-            except BaseException:  # an interrupted wait: the bridge aborts an order without a waiting client
+                raise type(error)(f"{error}; during the command '{op.replace('_', ' ')}'") from None
+            except BaseException:  # an interrupted wait: the bridge aborts a command without a waiting client
                 self._cut(line)
                 raise
         if not answer.ok:
@@ -307,7 +306,7 @@ class LinuxCNC(Driver):
             if message.number in self._unawaited:
                 self._unawaited.discard(message.number)
                 continue
-            if isinstance(message.number, int) and message.number < number:  # late: of an order that has failed
+            if isinstance(message.number, int) and message.number < number:  # late: of a command that has failed
                 continue
             if message.number != number:
                 raise ProtocolError(f"{self.address}: expected the answer to request {number}; found {message}")
@@ -352,7 +351,7 @@ class LinuxCNC(Driver):
         answer = self._await(line, 0)
         if not answer.ok and "unknown operation" in answer.error:
             raise InstrumentError(
-                f"{self.address}: the bridge is of an earlier version, which anybody can use; copy bridge.py of this "
+                f"{self.address}: the bridge is of an earlier version, without access control; copy bridge.py of this "
                 "version to the machine"
             )
         if not answer.ok:
@@ -370,8 +369,8 @@ class LinuxCNC(Driver):
 
 
 _WHERE = (
-    "the bridge writes its token to ~/.errormotion/linuxcnc.token of the user who runs it. Copy that file to this "
-    "user, with mode 0600, and name it as 'token_file'"
+    "the bridge writes its token to ~/.errormotion/linuxcnc.token of the user that runs it. Copy this file to the "
+    "user of this program, with mode 0600, and state it as 'token_file'"
 )
 
 
@@ -381,7 +380,7 @@ def read_token(path: Path, address: str) -> str:
     Raises
     ------
     InstrumentError
-        No such file, others can read it, or it has no token.
+        The file does not exist, others can read it, or it has no token.
     """
     path = path.expanduser()
     try:

@@ -15,12 +15,12 @@ class LinuxCNCSettings(ArmedSettings):
 
     token_file: Path = Field(
         default=Path("~/.errormotion/linuxcnc.token"),
-        description="file with the token of the bridge, readable by its user only",
+        description="file with the token of the bridge, which only its user may read",
     )
     timeout: Time = Field(default=3.0, description="time limit without data from the bridge, also during motion", gt=0)
     trip_delay: Time = Field(
         default=0.0,
-        description="delay from the contact until LinuxCNC latches the position; touches are corrected by its travel",
+        description="delay from the contact until LinuxCNC latches the position, for the correction of touches",
         ge=0,
         le=0.1,
     )

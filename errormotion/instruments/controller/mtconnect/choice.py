@@ -11,29 +11,30 @@ from errormotion.instruments.controller.mtconnect.settings import MTConnectSetti
 
 TIME_SERIES = "TIME_SERIES"
 _SINGLE_VALUES = ("VALUE", "DISCRETE")
-"""Representations of one value at a time; sets, tables and time series are only used where the settings name them."""
+"""Representations of one value at a time; sets, tables and time series are only used if the settings state them."""
 _ACTUAL = ("ACTUAL", "")
 _COMMANDED = ("COMMANDED", "PROGRAMMED", "TARGET")
 _SPEEDS = ("ROTARY_VELOCITY", "SPINDLE_SPEED")
 _WHOLE_POSITION = {"position": _ACTUAL, "commanded_position": _COMMANDED}
 _FEED_UNITS = ("", "MILLIMETER/SECOND", "MILLIMETER/MINUTE", "METER/SECOND", "INCH/SECOND", "INCH/MINUTE")
 _SPEED_UNITS = ("", "REVOLUTION/MINUTE", "REVOLUTION/SECOND")
-"""In percent a feed or spindle speed is an override; by revolution or in degrees it is another quantity."""
-_MOST_NAMED = 8  # data items in a message
+"""Units of a feed and of a spindle speed. In percent they are overrides; per revolution or in degrees, other
+quantities."""
+_MOST_NAMED = 8  # largest number of data items in a message
 _RANKS: Mapping[str, int] = {"MACHINE": 0, "": 1, "WORK": 3}
-"""Order of coordinate systems; those of other types, such as BASE, are before WORK."""
+"""Ranks of coordinate systems; those of other types, such as BASE, precede WORK."""
 
 
 @dataclass
 class Choice:
-    """What reports each quantity.
+    """The data item that reports each quantity.
 
     Attributes
     ----------
     items : dict of str to DataItem
-        By quantity: `settings.KEYS`, and whole positions where the axes have none of their own.
+        Data items by quantity: `settings.KEYS`, and whole positions if the axes have no items.
     unclear : dict of str to str
-        Quantities that several items report equally well, and what to state in the settings.
+        Quantities that several items report equally well, with a message on what to state in the settings.
     """
 
     items: dict[str, DataItem]
@@ -43,14 +44,14 @@ class Choice:
 def choose(device: Device, settings: MTConnectSettings) -> Choice:
     """Return the data items by quantity.
 
-    Quantities without a data item are missing. An item in ``settings.items`` comes first; then type, subtype, the
-    name of the component, and machine before work coordinates decide. Feeds and spindle speeds in percent, which are
-    overrides, or in other units than of a speed, and items of several values at once do not compete.
+    Quantities without a data item are missing. Items in ``settings.items`` have priority; then type, subtype, name of
+    the component, and machine before work coordinates decide. Feeds and spindle speeds in percent, which are overrides,
+    or in other units than those of a speed, and items of several values at once are not considered.
 
     Raises
     ------
     InstrumentError
-        A setting names an item or spindle that is not there, or an item of keys and values.
+        A setting states an item or spindle that does not exist, or an item of keys and values.
     """
     choice = Choice({key: _named(device, key, item) for key, item in settings.items.items()})
     for axis, name in zip("XYZ", settings.axes, strict=True):
@@ -81,7 +82,7 @@ def _named(device: Device, key: str, name: str) -> DataItem:
         )
     if item.representation not in (*_SINGLE_VALUES, TIME_SERIES):
         raise InstrumentError(
-            f"'{key}': the data item '{name}' is a {item.representation} of keys and values; name one that has a value"
+            f"'{key}': the data item '{name}' is a {item.representation} of keys and values; state one with one value"
         )
     return item
 
@@ -97,7 +98,7 @@ def _on(name: str, component: str) -> Callable[[DataItem], bool]:
 
 
 def _linear_axis(device: Device, name: str) -> Callable[[DataItem], bool]:
-    """Return whether an item is of an axis: the one of this name, else the first of several, such as Z1 for Z."""
+    """Return a check whether an item belongs to an axis with this name, or with a number, such as Z1 for Z."""
     fits = _on(name, "Linear")
     return fits if any(fits(item) for item in device.items.values()) else _on(f"{name}1", "Linear")
 
@@ -126,7 +127,7 @@ def _add(
     sub_types: Sequence[str],
     fits: Callable[[DataItem], bool] = _any,
 ) -> None:
-    """Add the data item that fits best, if any; where several do equally well, none."""
+    """Add the data item that fits best, if any; none if several fit equally well."""
     if key in choice.items:
         return
     for sub_type in sub_types:

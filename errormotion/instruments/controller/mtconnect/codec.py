@@ -1,6 +1,6 @@
-"""The XML of MTConnect agents (ANSI/MTC1.4, parts 1 and 2): what a device has, what was observed, what went wrong.
+"""The XML of MTConnect agents (ANSI/MTC1.4, parts 1 and 2): devices, observations, errors.
 
-Names count without their prefixes, so that all versions from 1.1 to 2.x are read alike.
+Prefixes of names are ignored, so that all versions from 1.1 to 2.x are read alike.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _SI: Mapping[str, float] = {
     "DEGREE/SECOND": math.pi / 180,
     "DEGREE/MINUTE": math.pi / 180 / 60,
     "RADIAN": 1.0,
-    "REVOLUTION/MINUTE": 1.0,  # spindle speeds stay per minute
+    "REVOLUTION/MINUTE": 1.0,  # spindle speeds remain per minute
     "REVOLUTION/SECOND": 60.0,
     "PERCENT": 0.01,
     "CELSIUS": 1.0,
@@ -60,12 +60,12 @@ _UNITS_OF: Mapping[str, str] = {
     "LOAD": "PERCENT",
     "TEMPERATURE": "CELSIUS",
 }
-"""Units by the standard, for an agent that leaves them out."""
+"""Units of the standard, for an agent that omits them."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """Head of a document; ``first`` to ``last`` are the sequence numbers that the agent still holds."""
+    """Header of a document; ``first`` to ``last`` are the sequence numbers in the buffer of the agent."""
 
     instance: int
     created: float  # s since 1970
@@ -79,10 +79,10 @@ class Header:
 
 @dataclass(frozen=True)
 class DataItem:
-    """A data item of a device, and its component: its element, names and id.
+    """A data item of a device, with element, names and id of its component.
 
-    ``coordinate_system`` is ``MACHINE``, ``WORK`` (from version 2.0 on a coordinate system of type OBJECT), empty where
-    the device does not state it, ``UNKNOWN`` where it refers to one that it does not have, or the type of another one.
+    ``coordinate_system`` is ``MACHINE``, ``WORK`` (from version 2.0 on a coordinate system of type OBJECT), empty if
+    the device does not state it, ``UNKNOWN`` for a reference to one that does not exist, or the type of another one.
     """
 
     id: str
@@ -100,17 +100,17 @@ class DataItem:
 
     @property
     def scale(self) -> float:
-        """What a value is multiplied by to be in SI; per minute for speeds of rotation.
+        """Factor that converts a value to SI; to 1/min for speeds of rotation.
 
         Raises
         ------
         ProtocolError
-            Units that are not known.
+            The units are unknown.
         """
         units = self.units or _UNITS_OF.get(self.type, "")
         if units not in _SI:
             known = ", ".join(sorted(_SI))
-            raise ProtocolError(f"The data item '{self.id}' ({self.type}) is in '{units}'; known are {known}")
+            raise ProtocolError(f"The data item '{self.id}' ({self.type}) is in '{units}'; expected one of {known}")
         return _SI[units]
 
 
@@ -128,7 +128,7 @@ class Device:
 
 @dataclass(frozen=True)
 class Observation:
-    """Something that was observed.
+    """One observation.
 
     Attributes
     ----------
@@ -137,13 +137,13 @@ class Observation:
     sequence : int
         Number of the observation; counts up over all data items while the agent runs.
     time : float
-        When, s since 1970 by the agent's clock.
+        Time on the agent's clock, s since 1970.
     value : str
-        As the agent reports it, ``UNAVAILABLE`` included; of a condition its text.
+        As reported by the agent, ``UNAVAILABLE`` included; for a condition its text.
     level : str
-        Of a condition ``Normal``, ``Warning``, ``Fault`` or ``Unavailable``; else empty.
+        For a condition ``Normal``, ``Warning``, ``Fault`` or ``Unavailable``; else empty.
     type, code : str
-        Of a condition: what it is about, and the machine's own code.
+        For a condition its type, and the code of the machine.
     """
 
     item: str
@@ -155,17 +155,17 @@ class Observation:
     code: str = ""
 
     def number(self, scale: float = 1.0) -> float:
-        """Return the value times ``scale``; NaN where it is unavailable.
+        """Return the value times ``scale``; NaN if it is unavailable.
 
         Raises
         ------
         ProtocolError
-            Neither a number nor unavailable.
+            The value is neither a number nor unavailable.
         """
         return self.numbers(scale)[0]
 
     def numbers(self, scale: float = 1.0) -> list[float]:
-        """Return the values of a list such as ``1.5 2 3`` times ``scale``; one NaN where it is unavailable."""
+        """Return the values of a list such as ``1.5 2 3`` times ``scale``; one NaN if it is unavailable."""
         if self.value.upper() == UNAVAILABLE:
             return [math.nan]
         found = []
@@ -178,7 +178,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class Document:
-    """What an agent answered: devices (of /probe), observations (of /current and /sample), or errors by their code."""
+    """An agent's answer: devices (/probe), observations (/current and /sample), or errors by their code."""
 
     header: Header
     devices: tuple[Device, ...] = ()
@@ -187,12 +187,12 @@ class Document:
 
 
 def parse(data: bytes) -> Document:
-    """Read an agent's answer.
+    """Parse an agent's answer.
 
     Raises
     ------
     ProtocolError
-        No XML, not of MTConnect, a document type, a header or an observation without what belongs to it.
+        The data are not XML or not of MTConnect, have a document type, or an incomplete header or observation.
     """
     root = parse_tree(data)
     kind = root.name
@@ -224,7 +224,7 @@ def parse_time(text: str) -> float:
     Raises
     ------
     ProtocolError
-        No such time.
+        The text is not such a time.
     """
     if len(text) > _MOST_TIME:
         raise ProtocolError(f"Expected a time such as 2025-03-01T12:00:00Z; found '{text[:40]}'")
@@ -256,7 +256,7 @@ def _devices(root: Element) -> Iterator[Device]:
         if devices.name != "Devices":
             continue
         for device in devices.children:
-            if device.name != "Device":  # an agent describes itself as well
+            if device.name != "Device":  # agents also describe themselves
                 continue
             about = device.child("Description") or Element("Description", {})
             yield Device(
@@ -270,7 +270,7 @@ def _devices(root: Element) -> Iterator[Device]:
 
 
 def _items(device: Element) -> Iterator[DataItem]:
-    """Yield the data items of a device; those of a component are in its ``DataItems``."""
+    """Yield the data items of a device and its components."""
     systems = {each.get("id"): each.get("type") for each in device.walk() if each.name == "CoordinateSystem"}
     waiting = [device]
     while waiting:
@@ -324,7 +324,7 @@ def _observations(root: Element) -> Iterator[Observation]:
 
 
 def _value(element: Element) -> str:
-    """Return the text of an observation; of a set or table ``key=text`` of each entry."""
+    """Return the text of an observation; for a set or table ``key=text`` of each entry."""
     entries = [each for each in element.children if each.name == "Entry"]
     if not entries:
         return element.text.strip()

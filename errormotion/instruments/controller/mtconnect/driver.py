@@ -1,4 +1,4 @@
-"""Driver of MTConnect agents: what the machine does now, and everything that was observed since."""
+"""Driver of MTConnect agents: the present state of the machine, and all observations."""
 
 from __future__ import annotations
 
@@ -31,18 +31,19 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Observed:
-    """Observations in the order of their sequence numbers, and what is missing before them.
+    """Observations in the order of their sequence numbers, and the number of lost ones before them.
 
     Attributes
     ----------
     observations : tuple of Observation
-        May be empty: an agent that has nothing new still answers.
+        May be empty: an agent without new observations also answers.
     next : int
-        Sequence number that follows.
+        Sequence number of the next observation.
     lost : int
-        Observations that the agent had overwritten before they were requested; of all its devices.
+        Number of observations, of all devices, that the agent had overwritten before they were requested.
     restarted : bool
-        The agent was restarted: its numbers start again, and what it held is gone uncounted.
+        Whether the agent was restarted: its sequence numbers start again, and its earlier observations are lost and not
+        counted.
     """
 
     observations: tuple[Observation, ...]
@@ -57,7 +58,7 @@ class MTConnect(Driver):
     Parameters
     ----------
     address : str
-        ``http://host:5000/device`` (without device where the agent has only one), ``sim://cframe/mtconnect``,
+        ``http://host:5000/device`` (without device if the agent has only one), ``sim://cframe/mtconnect``,
         ``replay://file``.
     settings : MTConnectSettings, optional
     record : Path, optional
@@ -66,9 +67,11 @@ class MTConnect(Driver):
     Attributes
     ----------
     lost, restarts : int
-        Observations that were overwritten unread, and restarts of the agent, both since the driver was made.
+        Number of observations that were overwritten before they were read, and of restarts of the agent, since the
+        driver was created.
     unclear : mapping of str to str
-        Quantities that several data items report equally well, and what to state in the settings; they are unknown.
+        Quantities that are unknown because several data items report them equally well, with a message on what to state
+        in the settings.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -83,8 +86,8 @@ class MTConnect(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
-        # Faults of observations do not affect the state, in which an alarm is a word.
+        """Return the subject of the conformance kit."""
+        # Faults of observations do not affect the state, in which an alarm is only a text.
         harmless = ("split", "overrun", "jump", "restart", "alarm")
         return InstrumentSubject(cls, "sim://cframe/mtconnect", harmless=harmless)
 
@@ -94,9 +97,9 @@ class MTConnect(Driver):
         self.restarts = 0
         self._instance: int | None = None
         self._next: int | None = None
-        self._held = 0  # observations that the agent keeps
+        self._buffer_size = 0  # number of observations in the buffer of the agent
         self._started_at: float | None = None
-        self._restarted = False  # while no client was connected
+        self._restarted = False  # whether the agent was restarted while the driver was not connected
         self._device = Device("", "")
         self._items: Mapping[str, DataItem] = {}
         self.unclear: Mapping[str, str] = {}
@@ -107,7 +110,7 @@ class MTConnect(Driver):
         return self._device.items
 
     def identify(self) -> Identity:
-        """Return the identity of the device as the agent states it."""
+        """Return the identity of the device that the agent reports."""
         document = self._query("probe")
         device = self._one(document)
         return Identity(
@@ -125,7 +128,7 @@ class MTConnect(Driver):
         self.settings = settings
 
     def read(self) -> dict[str, Any]:
-        """Return the state now, without values that are None."""
+        """Return the present state, without values that are None."""
         return {name: value for name, value in self.state().items() if value is not None}
 
     def state(self) -> dict[str, Any]:
@@ -134,22 +137,22 @@ class MTConnect(Driver):
         Returns
         -------
         dict
-            ``time`` (s on the agent's clock since the driver was first opened), ``position`` and
-            ``commanded_position`` (X, Y, Z, m), ``position_time`` (when the position last changed, s on the same
-            clock), ``spindle_speed`` (1/min), ``spindle_load`` (fraction), ``feed`` (m/s), ``mode`` (``manual``,
-            ``mdi``, ``automatic`` or empty), ``program``, ``running``, ``homed`` (None: agents do not report it),
-            ``enabled``, ``estop``, ``alarms`` and ``warnings`` (lists of str), and ``unavailable``: names of what is
-            unknown. Unknown numbers are NaN.
+            ``time`` (s on the agent's clock since the driver was first opened), ``position`` and ``commanded_position``
+            (X, Y, Z, m), ``position_time`` (when the position last changed, s on the same clock), ``spindle_speed``
+            (1/min), ``spindle_load`` (fraction), ``feed`` (m/s), ``mode`` (``manual``, ``mdi``, ``automatic`` or
+            empty), ``program``, ``running``, ``homed`` (None: agents do not report it), ``enabled``, ``estop``,
+            ``alarms`` and ``warnings`` (lists of str), and ``unavailable``: names of unknown values. Unknown numbers
+            are NaN.
 
         Raises
         ------
         ProtocolError
-            Not an answer of an agent, or an invalid value.
+            The answer is not that of an agent, or a value is invalid.
         InstrumentTimeoutError
             No answer within the time limit.
         """
         document = self._query("current")
-        self._notice(document)
+        self._detect_restart(document)
         return machine_state(document, self._items, self._start(document))
 
     def sample(self) -> Observed:
@@ -158,17 +161,17 @@ class MTConnect(Driver):
         Raises
         ------
         ProtocolError
-            No answer of an agent.
+            The answer is not that of an agent.
         InstrumentError
             The agent overwrites its buffer faster than it can be read.
         """
         if self._next is None:
             document = self._query("current")
-            self._notice(document)
+            self._detect_restart(document)
             restarted, self._restarted = self._restarted, False
-            return self._taken(document, 0, restarted=restarted)
+            return self._take(document, 0, restarted=restarted)
         document = self._query("sample", self._from(), refused=False)
-        return self._continued(document) or self._resynchronised(document)
+        return self._next_observed(document) or self._resynchronise(document)
 
     def observations(self, interval: float = 0.1) -> Iterator[Observed]:
         """Yield observations as the agent sends them, starting where `sample` or an earlier stream ended.
@@ -179,19 +182,19 @@ class MTConnect(Driver):
         Parameters
         ----------
         interval : float
-            Shortest time between two deliveries, s.
+            Minimum interval between two deliveries, s.
 
         Raises
         ------
         InstrumentTimeoutError
-            No data and no heartbeat, which is requested at half the time limit.
+            Neither data nor heartbeat, which is requested at half the time limit.
         ProtocolError, InstrumentError
-            As of `sample`.
+            See `sample`.
         """
         if self._next is None:
             yield self.sample()
         while True:
-            came = False
+            received = False
             query = self._from() | {
                 "interval": str(round(1000 * interval)),
                 "heartbeat": str(max(1, round(500 * self.settings.timeout))),
@@ -199,32 +202,34 @@ class MTConnect(Driver):
             parts = self._http.parts(self._path("sample"), query, limit=self.settings.most_bytes)
             try:
                 for part in parts:
-                    document, came = parse(part), True
-                    observed = self._continued(document)
+                    document, received = parse(part), True
+                    observed = self._next_observed(document)
                     if observed is None:
                         break
                     yield observed
             finally:
                 parts.close()  # type: ignore[attr-defined]
-            if not came:
+            if not received:
                 raise InstrumentError(f"The agent at {self.address} ended its stream without data")
             yield self.sample()
 
     # ------------------------------------------------------------------ sequence numbers
 
     def _from(self) -> dict[str, str]:
-        count = min(self.settings.count, self._held or self.settings.count)  # an agent refuses more than it holds
+        count = min(
+            self.settings.count, self._buffer_size or self.settings.count
+        )  # an agent refuses more than the size of its buffer
         return {"from": str(self._next), "count": str(count)}
 
-    def _continued(self, document: Document) -> Observed | None:
-        """Return the observations of an answer; None where the sequence numbers must be determined again."""
+    def _next_observed(self, document: Document) -> Observed | None:
+        """Return the observations of an answer; None if the sequence numbers must be determined again."""
         assert self._next is not None
         if document.header.instance != self._instance or OUT_OF_RANGE in document.errors:
             return None
         self._refuse(document, "sample")
-        return self._taken(document, max(0, document.header.first - self._next), restarted=False)
+        return self._take(document, max(0, document.header.first - self._next), restarted=False)
 
-    def _taken(self, document: Document, lost: int, *, restarted: bool) -> Observed:
+    def _take(self, document: Document, lost: int, *, restarted: bool) -> Observed:
         first = 0 if self._next is None else self._next
         fresh = tuple(each for each in document.observations if each.sequence >= first)
         after = fresh[-1].sequence + 1 if fresh else first  # for an agent that does not state the next number
@@ -232,15 +237,15 @@ class MTConnect(Driver):
         self._count(lost)
         return Observed(fresh, self._next, lost, restarted)
 
-    def _resynchronised(self, document: Document) -> Observed:
-        """Continue at the first observation that the agent still has."""
+    def _resynchronise(self, document: Document) -> Observed:
+        """Continue at the first observation in the buffer of the agent."""
         lost, restarted = 0, False
         for _ in range(_ATTEMPTS):
             document = self._query("current")
             header = document.header
             assert self._next is not None
-            again = self._notice(document)
-            if again or self._next > _end(document):  # a restart also shows in the numbers
+            again = self._detect_restart(document)
+            if again or self._next > _end(document):  # sequence numbers also indicate a restart
                 restarted = True
                 self._next = header.first
             elif header.first > self._next:
@@ -250,11 +255,11 @@ class MTConnect(Driver):
             if document.header.instance == self._instance and OUT_OF_RANGE not in document.errors:
                 self._refuse(document, "sample")
                 lost += max(0, document.header.first - self._next)
-                return self._taken(document, lost, restarted=restarted)
+                return self._take(document, lost, restarted=restarted)
         self._count(lost)
         raise InstrumentError(
             f"The agent at {self.address} overwrites its {document.header.buffer} observations faster than they can be "
-            "requested; give it a larger buffer, or request fewer data items"
+            "requested; configure a larger buffer or fewer data items"
         )
 
     def _count(self, lost: int) -> None:
@@ -262,8 +267,8 @@ class MTConnect(Driver):
             self.lost += lost
             log.warning("%s: %d observations were overwritten before they were requested", self.address, lost)
 
-    def _notice(self, document: Document) -> bool:
-        """Read the description of the device again where the agent was restarted; return whether it was."""
+    def _detect_restart(self, document: Document) -> bool:
+        """Read the description of the device again if the agent was restarted; return whether it was."""
         if document.header.instance == self._instance:
             return False
         self.restarts += 1
@@ -300,7 +305,7 @@ class MTConnect(Driver):
         except ProtocolError as error:
             status = f" (HTTP status {answer.status})" if answer.status != 200 else ""
             raise ProtocolError(f"{self.address}/{request}{status}: {error}") from None
-        self._held = document.header.buffer
+        self._buffer_size = document.header.buffer
         if refused:
             self._refuse(document, request)
         return document
@@ -314,7 +319,7 @@ class MTConnect(Driver):
         if len(document.devices) != 1:
             names = ", ".join(device.name or device.uuid for device in document.devices) or "none"
             raise InstrumentError(
-                f"The agent at {self.address} has the devices {names}; name one in the address, as in "
+                f"The agent at {self.address} has the devices {names}; state one in the address, as in "
                 "http://HOST:5000/DEVICE"
             )
         return document.devices[0]
@@ -327,7 +332,7 @@ class MTConnect(Driver):
         self._start(document)
 
     def _choose(self, settings: MTConnectSettings) -> None:
-        """Assign the data items, and report what could not be assigned."""
+        """Assign the data items, and log quantities that could not be assigned."""
         choice = choose(self._device, settings)
         for key, item in choice.items.items():
             if item.category == "SAMPLE":
@@ -358,7 +363,7 @@ class MTConnect(Driver):
 
 
 def _end(document: Document) -> int:
-    """Return the number that follows the newest observation of the agent."""
+    """Return the sequence number after the newest observation of the agent."""
     header = document.header
     newest = document.observations[-1].sequence if document.observations else -1
     return header.next or max(header.last, newest) + 1

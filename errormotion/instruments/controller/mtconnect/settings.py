@@ -19,14 +19,14 @@ class MTConnectSettings(PluginSettings):
     """Settings of an MTConnect agent."""
 
     axes: tuple[str, str, str] = Field(
-        default=("X", "Y", "Z"), description="names of the machine's linear axes X, Y and Z at the agent"
+        default=("X", "Y", "Z"), description="names of the machine's linear axes X, Y and Z in the agent"
     )
     spindle: str = Field(
-        default="", description="name of the rotary axis that is the spindle; empty: the only one that has a speed"
+        default="", description="name of the rotary axis that is the spindle; empty: the only one with a speed"
     )
     items: dict[str, str] = Field(
         default_factory=dict,
-        description="ids of data items, where type and name are not sufficient: spindle_speed = 'S2rpm'",
+        description="ids of data items, if type and name are ambiguous: spindle_speed = 'S2rpm'",
     )
     count: int = Field(default=1000, description="largest number of observations in one request", ge=1)
     most_bytes: int = Field(default=16 << 20, description="largest accepted document, bytes", ge=1024)

@@ -21,16 +21,16 @@ def machine_state(document: Document, items: Mapping[str, DataItem], start: floa
     Parameters
     ----------
     document : Document
-        What is observed now.
+        Answer to /current.
     items : mapping of str to DataItem
-        Which data item reports what.
+        Data items by quantity.
     start : float
-        Time 0 of the state, s since 1970.
+        Time of the zero of the state's clock, s since 1970.
 
     Raises
     ------
     ProtocolError
-        A value that is neither a number nor unavailable.
+        A value is neither a number nor unavailable.
     """
     last = {each.item: each for each in document.observations if not each.level}
     values = {key: last.get(item.id) for key, item in items.items()}
@@ -60,7 +60,7 @@ def machine_state(document: Document, items: Mapping[str, DataItem], start: floa
 
 
 def _number(key: str, values: Mapping[str, Observation | None], items: Mapping[str, DataItem]) -> float:
-    """Return a quantity in SI; of a time series the last of its values."""
+    """Return a quantity in SI; for a time series its last value."""
     observation, item = values.get(key), items.get(key)
     if observation is None or item is None:
         return math.nan
@@ -71,7 +71,7 @@ def _number(key: str, values: Mapping[str, Observation | None], items: Mapping[s
 def _position(
     key: str, values: Mapping[str, Observation | None], items: Mapping[str, DataItem]
 ) -> tuple[list[float], float]:
-    """Return X, Y, Z in m, and when they last changed, s since 1970."""
+    """Return X, Y, Z in m, and the time of their last change, s since 1970."""
     keys = [f"{key}.{axis}" for axis in "XYZ"]
     if key in items and (whole := values.get(key)) is not None:
         found = whole.numbers(items[key].scale)

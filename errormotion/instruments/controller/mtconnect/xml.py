@@ -1,7 +1,7 @@
-"""XML into a plain tree, with limits on size, depth and number of everything; names without their prefixes.
+"""Parsing of XML to a tree, with limits of size, depth and numbers of elements and attributes; names without prefixes.
 
 The parser does not resolve namespaces, so that a long namespace is not copied into each name. A document with a
-document type is refused before anything in it is expanded: entities, external or nested, never come to be.
+document type is refused before anything in it is expanded, so that there are no entities, external or nested.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ LONGEST = 16 << 20
 """Longest document, bytes."""
 MOST_DEPTH = 64
 MOST_ELEMENTS = 200_000
-MOST_ATTRIBUTES = 64  # of one element
+MOST_ATTRIBUTES = 64  # largest number of attributes of one element
 MOST_NAME = 256  # characters of a name, and of a name in an attribute
 _PIECE = 1 << 20  # bytes parsed at once
 
 
 class Element:
-    """An element: name and attributes without prefixes, own text, and children.
+    """An element: name and attributes without prefixes, text, and children.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Element:
         return next((each for each in self.children if each.name == name), None)
 
     def walk(self) -> Iterator[Element]:
-        """Yield the element and all below it, in the order of the document."""
+        """Yield the element and all its descendants, in the order of the document."""
         waiting = [self]
         while waiting:
             element = waiting.pop()
@@ -60,7 +60,7 @@ def parse_tree(data: bytes) -> Element:
     Raises
     ------
     ProtocolError
-        No XML, a document type, or more than one of the limits of this module.
+        The data are not XML, have a document type, or exceed a limit of this module.
     """
     if len(data) > LONGEST:
         raise ProtocolError(f"Expected a document of at most {LONGEST} bytes; found {len(data)}")
@@ -72,13 +72,13 @@ def parse_tree(data: bytes) -> Element:
         parser.EndElementHandler = builder.end
         parser.CharacterDataHandler = builder.text
         parser.StartDoctypeDeclHandler = builder.doctype
-        for place in range(0, len(data), _PIECE):
-            parser.Parse(data[place : place + _PIECE], False)
+        for start in range(0, len(data), _PIECE):
+            parser.Parse(data[start : start + _PIECE], False)
         parser.Parse(b"", True)
-    except (expat.ExpatError, ValueError, LookupError) as error:  # the others: unknown encodings
-        raise ProtocolError(f"Expected XML; it cannot be parsed ({error}); it starts with {data[:60]!r}") from None
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the latter two: unknown encodings
+        raise ProtocolError(f"Expected XML; found {data[:60]!r}, which cannot be parsed ({error})") from None
     if builder.root is None:
-        raise ProtocolError(f"Expected XML; it starts {data[:60]!r}")
+        raise ProtocolError(f"Expected XML; found {data[:60]!r}")
     return builder.root
 
 
@@ -101,8 +101,10 @@ class _Builder:
             )
         if len(name) > MOST_NAME or any(len(key) > MOST_NAME for key in attributes):
             raise ProtocolError(f"<{name[:40]}>: expected names of at most {MOST_NAME} characters")
-        own = {key: value for key, value in attributes.items() if ":" not in key}  # MTConnect's have no prefix
-        element = Element(name.rpartition(":")[2], own)
+        plain = {
+            key: value for key, value in attributes.items() if ":" not in key
+        }  # attributes of MTConnect have no prefix
+        element = Element(name.rpartition(":")[2], plain)
         if self._open:
             self._open[-1].children.append(element)
         elif self.root is None:

@@ -1,4 +1,4 @@
-"""Controls with an OPC UA server: the information model for CNC systems, or nodes named in the settings."""
+"""Controls with an OPC UA server: the information model for CNC systems, or nodes stated in the settings."""
 
 from errormotion.instruments.controller.opcua.driver import OpcUa
 from errormotion.instruments.controller.opcua.settings import OpcUaSettings

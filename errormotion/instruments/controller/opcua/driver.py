@@ -41,7 +41,7 @@ class OpcUa(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         return InstrumentSubject(cls, "sim://cframe/opcua", {"timeout": 1.5})
 
     def __init__(self, address: str, settings: OpcUaSettings | None = None, *, record: Path | None = None) -> None:
@@ -54,7 +54,7 @@ class OpcUa(Driver):
         self._started_at: float | None = None
 
     def identify(self) -> Identity:
-        """Return the identity of the control as the server states it."""
+        """Return the identity of the control that the server reports."""
         return Identity(
             manufacturer=self._identity.get("manufacturer", "unknown"),
             model=self._identity.get("model", "OPC UA server"),
@@ -65,7 +65,7 @@ class OpcUa(Driver):
         )
 
     def read(self) -> dict[str, Any]:
-        """Return the state now, without values that are None."""
+        """Return the present state, without values that are None."""
         return {name: value for name, value in self.state().items() if value is not None}
 
     def state(self) -> dict[str, Any]:
@@ -77,9 +77,9 @@ class OpcUa(Driver):
             ``time`` (s on the server's clock since the driver was first opened), ``position`` and
             ``commanded_position`` (X, Y, Z, m), ``position_time`` (when the position last changed, s on the same
             clock), ``spindle_speed`` (1/min), ``spindle_load`` (fraction), ``feed`` (m/s), ``mode`` (``manual``,
-            ``mdi``, ``automatic``, the server's own word, or empty), ``program``, ``running``, ``estop`` (None where
-            no node reports it), ``homed`` (all axes are; None where no node reports it), ``enabled`` (None: not read),
-            ``alarms`` (empty: not read), and ``unavailable``: names of what is unknown. Unknown numbers are NaN.
+            ``mdi``, ``automatic``, the text of the server, or empty), ``program``, ``running``, ``estop`` (None if no
+            node reports it), ``homed`` (whether all axes are; None if no node reports it), ``enabled`` (None: not
+            read), ``alarms`` (empty: not read), and ``unavailable``: names of unknown values. Unknown numbers are NaN.
 
         Raises
         ------
@@ -129,7 +129,7 @@ class OpcUa(Driver):
             return math.nan
         try:
             return float(value) * self._factors[key]
-        except OverflowError:  # a whole number beyond the range of float
+        except OverflowError:  # an integer beyond the range of float
             return math.nan
 
     # ------------------------------------------------------------------ requests
@@ -174,7 +174,7 @@ class OpcUa(Driver):
         self._nodes = found | self.settings.nodes
         if not self._nodes:
             raise InstrumentError(
-                f"The server at {self.address} has no object CncInterface (OPC 40502): name its nodes in the settings, "
+                f"The server at {self.address} has no object CncInterface (OPC 40502); state nodes in the settings, "
                 "as in nodes.spindle_speed = 'ns=2;s=/Channel/Spindle/actSpeed[u1,1]'"
             )
         self._factors = {key: self._factor(key) for key in NUMBERS if key in self._nodes}
@@ -193,7 +193,7 @@ class OpcUa(Driver):
 
 
 def _is_child(each: Any) -> bool:
-    """Whether this is a node as `transports.opc` describes one."""
+    """Whether an object describes a node like `transports.opc`."""
     return (
         isinstance(each, dict)
         and all(isinstance(each.get(name), str) for name in ("id", "name"))
@@ -202,7 +202,7 @@ def _is_child(each: Any) -> bool:
 
 
 def _seconds(time: Any) -> float:
-    """Return a time as s since 1970; NaN where there is none."""
+    """Return a time as s since 1970; NaN if it is invalid."""
     try:
         return datetime.fromisoformat(time).timestamp()
     except (TypeError, ValueError, OverflowError):
@@ -210,7 +210,7 @@ def _seconds(time: Any) -> float:
 
 
 def _all_of(answers: Sequence[Any]) -> bool | None:
-    """Return whether all answers are true; None where one is not known, or there is none."""
+    """Return whether all answers are true; None if one is unknown, or there are none."""
     if not answers or not all(isinstance(answer, bool) for answer in answers):
         return None
     return all(answers)

@@ -1,4 +1,4 @@
-"""The information model OPC UA for CNC Systems (OPC 40502): which node holds which quantity.
+"""The information model OPC UA for CNC Systems (OPC 40502): assignment of quantities to nodes.
 
 The object ``CncInterface`` has lists of axes, spindles and channels (clause 8.1). Names of objects and variables, and
 values of enumerations, are those of clauses 6.6 to 6.9 and 7.2.
@@ -17,11 +17,11 @@ NAMESPACE = "http://opcfoundation.org/UA/CNC"
 OBJECTS = "i=85"
 """The folder of all objects of a server."""
 NODE_TIME = "i=2258"
-"""The time of the server."""
+"""Node of the time of the server."""
 MODES = {"0": "manual", "1": "mdi", "2": "automatic"}
-"""CncOperationMode."""
+"""Modes by the value of CncOperationMode."""
 HOMED = "homed."
-"""Beginning of the quantities that report whether an axis is referenced."""
+"""Prefix of the quantities that report whether an axis is referenced."""
 IDENTITY = {"VendorName": "manufacturer", "CncTypeName": "model", "VendorRevision": "firmware"}
 
 #: Units by the code of the property EngineeringUnits: the characters of the UNECE code (Recommendation 20) as a number.
@@ -45,14 +45,14 @@ UNIT_CODES = {
 UNIT = "EngineeringUnits"
 """Name of the property that states a unit."""
 FRACTIONS = {"%": 0.01, "percent": 0.01, "1": 1.0}
-"""Units of pure numbers."""
+"""Units of dimensionless numbers."""
 
 Browse = Callable[[str], Sequence[Mapping[str, Any]]]
 """Returns the children of a node."""
 
 
 def interface(namespaces: Sequence[str], browse: Browse) -> str:
-    """Return the id of the object CncInterface; empty where the server has none."""
+    """Return the id of the object CncInterface; empty if the server has none."""
     if NAMESPACE not in namespaces:
         return ""
     index = namespaces.index(NAMESPACE)
@@ -61,14 +61,15 @@ def interface(namespaces: Sequence[str], browse: Browse) -> str:
 
 
 def quantities(root: str, browse: Browse, settings: OpcUaSettings) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the ids of nodes by quantity (`settings.KEYS`), and those of the properties that state their units.
+    """Return the ids of nodes by quantity (`settings.KEYS`), and of the properties that state their units.
 
     The unit of a position is a property of its group, ``PosDirect`` or ``PosIndirect`` (clause 7.3.2).
 
     Raises
     ------
     InstrumentError
-        The server has no axis, spindle or channel of the name that the settings give, or several and none is named.
+        The server has no axis, spindle or channel with the name in the settings; or several, and the settings state
+        none.
     """
     parts = children(browse, root)
     found: dict[str, str] = {}
@@ -89,19 +90,19 @@ def quantities(root: str, browse: Browse, settings: OpcUaSettings) -> tuple[dict
 
 
 def children(browse: Browse, node: str) -> dict[str, str]:
-    """Return the ids of the children of a node by name; of no node none."""
+    """Return the ids of the children of a node by name; none for an empty node id."""
     return {each["name"]: each["id"] for each in browse(node)} if node else {}
 
 
 def factor(key: str, stated: Any, settings: OpcUaSettings) -> float:
-    """Return what a number of a quantity is multiplied by: the unit of the settings, else that of the server.
+    """Return the factor that converts a number of a quantity: from the unit of the settings, else of the server.
 
     Parameters
     ----------
     key : str
         One of `settings.NUMBERS`.
     stated : object
-        Value of the property EngineeringUnits; None where the node has none.
+        Value of the property EngineeringUnits; None if the node has none.
     settings : OpcUaSettings
 
     Raises
@@ -118,7 +119,7 @@ def factor(key: str, stated: Any, settings: OpcUaSettings) -> float:
             return _scaled(UNIT_CODES[code], UNITS[name], f"'{key}'")
         if unit:
             return _scaled({"rpm": "1/min", "r/min": "1/min"}.get(unit, unit), UNITS[name], f"'{key}'")
-    raise InstrumentError(f"'{key}': the server does not state its unit; give it in the settings: units.{name} = 'mm'")
+    raise InstrumentError(f"'{key}': the server does not state its unit; state it in the settings: units.{name} = 'mm'")
 
 
 def _scaled(unit: str, target: str, what: str) -> float:
@@ -135,11 +136,11 @@ def _present(parts: Mapping[str, str], names: Mapping[str, str]) -> dict[str, st
 
 
 def _one(what: str, found: Mapping[str, str], name: str) -> str:
-    """Return the node of a name; without a name that of the only one, or none where there is none."""
+    """Return the node with a name; without a name the only node, or an empty id if there is none."""
     if name:
         if name in found or not found:
             return found.get(name, "")
         raise InstrumentError(f"The server has no {what} '{name}'; it has {', '.join(sorted(found))}")
     if len(found) > 1:
-        raise InstrumentError(f"The server has several: {what} {', '.join(sorted(found))}; name one in the settings")
+        raise InstrumentError(f"The server has several: {what} {', '.join(sorted(found))}; state one in the settings")
     return next(iter(found.values()), "")

@@ -10,7 +10,7 @@ from errormotion.datasets.units import Time
 from errormotion.plugins import PluginSettings
 
 UNITS = {"position": "m", "commanded_position": "m", "spindle_speed": "1/min", "spindle_load": "1", "feed": "m/s"}
-"""Numbers, with the unit in which they are returned."""
+"""Numeric quantities, with the unit in which they are returned."""
 NUMBERS = (
     *(f"{name}.{axis}" for name in ("position", "commanded_position") for axis in "XYZ"),
     *("spindle_speed", "spindle_load", "feed"),
@@ -25,13 +25,13 @@ class OpcUaSettings(PluginSettings):
 
     nodes: dict[str, str] = Field(
         default_factory=dict,
-        description="ids of nodes, for a server without the CNC model or beside it: spindle_speed = 'ns=2;s=...'",
+        description="ids of nodes, in addition to the CNC model or without it: spindle_speed = 'ns=2;s=...'",
     )
     units: dict[str, str] = Field(
         default_factory=dict,
-        description="units of numbers for which the server states none: position = 'mm', feed = 'mm/min'",
+        description="units of numbers whose unit the server does not state: position = 'mm', feed = 'mm/min'",
     )
-    axes: tuple[str, str, str] = Field(default=("X", "Y", "Z"), description="names of the linear axes at the server")
+    axes: tuple[str, str, str] = Field(default=("X", "Y", "Z"), description="names of the linear axes on the server")
     spindle: str = Field(default="", description="name of the spindle; empty: the only one")
     channel: str = Field(default="", description="name of the channel; empty: the only one")
     feedback: Literal["direct", "indirect"] = Field(
@@ -49,7 +49,7 @@ class OpcUaSettings(PluginSettings):
     )
     user: str = Field(default="", description="name of the user; empty: anonymous")
     password_file: str = Field(default="", description="file whose first line is the user's password")
-    timeout: Time = Field(default=4.0, description="time limit of one request", gt=0)
+    timeout: Time = Field(default=4.0, description="time limit for one request", gt=0)
 
     @field_validator("nodes")
     @classmethod

@@ -1,4 +1,4 @@
-"""Machines with an SHDR adapter, the plain text behind MTConnect agents, read-only."""
+"""Machines with an SHDR adapter, the text protocol between machines and MTConnect agents, read-only."""
 
 from errormotion.instruments.controller.shdr.driver import Shdr
 from errormotion.instruments.controller.shdr.settings import ShdrSettings

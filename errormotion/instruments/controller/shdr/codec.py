@@ -1,7 +1,7 @@
 """Lines of an SHDR adapter (adapter agent protocol 1.4 to 2.0, cppagent README): data, conditions, commands, assets.
 
 ``time|key|value|key|value``. A condition has five fields after its key, a message two, a time series three; each of
-them is expected on a line of its own, or its key is stated. Keys that begin with ``@`` (assets) are no data.
+them is expected alone on a line, unless the settings state its key. Keys that start with ``@`` (assets) are ignored.
 
 Longest line: 64 KiB; longest asset in several lines: 1 MiB; a line has at most 4096 fields.
 """
@@ -38,13 +38,13 @@ class Observed:
     Attributes
     ----------
     key, value : str
-        As the adapter wrote them, ``UNAVAILABLE`` included; of a condition its text, of a time series its last value.
+        As received, ``UNAVAILABLE`` included; for a condition its text, for a time series its last value.
     time : float
-        s since 1970 by the adapter's clock; NaN where the line has no absolute time.
+        s since 1970 by the adapter's clock; NaN if the line has no absolute time.
     level : str
-        Of a condition one of `LEVELS`; else empty.
+        For a condition one of `LEVELS`; else empty.
     code : str
-        Of a condition or message the machine's own code.
+        For a condition or message the code of the machine.
     """
 
     key: str
@@ -56,7 +56,7 @@ class Observed:
 
 @dataclass(frozen=True)
 class Command:
-    """What an adapter states about itself: ``* name: value``, or ``* PONG milliseconds``."""
+    """A statement of an adapter about itself: ``* name: value``, or ``* PONG milliseconds``."""
 
     name: str
     value: str
@@ -64,7 +64,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Keys:
-    """Keys whose values have several fields, where the settings state them."""
+    """Keys whose values have several fields, as stated in the settings."""
 
     conditions: Set[str] = frozenset()
     messages: Set[str] = frozenset()
@@ -72,7 +72,7 @@ class Keys:
 
 
 class Lines:
-    """Takes received bytes apart into lines; skips assets of several lines."""
+    """Splits received bytes into lines; skips assets of several lines."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -81,16 +81,16 @@ class Lines:
         self._asset_bytes = 0
 
     def clear(self) -> None:
-        """Forget what is not complete, after a connection was lost."""
+        """Discard incomplete data, after a connection was lost."""
         self.__init__()  # type: ignore[misc]
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Yield each complete line that is no part of an asset, without its end.
+        """Yield each complete line that is not part of an asset, without its line end.
 
         Raises
         ------
         ProtocolError
-            A line or asset that is longer than its limit; nothing is kept of what was received.
+            A line or asset is longer than its limit; all received data are discarded.
         """
         self._buffer += data
         while (end := self._buffer.find(b"\n", self._searched)) >= 0:
@@ -127,12 +127,12 @@ class Lines:
 
 
 def parse_line(line: bytes, keys: Keys = Keys()) -> Command | list[Observed]:
-    """Return what a line states: a command of the adapter, or values in their order; of an asset no values.
+    """Return the content of a line: a command of the adapter, or values in their order; no values for an asset.
 
     Raises
     ------
     ProtocolError
-        No such line.
+        The line has another format.
     """
     text = line.decode("utf-8", "replace").rstrip("\r\n")
     if text.startswith("*"):
@@ -155,7 +155,7 @@ def split_fields(text: str) -> list[str]:
     Raises
     ------
     ProtocolError
-        More than `MOST_FIELDS`.
+        The line has more than `MOST_FIELDS` fields.
     """
     parts = text.split("|", MOST_FIELDS + 1)
     if len(parts) > MOST_FIELDS:
@@ -179,12 +179,12 @@ def _unquoted(part: str) -> str:
 
 
 def parse_time(text: str) -> float:
-    """Return a time such as ``2009-06-15T00:00:00.25Z@100``, s since 1970; NaN for none, or a relative one.
+    """Return a time such as ``2009-06-15T00:00:00.25Z@100``, s since 1970; NaN for no time, or a relative one.
 
     Raises
     ------
     ProtocolError
-        No time.
+        The text is not a time.
     """
     word = text.partition("@")[0].strip()
     if not word or (_NUMBER.fullmatch(word) and len(word) <= _MOST_TIME):
@@ -199,12 +199,12 @@ def parse_time(text: str) -> float:
 
 
 def parse_numbers(text: str) -> list[float]:
-    """Return the numbers of a value such as ``1.5``, ``1 2 3`` or ``0:DAY``; one NaN where it is unavailable or empty.
+    """Return the numbers of a value such as ``1.5``, ``1 2 3`` or ``0:DAY``; one NaN if it is unavailable or empty.
 
     Raises
     ------
     ProtocolError
-        No numbers.
+        The value is not numeric.
     """
     if text.upper() == UNAVAILABLE:
         return [math.nan]
@@ -217,10 +217,10 @@ def parse_numbers(text: str) -> list[float]:
 
 
 def _observed(fields: list[str], time: float, keys: Keys, text: str) -> Iterator[Observed]:
-    place = 0
-    while place < len(fields):
-        key, rest = fields[place], fields[place + 1 :]
-        alone = place == 0
+    index = 0
+    while index < len(fields):
+        key, rest = fields[index], fields[index + 1 :]
+        alone = index == 0
         size = _size(key, rest, keys, alone=alone)
         if not key or len(rest) < size:
             raise ProtocolError(f"Expected a key and {size} fields after it; found '{text[:60]}'")
@@ -236,11 +236,11 @@ def _observed(fields: list[str], time: float, keys: Keys, text: str) -> Iterator
             yield Observed(key, rest[1], time, code=rest[0])
         else:
             yield Observed(key, rest[0], time)
-        place += 1 + size
+        index += 1 + size
 
 
 def _size(key: str, rest: list[str], keys: Keys, *, alone: bool) -> int:
-    """Return how many fields belong to a key; of keys that are not stated, by the form of the line."""
+    """Return the number of fields of a key; for keys that the settings do not state, from the form of the line."""
     for size, stated in ((5, keys.conditions), (2, keys.messages), (3, keys.series)):
         if key in stated:
             return size
@@ -257,7 +257,7 @@ def _size(key: str, rest: list[str], keys: Keys, *, alone: bool) -> int:
 
 
 def pong(command: Command) -> float | None:
-    """Return the heartbeat of ``* PONG``, s; None for another command, and where it states no number."""
+    """Return the heartbeat of ``* PONG``, s; None for another command, or without a number."""
     if command.name != "PONG" or not _MILLISECONDS.fullmatch(command.value):
         return None
     return min(int(command.value), MOST_MILLISECONDS) / 1000

@@ -1,4 +1,4 @@
-"""Driver of SHDR adapters: what the machine does now, read from the text that an MTConnect agent would read."""
+"""Driver of SHDR adapters: the state of the machine, from the text that an MTConnect agent would read."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from errormotion.instruments.transports import Transport
 from errormotion.instruments.transports.reconnecting import ReconnectingTransport, open_reconnecting
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
-MOST_COMMANDS = 100  # names that an adapter states about itself
+MOST_COMMANDS = 100  # largest number of statements of an adapter about itself
 QUIET = 0.1  # s without data after which an adapter has sent the present values
 _MODES = {"AUTOMATIC": "automatic", "SEMI_AUTOMATIC": "automatic", "MANUAL": "manual", "MANUAL_DATA_INPUT": "mdi"}
 _TEXTS = ("mode", "program", "execution", "estop", "availability")
@@ -44,11 +44,11 @@ log = logging.getLogger(__name__)
 
 
 class Shdr(Driver):
-    """A machine with an SHDR adapter; read-only: nothing but ``* PING`` is sent.
+    """A machine with an SHDR adapter; read-only: only ``* PING`` is sent.
 
-    The values of all keys are kept as they come. Each reading first takes what has arrived, up to the answer to a
-    ``* PING``. A connection that is lost, or older than its heartbeat, is opened again by the next reading, and nothing
-    is known until the adapter has sent its values again.
+    The values of all keys are stored as received. Each reading first processes the received data, up to the answer to a
+    ``* PING``. A connection that is lost, or was not read for longer than its heartbeat, is opened again by the next
+    reading, and all values are unknown until the adapter has sent them again.
 
     Parameters
     ----------
@@ -61,15 +61,15 @@ class Shdr(Driver):
     Attributes
     ----------
     heartbeat : float
-        What the adapter asks for, s; infinite where it does not answer ``* PING``.
+        Heartbeat that the adapter requires, s; infinite if it does not answer ``* PING``.
     malformed : int
-        Lines that were ignored because they are not of the protocol (``lenient``).
+        Number of lines that were ignored because they do not follow the protocol (``lenient``).
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
         id="shdr",
         kind="controller",
-        summary="Any machine with an SHDR adapter (the text behind MTConnect), read-only: positions, spindle, alarms",
+        summary="Any machine with an SHDR adapter (text protocol of MTConnect), read-only: positions, spindle, alarms",
         status="simulated_only",
         simulator="errormotion.instruments.simulators.controller.shdr:SimulatedAdapter",
     )
@@ -78,7 +78,7 @@ class Shdr(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         return InstrumentSubject(
             cls, "sim://cframe/shdr?style=vmc", settings={"timeout": 0.7}, harmless=("split", "alarm", "late")
         )
@@ -96,11 +96,11 @@ class Shdr(Driver):
 
     @property
     def values(self) -> Mapping[str, str]:
-        """Last value of each key, as the adapter wrote it."""
+        """Last value of each key, as received."""
         return {key: each.value for key, each in self._memory.values.items()}
 
     def identify(self) -> Identity:
-        """Return the identity of the device as its adapter states it."""
+        """Return the identity of the device that its adapter reports."""
         about = self._about
         return Identity(
             manufacturer=about.get("manufacturer", "unknown"),
@@ -117,7 +117,7 @@ class Shdr(Driver):
         self._assign()
 
     def read(self) -> dict[str, Any]:
-        """Return the state now, without values that are None."""
+        """Return the present state, without values that are None."""
         return {name: value for name, value in self.state().items() if value is not None}
 
     def state(self) -> dict[str, Any]:
@@ -139,7 +139,7 @@ class Shdr(Driver):
         InstrumentTimeoutError
             No answer to ``* PING`` within the time limit.
         ProtocolError
-            A line that is not of the protocol (unless ``lenient``), or a value that is no number.
+            A line that is not of the protocol (unless ``lenient``), or a value that is not a number.
         InstrumentError
             The connection is lost.
         """
@@ -150,12 +150,12 @@ class Shdr(Driver):
             raise ProtocolError(f"{self.address}, {error}") from None
 
     def _state(self) -> dict[str, Any]:
-        set_, memory = self.settings, self._memory
+        settings, memory = self.settings, self._memory
         position, moved = self._position("position")
         numbers = {
-            "spindle_speed": self._number(self._items["spindle_speed"], SPEEDS[set_.speed_unit]),
-            "spindle_load": self._number(self._items["spindle_load"], LOADS[set_.load_unit]),
-            "feed": self._number(self._items["feed"], FEEDS[set_.feed_unit]),
+            "spindle_speed": self._number(self._items["spindle_speed"], SPEEDS[settings.speed_unit]),
+            "spindle_load": self._number(self._items["spindle_load"], LOADS[settings.load_unit]),
+            "feed": self._number(self._items["feed"], FEEDS[settings.feed_unit]),
         }
         text = {key: memory.text(self._items[key]) for key in _TEXTS}
         state: dict[str, Any] = {
@@ -173,9 +173,10 @@ class Shdr(Driver):
             "alarms": memory.reported("FAULT"),
             "warnings": memory.reported("WARNING"),
             "temperatures": {
-                name: _celsius(self._number(key), set_.temperature_unit) for name, key in set_.temperatures.items()
+                name: _celsius(self._number(key), settings.temperature_unit)
+                for name, key in settings.temperatures.items()
             },
-            "angles": {name: self._number(key, ANGLES[set_.angle_unit]) for name, key in set_.angles.items()},
+            "angles": {name: self._number(key, ANGLES[settings.angle_unit]) for name, key in settings.angles.items()},
         }
         state["unavailable"] = [
             *(key for key in ("position", "commanded_position") if any(math.isnan(x) for x in state[key])),
@@ -201,7 +202,7 @@ class Shdr(Driver):
         return self._memory.numbers(key)[0] * scale
 
     def _position(self, quantity: str) -> tuple[list[float], float]:
-        """Return X, Y, Z in m, and when they last changed, s since 1970."""
+        """Return X, Y, Z in m, and the time of their last change, s since 1970."""
         scale, memory = LENGTHS[self.settings.length_unit], self._memory
         whole = self._items.get(quantity, "")
         if whole in memory.values:
@@ -212,8 +213,8 @@ class Shdr(Driver):
 
     # ------------------------------------------------------------------ lines
 
-    def _take(self, data: bytes) -> bool:
-        """Take received bytes; return whether ``* PONG`` was among them."""
+    def _process(self, data: bytes) -> bool:
+        """Process received bytes; return whether they contain ``* PONG``."""
         answered, wrong = False, ""
         for line in self._lines.feed(data):
             try:
@@ -226,7 +227,7 @@ class Shdr(Driver):
                 answered = self._command(found) or answered
             else:
                 for observed in filter(None, map(self._of_device, found)):
-                    self._memory.note(observed)
+                    self._memory.store(observed)
         if wrong and not self.settings.lenient:
             raise ProtocolError(f"{self.address}: {wrong}; set 'lenient' to ignore and count such lines")
         if wrong:
@@ -243,14 +244,14 @@ class Shdr(Driver):
         return False
 
     def _of_device(self, observed: Observed) -> Observed | None:
-        """Return a value without the name of its device; None where it is of another one."""
+        """Return a value without the name of its device; None if it belongs to another device."""
         mark = f"{self.settings.device}:" if self.settings.device else ""
         return replace(observed, key=observed.key.removeprefix(mark)) if observed.key.startswith(mark) else None
 
     # ------------------------------------------------------------------ connection
 
     def _update(self) -> None:
-        """Take everything that the adapter has sent up to now."""
+        """Process everything that the adapter has sent up to now."""
         try:
             self._renew()
             if self._silent:
@@ -271,13 +272,13 @@ class Shdr(Driver):
         return not self._fresh and math.isinf(self.heartbeat)
 
     def _renew(self) -> None:
-        """Give up a connection that the adapter will have closed: it waits for two heartbeats at most."""
+        """Drop a connection that the adapter may have closed: it waits for two heartbeats at most."""
         if time.monotonic() - self._last_ping > self.heartbeat and isinstance(self.transport, ReconnectingTransport):
-            self._forget("it was not read for more than its heartbeat")
+            self._forget("it was not read for longer than its heartbeat")
 
     def _forget(self, reason: str) -> None:
         self._lines.clear()
-        self._memory.forget()
+        self._memory.clear()
         self._fresh = True
         if isinstance(self._transport, ReconnectingTransport):
             self._transport.drop(f"The connection to {self.address} was closed: {reason}")
@@ -295,17 +296,17 @@ class Shdr(Driver):
             except InstrumentTimeoutError:
                 break
             self._last_data = time.monotonic()
-            if self._take(data):
+            if self._process(data):
                 return
         if not (self._fresh and self._memory.values):
             raise InstrumentTimeoutError(
                 f"{self.address}: no answer to '* PING' within {self.settings.timeout:g} s; is it an SHDR adapter?"
             )
         self.heartbeat = math.inf
-        log.warning("%s: the adapter has no heartbeat; it is believed for %g s", self.address, self.settings.silence)
+        log.warning("%s: the adapter has no heartbeat; values expire after %g s", self.address, self.settings.silence)
 
     def _drain(self, quiet: float) -> None:
-        """Take what comes until there is nothing for ``quiet`` s, at most for the time limit."""
+        """Process data until none arrive for ``quiet`` s, at most for the time limit."""
         end = time.monotonic() + self.settings.timeout
         while time.monotonic() < end:
             try:
@@ -313,7 +314,7 @@ class Shdr(Driver):
             except (InstrumentTimeoutError, ReplayError):
                 return
             self._last_data = time.monotonic()
-            self._take(data)
+            self._process(data)
 
     def _connect(self) -> Transport:
         return open_reconnecting(
@@ -325,7 +326,7 @@ class Shdr(Driver):
 
     def _start_session(self) -> None:
         self._lines.clear()
-        self._memory.forget()  # of a session before
+        self._memory.clear()  # of an earlier session
         self._fresh, self.heartbeat = True, math.inf
         self._update()
 

@@ -1,4 +1,4 @@
-"""What an adapter has stated last: values by key, conditions by key and code, and the times of its clock."""
+"""Last data of an adapter: values by key, conditions by key and code, and the times of its clock."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Memory:
     Attributes
     ----------
     values : dict of str to Observed
-        By key.
+        Last values by key.
     conditions : dict of (str, str) to Observed
-        Warnings and faults that are present, by key and code.
+        Active warnings and faults, by key and code.
     started, newest : float
-        Times of the first and of the newest line, s since 1970; NaN where none had a time.
+        Times of the first and of the newest line, s since 1970; NaN if no line had a time.
     """
 
     def __init__(self) -> None:
@@ -30,18 +30,18 @@ class Memory:
         self.conditions: dict[tuple[str, str], Observed] = {}
         self.started = self.newest = math.nan
 
-    def forget(self) -> None:
-        """Forget values and conditions; the clock goes on."""
+    def clear(self) -> None:
+        """Discard values and conditions; the clock continues."""
         self.values.clear()
         self.conditions.clear()
 
-    def note(self, observed: Observed) -> None:
-        """Keep a value or condition.
+    def store(self, observed: Observed) -> None:
+        """Store a value or condition.
 
         Raises
         ------
         ProtocolError
-            More than `MOST_KEYS` or `MOST_CONDITIONS`.
+            There are more than `MOST_KEYS` values or `MOST_CONDITIONS` conditions.
         """
         if not math.isnan(observed.time):
             self.started = observed.time if math.isnan(self.started) else self.started
@@ -51,15 +51,15 @@ class Memory:
         elif observed.key in self.values or len(self.values) < MOST_KEYS:
             self.values[observed.key] = observed
         else:
-            raise ProtocolError(f"Expected at most {MOST_KEYS} keys; '{observed.key[:40]}' is one more")
+            raise ProtocolError(f"Expected at most {MOST_KEYS} keys; found '{observed.key[:40]}' in addition")
 
     def text(self, key: str) -> str:
-        """Return a value; empty where it is unknown."""
+        """Return a value; empty if it is unknown."""
         observed = self.values.get(key)
         return "" if observed is None or observed.value.upper() == UNAVAILABLE else observed.value
 
     def numbers(self, key: str) -> list[float]:
-        """Return the numbers of a value; one NaN where it is unknown. ProtocolError where it is none."""
+        """Return the numbers of a value; one NaN if it is unknown. ProtocolError if it is not numeric."""
         observed = self.values.get(key)
         if observed is None:
             return [math.nan]
@@ -77,12 +77,12 @@ class Memory:
         ]
 
     def changed(self, keys: Mapping[str, str] | list[str]) -> float:
-        """Return when the newest of these keys was stated, s since 1970; NaN where none has a time."""
+        """Return the time of the newest of these keys, s since 1970; NaN if none has a time."""
         times = [self.values[key].time for key in keys if key in self.values]
         return max((time for time in times if not math.isnan(time)), default=math.nan)
 
     def _condition(self, observed: Observed) -> None:
-        """Keep or end conditions: a key may have several by code; NORMAL without a code ends all of them."""
+        """Store or end a condition: a key may have several by code; NORMAL without a code ends all of them."""
         if observed.level in ("NORMAL", UNAVAILABLE):
             ended = [each for each in self.conditions if each[0] == observed.key and observed.code in ("", each[1])]
             for each in ended:

@@ -1,4 +1,4 @@
-"""Settings of an SHDR adapter: which key is which quantity, and in what unit."""
+"""Settings of an SHDR adapter: keys and units of quantities."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DEFAULT_ITEMS: Mapping[str, str] = {
     "estop": "estop",
     "availability": "avail",
 }
-"""Keys of the device VMC-3Axis of the reference agent."""
+"""Keys of the device VMC-3Axis of the reference agent, by quantity."""
 
 LENGTHS: Mapping[str, float] = {"mm": 1e-3, "inch": 25.4e-3, "um": 1e-6, "m": 1.0}
 FEEDS: Mapping[str, float] = {
@@ -52,7 +52,7 @@ class ShdrSettings(PluginSettings):
     items: dict[str, str] = Field(
         default_factory=dict,
         description="keys of the adapter by quantity, in addition to those of the reference device: "
-        "'position.X' = 'X1actm', spindle_speed = 'S1speed'; an empty key: there is none",
+        "'position.X' = 'X1actm', spindle_speed = 'S1speed'; an empty key: the adapter has none",
     )
     temperatures: dict[str, str] = Field(default_factory=dict, description="keys by name: spindle = 'Stemp'")
     angles: dict[str, str] = Field(default_factory=dict, description="keys of rotary axes by name: B = 'Babs'")
@@ -64,18 +64,25 @@ class ShdrSettings(PluginSettings):
     load_unit: Literal["%", "1"] = Field(default="%", description="unit of the spindle load")
     angle_unit: Literal["degree", "rad"] = Field(default="degree", description="unit of the angles")
     temperature_unit: Literal["degC", "degF", "K"] = Field(default="degC", description="unit of the temperatures")
-    device: str = Field(default="", description="name before the keys, as in name:Xact; other devices are ignored")
+    device: str = Field(
+        default="", description="name of the device before the keys, as in name:Xact; other devices are ignored"
+    )
     conditions: tuple[str, ...] = Field(
-        default=(), description="keys of conditions, where they share their lines with other values"
+        default=(), description="keys of conditions, if their lines also contain other values"
     )
-    messages: tuple[str, ...] = Field(default=(), description="keys of messages, likewise")
-    series: tuple[str, ...] = Field(default=(), description="keys of time series, likewise")
+    messages: tuple[str, ...] = Field(
+        default=(), description="keys of messages, if their lines also contain other values"
+    )
+    series: tuple[str, ...] = Field(
+        default=(), description="keys of time series, if their lines also contain other values"
+    )
     lenient: bool = Field(
-        default=False, description="ignore and count lines that are not of the protocol, rather than refuse them"
+        default=False,
+        description="whether lines that do not follow the protocol are ignored and counted; if not, they are errors",
     )
-    timeout: Time = Field(default=2.0, description="time limit of an answer", gt=0)
+    timeout: Time = Field(default=2.0, description="time limit for an answer", gt=0)
     silence: Time = Field(
-        default=600.0, description="time limit without data from an adapter that has no heartbeat", gt=0
+        default=600.0, description="time limit without data from an adapter without a heartbeat", gt=0
     )
 
     @field_validator("items")

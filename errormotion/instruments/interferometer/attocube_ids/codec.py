@@ -11,7 +11,7 @@ from errormotion.errors import ProtocolError
 
 LINE_END = b"\r\n"
 LONGEST_REPLY = 4096
-"""Bytes, line end included; a reply with three lengths has some 100."""
+"""Bytes, line end included; a reply with three lengths has about 100."""
 PICOMETRE = 1e-12  # m
 API = 2
 """Version of the interface: every result starts with the number of an error or a warning."""
@@ -30,13 +30,13 @@ class Reply:
     Attributes
     ----------
     number : int or None
-        Of the request; None where the device could not read it.
+        Number of the request; None if the device could not read it.
     code : int
-        Error or warning of the function; 0: none.
+        Number of an error or a warning of the function; 0: none.
     values : tuple
-        What follows the code, as it came.
+        Values after the code, as received.
     refusal : str
-        Why the request was not executed; empty where it was.
+        Why the request was not executed; empty if it was.
     """
 
     number: int | None
@@ -45,11 +45,11 @@ class Reply:
     refusal: str = ""
 
     def length(self, index: int) -> float:
-        """Return a value in picometres as m; ProtocolError where there is none."""
+        """Return a value in picometres as m; ProtocolError if it is invalid."""
         return self.quantity(index) * PICOMETRE
 
     def quantity(self, index: int) -> float:
-        """Return a finite number; ProtocolError where there is none."""
+        """Return a finite number; ProtocolError if it is invalid."""
         value = self._value(index)
         if isinstance(value, int | float) and not isinstance(value, bool):
             try:
@@ -61,14 +61,14 @@ class Reply:
         raise ProtocolError(f"Value {index + 1} of a reply: expected a number; found {str(value)[:40]!r}")
 
     def flag(self, index: int) -> bool:
-        """Return true or false; ProtocolError where there is neither."""
+        """Return true or false; ProtocolError if it is neither."""
         value = self._value(index)
         if not isinstance(value, bool):
             raise ProtocolError(f"Value {index + 1} of a reply: expected true or false; found {str(value)[:40]!r}")
         return value
 
     def text(self, index: int) -> str:
-        """Return a text of at most 200 printable characters; ProtocolError where there is none."""
+        """Return a text of at most 200 printable characters; ProtocolError if it is invalid."""
         value = self._value(index)
         if not isinstance(value, str) or len(value) > 200 or not value.isprintable():
             raise ProtocolError(f"Value {index + 1} of a reply: expected a short text; found {str(value)[:40]!r}")
@@ -81,7 +81,7 @@ class Reply:
 
 
 def request(method: str, number: int, *parameters: bool | int | str) -> bytes:
-    """Return a request, in the form in which the maker's client writes it: without an end."""
+    """Return a request, in the form of the maker's client: without a line end."""
     found: dict[str, Any] = {"jsonrpc": "2.0", "method": method, "id": number, "api": API}
     if parameters:
         found["params"] = list(parameters)
@@ -94,7 +94,7 @@ def reply(line: bytes) -> Reply:
     Raises
     ------
     ProtocolError
-        No reply of an IDS3010, or a longer one than ``LONGEST_REPLY``.
+        Not a reply of an IDS3010, or longer than ``LONGEST_REPLY``.
     """
     if len(line) > LONGEST_REPLY:
         raise ProtocolError(f"A reply of {len(line)} bytes; expected at most {LONGEST_REPLY}")
@@ -104,12 +104,12 @@ def reply(line: bytes) -> Reply:
         found = None
     if not isinstance(found, dict) or found.get("jsonrpc") != "2.0":
         raise ProtocolError(
-            f'Expected a reply such as \'{{"jsonrpc":"2.0","id":1,"result":[0]}}\'; found {line[:60]!r}. Is this '
-            "port 9090 of an IDS3010?"
+            f'Expected a reply such as \'{{"jsonrpc":"2.0","id":1,"result":[0]}}\'; found {line[:60]!r}. Check '
+            "that the address is port 9090 of an IDS3010"
         )
     number, result, error = found.get("id"), found.get("result"), found.get("error")
     if not (number is None or (isinstance(number, int) and not isinstance(number, bool))):
-        raise ProtocolError(f"The number of a reply: expected a whole number; found {str(number)[:40]!r}")
+        raise ProtocolError(f"The number of a reply: expected an integer; found {str(number)[:40]!r}")
     if isinstance(error, dict):
         return Reply(number, refusal=f"{str(error.get('message', ''))[:120]} ({str(error.get('code', ''))[:12]})")
     if not isinstance(result, list) or not result or number is None:
@@ -118,15 +118,15 @@ def reply(line: bytes) -> Reply:
 
 
 def _code(value: Any) -> int:
-    if value is None or value == "null":  # as the maker's client takes it
+    if value is None or value == "null":  # as the maker's client reads it
         return 0
     if not isinstance(value, int) or isinstance(value, bool):
         raise ProtocolError(
             f"The first value of a reply: expected the number of an error or a warning; found {str(value)[:40]!r}. A "
-            f"firmware before version {API} of the interface states none: update it"
+            f"firmware before version {API} of the interface has none: update it"
         )
     return value
 
 
 def _refuse(text: str) -> NoReturn:
-    raise ValueError(f"no JSON: {text}")
+    raise ValueError(f"not JSON: {text}")

@@ -17,9 +17,9 @@ from errormotion.plugins.readings import Environment
 
 IDLE, STARTING, RUNNING = "system idle", "measurement starting", "measurement running"
 ALL_AXES = -1
-"""Axis of the requests for the refraction index: the device takes no other yet."""
+"""Axis of the requests for the refraction index: the device accepts no other."""
 POLL_INTERVAL = 0.2
-"""Between two looks at the mode of the device, s."""
+"""Interval between two queries of the mode of the device, s."""
 PASSES = ("single", "dual")
 HECTOPASCAL = 100.0  # Pa
 
@@ -29,9 +29,9 @@ GOOD = ""
 class AttocubeIds(Driver):
     """An attocube IDS3010, a fibre interferometer with three beams.
 
-    Each axis is a channel, ``axis1`` to ``axis3``, with its displacement in m; two parallel beams make a channel of an
-    angle. Until `zero` a reading counts from where the device counts from. A beam that was broken has lost its count:
-    its channels are NaN until the next `zero`, with the reason in ``flags``.
+    Each axis is a channel, ``axis1`` to ``axis3``, with its displacement in m; two parallel beams form a channel of an
+    angle. Before the first `zero`, readings are relative to the zero of the device. A beam that was broken has
+    lost its count: its channels are NaN until the next `zero`, with the reason in ``flags``.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class AttocubeIds(Driver):
     Attributes
     ----------
     flags : dict of str to str
-        Of the last reading, by channel: why it has no value; empty where it has one.
+        Why the last reading of a channel has no value, by channel; empty if it has one.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -59,7 +59,7 @@ class AttocubeIds(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         return InstrumentSubject(cls, "sim://cframe/ids?seed=3", vary=simulators.in_steps(seed=3))
 
     _number = 0
@@ -89,7 +89,7 @@ class AttocubeIds(Driver):
             raise InstrumentError(f"{self.address} refuses '{method}': {found.refusal}")
         return found
 
-    def _ask(self, method: str, *parameters: bool | int | str) -> codec.Reply:
+    def _request(self, method: str, *parameters: bool | int | str) -> codec.Reply:
         """Return the reply to a request that must succeed."""
         found = self._call(method, *parameters)
         if found.code:
@@ -108,23 +108,23 @@ class AttocubeIds(Driver):
         self.flags: dict[str, str] = dict.fromkeys(self.channels, GOOD)
         self._zero = dict.fromkeys(self.settings.axes, 0.0)
         self._lost: dict[int, str] = {}  # reasons by axis, until the next zero
-        model = self._ask(codec.SYSTEM + "getDeviceType").text(0)
+        model = self._request(codec.SYSTEM + "getDeviceType").text(0)
         if not model.startswith("IDS"):
             raise InstrumentError(f"{self.address}: expected an IDS3010; found '{model}'")
         passes = self._passes()
         if self.settings.passes not in ("as_set", passes):
             raise InstrumentError(
-                f"{self.address}: expected a device that is set to {self.settings.passes} pass (passes); it is set to "
-                f"{passes} pass"
+                f"{self.address}: expected a device in {self.settings.passes} pass mode (setting 'passes'); it is in "
+                f"{passes} pass mode"
             )
         self._prepare()
 
     def _passes(self) -> str:
-        mode = self._ask(codec.AXIS + "getPassMode").quantity(0)
+        mode = self._request(codec.AXIS + "getPassMode").quantity(0)
         return PASSES[int(mode)] if mode in (0.0, 1.0) else f"mode {mode:g}"
 
     def _prepare(self) -> None:
-        """Set the averaging, and see to it that the device measures."""
+        """Set the averaging, and start the measurement if it is not running."""
         mode = self._mode()
         if mode not in (IDLE, STARTING, RUNNING):
             raise InstrumentError(
@@ -140,16 +140,16 @@ class AttocubeIds(Driver):
         elif mode == STARTING:
             self._await(RUNNING)
         if (parameter := self.settings.average_parameter) is not None:
-            self._ask(codec.DISPLACEMENT + "setAverageN", parameter)
+            self._request(codec.DISPLACEMENT + "setAverageN", parameter)
 
     def _start(self) -> None:
         if self.settings.initialisation != "as_set":
-            self._ask(codec.SYSTEM + "setInitMode", int(self.settings.initialisation == "quick"))
-        self._ask(codec.SYSTEM + "startMeasurement")
+            self._request(codec.SYSTEM + "setInitMode", int(self.settings.initialisation == "quick"))
+        self._request(codec.SYSTEM + "startMeasurement")
         self._await(RUNNING)
 
     def _mode(self) -> str:
-        return self._ask(codec.SYSTEM + "getCurrentMode").text(0)
+        return self._request(codec.SYSTEM + "getCurrentMode").text(0)
 
     def _await(self, goal: str) -> None:
         """Wait until the device is in a mode.
@@ -164,7 +164,7 @@ class AttocubeIds(Driver):
             if goal == RUNNING and mode == IDLE:
                 code = self._call(codec.SYSTEM + "getSystemError").code
                 raise InstrumentError(
-                    f"{self.address} has not started to measure: {self._meaning(code)}. Are all beams aligned?"
+                    f"{self.address} has not started to measure: {self._meaning(code)}. Check that beams are aligned"
                 )
             if time.monotonic() > deadline:
                 raise InstrumentTimeoutError(
@@ -174,13 +174,13 @@ class AttocubeIds(Driver):
             time.sleep(POLL_INTERVAL)
 
     def identify(self) -> Identity:
-        """Return maker, model, serial number and firmware, and how the device is set."""
-        average = self._ask(codec.DISPLACEMENT + "getAverageN").quantity(0)
+        """Return maker, model, serial number, firmware and settings of the device."""
+        average = self._request(codec.DISPLACEMENT + "getAverageN").quantity(0)
         return Identity(
             manufacturer="attocube",
-            model=self._ask(codec.SYSTEM + "getDeviceType").text(0),
-            serial_number=self._ask(codec.SERVICE + "getSerialNumber").text(0),
-            firmware=self._ask(codec.SERVICE + "getFirmwareVersion").text(0),
+            model=self._request(codec.SYSTEM + "getDeviceType").text(0),
+            serial_number=self._request(codec.SERVICE + "getSerialNumber").text(0),
+            firmware=self._request(codec.SERVICE + "getFirmwareVersion").text(0),
             simulated=self.transport.simulated,
             details={
                 "address": self.address,
@@ -191,7 +191,7 @@ class AttocubeIds(Driver):
         )
 
     def configure(self, settings: IdsSettings) -> None:
-        """Use other settings from now on; other axes count from where the device counts from."""
+        """Use other settings from now on; newly selected axes are relative to the zero of the device until `zero`."""
         self.settings = settings
         self._zero = {axis: self._zero.get(axis, 0.0) for axis in settings.axes}
         self.flags = dict.fromkeys(self.channels, GOOD)
@@ -200,12 +200,12 @@ class AttocubeIds(Driver):
     # ------------------------------------------------------------------ measuring
 
     def read(self) -> dict[str, float]:
-        """Return displacement (m) or angle (rad) of each channel since `zero`; NaN from a broken beam until `zero`.
+        """Return displacement (m) or angle (rad) of each channel since `zero`; NaN if a beam was broken since.
 
         Raises
         ------
         InstrumentError
-            The device does not answer, or does not measure any more.
+            The device does not answer, or has stopped measuring.
         """
         found = self._displacements()
         lengths = {axis: found[axis] - self._zero[axis] for axis in self.settings.axes}
@@ -217,11 +217,11 @@ class AttocubeIds(Driver):
         return values
 
     def _displacements(self) -> dict[int, float]:
-        """Return the device's counts by axis, m; NaN for an axis that has lost its count."""
+        """Return the displacements that the device reports by axis, m; NaN for an axis that has lost its count."""
         found = self._call(codec.DISPLACEMENT + "getAxesDisplacement")
         if found.code == 0:
             counts = {axis: found.length(axis - 1) for axis in self.settings.axes}
-        else:  # one warning for three axes, also for those that are not used
+        else:  # one warning applies to three axes, also to those that are not used
             counts = {axis: self._displacement(axis) for axis in self.settings.axes}
         return {axis: math.nan if axis in self._lost else count for axis, count in counts.items()}
 
@@ -230,51 +230,53 @@ class AttocubeIds(Driver):
         if found.code == 0:
             return found.length(0)
         if (mode := self._mode()) != RUNNING:
-            raise InstrumentError(f"{self.address} does not measure any more; its mode is '{mode}'")
+            raise InstrumentError(f"{self.address} has stopped measuring; its mode is '{mode}'")
         if axis not in self._lost:
             self._lost[axis] = f"count lost: {self._meaning(found.code)}"
         return math.nan
 
     def zero(self) -> None:
-        """Count from the present position on.
+        """Make readings relative to the present position.
 
-        After a broken beam the measurement is started again first, or its error cleared (``after_break``).
+        After a beam was broken, the measurement is first restarted or its error cleared (``after_break``).
 
         Raises
         ------
         InstrumentError
-            A beam is broken; the device does not answer.
+            A beam is broken, or the device does not answer.
         """
         if self._lost:
             if self.settings.after_break == "restart":
-                self._ask(codec.SYSTEM + "stopMeasurement")
+                self._request(codec.SYSTEM + "stopMeasurement")
                 self._await(IDLE)
                 self._start()
             else:
-                self._ask(codec.SYSTEM + "resetError", False)
+                self._request(codec.SYSTEM + "resetError", False)
             self._lost = {}
         found = self._displacements()
         if self._lost:
             broken = ", ".join(f"{axis_name(axis)} ({reason})" for axis, reason in self._lost.items())
-            raise InstrumentError(f"{self.address}: no zero while a beam is broken: {broken}. Align its reflector")
+            raise InstrumentError(
+                f"{self.address}: the zero cannot be set while a beam is broken: {broken}. Align its reflector"
+            )
         self._zero = found
 
     # ------------------------------------------------------------------ air
 
     def environment(self) -> Environment:
-        """Return the air as the environmental unit measures it; NaN without one."""
+        """Return the conditions of the air that the environmental unit measures; NaN without one."""
         if not self._has_unit():
             return Environment()
         return Environment(
-            self._ask(codec.UNIT + "getTemperatureInDegrees").quantity(0),
-            self._ask(codec.UNIT + "getPressureInHPa").quantity(0) * HECTOPASCAL,
-            self._ask(codec.UNIT + "getHumidityInPercent").quantity(0),
+            self._request(codec.UNIT + "getTemperatureInDegrees").quantity(0),
+            self._request(codec.UNIT + "getPressureInHPa").quantity(0) * HECTOPASCAL,
+            self._request(codec.UNIT + "getHumidityInPercent").quantity(0),
         )
 
     def refraction(self) -> float:
         """Return the refraction index with which the device computes lengths."""
-        return self._ask(codec.UNIT + "getRefractiveIndexForCompensation", ALL_AXES).quantity(0)
+        return self._request(codec.UNIT + "getRefractiveIndexForCompensation", ALL_AXES).quantity(0)
 
     def _has_unit(self) -> bool:
-        """Whether an environmental unit is connected; the device tells this while the unit is enabled."""
-        return self._ask(codec.UNIT + "getEnabled").flag(0) and self._ask(codec.UNIT + "getConnected").flag(0)
+        """Whether an environmental unit is connected; the device reports this only while the unit is enabled."""
+        return self._request(codec.UNIT + "getEnabled").flag(0) and self._request(codec.UNIT + "getConnected").flag(0)

@@ -12,7 +12,7 @@ from errormotion.plugins import PluginSettings
 
 AXES = 3
 AVERAGE_STEP = 40e-9
-"""Averaging time of the parameter 0, s; each step doubles it."""
+"""Averaging time for the parameter 0, s; each step doubles it."""
 LARGEST_AVERAGE = 24
 
 
@@ -20,37 +20,37 @@ class AngleChannel(PluginSettings):
     """An angle from the difference of two parallel beams."""
 
     plus: int = Field(ge=1, le=AXES, description="axis whose displacement increases with the angle")
-    minus: int = Field(ge=1, le=AXES, description="axis whose displacement decreases with it")
-    base: Length = Field(gt=0, description="distance of the two beams from one another")
+    minus: int = Field(ge=1, le=AXES, description="axis whose displacement decreases with the angle")
+    base: Length = Field(gt=0, description="distance between the two beams")
 
 
 class IdsSettings(PluginSettings):
     """Settings of ``attocube_ids``."""
 
     axes: tuple[int, ...] = Field(
-        default=(1,), min_length=1, description="axes with a reflector, 1 to 3, as they are labelled on the device"
+        default=(1,), min_length=1, description="axes with a reflector, 1 to 3, as labelled on the device"
     )
     angles: dict[str, AngleChannel] = Field(
-        default_factory=dict, description="channels of angles, by name: two axes and the distance of their beams"
+        default_factory=dict, description="channels of angles, by name: two axes and the distance between their beams"
     )
     passes: Literal["as_set", "single", "dual"] = Field(
         default="as_set",
-        description="how often the light travels to the reflector; a device that is set otherwise is refused",
+        description="number of passes of the light to the reflector; a device in another mode is refused",
     )
     averaging: Time | None = Field(
-        default=None, gt=0, le=1.0, description="averaging time, 40 ns times a power of 2; default as the device is set"
+        default=None, gt=0, le=1.0, description="averaging time, 40 ns times a power of 2; default: unchanged"
     )
     initialisation: Literal["as_set", "accurate", "quick"] = Field(
-        default="as_set", description="initialisation when the driver starts a measurement"
+        default="as_set", description="type of initialisation when the driver starts a measurement"
     )
-    start: bool = Field(default=True, description="start the measurement where the device is idle; else refuse it")
-    start_timeout: Time = Field(default=90.0, gt=0, description="time limit of starting and stopping a measurement")
+    start: bool = Field(default=True, description="start the measurement if the device is idle; else refuse the device")
+    start_timeout: Time = Field(default=90.0, gt=0, description="time limit for starting and stopping a measurement")
     after_break: Literal["restart", "clear"] = Field(
         default="restart",
-        description="what the zero after a broken beam does: start the measurement again, as the maker recommends, or "
-        "clear the error",
+        description="action of the first zero after a beam was broken: restart the measurement, as the maker "
+        "recommends, or clear the error",
     )
-    timeout: Time = Field(default=3.0, gt=0, description="time limit of an answer")
+    timeout: Time = Field(default=3.0, gt=0, description="time limit for an answer")
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -65,12 +65,12 @@ class IdsSettings(PluginSettings):
                     f"{angle.minus}"
                 )
             if name in map(axis_name, self.axes):
-                raise ValueError(f"angles.{name}: this is the name of an axis")
+                raise ValueError(f"angles.{name}: expected another name than that of an axis")
         return self
 
     @property
     def average_parameter(self) -> int | None:
-        """The parameter of the low pass whose averaging time is the longest within ``averaging``; None: as set."""
+        """Parameter of the low pass with the longest averaging time up to ``averaging``; None: unchanged."""
         if self.averaging is None:
             return None
         return min(max(math.floor(math.log2(self.averaging / AVERAGE_STEP) + 1e-9), 0), LARGEST_AVERAGE)

@@ -1,4 +1,4 @@
-"""Leica laser trackers behind an emScon server: LT and AT901 series, AT4xx."""
+"""Leica laser trackers with an emScon server: LT and AT901 series, AT4xx."""
 
 from errormotion.instruments.laser_tracker.leica_emscon.driver import Event, LeicaEmScon
 from errormotion.instruments.laser_tracker.leica_emscon.settings import EmSconSettings

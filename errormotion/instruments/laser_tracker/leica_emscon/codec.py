@@ -1,12 +1,12 @@
 """Packets of an emScon server: little-endian structures, packed, over TCP port 700.
 
 Every packet starts with its size in bytes (i32, header included) and its type (u32). A command is the header, its
-number, and parameters; the answer repeats the number and adds a status, then values where the status is 0. Unsolicited
+number, and parameters; the answer repeats the number and adds a status, then values if the status is 0. Unsolicited
 packets arrive between the answers: reflector positions, levels, status changes, errors such as a broken beam.
 
 The layouts are those of the interface's C definitions, versions 3.6 and 3.8. ``long``, ``int`` and enumerations have
-four bytes; names are 32 characters of UTF-16. Results of measurements have a status behind the header and no number of
-a command: 156 bytes for a single one.
+four bytes; names are 32 characters of UTF-16. Results of measurements have a status after the header and no command
+number: 156 bytes for a single measurement.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from errormotion.errors import ProtocolError
 
 HEADER = struct.Struct("<iI")
 MAX_PACKET_BYTES = 1 << 16
-"""Longest packet: 712 points with covariances; 1000 points per second come in at least 3 packets per second."""
+"""Longest packet: 712 points with covariances; at 1000 points per second, the server sends at least 3 packets per
+second."""
 NAME = "64s"
 
 # ---------------------------------------------------------------------- types of packets
@@ -42,7 +43,7 @@ GET_TRACKER_INFO, GO_AND_MEASURE, GET_METEO_STATION = 132, 135, 139
 METRE, RADIAN, CELSIUS, MILLIBAR, RELATIVE = 0, 0, 0, 0, 0
 SPHERICAL = 7  # counterclockwise: azimuth, zenith angle, distance
 STATIONARY, CONTINUOUS_TIME = 0, 1
-SPHERE = 0  # region, where none is used: headers up to 3.6 have 0 and 1 only, newer ones also 10, not applicable
+SPHERE = 0  # region if none is used: headers up to 3.6 only have 0 and 1, newer ones also 10, not applicable
 INITIALISED = 5  # tracker processor
 METEO_OFF, METEO_READ, METEO_REFRACTION = 0, 1, 2
 
@@ -59,7 +60,7 @@ class Layout:
         return struct.Struct("<" + "".join(code for _, code in self.fields))
 
     def pack(self, values: Mapping[str, Any]) -> bytes:
-        """Return fields as bytes; those not given are 0."""
+        """Return fields as bytes; missing ones are 0."""
         return self.packed.pack(
             *(
                 _pack_name(values.get(name, "")) if code == NAME else values.get(name, 0.0 if code == "d" else 0)
@@ -67,9 +68,9 @@ class Layout:
             )
         )
 
-    def unpack(self, data: bytes, place: int = 0) -> dict[str, Any]:
+    def unpack(self, data: bytes, offset: int = 0) -> dict[str, Any]:
         """Return fields by name."""
-        values = self.packed.unpack_from(data, place)
+        values = self.packed.unpack_from(data, offset)
         return {
             name: _unpack_name(value) if code == NAME else value
             for (name, code), value in zip(self.fields, values, strict=True)
@@ -90,7 +91,7 @@ def _unpack_name(data: bytes) -> str:
 
 
 _AIR = "d:temperature d:pressure d:humidity"
-_PLACE = "d:val1 d:val2 d:val3"
+_POSITION = "d:val1 d:val2 d:val3"
 _REFRACTION = "d:ifm d:adm"
 _UNITS = "I:length I:angle I:temperature I:pressure I:humidity"
 _SYSTEM = (
@@ -104,7 +105,7 @@ _TRACKER = (
 
 @dataclass(frozen=True)
 class Command:
-    """A command: its name in messages, its parameters, the values of its answer."""
+    """A command: its name for messages, its parameters, the values of its answer."""
 
     name: str
     request: Layout
@@ -141,12 +142,12 @@ COMMANDS: Mapping[int, Command] = {
         (GET_SYSTEM_SETTINGS, "GetSystemSettings", "", _SYSTEM),
         (START_MEASUREMENT, "StartMeasurement", "", ""),
         (STOP_MEASUREMENT, "StopMeasurement", "", ""),
-        (GO_POSITION, "GoPosition", f"{_PLACE} i:use_adm", ""),
+        (GO_POSITION, "GoPosition", f"{_POSITION} i:use_adm", ""),
         (FIND_REFLECTOR, "FindReflector", "d:distance", ""),
         (GET_DIRECTION, "GetDirection", "", "d:azimuth d:zenith"),
         (GO_BIRD_BATH2, "GoBirdBath2", "i:clockwise", ""),
         (GET_TRACKER_INFO, "GetTrackerInfo", "", _TRACKER),
-        (GO_AND_MEASURE, "GoAndMeasure", _PLACE, ""),
+        (GO_AND_MEASURE, "GoAndMeasure", _POSITION, ""),
         (GET_METEO_STATION, "GetMeteoStationInfo", "", f"I:type {NAME}:name i:major i:minor"),
     )
 }
@@ -157,40 +158,40 @@ _POINTING = "d:pointing1 d:pointing2 d:pointing3"
 _PRIOR = "d:prior1 d:prior2 d:prior3 d:prior_total"
 _PRIOR_COVARIANCE = "d:prior_cov12 d:prior_cov13 d:prior_cov23"
 
-#: What comes behind the status of packets that are no answers.
+#: Fields after the status of packets that are not answers.
 RESULTS: Mapping[int, Layout] = {
-    SINGLE: _layout(f"I:mode i:try_mode {_PLACE} {_SPREAD} {_POINTING} {_PRIOR} {_AIR}"),
+    SINGLE: _layout(f"I:mode i:try_mode {_POSITION} {_SPREAD} {_POINTING} {_PRIOR} {_AIR}"),
     SINGLE2: _layout(
-        f"I:mode i:try_mode {_PLACE} {_SPREAD} {_COVARIANCE} {_POINTING} {_PRIOR} {_PRIOR_COVARIANCE} {_AIR}"
+        f"I:mode i:try_mode {_POSITION} {_SPREAD} {_COVARIANCE} {_POINTING} {_PRIOR} {_PRIOR_COVARIANCE} {_AIR}"
     ),
     MULTI: _layout(f"i:count I:mode i:try_mode {_AIR}"),
     MULTI2: _layout(f"i:count I:mode i:try_mode {_AIR}"),
     LEVEL: _layout("I:level_status d:tilt_x d:tilt_y d:temperature"),
-    REFLECTOR: _layout(_PLACE),
+    REFLECTOR: _layout(_POSITION),
 }
 
 #: One point of a continuous measurement.
 POINTS: Mapping[int, Layout] = {
-    MULTI: _layout(f"I:status i:seconds i:microseconds {_PLACE}"),
-    MULTI2: _layout(f"I:status i:seconds i:microseconds {_PLACE} {_PRIOR} {_PRIOR_COVARIANCE}"),
+    MULTI: _layout(f"I:status i:seconds i:microseconds {_POSITION}"),
+    MULTI2: _layout(f"I:status i:seconds i:microseconds {_POSITION} {_PRIOR} {_PRIOR_COVARIANCE}"),
 }
 
 
 @dataclass(frozen=True)
 class Packet:
-    """A packet from the server, taken apart.
+    """A decoded packet from the server.
 
     Attributes
     ----------
     kind : int
-        Its type.
+        Type of the packet.
     command : int
-        Which command it answers; -1 where it is no answer.
+        Number of the command that it answers; -1 if it is not an answer.
     status : int
-        Of the result; of a status change, what has changed.
+        Status of the result; for a status change, number of the change.
     values : mapping of str to int, float or str
     points : list of mapping
-        Of a continuous measurement.
+        Points of a continuous measurement.
     """
 
     kind: int
@@ -213,7 +214,7 @@ def encode_command(number: int, /, **values: Any) -> bytes:
 
 
 def decode_header(data: bytes | bytearray) -> tuple[int, int]:
-    """Return how many bytes follow the header, and the type.
+    """Return the number of bytes after the header, and the type.
 
     Raises
     ------
@@ -268,8 +269,8 @@ def _points(kind: int, body: bytes, start: int, count: int) -> Iterator[Mapping[
         raise ProtocolError(
             f"Expected a packet of {count} points with {size} bytes each; found {len(body) - start} bytes"
         )
-    for place in range(start, start + count * size, size):
-        yield layout.unpack(body, place)
+    for offset in range(start, start + count * size, size):
+        yield layout.unpack(body, offset)
 
 
 # ---------------------------------------------------------------------- server's side
@@ -281,7 +282,7 @@ def decode_command(data: bytes) -> tuple[int, dict[str, Any]]:
     Raises
     ------
     ProtocolError
-        Not a command, or too short.
+        The data are not a command, or too short.
     """
     try:
         _, kind = HEADER.unpack_from(data)

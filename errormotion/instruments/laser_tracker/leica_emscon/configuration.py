@@ -1,7 +1,7 @@
-"""How the driver sets up an emScon server, and how it checks that the server still is so.
+"""Configuration of an emScon server by the driver, and check that it is unchanged.
 
 Several clients may be connected to one server, and each may change units and coordinates for all of them. The server
-reports such a change; what it holds is then requested again before the next measurement.
+reports such a change; the driver then checks the configuration before the next measurement.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ UNITS = {
 }
 COORDINATES = {"kind": codec.SPHERICAL}
 OWN_FRAME = {"transformation": 0, "orientation": 0}
-"""Neither the transformation nor the station orientation that the server may hold is applied."""
+"""Neither the transformation nor the station orientation of the server is applied."""
 
 
 def configure(link: Link, settings: EmSconSettings) -> None:
-    """Set units, coordinates, weather station, measuring time and search radius; initialise where this is needed.
+    """Set units, coordinates, weather station, measuring time and search radius; initialise if necessary.
 
     Raises
     ------
@@ -52,9 +52,9 @@ def configure(link: Link, settings: EmSconSettings) -> None:
 
 
 def verify(link: Link) -> None:
-    """Request units, coordinates and frame, and check that they are as `configure` has set them.
+    """Check that units, coordinates and frame are as `configure` has set them.
 
-    A server that does not implement a request is not checked in this respect.
+    A setting whose request the server does not implement is not checked.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def verify(link: Link) -> None:
             link.stale_units = True
             raise InstrumentError(
                 f"{link.url} answers {codec.COMMANDS[number].name} with {differing}; expected "
-                f"{ {name: expected[name] for name in differing} }, as it was set. Another client has changed it: end "
+                f"{ {name: expected[name] for name in differing} }, as configured. Another client has changed it: end "
                 "the other client, then call configure() or open the tracker again"
             )
 
@@ -94,6 +94,6 @@ def set_environment(link: Link, environment: Environment) -> None:
 
 
 def set_refraction(link: Link, index: float) -> None:
-    """Set the index, of interferometer and absolute distance meter alike."""
+    """Set the refraction index of interferometer and absolute distance meter."""
     link.query(codec.SET_REFRACTION, ifm=float(index), adm=float(index))
     link.stale_refraction = True

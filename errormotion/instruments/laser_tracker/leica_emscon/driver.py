@@ -1,4 +1,4 @@
-"""Driver of a laser tracker behind an emScon server."""
+"""Driver of a laser tracker with an emScon server."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, Sam
 from errormotion.plugins.readings import Environment, Measurement
 
 MEASURING_TIMEOUT_FACTOR = 20.0
-"""Allowed duration of a measurement beyond the timeout, in measuring times: the tracker repeats measurements."""
+"""Permitted duration of a measurement beyond the timeout, as a multiple of the measuring time: the tracker repeats
+measurements."""
 
 __all__ = ["Event", "LeicaEmScon"]
 
@@ -26,8 +27,8 @@ __all__ = ["Event", "LeicaEmScon"]
 class LeicaEmScon(EmSconSession):
     """A Leica laser tracker: LT or AT901 with an interferometer, or AT4xx with an absolute distance meter.
 
-    Lengths are in m, angles in rad, positions in the tracker's own frame: neither the station orientation nor the
-    transformation that the server may hold is applied.
+    Lengths are in m, angles in rad, positions in the frame of the tracker: neither the station orientation nor the
+    transformation of the server is applied.
 
     Parameters
     ----------
@@ -41,14 +42,14 @@ class LeicaEmScon(EmSconSession):
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
         id="leica_emscon",
         kind="laser_tracker",
-        summary="Leica laser trackers (LT, AT901, AT4xx) behind an emScon server, TCP",
+        summary="Leica laser trackers (LT, AT901, AT4xx) with an emScon server, TCP",
         status="peer_verified",
         simulator="errormotion.instruments.simulators.laser_tracker.leica_emscon:SimulatedEmScon",
     )
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines; a tracker whose reflector rests gives a lost reading once more."""
+        """Return the subject of the conformance kit, with a moving reflector, so that all readings differ."""
         return InstrumentSubject(cls, "sim://cframe?seed=3", vary=simulators.in_steps(seed=3))
 
     # ------------------------------------------------------------------ identity and state
@@ -60,17 +61,17 @@ class LeicaEmScon(EmSconSession):
 
     @property
     def distance_is_displacement(self) -> bool:
-        """Whether distances count from an unknown dead path, and not from the tracker's centre.
+        """Whether distances have an unknown zero and not the tracker's centre.
 
-        Of an interferometer all readings of one `dead_path` share an unknown constant; only their differences
-        have the uncertainty ``noise``. An AT4xx reports absolute distances. Multilateration takes
-        ``Measurement.distance`` of either, with the dead path of each station unknown.
+        All readings of an interferometer with the same `dead_path` share an unknown constant; only their differences
+        have the uncertainty ``noise``. An AT4xx reports absolute distances. Multilateration uses
+        ``Measurement.distance`` of either, and treats the dead path of each station as unknown.
         """
         return self.settings.tracker != "AT4xx"
 
     @property
     def dead_path(self) -> int:
-        """Number of times the distance was lost or set again since opening; 0 where distances are absolute."""
+        """Number of times the distance was lost or set again since opening; 0 if distances are absolute."""
         return self._link.breaks + self._resets if self.distance_is_displacement else 0
 
     def identify(self) -> Identity:
@@ -92,11 +93,11 @@ class LeicaEmScon(EmSconSession):
         )
 
     def environment(self) -> Environment:
-        """Return the air that the tracker uses: of its weather station, or as set."""
+        """Return the conditions of the air that the tracker uses: of its weather station, or as set."""
         return results.environment(self._query(codec.GET_ENVIRONMENT).values)
 
     def set_environment(self, environment: Environment) -> None:
-        """Set the state of the air; without effect where the weather station sets it."""
+        """Set the conditions of the air; without effect if the weather station sets them."""
         configuration.set_environment(self._link, environment)
 
     def refraction(self) -> float:
@@ -107,7 +108,7 @@ class LeicaEmScon(EmSconSession):
         return self._refraction
 
     def set_refraction(self, index: float) -> None:
-        """Set the index, of interferometer and absolute distance meter alike."""
+        """Set the refraction index of interferometer and absolute distance meter."""
         configuration.set_refraction(self._link, index)
 
     def reflectors(self) -> tuple[Reflector, ...]:
@@ -125,7 +126,7 @@ class LeicaEmScon(EmSconSession):
         )
 
     def set_reflector(self, name: str) -> None:
-        """Choose a reflector by its name; InstrumentError lists the defined ones."""
+        """Select a reflector by its name; the InstrumentError for another name lists the defined ones."""
         known = {each.name: each.number for each in self.reflectors()}
         if name not in known:
             raise InstrumentError(f"{self.address} has the reflectors {', '.join(known) or 'none'}; found '{name}'")
@@ -139,16 +140,16 @@ class LeicaEmScon(EmSconSession):
     # ------------------------------------------------------------------ moving
 
     def initialise(self) -> None:
-        """Initialise the tracker: it moves, for about a minute."""
+        """Initialise the tracker: it moves for about a minute."""
         self._query(codec.INITIALIZE, limit=self.settings.initialise_timeout)
 
     def home(self, *, clockwise: bool = True) -> None:
-        """Point at the nest of the tracker and lock on to its reflector, which sets the interferometer's distance.
+        """Point at the home position and lock on to its reflector, which sets the interferometer's distance.
 
         Raises
         ------
         BeamBrokenError
-            No reflector in the nest.
+            No reflector in the home position.
         """
         self._move(codec.GO_BIRD_BATH2, clockwise=int(clockwise))
 
@@ -172,12 +173,12 @@ class LeicaEmScon(EmSconSession):
         Raises
         ------
         BeamBrokenError
-            None within the search radius.
+            No reflector within the search radius.
         """
         self._move(codec.FIND_REFLECTOR, distance=float(distance))
 
     def _move(self, number: int, /, **values: Any) -> None:
-        self._not_streaming()
+        self._refuse_while_streaming()
         try:
             self._query(number, limit=self.settings.motion_timeout, **values)
         except RefusedError as error:
@@ -192,10 +193,10 @@ class LeicaEmScon(EmSconSession):
     def measure(self, target: tuple[float, float, float] | None = None) -> Measurement:
         """Measure a reflector.
 
-        A tracker with an interferometer that follows its reflector to the target keeps its count: it is moved only
-        if it does not already point to the target, and `dead_path` then increases. An AT4xx is always moved. A broken
-        beam is not an error: the reflector is searched ``reacquire`` times, and where that fails the measurement is
-        not valid and states the reason.
+        A tracker with an interferometer that follows its reflector to the target keeps its count: it is moved only if
+        it does not already point to the target, and `dead_path` then increases. An AT4xx is always moved. A broken beam
+        is not an error: the reflector is searched ``reacquire`` times; if this fails, the measurement is not valid and
+        states the reason.
 
         Parameters
         ----------
@@ -207,7 +208,7 @@ class LeicaEmScon(EmSconSession):
         InstrumentError
             The tracker refuses for another reason, does not answer or remains busy, or the connection is lost.
         """
-        self._not_streaming()
+        self._refuse_while_streaming()
         goal = None if target is None else polar(target)
 
         radius = self.settings.search_radius
@@ -230,11 +231,11 @@ class LeicaEmScon(EmSconSession):
         return found
 
     def read(self) -> float:
-        """Return the distance now, m; NaN where the beam stays broken."""
+        """Return the present distance, m; NaN if the beam remains broken."""
         return self.measure().distance
 
     def stream(self, block: int | None = None) -> Iterator[Samples]:
-        """Yield blocks of interferometer distances, evenly spaced by the tracker's own clock, until the caller stops.
+        """Yield blocks of interferometer distances, evenly spaced by the tracker's clock, until the caller stops.
 
         Parameters
         ----------
@@ -244,19 +245,19 @@ class LeicaEmScon(EmSconSession):
         Yields
         ------
         Samples
-            ``values`` (1, block) in m. Points that the tracker's clock shows missing are NaN: ``lost``, or
-            ``beam broken`` where it was.
+            ``values`` (1, block) in m. Points that are missing by the tracker's clock are NaN: ``lost``, or ``beam
+            broken``.
 
         Raises
         ------
         InstrumentError
             An AT4xx has no interferometer; the tracker refuses.
         BeamBrokenError
-            The beam stays broken for longer than ``timeout``.
+            The beam remains broken for longer than ``timeout``.
         InstrumentTimeoutError
             No answer within the time limit.
         """
-        self._not_streaming()
+        self._refuse_while_streaming()
         if self.settings.tracker == "AT4xx":
             raise InstrumentError(
                 "An AT4xx measures point by point and has no stream of distances; use measure(), or set "
@@ -336,7 +337,7 @@ class LeicaEmScon(EmSconSession):
         InstrumentError
             The tracker refuses, or the reflector is not defined.
         """
-        self._not_streaming()
+        self._refuse_while_streaming()
         configuration.configure(self._link, settings)
         if settings.reflector is not None:
             self.set_reflector(settings.reflector)

@@ -1,4 +1,4 @@
-"""Connection to an emScon server: commands and their answers, with the unsolicited messages between them."""
+"""Connection to an emScon server: commands and their answers, with unsolicited messages between them."""
 
 from __future__ import annotations
 
@@ -69,15 +69,16 @@ class Event:
 class Link:
     """One connection to an emScon server.
 
-    An answer carries the number of its command, but answers to two commands of one number look alike, and results of
-    measurements carry none. After a timeout a marker is therefore exchanged ahead of the next command: a server works
-    on one command at a time, so that the answer to the marker, other than "busy", is behind whatever was late.
+    An answer contains the number of its command, but answers to two commands with the same number cannot be
+    distinguished, and results of measurements contain none. After a timeout a marker is therefore exchanged before the
+    next command: a server processes one command at a time, so that its answer to the marker, other than "busy", follows
+    all late answers.
 
     Parameters
     ----------
     transport : Transport
     timeout, busy_timeout : float
-        Time limit of an answer, and of retries with a busy server, s.
+        Time limit for an answer, and for retries while the server is busy, s.
 
     Attributes
     ----------
@@ -99,7 +100,7 @@ class Link:
         self._busy_timeout = busy_timeout
         self._lost = ""
         self._waiting = bytearray()
-        self._owed: set[int] = set()  # commands whose answer was late
+        self._unanswered: set[int] = set()  # commands without an answer in time
         self.events: deque[Event] = deque(maxlen=MAX_EVENTS)
         self.early: deque[Packet] = deque(maxlen=MAX_EARLY_PACKETS)
         self.broken = False
@@ -119,7 +120,7 @@ class Link:
         RefusedError
             The server refuses.
         InstrumentTimeoutError
-            No answer in time; it is not taken for the answer to a later command.
+            No answer in time; a late one is not mistaken for the answer to a later command.
         ProtocolError
             An invalid answer: the connection must be opened again.
         """
@@ -134,10 +135,10 @@ class Link:
         total: Callable[[Packet], int] = lambda _: 1,
         **values: Any,
     ) -> Iterator[Packet]:
-        """Send a command and yield its answers; ``total(first)`` states how many there are, see `ask`."""
+        """Send a command and yield its answers; ``total(first)`` is their number, see `query`."""
         allowed = self._timeout if limit is None else limit
         self._check()
-        if self._owed:
+        if self._unanswered:
             self._resynchronise()
         yield from self._exchange(number, allowed, total, values)
 
@@ -168,9 +169,9 @@ class Link:
         InstrumentTimeoutError
             No answer to the marker; the next command tries again, with another marker.
         InstrumentError
-            The server stays busy, or no marker is left: the connection must be opened again.
+            The server remains busy, or no marker is left: the connection must be opened again.
         """
-        marker = next((each for each in MARKERS if each not in self._owed), None)
+        marker = next((each for each in MARKERS if each not in self._unanswered), None)
         if marker is None:
             self._lost = "no answer to several commands"
             self._check()
@@ -185,7 +186,7 @@ class Link:
         except RefusedError as error:
             if error.status == statuses.BUSY:
                 raise
-        self._owed.clear()
+        self._unanswered.clear()
         self.early.clear()
 
     def _answer(self, number: int, limit: float) -> Packet:
@@ -197,7 +198,7 @@ class Link:
         )
 
     def await_packet(self, wanted: Callable[[Packet], bool], limit: float, what: str, number: int) -> Packet:
-        """Return the next packet that fulfils ``wanted``, to command ``number``; record the others.
+        """Return the next packet that fulfils ``wanted``, for command ``number``; note the others.
 
         Raises
         ------
@@ -208,7 +209,7 @@ class Link:
         while True:
             packet = self.next_packet(max(end - time.monotonic(), 0.0))
             if packet is None:
-                self._owed.add(number)
+                self._unanswered.add(number)
                 raise InstrumentTimeoutError(f"{self._transport.url}: no answer to {what} within {limit:g} s")
             if wanted(packet):
                 return packet

@@ -13,7 +13,7 @@ MILLIBAR = 100.0  # Pa
 
 
 def environment(values: Mapping[str, Any]) -> Environment:
-    """Return the state of the air."""
+    """Return the conditions of the air."""
     return Environment(float(values["temperature"]), MILLIBAR * float(values["pressure"]), float(values["humidity"]))
 
 
@@ -48,5 +48,5 @@ def is_near(found: Measurement, goal: tuple[float, float, float], radius: float)
 
 
 def reason(status: int) -> str:
-    """Return why there is no measurement."""
+    """Return the reason of a missing measurement."""
     return f"status {status}: {statuses.result_text(status)}"

@@ -12,7 +12,6 @@ from errormotion.instruments.laser_tracker.leica_emscon import codec, statuses
 from errormotion.instruments.laser_tracker.leica_emscon.codec import Packet
 from errormotion.instruments.laser_tracker.leica_emscon.link import Event, Link, RefusedError
 from errormotion.instruments.laser_tracker.leica_emscon.settings import EmSconSettings
-from errormotion.instruments.transports import Transport, open_transport
 
 
 class EmSconSession(Driver):
@@ -43,7 +42,7 @@ class EmSconSession(Driver):
     @property
     def _link(self) -> Link:
         if self._connection is None or self._transport is None:
-            self.transport  # noqa: B018 - raises where it is not open
+            self.transport  # noqa: B018 - raises before open
             raise InstrumentError(f"The connection to {self.address} is closed; open it again")
         return self._connection
 
@@ -58,14 +57,9 @@ class EmSconSession(Driver):
                 raise
             return {}
 
-    def _not_streaming(self) -> None:
+    def _refuse_while_streaming(self) -> None:
         if self._streaming:
             raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
-
-    def _connect(self) -> Transport:
-        return open_transport(
-            self.address, simulator=self.info.simulator, recorder=self._record, timeout=self.settings.timeout
-        )
 
     def _start_session(self) -> None:
         self._last, self._resets = None, 0

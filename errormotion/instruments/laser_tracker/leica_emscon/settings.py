@@ -1,4 +1,4 @@
-"""Settings of a tracker behind an emScon server."""
+"""Settings of a tracker with an emScon server."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class EmSconSettings(PluginSettings):
         description="AT901: LT or AT901, with an interferometer; AT4xx: absolute distances, point by point",
     )
     reflector: str | None = Field(
-        default=None, description="name of the reflector at the tracker; default: the one that is set"
+        default=None, description="name of the reflector, as defined in the tracker; default: unchanged"
     )
     initialise: Literal["if_needed", "always", "never"] = Field(
-        default="if_needed", description="whether the tracker is initialised when it is opened: it moves, for a minute"
+        default="if_needed", description="when to initialise the tracker on opening; it moves for a minute"
     )
     meteo: Literal["refraction", "read", "manual"] = Field(
         default="refraction",
-        description="weather station: sets the refraction index, is read only, or is absent and the values are given",
+        description="weather station: sets the refraction index, is only read, or is absent and the values are given",
     )
     temperature: Temperature = Field(
         default=20.0, description="temperature of the air, with meteo = manual", ge=0, le=50
@@ -36,7 +36,7 @@ class EmSconSettings(PluginSettings):
     humidity: float = Field(default=50.0, description="relative humidity in %, with meteo = manual", ge=0, le=100)
     refraction_index: float | None = Field(
         default=None,
-        description="refraction index that the tracker uses; default: its own. 1: distances in vacuum",
+        description="refraction index that the tracker uses; default: that of the tracker; 1: distances in vacuum",
         ge=1.0,
         le=1.0005,
     )
@@ -47,26 +47,26 @@ class EmSconSettings(PluginSettings):
     )
     reacquire: int = Field(default=1, description="number of searches for the reflector after a broken beam", ge=0)
     noise: Length = Field(default=0.5e-6, description="standard deviation of a single distance", ge=0)
-    timeout: Time = Field(default=3.0, description="time limit of an answer", gt=0)
-    motion_timeout: Time = Field(default=30.0, description="time limit of a motion or a search", gt=0)
-    initialise_timeout: Time = Field(default=180.0, description="time limit of the initialisation", gt=0)
-    busy_timeout: Time = Field(default=5.0, description="time limit of retries with a busy tracker", ge=0)
+    timeout: Time = Field(default=3.0, description="time limit for an answer", gt=0)
+    motion_timeout: Time = Field(default=30.0, description="time limit for a motion or a search", gt=0)
+    initialise_timeout: Time = Field(default=180.0, description="time limit for the initialisation", gt=0)
+    busy_timeout: Time = Field(default=5.0, description="time limit for retries while the tracker is busy", ge=0)
 
     @property
     def interval(self) -> int:
-        """Time between the points of a stream, ms."""
+        """Interval between the points of a stream, ms."""
         return round(1000.0 / self.rate)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if abs(self.interval * self.rate / 1000.0 - 1.0) > 1e-6:
             raise ValueError(
-                f"the tracker counts the time between two points in whole ms; {self.rate:g} points/s are "
+                f"expected a rate whose interval is a multiple of 1 ms; {self.rate:g} points/s are "
                 f"{1000.0 / self.rate:g} ms apart. Choose 1000, 500, 250, 200, 125, 100, 50, ... points/s"
             )
         if self.refraction_index is not None and self.meteo == "refraction":
             raise ValueError(
-                "with meteo = refraction the tracker sets its refraction index itself; give meteo = read or manual "
-                "beside refraction_index"
+                "with meteo = refraction the tracker sets its refraction index itself; expected meteo = read or manual "
+                "with refraction_index"
             )
         return self

@@ -1,7 +1,7 @@
-"""What the numbers of an emScon server mean, in words.
+"""Meanings of the status numbers of an emScon server.
 
-Numbers are those of the interface's C definitions 3.6 and newer. Errors of the tracker's own processor have further
-numbers that its manual lists; they are shown as they come.
+Numbers are those of the interface's C definitions 3.6 and newer. Errors of the tracker processor have further numbers,
+listed in its manual; they are reported as received.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ RESULTS: Mapping[int, str] = {
     10021: "the target recognition has a fault",
 }
 
-#: There is nothing to measure: no fault of the tracker, but no distance either.
+#: Statuses without a distance that are not faults of the tracker.
 NO_TARGET = frozenset({NO_DISTANCE, NOT_READY, NO_RESULT, SYSTEM_NOT_READY})
 
 #: Messages of a server about itself that were not requested.
@@ -89,7 +89,7 @@ MEASURE_NOT_READY, MEASURE_BUSY, MEASURE_READY = 25, 26, 27
 REFRACTION_CHANGED, ENVIRONMENT_CHANGED, DISTANCE_SET, UNITS_CHANGED, COORDINATES_CHANGED = 3, 2, 0, 6, 12
 SYSTEM_SETTINGS_CHANGED = 8
 FRAME_CHANGED = frozenset({UNITS_CHANGED, COORDINATES_CHANGED, SYSTEM_SETTINGS_CHANGED})
-"""What positions are expressed in may have changed."""
+"""Changes after which the frame or units of positions may differ."""
 CHANGES: Mapping[int, str] = {
     DISTANCE_SET: "distance set",
     1: "laser warmed up",
@@ -126,9 +126,9 @@ CHANGES: Mapping[int, str] = {
     999: "server started",
 }
 
-#: Of one point of a continuous measurement.
+#: Statuses of one point of a continuous measurement.
 POINTS: Mapping[int, str] = {
-    1: "fast",  # a warning, the value holds
+    1: "fast",  # a warning; the value is valid
     2: "too fast",
     3: "reflector",
     4: "trigger",
@@ -153,5 +153,5 @@ STATIONS: Mapping[int, str] = {0: "none", 1: "Thommen", 2: "AT"}
 
 
 def result_text(status: int) -> str:
-    """Return what a result status means."""
+    """Return the meaning of a result status."""
     return RESULTS.get(status, "an error of the tracker processor; its manual lists the number")

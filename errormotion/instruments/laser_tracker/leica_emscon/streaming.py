@@ -25,21 +25,21 @@ _WARNINGS = frozenset({0, 1})
 def points(link: Link, settings: EmSconSettings, block: int | None = None) -> Iterator[Samples]:
     """Yield blocks of distances from the packets of a link.
 
-    A point's index is its time since the first one over the interval that was set. Indices without a point are NaN,
-    ``lost``; or ``beam broken`` where the tracker has reported so since the last point.
+    The index of a point is its time since the first point divided by the interval. Indices without a point are NaN:
+    ``lost``, or ``beam broken`` if the tracker has reported this since the last point.
 
     Raises
     ------
     InstrumentTimeoutError
         No data for the settings' ``timeout``.
     BeamBrokenError
-        The same after a broken beam.
+        No data for this time after a broken beam.
     ProtocolError
         The tracker's clock decreases or jumps.
     """
     size = block or max(1, round(BLOCK_SECONDS * settings.rate))
     interval = 1000 * settings.interval  # us
-    waiting: deque[tuple[float, str]] = deque()  # value, and the reason where it is missing
+    waiting: deque[tuple[float, str]] = deque()  # value, and the reason if it is missing
     start: int | None = None
     expected = first = 0
     breaks = link.breaks
@@ -51,7 +51,7 @@ def points(link: Link, settings: EmSconSettings, block: int | None = None) -> It
             if not 0 <= index - expected <= MAX_GAP * settings.rate:
                 raise ProtocolError(
                     f"The tracker's clock jumps from point {expected - 1} to point {index}: expected steps of one, "
-                    f"{settings.interval} ms apart. Is another client measuring?"
+                    f"{settings.interval} ms apart. Check that no other client is measuring"
                 )
             waiting.extend([(np.nan, BROKEN if link.breaks > breaks else LOST)] * (index - expected))
             expected, breaks = index + 1, link.breaks

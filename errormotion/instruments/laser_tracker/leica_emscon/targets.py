@@ -9,12 +9,12 @@ from errormotion.errors import InstrumentError
 
 
 class BeamBrokenError(InstrumentError):
-    """The beam has no reflector, and none was found again."""
+    """The beam has no reflector, and the search found none."""
 
 
 @dataclass(frozen=True)
 class Reflector:
-    """A reflector of a tracker: its number and name there, its kind, and its surface offset in m."""
+    """A reflector, with its number and name in the tracker, its kind, and its surface offset in m."""
 
     number: int
     name: str

@@ -1,11 +1,11 @@
-"""The air as a station takes it, with a wet temperature, and as this project does, with a relative humidity."""
+"""Conversion of the air between the wet temperature of a station and the relative humidity of this project."""
 
 from __future__ import annotations
 
 import math
 
 PSYCHROMETER = 6.62e-4
-"""1/K; psychrometer constant over the pressure (Sprung), above water."""
+"""1/K; psychrometer constant divided by the pressure (Sprung), over water."""
 REFERENCE_INDEX_PPM = 286.34
 """1e6 (n - 1) at which the station's atmospheric correction is 0 ppm; assumption for all models."""
 
@@ -16,7 +16,7 @@ def vapour_pressure(temperature: float) -> float:
 
 
 def humidity(dry: float, wet: float, pressure: float) -> float:
-    """Return the relative humidity, %, for dry and wet temperature (degC) and pressure (Pa); NaN where none fits."""
+    """Return the relative humidity, %, for dry and wet temperature (degC) and pressure (Pa); NaN if not possible."""
     if not (-60.0 < wet <= dry < 80.0):
         return math.nan
     vapour = vapour_pressure(wet) - PSYCHROMETER * pressure * (dry - wet)

@@ -13,14 +13,14 @@ LINE_END = b"\r\n"
 LONGEST_REPLY = 1024
 """Bytes, line end included."""
 LARGEST_TRANSACTION = 7
-"""Transaction numbers run from 1 to this; 0 is the number of a reply to a request without one."""
+"""Transaction numbers are 1 to this; a reply to a request without a number has 0."""
 
 _REPLY = re.compile(r"%R1P,(\d{1,5})(?:,(\d{1,5}))?:(\d{1,5})(?:,(.*))?", re.ASCII | re.DOTALL)
 _NUMBER = re.compile(r"[+-]?\d{1,40}(?:\.\d{0,40})?(?:[eE][+-]?\d{1,3})?", re.ASCII)
 _WHOLE = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 _HEX = re.compile(r"0[xX][0-9a-fA-F]{1,16}", re.ASCII)
 _BYTE = re.compile(r"'([0-9a-fA-F]{2})'", re.ASCII)
-_FIELD = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"|[^,"]*', re.DOTALL)  # possessive: without a stack of places
+_FIELD = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"|[^,"]*', re.DOTALL)  # possessive: no backtracking
 _ESCAPE = re.compile(r"\\(?:[xX]([0-9a-fA-F]{2})|(.))", re.DOTALL)
 
 
@@ -31,13 +31,13 @@ class Reply:
     Attributes
     ----------
     communication : int
-        Return code of the communication; 0: the call was made.
+        Return code of the communication; 0: the call was executed.
     transaction : int
-        Number of the request, 0 where it had none.
+        Number of the request; 0 if it had none.
     code : int
         Return code of the call.
     values : tuple of str
-        What follows, as it came.
+        Values after the code, as received.
     """
 
     communication: int
@@ -46,7 +46,7 @@ class Reply:
     values: tuple[str, ...] = ()
 
     def number(self, index: int) -> float:
-        """Return a finite value; ProtocolError where there is none."""
+        """Return a finite value; ProtocolError if it is invalid."""
         text = self._value(index)
         if _HEX.fullmatch(text):
             return float(int(text, 16))
@@ -56,7 +56,7 @@ class Reply:
         return value
 
     def whole(self, index: int) -> int:
-        """Return a whole value, also of a byte or in hexadecimal; ProtocolError where there is none."""
+        """Return an integer, also of a byte or in hexadecimal; ProtocolError if it is invalid."""
         text = self._value(index)
         if byte := _BYTE.fullmatch(text):
             return int(byte[1], 16)
@@ -67,7 +67,7 @@ class Reply:
         return int(text)
 
     def text(self, index: int) -> str:
-        """Return a string without its quotation marks; ProtocolError where there is none."""
+        """Return a string without its quotation marks; ProtocolError if it is invalid."""
         text = self._value(index)
         if len(text) < 2 or text[0] != '"' or text[-1] != '"':
             raise ProtocolError(f"Value {index + 1} of a GeoCOM reply: expected a string; found {text[:40]!r}")
@@ -80,7 +80,7 @@ class Reply:
 
 
 def request(call: int, transaction: int, *parameters: int | float) -> bytes:
-    """Return a request; floats have as many digits as they need.
+    """Return a request; floats have as many digits as necessary.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def reply(line: bytes) -> Reply:
     Raises
     ------
     ProtocolError
-        No GeoCOM reply, or a longer one than ``LONGEST_REPLY``.
+        The line is not a GeoCOM reply, or is longer than ``LONGEST_REPLY``.
     """
     if len(line) > LONGEST_REPLY:
         raise ProtocolError(f"A GeoCOM reply of {len(line)} bytes; expected at most {LONGEST_REPLY}")
@@ -127,7 +127,7 @@ def _fields(values: str | None) -> tuple[str, ...]:
         found = _FIELD.match(values, start)
         end = start if found is None else found.end()
         if found is None or (end < len(values) and values[end] != ","):
-            raise ProtocolError(f"A GeoCOM reply has an unfinished value: {values[start : start + 40]!r}")
+            raise ProtocolError(f"A GeoCOM reply has an incomplete value: {values[start : start + 40]!r}")
         fields.append(found[0])
         if end == len(values):
             return tuple(fields)
@@ -135,7 +135,7 @@ def _fields(values: str | None) -> tuple[str, ...]:
 
 
 def check(call: int, found: Reply) -> None:
-    """Raise InstrumentError where the communication failed: the call was not made."""
+    """Raise InstrumentError if the communication failed: the call was not executed."""
     if found.communication:
         raise InstrumentError(
             f"GeoCOM call {codes.name(call)} failed: code {found.communication}, {codes.text(found.communication)}"

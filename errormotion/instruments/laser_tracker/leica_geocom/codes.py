@@ -35,7 +35,7 @@ _NAMES = {
 }
 
 MEASURE_DEFAULT, MEASURE_CLEAR = 1, 3
-"""Programs of TMC_DoMeasure: a distance in the mode that is set; forget the last one."""
+"""Programs of TMC_DoMeasure: measure a distance in the mode that is set; clear the last distance."""
 INCLINATION = {"measured": 0, "automatic": 1, "plane": 2}
 DISTANCE_MODES = {"standard": 2, "fast": 3, "precise": 13}
 
@@ -43,12 +43,12 @@ OK = 0
 NOT_FULLY_CORRECTED = 1283
 ACCURACY_NOT_GUARANTEED = 1284
 WARNINGS = (NOT_FULLY_CORRECTED, ACCURACY_NOT_GUARANTEED)
-"""Return codes of a measurement whose values are there nevertheless."""
+"""Return codes of a measurement whose values are valid nevertheless."""
 NO_DISTANCE = (1285, 1288, 1289, 1290, 1291, 1292, 1294)
-"""Return codes without a distance that no repetition of the request changes."""
+"""Return codes of a measurement without a distance; a repeated request returns the same."""
 BUSY = 1293
 NO_TARGET = (8704, 8706, 8710, 8711, 8712, 8713, 8716)
-"""Return codes of a search without a reflector at its end."""
+"""Return codes of a search that found no reflector."""
 UNAVAILABLE = (3080, 3081)
 """Communication codes of a call that the station does not have."""
 

@@ -17,18 +17,18 @@ from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 from errormotion.plugins.readings import Environment, Measurement
 
 HECTOPASCAL = 100.0  # Pa
-BUSY_PAUSE = 0.05
-"""Time before a request to a busy station is repeated, s."""
+BUSY_INTERVAL = 0.05
+"""Interval between requests to a busy station, s."""
 
 log = logging.getLogger(__name__)
 
 
 class LeicaGeoCom(Driver):
-    """A Leica total station or industrial station: TM30, TS30, TS60, TDRA6000, TPS1200 and their sisters.
+    """A Leica total station or industrial station: TM30, TS30, TS60, TDRA6000, TPS1200 and related models.
 
     Distances are absolute, in m, with the prism constant that is set at the station. The station's frame has x along
     the horizontal angle 0, z up and y to the left: the azimuth is the negative horizontal angle, which the station
-    counts clockwise. The station moves only with ``move = true``; else the operator points it.
+    counts clockwise. The station moves only with ``move = true``; otherwise the operator points it.
 
     Parameters
     ----------
@@ -41,8 +41,8 @@ class LeicaGeoCom(Driver):
     Attributes
     ----------
     warnings : Counter of int
-        Measurements whose values are not fully corrected, or of which the station does not guarantee the accuracy:
-        their number by return code. They are valid.
+        Number, by return code, of measurements that are valid but not fully corrected, or whose accuracy the station
+        does not guarantee.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -57,11 +57,11 @@ class LeicaGeoCom(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines; a station whose reflector rests gives a lost reading once more."""
+        """Return the subject of the conformance kit, with a moving reflector, so that all readings differ."""
         return InstrumentSubject(cls, "sim://cframe?seed=3", vary=simulators.in_steps(seed=3))
 
     _transaction = 0
-    _clear = True  # whether unfinished requests may lie in the station's buffer
+    _clear = True  # whether the station's buffer may contain unfinished requests
 
     # ------------------------------------------------------------------ requests
 
@@ -109,7 +109,7 @@ class LeicaGeoCom(Driver):
         return found
 
     def _optional(self, call: int) -> codec.Reply | None:
-        """Return the reply to a call that not all stations have; None where there is none."""
+        """Return the reply to a call that not all stations have; None if it is unavailable or fails."""
         found = self._call(call)
         if found.communication in codes.UNAVAILABLE:
             return None
@@ -120,12 +120,12 @@ class LeicaGeoCom(Driver):
 
     @property
     def distance_is_displacement(self) -> bool:
-        """Distances are absolute."""
+        """False: distances are absolute."""
         return False
 
     @property
     def dead_path(self) -> int:
-        """Number of times the distance was set again: none, it is absolute."""
+        """0: distances are absolute and are never set again."""
         return 0
 
     def identify(self) -> Identity:
@@ -148,18 +148,18 @@ class LeicaGeoCom(Driver):
         )
 
     def environment(self) -> Environment:
-        """Return the air for which the station corrects distances: degC, Pa, %."""
+        """Return the conditions of the air for which the station corrects distances: degC, Pa, %."""
         found = self._request(codes.GET_AIR)
         pressure, dry, wet = HECTOPASCAL * found.number(1), found.number(2), found.number(3)
         return Environment(dry, pressure, air.humidity(dry, wet, pressure))
 
     def set_environment(self, environment: Environment) -> None:
-        """Set the air for which the station corrects distances; this writes to the station.
+        """Set the conditions of the air for which the station corrects distances; this writes to the station.
 
         Raises
         ------
         InstrumentError
-            A value is unknown, or no state of the air; the station refuses.
+            A value is unknown or not plausible, or the station refuses.
         """
         given = environment.temperature, environment.pressure, environment.humidity
         if not (-60.0 <= given[0] <= 60.0 and 5e4 <= given[1] <= 1.1e5 and 0.0 <= given[2] <= 100.0):
@@ -171,9 +171,9 @@ class LeicaGeoCom(Driver):
         self._request(codes.SET_AIR, wavelength, given[1] / HECTOPASCAL, float(given[0]), wet)
 
     def refraction(self) -> float:
-        """Return the index by which the station divides the optical path; NaN where it does not state its correction.
+        """Return the index by which the station divides the optical path; NaN if it does not report its correction.
 
-        It follows from the atmospheric correction and from the reference index of the distance meter, `air`.
+        It follows from the atmospheric correction and from the reference index of the distance meter, see `air`.
         """
         found = self._optional(codes.GET_AIR_PPM)
         return math.nan if found is None else air.refraction_index(found.number(0))
@@ -200,16 +200,16 @@ class LeicaGeoCom(Driver):
         Raises
         ------
         InstrumentError
-            ``move`` is not set; no position; the station refuses, or finds no reflector.
+            ``move`` is not set, the target is not a position, or the station refuses or finds no reflector.
         """
         if reason := self._point_at(target):
-            raise InstrumentError(f"{self.address} does not aim at a reflector near {target}: {reason}")
+            raise InstrumentError(f"{self.address} found no reflector near {target}: {reason}")
 
     def _point_at(self, target: tuple[float, float, float]) -> str:
-        """Turn to a position; return why no reflector is aimed at, empty where one is."""
+        """Turn to a position; return why no reflector was found, empty if one was found."""
         if not self.settings.move:
             raise InstrumentError(
-                f"{self.address} is not armed: set 'move = true' so that the driver may turn the station, or point it "
+                f"{self.address} is not armed: set 'move = true' to permit the driver to turn the station, or point it "
                 "by hand and measure without a target"
             )
         x, y, z = (float(each) for each in target)
@@ -247,12 +247,12 @@ class LeicaGeoCom(Driver):
         Returns
         -------
         Measurement
-            ``std`` is that of the settings. Without a distance it is not valid and states the reason.
+            ``std`` is that of the settings. A measurement without a distance is not valid and states the reason.
 
         Raises
         ------
         InstrumentError
-            A target without ``move``; the station refuses for another reason, or does not answer.
+            A target is given without ``move``; or the station refuses for another reason, or does not answer.
         """
         if target is not None and (reason := self._point_at(target)):
             return Measurement(reason=reason)
@@ -280,7 +280,7 @@ class LeicaGeoCom(Driver):
         )
 
     def _result(self, inclination: int) -> codec.Reply:
-        """Return the measurement that was started; a busy station is asked again."""
+        """Return the measurement that was started; repeat the request while the station is busy."""
         limit = self.settings.measuring_timeout
         deadline = time.monotonic() + limit
         while True:
@@ -292,10 +292,10 @@ class LeicaGeoCom(Driver):
                 return found
             if found.code != codes.BUSY or time.monotonic() > deadline:
                 raise InstrumentError(f"{self.address} does not measure: code {found.code}, {codes.text(found.code)}")
-            time.sleep(BUSY_PAUSE)
+            time.sleep(BUSY_INTERVAL)
 
     def read(self) -> float:
-        """Return the distance now, m; NaN where there is none."""
+        """Return the present distance, m; NaN if there is none."""
         return self.measure().distance
 
     # ------------------------------------------------------------------ settings

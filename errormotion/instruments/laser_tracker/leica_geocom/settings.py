@@ -15,7 +15,7 @@ class GeoComSettings(PluginSettings):
 
     move: bool = Field(
         default=False,
-        description="whether the driver may turn the station to a target; else the operator points it",
+        description="whether the driver may turn the station to a target; if not, the operator points it",
     )
     search_angle: Angle = Field(
         default=0.02, description="range of the search for a reflector around a target, in both angles", gt=0, le=3.1
@@ -25,15 +25,15 @@ class GeoComSettings(PluginSettings):
     )
     inclination: Literal["measured", "automatic", "plane"] = Field(
         default="automatic",
-        description="correction of the angles for the inclination: measured each time, as the station chooses, or "
-        "from the last plane",
+        description="inclination for the correction of the angles: measured each time, chosen by the station "
+        "(automatic), or from the last plane",
     )
     noise: Length = Field(default=0.6e-3, description="standard deviation of a distance, constant part", ge=0)
     noise_per_length: float = Field(
-        default=1e-6, description="standard deviation of a distance, part in proportion to it", ge=0, le=1e-3
+        default=1e-6, description="standard deviation of a distance, part proportional to the distance", ge=0, le=1e-3
     )
     angle_noise: Angle = Field(default=2.4e-6, description="standard deviation of an angle", ge=0)
     baudrate: int = Field(default=115200, description="baud rate of a serial line", gt=0)
-    timeout: Time = Field(default=3.0, description="time limit of an answer", gt=0)
-    measuring_timeout: Time = Field(default=15.0, description="time limit of a distance measurement", gt=0, le=60)
-    motion_timeout: Time = Field(default=60.0, description="time limit of a motion and of a search", gt=0)
+    timeout: Time = Field(default=3.0, description="time limit for an answer", gt=0)
+    measuring_timeout: Time = Field(default=15.0, description="time limit for a distance measurement", gt=0, le=60)
+    motion_timeout: Time = Field(default=60.0, description="time limit for a motion or a search", gt=0)

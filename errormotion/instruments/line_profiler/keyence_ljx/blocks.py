@@ -15,9 +15,8 @@ Array = np.ndarray[Any, Any]
 class SpacedRows:
     """Fills blocks with packed profiles so that successive rows have successive trigger counts.
 
-    Where the trigger count of the received profiles leaps, the rest of the block up to the next profile is lost. What
-    remains of the gap at the end of a block is not filled but skipped and counted, so that the memory for a gap is
-    that of one block however long it is.
+    If the trigger count of the received profiles jumps, the rest of the block up to the next profile is lost. A gap
+    that extends beyond the end of a block is skipped and counted, so that a gap needs the memory of one block at most.
 
     Parameters
     ----------
@@ -33,16 +32,16 @@ class SpacedRows:
         self._receive = receive
         self._rows = np.empty((batch, words), dtype=np.uint32)
         self._reasons = np.empty(batch, dtype=np.uint8)
-        self._missing = np.zeros(batch, dtype=np.int64)  # before each received row
-        self._used = self._held = 0
+        self._missing = np.zeros(batch, dtype=np.int64)  # number of missing rows before each received row
+        self._used = self._received = 0
         self._last: int | None = None  # trigger count of the last received row
         self._gap = 0
 
     def fill(self, packed: Array, reasons: Array) -> None:
-        """Fill both arrays with the next rows, in number at most ``batch``."""
+        """Fill both arrays with the next rows, at most ``batch`` of them."""
         done, size = 0, len(packed)
         while done < size:
-            if self._used == self._held:
+            if self._used == self._received:
                 self._take(size - done)
             if not self._gap and self._missing[self._used]:
                 self._gap, self._missing[self._used] = int(self._missing[self._used]), 0
@@ -58,7 +57,7 @@ class SpacedRows:
             done += n
 
     def skip_gap(self) -> int:
-        """Return the number of lost profiles between the last row and the next one; they are skipped."""
+        """Skip the lost profiles between the last row and the next one; return their number."""
         gap, self._gap = self._gap, 0
         return gap
 
@@ -69,8 +68,8 @@ class SpacedRows:
         before = np.concatenate(([triggers[0] - 1 if self._last is None else self._last], triggers[:-1]))
         self._missing[:n] = (triggers - before - 1) & 0xFFFFFFFF
         self._last = int(triggers[-1])
-        self._used, self._held = 0, n
+        self._used, self._received = 0, n
 
     def _rows_without_gap(self) -> int:
-        gaps = np.flatnonzero(self._missing[self._used : self._held])
-        return int(gaps[0]) if gaps.size else self._held - self._used
+        gaps = np.flatnonzero(self._missing[self._used : self._received])
+        return int(gaps[0]) if gaps.size else self._received - self._used

@@ -1,14 +1,14 @@
 """Protocol of the LJ-X8000A: requests, replies, and the layout of its high-speed stream. Little-endian throughout.
 
-The sources are on the page of the device, docs/reference/devices/keyence_ljx.md; facts marked (m) have none. A request
-is a 16-byte head and a payload that starts with its opcode. A reply has the length of its body at byte 12, the command
-that it answers at 16, its return code at 17, the active program at 24 and its data from 28 on.
+Sources: docs/reference/devices/keyence_ljx.md; facts marked (m) are from memory. A request is a 16-byte head and a
+payload that starts with its opcode. A reply has the length of its body at byte 12, the command that it answers at 16,
+its return code at 17, the active program at 24 and its data from 28 on.
 
 A profile of the stream is a header of six words (reserved, trigger count, encoder count, three reserved), the heights
-with 20 bits each from the least significant bit on, where switched on the intensities with 10 bits each, and the sum
-of all words before it. The intensities follow the last height without padding, at bit 20 n; the room for heights and
-for intensities is each rounded up to a word. The bulk of it is done by the compiled functions of `kernels`; this module
-holds the facts and the small cases.
+with 20 bits each from the least significant bit on, the intensities with 10 bits each if they are switched on, and the
+sum of all words before it. The intensities follow the last height without padding, at bit 20 n; the sizes of heights
+and of intensities are each rounded up to a word. The compiled functions of `kernels` process streams; this module has
+the constants and the commands.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STREAM_PORT = 24692
 
 # ------------------------------------------------------------------ requests and replies
 
-#: The byte by which the controllers' generations differ.
+#: The byte that differs between the generations of controllers.
 GENERATIONS: Mapping[str, int] = {"LJ-X8000": 0x03, "LJ-V7000": 0x01}
 
 GET_ERROR, CLEAR_ERROR, DESCRIBE = 0x04, 0x05, 0x06
@@ -56,7 +56,7 @@ RETURN_CODES: Mapping[int, str] = {
     0x80: "not possible in this mode",
     0x81: "not possible with the present setting of batch measurement, or no such start position",
     0xA0: "no connection for the stream",
-    0xA1: "the stream is running already",
+    0xA1: "the stream is already running",
     0xA2: "another command code was expected, or the stream was not prepared",
     0xA3: "another start code was expected",
     0xA4: "the profiles to be sent have been deleted",
@@ -66,7 +66,7 @@ RETURN_CODES: Mapping[int, str] = {
 def request(opcode: int, arguments: bytes = b"", *, generation: str = "LJ-X8000") -> bytes:
     """Return the bytes of a request.
 
-    The one for the errors is published byte by byte:
+    The request for the errors is published byte by byte:
 
     >>> request(GET_ERROR).hex(" ")
     '10 00 00 00 03 00 f0 00 00 00 00 00 04 00 00 00 04 00 00 00'
@@ -77,7 +77,7 @@ def request(opcode: int, arguments: bytes = b"", *, generation: str = "LJ-X8000"
 
 
 def parse_request(frame: bytes) -> tuple[int, bytes, str]:
-    """Return opcode, arguments and generation of a request; ProtocolError where it is none."""
+    """Return opcode, arguments and generation of a request; ProtocolError if it is invalid."""
     if len(frame) < REQUEST_HEAD + 4:
         raise ProtocolError(f"A request has at least {REQUEST_HEAD + 4} bytes; found {frame.hex(' ')}")
     length, variant, _, size = struct.unpack_from("<I4sII", frame)
@@ -89,25 +89,25 @@ def parse_request(frame: bytes) -> tuple[int, bytes, str]:
 
 @dataclass(frozen=True)
 class Reply:
-    """A reply: return code (0 = done), active program, data, answered command (0: the device states none)."""
+    """A reply: return code (0: done), active program, data, answered command (0: not stated)."""
 
     code: int
     program: int
     data: bytes
     command: int = 0
 
-    def unpack(self, layout: str, place: int = 0) -> tuple[Any, ...]:
-        """Return what ``struct`` reads from the data; ProtocolError where they are too short."""
+    def unpack(self, layout: str, offset: int = 0) -> tuple[Any, ...]:
+        """Return the values that ``struct`` reads from the data; ProtocolError if they are too short."""
         try:
-            return struct.unpack_from("<" + layout, self.data, place)
+            return struct.unpack_from("<" + layout, self.data, offset)
         except struct.error:
             raise ProtocolError(
-                f"Expected a reply with {place + struct.calcsize('<' + layout)} bytes of data; found {len(self.data)}"
+                f"Expected a reply with {offset + struct.calcsize('<' + layout)} bytes of data; found {len(self.data)}"
             ) from None
 
 
 def reply_length(head: bytes) -> int:
-    """Return the length of a reply from its first four bytes; ProtocolError where it cannot be."""
+    """Return the length of a reply from its first four bytes; ProtocolError if it is not possible."""
     length: int = struct.unpack("<I", head)[0] + 4
     if not REPLY_HEAD <= length <= MAX_REPLY_BYTES:
         raise ProtocolError(
@@ -117,7 +117,7 @@ def reply_length(head: bytes) -> int:
 
 
 def parse_reply(frame: bytes) -> Reply:
-    """Return a reply taken apart; ProtocolError where one of its two lengths is wrong.
+    """Return a decoded reply; ProtocolError if one of its two lengths is wrong.
 
     A body length of 0 is accepted: the maker's client does not read it.
     """
@@ -152,7 +152,7 @@ _UNITS, _UNIT_SIZE, _MODEL_SIZE, _SERIAL_SIZE = 16, 52, 32, 16  # positions in t
 
 
 def parse_description(reply: Reply) -> list[tuple[str, str]]:
-    """Return model and serial number of the controller and, where there is one, the head."""
+    """Return model and serial number of the controller and of the head, if any."""
     count = min(reply.unpack("B")[0], 2)
     fields = [reply.unpack(f"{_MODEL_SIZE}s{_SERIAL_SIZE}s", _UNITS + i * _UNIT_SIZE) for i in range(count)]
     return [(_text(model), _text(serial)) for model, serial in fields]
@@ -200,14 +200,14 @@ LOST, GARBLED = 4, 5
 
 @dataclass(frozen=True)
 class StreamLayout:
-    """What the profiles of a stream look like, as the reply to PREPARE_STREAM states.
+    """Layout of the profiles of a stream, from the reply to PREPARE_STREAM.
 
     Attributes
     ----------
     start_code : int
-        To be given back with START_STREAM.
+        To be sent with START_STREAM.
     kind : int
-        Bits; ``INTENSITY`` among them.
+        Bits, such as ``INTENSITY``.
     points : int
     z_unit : float
         Height of one step, m.
@@ -224,27 +224,27 @@ class StreamLayout:
 
     @property
     def with_intensity(self) -> bool:
-        """Whether the profiles bring intensities."""
+        """Whether the profiles contain intensities."""
         return bool(self.kind & INTENSITY)
 
     @property
     def height_words(self) -> int:
-        """Words that the heights of a profile take."""
+        """Number of words of the heights of a profile."""
         return -(-self.points * HEIGHT_BITS // WORD_BITS)
 
     @property
     def intensity_words(self) -> int:
-        """Words by which intensities lengthen a profile. They start at bit ``HEIGHT_BITS * points`` of its data."""
+        """Number of words added by the intensities, which start at bit ``HEIGHT_BITS * points`` of the data."""
         return -(-self.points * INTENSITY_BITS // WORD_BITS) if self.with_intensity else 0
 
     @property
     def words(self) -> int:
-        """Words of a whole profile, header and checksum included; heights and intensities are each rounded up."""
+        """Number of words of a complete profile, with header and checksum."""
         return HEADER_WORDS + self.height_words + self.intensity_words + 1
 
     @property
     def x(self) -> np.ndarray[Any, Any]:
-        """Where on the line the points are, m."""
+        """Positions of the points on the line, m."""
         return self.x_start + self.x_pitch * np.arange(self.points)
 
 
@@ -252,12 +252,12 @@ _LAYOUT = "iIBBHHHii"  # from byte 32 of the reply on: start code, -, kind, -, -
 
 
 def parse_layout(reply: Reply) -> StreamLayout:
-    """Return what a reply to PREPARE_STREAM states.
+    """Return the layout from a reply to PREPARE_STREAM.
 
     Raises
     ------
     ProtocolError
-        No points, more than there can be, or a unit of 0.
+        No points, too many points, or a unit of 0.
     """
     code, _, kind, _, _, points, z_unit, x_start, x_pitch = reply.unpack(_LAYOUT, 4)
     if not 0 < points <= MAX_POINTS or z_unit == 0:

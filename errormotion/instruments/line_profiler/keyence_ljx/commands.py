@@ -1,4 +1,4 @@
-"""Exchange of commands: one request, its reply, and recovery after a reply that came late."""
+"""Exchange of commands: one request, its reply, and recovery after a late reply."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ from errormotion.instruments.transports.quiet import discard_input
 SYNCHRONISING: tuple[int, ...] = (codec.GET_STATUS, codec.GET_TEMPERATURE, codec.GET_COUNTS)
 """Opcodes that only read: after a timeout, the reply to one of them shows that all earlier replies have arrived."""
 MAX_STALE_REPLIES = 16
-"""Replies to other commands that are skipped before the reply to a request."""
+"""Largest number of replies to other commands that are skipped before the reply to a request."""
 _HEAD = 4  # bytes of a reply that state its length
 
 
 class CommandLine:
     """Requests and replies on one connection.
 
-    Unread bytes are discarded ahead of a request, as the maker's client does. A reply names its command, so that a late
-    reply is not taken for the reply to a later request. After a timeout the
-    next exchange is preceded by a reading request of another opcode; once its reply has arrived, no earlier reply is
-    outstanding. Where the device does not name the command, or does not answer this request either, the connection is
-    lost, and another one is needed.
+    Unread bytes are discarded before a request, as by the maker's client. A reply states its command, so that a late
+    reply is not mistaken for the reply to a later request. After a timeout, the next exchange is preceded by a reading
+    request of another opcode; once its reply has arrived, no earlier reply is outstanding. If the device does not state
+    the command, or does not answer this request either, the connection is lost and must be opened again.
 
     Parameters
     ----------
@@ -32,9 +31,9 @@ class CommandLine:
     name : str
         Name of the instrument, for messages.
     generation : str
-        Of the controller, one of `codec.GENERATIONS`.
+        Generation of the controller, one of `codec.GENERATIONS`.
     timeout : float
-        Time limit of one reply, s.
+        Time limit for one reply, s.
 
     Attributes
     ----------
@@ -54,7 +53,7 @@ class CommandLine:
         return self.lost is None and not self._unanswered
 
     def usable(self) -> bool:
-        """Whether replies can be assigned to requests, where necessary after a request that shows it."""
+        """Return whether replies can be assigned to requests; synchronise first if necessary."""
         if self.lost is None and self._unanswered:
             self._synchronise()
         return self.lost is None
@@ -67,12 +66,12 @@ class CommandLine:
         InstrumentError
             The profiler refuses, or the connection is lost.
         InstrumentTimeoutError
-            It does not answer.
+            The profiler does not answer.
         ProtocolError
             The bytes are not a reply to this request.
         """
         if not self.usable():
-            raise InstrumentError(f"The connection to {self._name} is lost ({self.lost}); end the stream")
+            raise InstrumentError(f"The connection to {self._name} is lost ({self.lost}); close the stream")
         reply = self._exchange(opcode, arguments)
         if reply.code:
             raise codec.refusal(opcode, reply.code)
@@ -113,7 +112,7 @@ class CommandLine:
         raise ProtocolError(f"{self._transport.url}: more than {MAX_STALE_REPLIES} replies to other commands")
 
     def _frame(self) -> bytes:
-        """Return one reply; what arrived of an incomplete one is kept for the next call."""
+        """Return one reply; the bytes of an incomplete reply are kept for the next call."""
         head = self._collect(0, _HEAD)
         size = codec.reply_length(head)
         frame = self._collect(_HEAD, size)
@@ -121,7 +120,7 @@ class CommandLine:
         return frame
 
     def _collect(self, start: int, stop: int) -> bytes:
-        """Return the first ``stop`` bytes of the reply; those before ``start`` are there."""
+        """Return the first ``stop`` bytes of the reply; those before ``start`` have been received."""
         end = time.monotonic() + self._timeout
         while len(self._partial) < stop:
             try:

@@ -1,4 +1,4 @@
-"""Decoder of a stream: joins split data, checks profiles, follows the trigger count, fills short gaps."""
+"""Decoder of a stream: joins split data, checks profiles and trigger count, fills short gaps."""
 
 from __future__ import annotations
 
@@ -25,30 +25,31 @@ WORD = 4
 UNSYNCHRONISED_PROFILES = 8
 """Amount of data without a valid profile after which the stream ends with an error, in profiles."""
 PIECE = 1 << 16
-"""Data decoded at once, bytes: longer data are decoded piece by piece, so that the effort grows with their length."""
+"""Data decoded at once, bytes: longer data are decoded piece by piece, so that the time grows linearly with their
+length."""
 
 
 class StreamEndedError(InstrumentError):
-    """The profiler states that it has ended the stream."""
+    """The profiler has ended the stream."""
 
 
 class StreamDecoder:
-    """Turns the bytes of one stream, however they are split, into profiles, still packed.
+    """Converts the bytes of one stream, however they are split, to packed profiles.
 
-    A chunk's values are (n, words) uint32 and its reasons 0, or LOST or GARBLED where there is no profile. They are
-    LOST where the trigger count jumps between valid profiles, GARBLED where damaged bytes are between them. A gap of
-    more than `kernels.MAX_FILLED_PROFILES` profiles brings no rows; the trigger counts on both sides of it show its
-    length. After damaged bytes the next position is searched at which checksum and trigger count are right.
+    A chunk's values are (n, words) uint32 and its reasons 0, or LOST or GARBLED for a missing profile: LOST where the
+    trigger count jumps between valid profiles, GARBLED where damaged bytes are between them. A gap of more than
+    `kernels.MAX_FILLED_PROFILES` profiles adds no rows; the trigger counts on both sides show its length. After damaged
+    bytes, the decoder searches the next position with a valid checksum and trigger count.
 
-    Memory: a chunk holds at most ``MAX_FILLED_PROFILES + 1`` times the received bytes, and is built from a copy of
-    itself; between two calls at most ``UNSYNCHRONISED_PROFILES`` profiles and ``PIECE`` bytes are kept.
+    Memory: a chunk has at most ``MAX_FILLED_PROFILES + 1`` times the received bytes, and temporarily twice as many;
+    between two calls at most ``UNSYNCHRONISED_PROFILES`` profiles and ``PIECE`` bytes are stored.
 
     Parameters
     ----------
     layout : StreamLayout
     late_notice : bool
-        The notice of the end of the previous stream has not arrived. One notice ahead of the first profile is then
-        ignored.
+        Whether the notice of the end of the previous stream has not arrived; one notice before the first profile is
+        then ignored.
     """
 
     def __init__(self, layout: StreamLayout, *, late_notice: bool = False) -> None:
@@ -57,15 +58,15 @@ class StreamDecoder:
         self._rest = b""
         self._trigger = -1  # expected next count; -1: any
         self._searching = False
-        self._searched = 0  # bytes of the rest at which no profile starts
+        self._searched = 0  # bytes of the rest in which no profile starts
         self.first_trigger = 0
         self.stray_bytes = 0
 
     def __call__(self, data: bytes) -> Chunk:
-        """Return the profiles that the next bytes complete; the chunk's ``end`` states why nothing follows.
+        """Return the profiles that the next bytes complete; the chunk's ``end`` states why none follow.
 
-        Its ``end`` is a ProtocolError where many bytes contain no profile, or the trigger count is
-        inconsistent; a StreamEndedError where the profiler ends the stream.
+        Its ``end`` is a ProtocolError if many bytes contain no profile, or the trigger count is inconsistent; a
+        StreamEndedError if the profiler ends the stream.
         """
         values: list[Array] = []
         reasons: list[Array] = []
@@ -78,13 +79,13 @@ class StreamDecoder:
         return self._chunk(values, reasons, end)
 
     def _decode(self, values: list[Array], reasons: list[Array]) -> InstrumentError | None:
-        """Append the complete profiles of the rest; return why nothing follows, if so."""
+        """Append the complete profiles of the rest; return why none follow, else None."""
         while True:
             if self._searching and not self._found():
                 if len(self._rest) > UNSYNCHRONISED_PROFILES * self._size * WORD:
                     return ProtocolError(
-                        f"No profile of {self._size} words with a right checksum in {len(self._rest)} bytes: were "
-                        "settings changed during the stream? Start the stream again"
+                        f"No profile of {self._size} words with a valid checksum in {len(self._rest)} bytes. Check "
+                        "that no settings were changed during the stream. Start the stream again"
                     )
                 return None
             words = np.frombuffer(self._rest, dtype="<u4", count=len(self._rest) // WORD)
@@ -100,8 +101,8 @@ class StreamDecoder:
             elif why == kernels.LEAP:
                 count = int(words[n * self._size + TRIGGER_WORD])
                 return ProtocolError(
-                    f"The trigger count jumps from {self._trigger - 1} to {count}: was it reset, or the profiler "
-                    "restarted? Start the stream again"
+                    f"The trigger count jumps from {self._trigger - 1} to {count}: it was reset, or the profiler was "
+                    "restarted. Start the stream again"
                 )
             elif len(self._rest) < NOTIFY_WORDS * WORD:
                 return None
@@ -109,26 +110,26 @@ class StreamDecoder:
                 return end
 
     def _found(self) -> bool:
-        """Skip to the next valid profile; False where there is none yet. No byte is searched twice."""
+        """Skip to the next valid profile; return whether one was found. No byte is searched twice."""
         room = self._size * WORD
         while self._searched + room <= len(self._rest):
             part = self._rest[self._searched : self._searched + 2 * room - 1]
-            if (place := self._first_profile(part)) >= 0:
-                self.stray_bytes += self._searched + place
-                self._rest = self._rest[self._searched + place :]
+            if (start := self._first_profile(part)) >= 0:
+                self.stray_bytes += self._searched + start
+                self._rest = self._rest[self._searched + start :]
                 return True
             self._searched += len(part) - room + 1
         return False
 
     def _first_profile(self, data: bytes) -> int:
         """Return the first byte of data at which a valid profile starts; -1: none."""
-        places = []
+        starts = []
         for shift in range(WORD):
             words = np.frombuffer(data[shift:], dtype="<u4", count=(len(data) - shift) // WORD)
-            place = kernels.search(words, self._size, self._trigger)
-            if place >= 0:
-                places.append(place * WORD + shift)
-        return min(places, default=-1)
+            start = kernels.search(words, self._size, self._trigger)
+            if start >= 0:
+                starts.append(start * WORD + shift)
+        return min(starts, default=-1)
 
     def _take(self, profiles: Array, aheads: Array, values: list[Array], reasons: list[Array]) -> None:
         if self._trigger < 0:
@@ -141,17 +142,17 @@ class StreamDecoder:
             values.append(profiles)
             reasons.append(np.zeros(len(profiles), dtype=np.uint8))
             return
-        places = np.arange(len(profiles)) + np.cumsum(aheads)
-        filled = np.zeros((places[-1] + 1, self._size), dtype=np.uint32)
+        received = np.arange(len(profiles)) + np.cumsum(aheads)
+        filled = np.zeros((received[-1] + 1, self._size), dtype=np.uint32)
         rows = np.arange(len(filled))
-        following = np.searchsorted(places, rows)  # the received profile at a row, or the next one
-        filled[:, TRIGGER_WORD] = (profiles[following, TRIGGER_WORD].astype(np.int64) + rows - places[following]) & (
+        following = np.searchsorted(received, rows)  # the received profile at a row, or the next one
+        filled[:, TRIGGER_WORD] = (profiles[following, TRIGGER_WORD].astype(np.int64) + rows - received[following]) & (
             0xFFFFFFFF
         )
-        filled[places] = profiles
+        filled[received] = profiles
         missing = np.full(len(filled), LOST, dtype=np.uint8)
-        missing[: places[0]] = why
-        missing[places] = 0
+        missing[: received[0]] = why
+        missing[received] = 0
         values.append(filled)
         reasons.append(missing)
 
@@ -172,14 +173,14 @@ class StreamDecoder:
 
 
 class HeightDecoder:
-    """Unpacks profiles: heights, intensities, counts."""
+    """Unpacks heights, intensities and encoder counts of profiles."""
 
     def __init__(self, layout: StreamLayout) -> None:
         self._layout = layout
-        self._encoder: int | None = None  # the last one, corrected for overflow
+        self._encoder: int | None = None  # last count, corrected for overflow
 
     def heights(self, profiles: Array, reasons: Array, heights: Array, counts: Array) -> None:
-        """Unpack the heights (m) of profiles into (n, point); ``counts`` by `codec.REASONS` grow."""
+        """Unpack the heights (m) of profiles into (n, point); add to the ``counts`` by `codec.REASONS`."""
         kernels.unpack_heights(profiles, self._layout.z_unit, reasons, heights, counts)
 
     def intensities(self, profiles: Array, reasons: Array, intensities: Array) -> None:
@@ -189,22 +190,22 @@ class HeightDecoder:
     def encoder(self, readings: Array, reasons: Array) -> Array:
         """Return encoder counts of the next profiles (n,), float64, corrected for the overflow of their 32 bits.
 
-        NaN where the profile was lost. Between two received profiles the encoder must move by less than half
-        of its 2**32.
+        NaN for lost profiles. Between two received profiles the encoder must move by less than half of its 2**32
+        counts.
         """
-        there = reasons == 0
+        valid = reasons == 0
         counts = np.full(len(reasons), np.nan)
-        raw = readings[there].astype(np.uint32).view(np.int32).astype(np.int64)
+        raw = readings[valid].astype(np.uint32).view(np.int32).astype(np.int64)
         if raw.size:
             last = int(raw[0]) if self._encoder is None else self._encoder
             steps = (np.diff(raw, prepend=last) + (1 << 31)) % (1 << 32) - (1 << 31)
-            counts[there] = last + np.cumsum(steps)
+            counts[valid] = last + np.cumsum(steps)
             self._encoder = int(last + steps.sum())
         return counts
 
     def warm_up(self) -> None:
         """Compile all loops before the first profiles arrive."""
-        blank = bytes(4 * self._layout.words)  # its checksum is right
+        blank = bytes(4 * self._layout.words)  # its checksum is valid
         trial = StreamDecoder(self._layout)
         chunk = trial(blank + notice(STOPPED))
         trial._searching = True

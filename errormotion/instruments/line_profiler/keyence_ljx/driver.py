@@ -40,14 +40,14 @@ BLOCK_SECONDS = 0.1
 QUEUE_SECONDS = 0.5
 SMALLEST_QUEUE = 64
 BATCH_PROFILES = 64
-"""Profiles unpacked at once: their packed form stays in the processor's cache."""
+"""Number of profiles unpacked at once; their packed data fit into the processor's cache."""
 QUIET_INTERVAL = 0.3
-"""Time without data after which a stopped stream has ended, where no notice was received, s."""
+"""Time without data after which a stopped stream counts as ended if no notice was received, s."""
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Triggers and encoder pulses that a profiler has counted; the encoder's count overflows at 32 bits."""
+    """Triggers and encoder pulses that a profiler has counted; the encoder count overflows at 32 bits."""
 
     trigger: int
     encoder: int
@@ -56,7 +56,7 @@ class Counts:
 class KeyenceLJX(Driver):
     """A Keyence LJ-X8000A line profiler over Ethernet: one connection for commands, one for the stream.
 
-    Heights and positions on the line are in m; heights are NaN where the profiler has none.
+    Heights and positions on the line are in m; heights are NaN where the profiler reports none.
 
     Parameters
     ----------
@@ -79,11 +79,11 @@ class KeyenceLJX(Driver):
     name = "keyence_ljx"
     _reader: Reader | None = None
     _commands: CommandLine | None = None
-    _notice_pending = False  # a stream was stopped, and its notice has not arrived
+    _notice_pending = False  # whether the notice of a stopped stream has not arrived
 
     @property
     def rate(self) -> float:
-        """Profiles per second, as set."""
+        """Profiles per second, as in the settings."""
         return self.settings.rate
 
     # ------------------------------------------------------------------ commands
@@ -103,12 +103,12 @@ class KeyenceLJX(Driver):
         )
 
     def configure(self, settings: LJXSettings) -> None:
-        """Change program and X pitch, where the settings name them.
+        """Change program and X pitch, if the settings state them.
 
         Raises
         ------
         InstrumentError
-            The profiler refuses; it is streaming.
+            The profiler refuses, or is streaming.
         """
         self._refuse_while_streaming()
         if settings.program is not None:
@@ -122,20 +122,20 @@ class KeyenceLJX(Driver):
         return self.command(codec.GET_STATUS).program
 
     def change_program(self, number: int) -> None:
-        """Make another program the active one."""
+        """Activate another program."""
         self._refuse_while_streaming()
         if not 0 <= number < codec.PROGRAMS:
-            raise InstrumentError(f"The programs have the numbers 0 to {codec.PROGRAMS - 1}; found {number}")
+            raise InstrumentError(f"Expected the number of a program, 0 to {codec.PROGRAMS - 1}; found {number}")
         self.command(codec.CHANGE_PROGRAM, bytes((number, 0, 0, 0)))
         if (active := self.program()) != number:
             raise InstrumentError(f"Program {number} was requested, but {active} is active")
 
     def x_pitch(self) -> float:
-        """Request the distance of the points on the line, m."""
+        """Request the distance between points on the line, m."""
         return float(self.command(codec.GET_X_PITCH).unpack("I")[0] * LENGTH)
 
     def set_x_pitch(self, pitch: float) -> None:
-        """Set the distance of the points on the line, m, to the next 0.01 um."""
+        """Set the distance between points on the line, m, rounded to 0.01 um."""
         self._refuse_while_streaming()
         self.command(codec.SET_X_PITCH, struct.pack("<I", round(pitch / LENGTH)))
 
@@ -157,21 +157,21 @@ class KeyenceLJX(Driver):
         self.command(codec.CLEAR_ERROR, struct.pack("<HH", code, 0))
 
     def trigger(self) -> None:
-        """Take one profile, where the program waits for triggers from outside."""
+        """Trigger one profile, if the program waits for external triggers."""
         self.command(codec.TRIGGER)
 
     def command(self, opcode: int, arguments: bytes = b"") -> Reply:
         """Send a request and return the reply; works while profiles are streaming.
 
-        Where replies can no longer be assigned to requests, both connections are opened again first, unless profiles
-        are streaming, and the session is started as by `open`.
+        If replies can no longer be assigned to requests, and no profiles are streaming, both connections are first
+        opened again, and the session is started as by `open`.
 
         Raises
         ------
         InstrumentError
             The profiler refuses, or the connection is lost.
         InstrumentTimeoutError
-            It does not answer. A reply that comes later is skipped.
+            The profiler does not answer. A late reply is skipped.
         ProtocolError
             The bytes are not a reply.
         """
@@ -197,14 +197,14 @@ class KeyenceLJX(Driver):
     # ------------------------------------------------------------------ measuring
 
     def read(self) -> np.ndarray[Any, Any]:
-        """Take one profile and return its heights, m, (point,); NaN where there is none.
+        """Measure one profile and return its heights, m, (point,); NaN where missing.
 
-        A profiler that waits for its encoder is triggered by command; a free-running one may refuse it.
+        A profiler that waits for its encoder is triggered by command; a free-running one may refuse the trigger.
 
         Raises
         ------
         InstrumentTimeoutError
-            No profile within the time limit: it waits for its trigger, or does not answer at all.
+            No profile within the time limit: the profiler waits for its trigger, or does not answer.
         """
         refused: list[InstrumentError] = []
         try:
@@ -241,7 +241,7 @@ class KeyenceLJX(Driver):
         )
 
     def stream(self, block: int | None = None) -> Iterator[Profiles]:
-        """Yield blocks of profiles until the caller stops; the end of the loop stops the stream.
+        """Yield blocks of profiles until the caller stops, which stops the stream.
 
         Parameters
         ----------
@@ -251,9 +251,9 @@ class KeyenceLJX(Driver):
         Yields
         ------
         Profiles
-            ``values`` (point, block) in m. Profiles that the trigger count shows missing are NaN and counted. What
-            remains of a gap at the end of a block is counted there and skipped: ``first`` and ``trigger`` of the next
-            block are those of the next profile.
+            ``values`` (point, block) in m. Profiles that are missing by the trigger count are NaN and counted. The rest
+            of a gap at the end of a block is counted there and skipped: ``first`` and ``trigger`` of the next block are
+            those of the next profile.
 
         Raises
         ------
@@ -267,7 +267,7 @@ class KeyenceLJX(Driver):
         yield from self._stream(block)
 
     def _stream(self, block: int | None, on_start: Callable[[], None] | None = None) -> Generator[Profiles]:
-        """Yield blocks as `stream`; ``on_start`` is called once the profiler streams."""
+        """Yield blocks as `stream`; call ``on_start`` when the stream has started."""
         from errormotion.instruments.line_profiler.keyence_ljx.blocks import SpacedRows
         from errormotion.instruments.line_profiler.keyence_ljx.decoder import HeightDecoder, StreamDecoder
         from errormotion.instruments.streaming import Reader
@@ -333,7 +333,7 @@ class KeyenceLJX(Driver):
         return parts, skipped
 
     def _stop(self) -> None:
-        """Stop the stream and its thread; where the profiler does not confirm this, the next command reconnects."""
+        """Stop the stream and its thread; if the profiler does not confirm this, the next command reconnects."""
         from errormotion.instruments.line_profiler.keyence_ljx.decoder import StreamEndedError
 
         reader, self._reader = self._reader, None
@@ -370,7 +370,7 @@ class KeyenceLJX(Driver):
             self.command(codec.STOP_STREAM)  # an earlier connection may have left it streaming
             self._notice_pending = True
         except InstrumentError:
-            if not self._line().answers:  # else there was no stream to stop
+            if not self._line().answers:  # if it answers, there was no stream to stop
                 raise
         self.configure(self.settings)
 

@@ -19,9 +19,9 @@ Array = np.ndarray[Any, Any]
 
 LOWEST = SMALLEST_HEIGHT - SENTINELS
 MAX_GAP_PROFILES = 1 << 16
-"""Profiles: a trigger count that leaps further did not come from lost profiles."""
+"""Largest number of lost profiles; a larger jump of the trigger count is an error."""
 MAX_FILLED_PROFILES = 64
-"""Longest gap of which each lost profile is a row, profiles; a longer gap is a leap of the trigger count."""
+"""Longest gap that is filled with rows, profiles; a longer gap only appears as a jump of the trigger count."""
 
 MORE, NOTICE, DAMAGED, LEAP = range(4)  # why `follow` stops
 
@@ -36,7 +36,7 @@ def _sum(words: Array, first: int, n: int) -> np.uint32:
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def follow(words: Array, size: int, trigger: Any, aheads: Array) -> tuple[int, int]:
-    """Follow profiles that lie behind one another.
+    """Find consecutive profiles.
 
     Parameters
     ----------
@@ -45,17 +45,17 @@ def follow(words: Array, size: int, trigger: Any, aheads: Array) -> tuple[int, i
     size : int
         Words of a profile.
     trigger : int
-        Trigger count to be expected of the first; negative: any.
+        Expected trigger count of the first profile; negative: any.
     aheads : ndarray, int64
-        Receives, for each profile, how many are missing before it; room for ``words.size // size``.
+        Receives, for each profile, the number of missing profiles before it; size at least ``words.size // size``.
 
     Returns
     -------
     n : int
-        Profiles found.
+        Number of profiles found.
     why : int
-        MORE: there are too few words; NOTICE: a notify packet comes; DAMAGED: what comes has a wrong checksum; LEAP:
-        its trigger count is no continuation.
+        Why the search stopped. MORE: more words are needed; NOTICE: a notify packet follows; DAMAGED: the checksum is
+        wrong; LEAP: the trigger count jumps.
     """
     n = first = 0
     while first < words.size:
@@ -78,7 +78,7 @@ def follow(words: Array, size: int, trigger: Any, aheads: Array) -> tuple[int, i
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def search(words: Array, size: int, trigger: int) -> int:
-    """Return where in words the next profile with a right checksum and a fitting trigger count starts; -1: nowhere."""
+    """Return the index of the next profile with a valid checksum and a plausible trigger count; -1: none."""
     if words.size < size:
         return -1
     total = _sum(words, 0, size - 1)
@@ -102,11 +102,11 @@ def unpack_heights(profiles: Array, unit: float, reasons: Array, heights: Array,
     unit : float
         Height of one step.
     reasons : ndarray, uint8, (n,)
-        Not 0 where there is no profile.
+        Not 0 for missing profiles.
     heights : ndarray, float64, (n, point)
-        Receives the heights; NaN where there is none.
+        Receives the heights; NaN where missing.
     counts : ndarray, int64, (len(REASONS),)
-        Counts why not, on top of what it holds.
+        Incremented by the number of missing heights by reason.
     """
     n, points = heights.shape
     for row in range(n):
@@ -146,10 +146,10 @@ def unpack_heights(profiles: Array, unit: float, reasons: Array, heights: Array,
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def _field(words: Array, bit: int, width: int) -> Any:
-    place, shift = bit // 32, bit % 32
-    value = np.int64(words[place]) >> shift
+    index, shift = bit // 32, bit % 32
+    value = np.int64(words[index]) >> shift
     if shift + width > 32:
-        value |= np.int64(words[place + 1]) << (32 - shift)
+        value |= np.int64(words[index + 1]) << (32 - shift)
     return value & ((1 << width) - 1)
 
 
@@ -162,9 +162,9 @@ def unpack_intensities(profiles: Array, reasons: Array, intensities: Array) -> N
     profiles : ndarray, uint32, (n, words)
         Whole profiles with intensities.
     reasons : ndarray, uint8, (n,)
-        Not 0 where there is no profile.
+        Not 0 for missing profiles.
     intensities : ndarray, uint16, (n, point)
-        Receives them; 0 where there is no profile, and for the last of an odd number where the profile ends before it.
+        Receives them; 0 for missing profiles, and for the last of an odd number if the profile ends before it.
     """
     n, points = intensities.shape
     for row in range(n):
@@ -185,11 +185,11 @@ def _intensity_bit(i: int, points: int) -> int:
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def _put(words: Array, bit: int, value: int) -> None:
-    place, shift = bit // 32, bit % 32
+    index, shift = bit // 32, bit % 32
     shifted = np.uint64(value) << np.uint64(shift)
-    words[place] |= np.uint32(shifted & np.uint64(0xFFFFFFFF))
+    words[index] |= np.uint32(shifted & np.uint64(0xFFFFFFFF))
     if shifted >> np.uint64(32):
-        words[place + 1] |= np.uint32(shifted >> np.uint64(32))
+        words[index + 1] |= np.uint32(shifted >> np.uint64(32))
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
@@ -199,7 +199,7 @@ def pack(raws: Array, intensities: Array, trigger: int, encoder: int, words: Arr
     Parameters
     ----------
     raws : ndarray, int32, (point,)
-        Heights in steps; the codes of points without height lie below ``SMALLEST_HEIGHT``.
+        Heights in steps; codes of points without height are below ``SMALLEST_HEIGHT``.
     intensities : ndarray, uint16, (point,) or (0,)
     trigger, encoder : int
         Counts; their lower 32 bits are written.

@@ -1,4 +1,4 @@
-"""Scans that exist already, as files."""
+"""Existing scans in files."""
 
 from errormotion.instruments.line_profiler.profile_files.driver import ProfileFiles
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings

@@ -1,28 +1,20 @@
-"""A scan as a file for the conformance kit."""
+"""File of a scan for the conformance kit."""
 
 from __future__ import annotations
 
-import atexit
-import shutil
-import tempfile
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-
-def own_folder() -> Path:
-    """Return a new folder that lasts as long as this process."""
-    folder = Path(tempfile.mkdtemp(prefix="errormotion-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
+from errormotion.instruments.temporary import temporary_folder
 
 
 @cache
 def scan_file() -> Path:
-    """Return a scan of 350 profiles as a file that lasts as long as this process; three heights are unknown."""
-    folder = own_folder()
+    """Return a temporary file with a scan of 350 profiles; three heights are unknown."""
+    folder = temporary_folder()
     x, y = 12.5e-6 * np.arange(60), 25e-6 * np.arange(350)
     heights = 1e-3 * np.sin(np.add.outer(700.0 * y, 5000.0 * x))
     heights[10:13, 7] = np.nan

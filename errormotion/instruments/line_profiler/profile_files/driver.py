@@ -8,13 +8,13 @@ import time
 from collections.abc import Iterator
 from glob import glob
 from pathlib import Path
-from types import TracebackType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
 from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import InstrumentError, ReplayError
+from errormotion.instruments.driver import Openable
 from errormotion.instruments.line_profiler.profile_files.readers import READERS, read_scan
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
@@ -24,17 +24,17 @@ FORMAT = "errormotion-scans/1"
 BLOCK = 100
 
 
-class ProfileFiles:
+class ProfileFiles(Openable):
     """Recorded scans, one per file: PLY, PCD, XYZ (with Open3D), CSV height maps, NetCDF.
 
     Parameters
     ----------
     address : str
-        A file, or a pattern such as ``scans/*.ply``, whose files are read in the order of their names. ``replay://file``
-        is a recording: a list of files with their hashes, all of which must be unchanged.
+        A file, or a pattern such as ``scans/*.ply``, whose files are read in the order of their names.
+        ``replay://file`` is a recording: a list of files with their hashes; the files must be unchanged.
     settings : ProfileFileSettings, optional
     record : Path, optional
-        List that is written.
+        List of the files that is written.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -62,7 +62,7 @@ class ProfileFiles:
 
     @property
     def rate(self) -> float:
-        """Profiles per second, as set."""
+        """Profiles per second, as in the settings."""
         return self.settings.rate
 
     def open(self) -> None:
@@ -71,7 +71,7 @@ class ProfileFiles:
         Raises
         ------
         InstrumentError
-            No such file, or of an unknown kind; a file of a recording has changed.
+            No file was found, a file has an unknown format, or a file of a recording has changed.
         """
         if self._files is not None:
             return
@@ -83,7 +83,7 @@ class ProfileFiles:
             raise InstrumentError(f"Expected a file or a pattern such as scans/*.ply; found '{self.address}'")
         paths = [Path(rest)] if Path(rest).is_file() else [Path(name) for name in sorted(glob(rest))]
         if not paths:
-            raise InstrumentError(f"Expected scans of {', '.join(sorted(READERS))}; there is no file '{rest}'")
+            raise InstrumentError(f"Expected scans of {', '.join(sorted(READERS))}; found no file '{rest}'")
         files = {path: _hash(path) for path in paths}
         if self._record is not None:
             _write_list(self._record, files)
@@ -93,17 +93,8 @@ class ProfileFiles:
         """Close the files; idempotent."""
         self._files = None
 
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def identify(self) -> Identity:
-        """Identify the files by their kind and hash."""
+        """Return the identity of the files: their formats and hashes."""
         files = self._opened()
         together = hashlib.sha256("".join(files.values()).encode()).hexdigest()
         return Identity(
@@ -114,16 +105,16 @@ class ProfileFiles:
         )
 
     def scans(self) -> Iterator[Scan]:
-        """Yield the scans as height maps, in the order of their files' names; InstrumentError where one is wrong."""
+        """Yield the scans as height maps, in the order of the file names; InstrumentError if one is invalid."""
         for path in self._opened():
             yield read_scan(path, self.settings)
 
     def read(self) -> np.ndarray[Any, Any]:
-        """Return the heights of the first profile, m, (point,); NaN where there is none."""
+        """Return the heights of the first profile, m, (point,); NaN where missing."""
         return np.asarray(next(self.scans()).heights[0])
 
     def stream(self, block: int | None = None) -> Iterator[Profiles]:
-        """Yield the profiles of all scans in blocks of at most ``block`` (100); a block holds profiles of one scan."""
+        """Yield the profiles of all scans in blocks of at most ``block`` (100), each from one scan."""
         first, size = 0, block or BLOCK
         for scan in self.scans():
             for start in range(0, len(scan.y), size):
@@ -158,7 +149,7 @@ def _hash(path: Path) -> str:
     except OSError as error:
         raise InstrumentError(f"{path} cannot be read: {error.strerror}") from None
     except ValueError as error:  # a name with the character NUL
-        raise InstrumentError(f"{str(path)!r} is no name of a file: {error}") from None
+        raise InstrumentError(f"{str(path)!r} is not a file name: {error}") from None
 
 
 def _write_list(path: Path, files: dict[Path, str]) -> None:

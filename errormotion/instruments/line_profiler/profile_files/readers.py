@@ -1,4 +1,4 @@
-"""Files of scans to height maps in m: point clouds (PLY, PCD, XYZ) through Open3D, CSV, NetCDF."""
+"""Reading of scans as height maps in m: point clouds (PLY, PCD, XYZ) by Open3D, CSV, NetCDF."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from errormotion.plugins.readings import Scan
 
 Array = np.ndarray[Any, Any]
 
-MAX_HEIGHT = 0.5  # m; a larger one is a mistaken unit
+MAX_HEIGHT = 0.5  # m; a larger one indicates a wrong unit
 FULL = 0.25
-"""Smallest share of the cells of a height map that a point cloud must fill."""
+"""Smallest fraction of the cells of a height map that a point cloud must fill."""
 
 
 def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:
@@ -27,8 +27,8 @@ def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:
     Raises
     ------
     InstrumentError
-        Unknown kind of file, not readable, cut off, no unit, no height map, heights of more than half a metre, profiles
-        that are not in order along the feed.
+        Unknown format, file not readable or incomplete, no unit, no height map, heights of more than half a metre, or
+        profiles that are not in order along the feed.
     """
     suffix = path.suffix.lower()
     if suffix not in READERS:
@@ -37,7 +37,7 @@ def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:
         raise InstrumentError(f"{path}: file not found")
     heights, x, y = READERS[suffix](path, settings)
     if not np.isfinite(heights).any():
-        raise InstrumentError(f"{path}: expected heights; found none. Is the file complete?")
+        raise InstrumentError(f"{path}: expected heights; found none. Check that the file is complete")
     highest = float(np.nanmax(np.abs(heights)))
     if highest > MAX_HEIGHT:
         raise InstrumentError(f"{path}: found a height of {highest:.4g} m; check its unit '{settings.unit or 'm'}'")
@@ -45,8 +45,8 @@ def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:
         steps = np.diff(positions)
         if not (np.isfinite(positions).all() and ((steps > 0).all() or (steps < 0).all())):
             raise InstrumentError(
-                f"{path}: {name} is not monotonic: expected profiles and points in order; cut the file where the feed "
-                "reverses"
+                f"{path}: {name} is not monotonic: expected profiles and points in order; split the file where the "
+                "feed reverses"
             )
     return Scan(path, np.ascontiguousarray(heights), x, y)
 
@@ -57,24 +57,24 @@ def _unit(path: Path, settings: ProfileFileSettings) -> str:
     return settings.unit
 
 
-def _cleared(values: Array, settings: ProfileFileSettings) -> Array:
+def _with_nan(values: Array, settings: ProfileFileSettings) -> Array:
     return values if settings.no_value is None else np.where(values == settings.no_value, np.nan, values)
 
 
 def _read_csv(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, Array]:
-    """Read rows of heights, a profile each; an empty cell is a missing height. Lines that start with # are ignored."""
+    """Read rows of heights, one for each profile; an empty cell is a missing height. Lines with # are comments."""
     unit = _unit(path, settings)
     if settings.x_pitch is None or settings.y_pitch is None:
         raise InstrumentError(
-            f"{path} has heights only: set 'x_pitch' and 'y_pitch', the distances of its columns and rows"
+            f"{path} only has heights: set 'x_pitch' and 'y_pitch', the distances of its columns and rows"
         )
-    heights = _in_metres(_cleared(_csv_rows(path, settings.delimiter), settings), unit)
+    heights = _in_metres(_with_nan(_csv_rows(path, settings.delimiter), settings), unit)
     n, points = heights.shape
     return heights, settings.x_pitch * np.arange(points), settings.y_pitch * np.arange(n)
 
 
 def _csv_rows(path: Path, delimiter: str) -> Array:
-    """Return the cells of a CSV file, (row, column); NaN where empty. A delimiter at the end adds no column."""
+    """Return the cells of a CSV file, (row, column); NaN where empty. A trailing delimiter adds no column."""
     rows: list[list[float]] = []
     lines: list[tuple[int, bool]] = []  # number of the line, and whether it ends with a delimiter
     number = 0
@@ -130,9 +130,9 @@ def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Arra
         if not unit:
             raise InstrumentError(f"{path}: the variable {name} has no attribute 'units'")
         if variable.dtype.kind not in "iuf":
-            raise InstrumentError(f"{path}: the variable {name} has no numbers")
+            raise InstrumentError(f"{path}: the variable {name} is not numeric")
         values = np.asarray(variable.values, dtype=np.float64)
-        found.append(_in_metres(_cleared(values, settings) if name == "height" else values, unit))
+        found.append(_in_metres(_with_nan(values, settings) if name == "height" else values, unit))
     heights, x, y = found
     return heights, x, y
 
@@ -146,14 +146,14 @@ def _read_cloud(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         cloud = open3d.t.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
     if "positions" not in cloud.point or not len(cloud.point.positions):
-        raise InstrumentError(f"{path} cannot be read: Open3D finds no points. Is the file complete?")
+        raise InstrumentError(f"{path} cannot be read: Open3D found no points. Check that the file is complete")
     points = cloud.point.positions.numpy().astype(np.float64)
-    points[:, 2] = _cleared(points[:, 2], settings)
+    points[:, 2] = _with_nan(points[:, 2], settings)
     return height_map(_in_metres(points, unit), path)
 
 
 def _open3d(path: Path) -> Any:
-    """Return the package. Its TBB is too old for numba, which is therefore set to use it last."""
+    """Return the package. Its TBB is too old for numba, which is therefore set to prefer other layers."""
     import numba
 
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined, unused-ignore]
@@ -173,21 +173,21 @@ _PLY_SIZES = {
 
 
 def check_complete(path: Path) -> None:
-    """Refuse a PLY or PCD file that holds fewer points than its header announces: Open3D invents the others.
+    """Refuse a PLY or PCD file with fewer points than its header states: Open3D would invent the others.
 
     Raises
     ------
     InstrumentError
-        Incomplete, or without a header.
+        The file is incomplete, or has no header.
     """
-    announced, width, text = -1, 0, False
+    stated, width, text = -1, 0, False
     with path.open("rb") as file:
         for line in file:
             match line.decode("ascii", errors="replace").split():
                 case ["format", kind, *_]:
                     text = kind == "ascii"
                 case ["element", "vertex", number] | ["POINTS", number] if number.isdigit():
-                    announced, width = int(number), 0
+                    stated, width = int(number), 0
                 case ["element", *_]:
                     break  # the points come first
                 case ["property", kind, _]:
@@ -200,18 +200,18 @@ def check_complete(path: Path) -> None:
                     text, width = kind == "ascii", width if kind == "binary" else 0
                     break
         else:
-            raise InstrumentError(f"{path} cannot be read: its header has no end. Is the file complete?")
-        there = announced
+            raise InstrumentError(f"{path} cannot be read: its header has no end. Check that the file is complete")
+        found = stated
         if text:
-            there = _whole_lines(file)
+            found = _whole_lines(file)
         elif width:
-            there = (path.stat().st_size - file.tell()) // width
-    if there < announced:
-        raise InstrumentError(f"{path} cannot be read: its header announces {announced} points; found {there}")
+            found = (path.stat().st_size - file.tell()) // width
+    if found < stated:
+        raise InstrumentError(f"{path} cannot be read: its header states {stated} points; found {found}")
 
 
 def _whole_lines(file: Iterable[bytes]) -> int:
-    """Count lines with text; the last only when it has as many cells as the one before it."""
+    """Count lines with text; the last one only if it has as many cells as the one before it."""
     count, cells, before = 0, 0, 0
     for line in file:
         if found := len(line.split()):
@@ -244,13 +244,13 @@ def height_map(points: Array, path: Path) -> tuple[Array, Array, Array]:
     return heights.reshape(y.size, x.size), x, y
 
 
-def _lines(places: Array) -> tuple[Array, Array]:
-    """Return the different positions, but for the rounding of the file, and which of them each is."""
-    order = np.argsort(places, kind="stable")
-    ordered = places[order]
+def _lines(positions: Array) -> tuple[Array, Array]:
+    """Return the distinct positions, apart from the rounding of the file, and the index of each."""
+    order = np.argsort(positions, kind="stable")
+    ordered = positions[order]
     tolerance = 0.01 * np.ptp(ordered) / np.sqrt(ordered.size)  # 1 % of the pitch of a square grid
     starts = np.concatenate([[True], np.diff(ordered) > tolerance])
-    line = np.empty(places.size, dtype=np.int64)
+    line = np.empty(positions.size, dtype=np.int64)
     line[order] = np.cumsum(starts) - 1
     first = np.flatnonzero(starts)
     return np.add.reduceat(ordered, first) / np.diff(np.append(first, ordered.size)), line

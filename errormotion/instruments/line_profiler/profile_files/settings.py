@@ -11,14 +11,16 @@ from errormotion.plugins import PluginSettings
 
 
 class ProfileFileSettings(PluginSettings):
-    """What the files do not state themselves."""
+    """Settings of scans in files: values that the files do not state."""
 
     unit: Literal["m", "mm", "um", "inch"] | None = Field(
-        default=None, description="of the lengths in the files; NetCDF files name their own, all others need it"
+        default=None, description="unit of lengths in the files; required, except for NetCDF files, which state it"
     )
-    x_pitch: Length | None = Field(default=None, description="distance of the columns of a CSV height map", gt=0)
-    y_pitch: Length | None = Field(default=None, description="distance of the rows of a CSV height map", gt=0)
-    delimiter: str = Field(default=",", description="between the cells of a CSV height map", min_length=1, max_length=1)
-    no_value: float | None = Field(default=None, description="number that means no height, in the file's unit")
-    rate: Frequency = Field(default=1000.0, description="profiles per second at which they were scanned", gt=0)
+    x_pitch: Length | None = Field(default=None, description="distance between the columns of a CSV height map", gt=0)
+    y_pitch: Length | None = Field(default=None, description="distance between the rows of a CSV height map", gt=0)
+    delimiter: str = Field(
+        default=",", description="separator of the cells of a CSV height map", min_length=1, max_length=1
+    )
+    no_value: float | None = Field(default=None, description="number that means no height, in the unit of the file")
+    rate: Frequency = Field(default=1000.0, description="profiles per second of the scan", gt=0)
     noise: Length = Field(default=0.5e-6, description="standard deviation of the height of one point", ge=0)

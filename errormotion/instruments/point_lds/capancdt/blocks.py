@@ -1,11 +1,11 @@
-"""Blocks of values on the data port of a capaNCDT 6200: a header of 32 bytes and frames of one value a channel.
+"""Blocks of values on the data port of a capaNCDT 6200: a header of 32 bytes and frames of one value for each channel.
 
 Layout (6200 p. 55), all little-endian: preamble, order number, serial number (32 bit each), channels (64 bit, two bits
 each), status (32 bit, not used), number of frames and bytes of a frame (16 bit each), counter of the first frame
 (32 bit), values (32 bit each).
 
-The manual names the preamble ``MEAS`` and the number of frames ahead of the bytes of a frame. Three independent
-drivers find the preamble as a little-endian word, ``SAEM``, and two find the bytes of a frame first. Both are read:
+In the manual, the preamble is ``MEAS`` and the number of frames precedes the bytes of a frame. Three independent
+drivers read the preamble as a little-endian word, ``SAEM``, and two read the bytes of a frame first. Both are accepted:
 the bytes of a frame follow from the channels.
 """
 
@@ -26,10 +26,10 @@ from errormotion.instruments.point_lds.counted import GARBLED, LOST, CountedRead
 HEADER = struct.Struct("<4sIIQIHHI")
 CHANNELS = 32
 LONGEST_GAP = 100_000
-"""Readings: a larger jump of the counter is none that was lost, but another sequence."""
+"""Largest number of readings that can be lost at once; a larger jump of the counter is an error."""
 
 FULL_SCALE = 0xFFFFFF
-"""Value at the end of the measuring range; it is 0 at its start (6200 p. 56)."""
+"""Value at the end of the measuring range; at its start it is 0 (6200 p. 56)."""
 
 VALID, UNDER, OVER, UNKNOWN = range(4)
 REASONS = ("", "under range", "over range", "unknown code", GARBLED, LOST)
@@ -37,9 +37,9 @@ REASONS = ("", "under range", "over range", "unknown code", GARBLED, LOST)
 
 Array = np.ndarray[Any, Any]
 
-_LOW_BITS = int("01" * CHANNELS, 2)  # of the two bits of each channel
+_LOW_BITS = int("01" * CHANNELS, 2)  # the lower of the two bits of each channel
 _SIZE = b"[%s]\\x00" % re.escape(bytes(range(BYTES_OF_VALUE, BYTES_OF_VALUE * CHANNELS + 1, BYTES_OF_VALUE)))
-_POSSIBLE = b".{20}(?:%s..|..%s).{4}" % (_SIZE, _SIZE)  # one of the two numbers is that of the bytes of a frame
+_POSSIBLE = b".{20}(?:%s..|..%s).{4}" % (_SIZE, _SIZE)  # one of the two numbers is the size of a frame
 
 
 def block_decoder() -> BlockDecoder:
@@ -67,7 +67,7 @@ def _channels(present: int) -> tuple[int, ...]:
 def scale(raws: Array, low: float, span: float) -> tuple[Array, Array]:
     """Return readings, m, and the code of each.
 
-    A value at either end of the 24 bits is one that was cut off there: beyond the range (assumption).
+    A value at either end of the 24 bits is clipped: the surface is beyond the range (assumption).
     """
     codes = np.full(raws.shape, VALID, dtype=np.int8)
     codes[raws <= 0] = UNDER
@@ -92,7 +92,7 @@ def column(block: Block, channel: int) -> Array:
 
 
 def readings_of(number: int, channel: Channel) -> CountedReadings:
-    """Return what collects the readings of a channel with this number and range."""
+    """Return an empty collection of readings of a channel with this number and range."""
     return CountedReadings(
         REASONS,
         lambda raws: scale(raws, channel.offset, channel.measuring_range),

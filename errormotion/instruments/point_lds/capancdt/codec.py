@@ -34,9 +34,9 @@ ON_REQUEST = 1
 """Trigger modes of TRG: all samples, or one for each edge of the trigger input and each GMD (6500 p. 37)."""
 
 AVERAGINGS = {"none": 0, "moving": 1, "arithmetic": 2, "median": 3, "dynamic noise rejection": 4}
-"""Parameters of AVT (6500 p. 37). The arithmetic average gives only every nth value."""
+"""Parameters of AVT (6500 p. 37). The arithmetic average returns only every nth value."""
 NUMBERS = (2, 8)
-"""Least and largest parameter of AVN (6228 p. 55)."""
+"""Smallest and largest parameter of AVN (6228 p. 55)."""
 RATES = (2.5, 3906.25)
 """Lowest and highest data rate, Hz (6200 p. 56)."""
 
@@ -44,7 +44,7 @@ ABSENT, PRESENT, MATHS = 0, 1, 2
 """States of a channel in the answer to CHS (6200 p. 63)."""
 
 ERRORS = ("$UNKNOWN COMMAND", "$WRONG PARAMETER", "$WRONG PASSWORD", "$TIMEOUT")
-"""Refusals. The first two are those that an independent driver of the DT6220 reads; the others are assumptions."""
+"""Refusals. An independent driver of the DT6220 reads the first two; the others are assumptions."""
 
 UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
 """Units of a measuring range, m; the maker's example is ``µm`` (6500 p. 44)."""
@@ -59,12 +59,12 @@ def encode(command: str) -> bytes:
 
 
 def echoes(command: str, line: bytes) -> bool:
-    """Whether a line answers a command: it has its echo. Others are a welcome, or late answers to other commands."""
+    """Whether a line answers a command, by its echo; others are a greeting, or late answers to other commands."""
     return f"${command}" in decode_text(line)
 
 
 def answer_to(command: str, line: bytes) -> str:
-    """Return what a line answers to a command, without the echo and the ``OK``.
+    """Return the answer to a command from a line, without the echo and the ``OK``.
 
     Raises
     ------
@@ -131,9 +131,9 @@ class Channel:
     Attributes
     ----------
     name, serial_number : str
-        Of its demodulator.
+        Of the demodulator.
     offset, measuring_range : float
-        Reading of the lowest value, and distance from there to the highest one, m.
+        Reading of the lowest value, and difference between highest and lowest reading, m.
     """
 
     name: str
@@ -143,12 +143,12 @@ class Channel:
 
 
 def channel_request(channel: int) -> str:
-    """Return the command that requests what a channel is."""
+    """Return the command that requests the description of a channel."""
     return f"CHI{channel}"
 
 
 def parse_channel(channel: int, text: str) -> Channel:
-    """Return what a channel is, from the answer to CHI (6500 p. 44).
+    """Return the description of a channel, from the answer to CHI (6500 p. 44).
 
     Raises
     ------
@@ -167,7 +167,9 @@ def parse_channel(channel: int, text: str) -> Channel:
         )
     low, span = (_number(command, fields.get(name, "0")) * unit for name in ("OFS", "RNG"))
     if span <= 0:
-        raise ProtocolError(f"Channel {channel} states a measuring range of {fields['RNG']}; is a sensor assigned?")
+        raise ProtocolError(
+            f"Channel {channel} states a measuring range of {fields['RNG']}; check that a sensor is assigned"
+        )
     return Channel(fields.get("NAM", ""), fields.get("SNO", ""), low, span)
 
 

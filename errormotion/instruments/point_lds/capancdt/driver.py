@@ -15,15 +15,15 @@ from errormotion.instruments.point_lds.counting import CountingDriver, check_ran
 from errormotion.plugins import Identity, InstrumentInfo
 
 MAX_OTHER_LINES = 16
-PAUSE_OF_REQUEST = 0.3
-"""Time after which a reading is requested again on a data line that was just opened, s."""
+REQUEST_INTERVAL = 0.3
+"""Time after which a reading is requested again if the data line was just opened, s."""
 
 
 class CapaNCDT(CountingDriver):
     """A capacitive displacement sensor at a channel of a Micro-Epsilon capaNCDT 6200 (DT6220, DT6230).
 
-    Readings are the distance in m that the controller reports, larger for a more distant surface; NaN where the
-    sensor has none.
+    Readings are the distance in m that the controller reports, larger for a more distant surface; NaN if the sensor has
+    none.
 
     Opening sets the trigger mode of the controller to single readings; closing restores it.
 
@@ -38,7 +38,7 @@ class CapaNCDT(CountingDriver):
     Attributes
     ----------
     no_value : str
-        Reason of the last reading where it is NaN, one of `blocks.REASONS`; else empty.
+        Why the last reading is NaN, one of `blocks.REASONS`; empty if it is valid.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -52,7 +52,7 @@ class CapaNCDT(CountingDriver):
     settings: CapaSettings
     data_port: ClassVar[int] = codec.DATA_PORT
     _channel: codec.Channel | None = None
-    _trigger: int | None = None  # of the controller, before it was opened
+    _trigger: int | None = None  # mode of the controller before ``open``
 
     @property
     def measuring_range(self) -> tuple[float, float]:
@@ -61,7 +61,7 @@ class CapaNCDT(CountingDriver):
         return channel.offset, channel.offset + channel.measuring_range
 
     def identify(self) -> Identity:
-        """Return what the controller and the demodulator of the channel report."""
+        """Return the identity that the controller reports, and the demodulator of the channel."""
         channel = self._ready()
         details: dict[str, Any] = {"address": self.address, "channel": self.settings.channel}
         try:
@@ -71,7 +71,7 @@ class CapaNCDT(CountingDriver):
             raise
         except InstrumentTimeoutError:
             raise
-        except InstrumentError:  # older controllers report a version only
+        except InstrumentError:  # older controllers only report a version
             name, version, *_ = [*self._query(codec.VERSION).split(";"), ""]
             number = ""
         details["demodulator"] = f"{channel.name} {channel.serial_number}".strip()
@@ -86,21 +86,21 @@ class CapaNCDT(CountingDriver):
         )
 
     def configure(self, settings: CapaSettings) -> None:
-        """Compare the settings with the controller and send those that are given; they hold for all its channels.
+        """Compare the settings with the controller and send those that are given, for all its channels.
 
         Raises
         ------
         InstrumentError
-            No sensor at the channel, another measuring range, a mathematical function at the channel; or it refuses.
+            The channel has no sensor, another measuring range or a mathematical function; or the controller refuses.
         """
         self._refuse_while_streaming()
         number = settings.channel
         states = codec.parse_channels(self._query(codec.CHANNELS))
         state = states[number - 1] if number <= len(states) else codec.ABSENT
         if state != codec.PRESENT:
-            what = "gives a mathematical function" if state == codec.MATHS else "is not there"
+            found = "a mathematical function" if state == codec.MATHS else "none"
             raise InstrumentError(
-                f"{self.address}: expected a sensor at channel {number}; it {what}. "
+                f"{self.address}: expected a sensor at channel {number}; found {found}. "
                 f"States of the channels: {', '.join(map(str, states))}"
             )
         channel = codec.parse_channel(number, self._query(codec.channel_request(number)))
@@ -112,7 +112,7 @@ class CapaNCDT(CountingDriver):
         self._rate = 1 / (time_of_sample * average)
 
     def read(self) -> float:
-        """Return one reading now, m; NaN where the sensor has none, with the reason in ``no_value``.
+        """Return the present reading, m; NaN if the sensor has none, with the reason in ``no_value``.
 
         Raises
         ------
@@ -125,7 +125,9 @@ class CapaNCDT(CountingDriver):
         self._refuse_while_streaming()
         block = self._requested_block()
         if not block.intact:
-            raise ProtocolError(f"{self.address}: the block of a reading broke off, or stray bytes follow; read again")
+            raise ProtocolError(
+                f"{self.address}: the block of a reading is incomplete, or stray bytes follow; read again"
+            )
         values, codes = scale(column(block, self.settings.channel)[-1:], channel.offset, channel.measuring_range)
         self.no_value = REASONS[int(codes[0])]
         self._data.report_delivered(1)
@@ -147,27 +149,27 @@ class CapaNCDT(CountingDriver):
         self._query(f"{codec.TRIGGER}{codec.ON_REQUEST}")
 
     def _refresh(self) -> bool:
-        """Make sure that the next values on the data line are new ones; return whether it was opened again."""
+        """Ensure that the next values on the data line are new ones; return whether it was opened again."""
         if not self._stale:
             return False
         self._query(f"{codec.TRIGGER}?")  # earlier requests have been carried out by now
         self._data.reopen()
-        self._query(f"{codec.TRIGGER}?")  # meanwhile the controller accepts the connection
+        self._query(f"{codec.TRIGGER}?")  # by its answer the controller has accepted the connection
         self._stale = False
         return True
 
     def _requested_block(self) -> Block:
         reopened = self._refresh()
-        self._stale = True  # until the value has come
+        self._stale = True  # until the value has arrived
         self._query(codec.ONE_READING)
         if reopened:
-            with suppress(InstrumentTimeoutError):  # the request was ahead of the new connection
-                *_, block = self._next_blocks(min(PAUSE_OF_REQUEST, self.settings.timeout / 2))
+            with suppress(InstrumentTimeoutError):  # the request preceded the new connection
+                *_, block = self._next_blocks(min(REQUEST_INTERVAL, self.settings.timeout / 2))
                 self._stale = False
                 return block
             self._query(codec.ONE_READING)
             *_, block = self._next_blocks(self.settings.timeout)
-            return block  # two may come: the line is opened again for the next one
+            return block  # two may arrive: the line is opened again for the next one
         *_, block = self._next_blocks(self.settings.timeout)
         self._stale = False
         return block
@@ -175,13 +177,13 @@ class CapaNCDT(CountingDriver):
     # ------------------------------------------------------------------ commands
 
     def _ready(self) -> codec.Channel:
-        self.transport  # noqa: B018 - an error before it was opened
+        self.transport  # noqa: B018 - raises before open
         if self._channel is None:
             raise InstrumentError(f"{self.address}: the controller has not been set up")
         return self._channel
 
     def _query(self, command: str) -> str:
-        """Send a command and return its answer; lines that answer another one are skipped."""
+        """Send a command and return its answer; lines that answer other commands are skipped."""
         with self.exchange() as line:
             line.write(codec.encode(command))
             for _ in range(MAX_OTHER_LINES):
@@ -192,10 +194,10 @@ class CapaNCDT(CountingDriver):
                 raise ProtocolError(
                     f"{self.address}: expected an answer to '${command}'; found {MAX_OTHER_LINES} other lines"
                 )
-        return codec.answer_to(command, answer)  # a refusal is an answer as well
+        return codec.answer_to(command, answer)  # a refusal is also an answer
 
     def _average(self, settings: CapaSettings) -> int:
-        """Set the averaging; return of how many samples a reading is made."""
+        """Set the averaging; return the number of samples of a reading."""
         if settings.averaging is not None:
             self._query(f"{codec.AVERAGING}{codec.AVERAGINGS[settings.averaging]}")
         if settings.averaging_number is not None:
@@ -208,8 +210,8 @@ class CapaNCDT(CountingDriver):
 
     def _sample_time(self, settings: CapaSettings) -> float:
         """Set the sample time; return the actual one, s."""
-        asked = "?" if settings.rate is None else f"{round(1e6 / settings.rate)}"
-        request = f"{codec.SAMPLE_TIME}{asked}"
+        parameter = "?" if settings.rate is None else f"{round(1e6 / settings.rate)}"
+        request = f"{codec.SAMPLE_TIME}{parameter}"
         return codec.parse_sample_time(request, self._query(request))
 
     # ------------------------------------------------------------------ opening and closing

@@ -14,9 +14,11 @@ Averaging = Literal["none", "moving", "arithmetic", "median", "dynamic noise rej
 
 
 class CapaSettings(PluginSettings):
-    """Settings of one channel. What is not given stays as it is set in the controller."""
+    """Settings of one channel. Settings without a value are not changed in the controller."""
 
-    channel: int = Field(default=1, description="channel of the controller that the sensor is connected to", ge=1, le=4)
+    channel: int = Field(
+        default=1, description="channel of the controller to which the sensor is connected", ge=1, le=4
+    )
     measuring_range: Length | None = Field(
         default=None,
         description="measuring range of the sensor, compared with the one that the controller reports",
@@ -24,7 +26,7 @@ class CapaSettings(PluginSettings):
     )
     rate: Frequency | None = Field(
         default=None,
-        description="data rate of all channels, written to the controller, which takes the next available one",
+        description="data rate of all channels, written to the controller, which selects the next available one",
         ge=RATES[0],
         le=RATES[1],
     )
@@ -38,7 +40,7 @@ class CapaSettings(PluginSettings):
         le=NUMBERS[1],
     )
     noise: Length = Field(default=0.0, description="standard deviation of a single reading; 0: unknown", ge=0)
-    timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit for an answer", gt=0)
 
     @model_validator(mode="after")
     def _belong_together(self) -> Self:

@@ -1,4 +1,4 @@
-"""Answers of a confocalDT 24x1 beyond the grammar that it shares with the optoNCDT.
+"""Answers of a confocalDT 24x1, apart from the grammar that it shares with the optoNCDT.
 
 Pages: operating instructions confocalDT 24x1 of Micro-Epsilon. Commands, prompt and errors are those of
 `optoncdt.commands` (p. 92).
@@ -14,7 +14,7 @@ from errormotion.instruments.point_lds.optoncdt.commands import parse_info, repo
 
 COMMAND_PORT = 23
 DATA_PORT = 1024
-"""Port of the values; that of a client of the IFC2421, a sister (assumption)."""
+"""Port of the values; the one that a client of the related IFC2421 uses (assumption)."""
 
 INFO, SENSOR = "GETINFO", "SENSORINFO"
 OUTPUT, ADDITIONAL, STATISTICS, REDUCTION = "OUTPUT", "OUTADD_ETH", "OUTSTATISTIC_ETH", "OUTREDUCE"
@@ -24,7 +24,7 @@ MODELS = ("IFC2451", "IFC2461", "IFC2471")
 RATES = (100.0, 70_000.0)
 """Lowest and highest measuring rate of any model, Hz (p. 102)."""
 RATE_STEP = 100.0
-"""Hz: no more than one decimal place of a kHz (p. 102)."""
+"""Hz; a rate in kHz has at most one decimal (p. 102)."""
 
 _NUMBER = re.compile(r"\d{1,6}(?:\.\d{1,6})?")
 
@@ -32,7 +32,7 @@ _NUMBER = re.compile(r"\d{1,6}(?:\.\d{1,6})?")
 def facts_of(lines: Sequence[str]) -> dict[str, str]:
     """Return the facts of an answer to GETINFO or SENSORINFO (p. 95, 97) by their names in lower case.
 
-    A value on the line behind its name, as the manual prints it, is read as well.
+    A value on the line after its name, as the manual prints it, is also read.
     """
     joined: list[str] = []
     for line in lines:
@@ -49,12 +49,12 @@ def model_of(facts: dict[str, str]) -> str:
     Raises
     ------
     InstrumentError
-        It is none whose commands are known.
+        The commands of this model are unknown.
     """
     name = facts.get("name", "")
     if not name.startswith(MODELS):
         raise InstrumentError(
-            f"The controller states the name '{name[:40]}'; expected {', '.join(MODELS)}: the commands of others differ"
+            f"The controller states the name '{name[:40]}'; expected {', '.join(MODELS)}, since others differ"
         )
     return name
 
@@ -65,7 +65,7 @@ def range_of(facts: dict[str, str]) -> float:
     Raises
     ------
     ProtocolError
-        The controller states none, or one that is no length in mm.
+        The controller states no range, or one that is not a length in mm.
     """
     found = reported_range(facts)
     if found is None:
@@ -74,7 +74,7 @@ def range_of(facts: dict[str, str]) -> float:
 
 
 def rate_of(lines: Sequence[str]) -> float:
-    """Return the measuring rate of an answer to MEASRATE, Hz; it is in kHz (p. 102)."""
+    """Return the measuring rate, Hz, from an answer to MEASRATE in kHz (p. 102)."""
     rate = _number(RATE, lines) * 1000.0
     if not 0 < rate <= 10 * RATES[1]:
         raise ProtocolError(f"Expected a measuring rate up to {RATES[1]:g} Hz; found {rate:g} Hz")
@@ -82,7 +82,7 @@ def rate_of(lines: Sequence[str]) -> float:
 
 
 def reduction_of(lines: Sequence[str]) -> int:
-    """Return of how many values one is sent, from an answer to OUTREDUCE (p. 105)."""
+    """Return the reduction n, from an answer to OUTREDUCE: one of n values is sent (p. 105)."""
     return int(_number(REDUCTION, lines))
 
 
@@ -92,7 +92,9 @@ def rate_request(rate: float) -> str:
 
 
 def _number(command: str, lines: Sequence[str]) -> float:
-    words = setting(command, lines).split(" ")[1:] or " ".join(lines).split(" ")[:1]  # with ECHO OFF: without its name
+    words = (
+        setting(command, lines).split(" ")[1:] or " ".join(lines).split(" ")[:1]
+    )  # with ECHO OFF the name is missing
     if not words or not _NUMBER.fullmatch(words[0]):
         raise ProtocolError(f"Expected a number as the answer to '{command}'; found {' '.join(lines)[:80]!r}")
     return float(words[0])

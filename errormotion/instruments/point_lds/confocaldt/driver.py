@@ -22,8 +22,8 @@ ON, OFF = f"{codec.OUTPUT} ETHERNET", f"{codec.OUTPUT} NONE"
 class ConfocalDT(CountingDriver):
     """A confocal chromatic sensor at a Micro-Epsilon confocalDT IFC2451, IFC2461 or IFC2471.
 
-    Readings are the distance from the start of the measuring range in m, larger for a more distant surface; NaN where
-    the sensor has none.
+    Readings are the distance from the start of the measuring range in m, larger for a more distant surface; NaN if the
+    sensor has none.
 
     Opening switches the output of values off and selects one distance for Ethernet; closing restores both.
 
@@ -38,7 +38,7 @@ class ConfocalDT(CountingDriver):
     Attributes
     ----------
     no_value : str
-        Reason of the last reading where it is NaN, one of `blocks.REASONS`; else empty.
+        Why the last reading is NaN, one of `blocks.REASONS`; empty if it is valid.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -63,7 +63,7 @@ class ConfocalDT(CountingDriver):
         return 0.0, self._range
 
     def identify(self) -> Identity:
-        """Return what the controller reports of itself and of its sensor."""
+        """Return the identity that the controller reports, and its sensor."""
         self._commands()
         sensor = f"{self._sensor.get('name', '')} {self._sensor.get('serial', '')}".strip()
         details: dict[str, Any] = {"address": self.address, "sensor": sensor}
@@ -77,12 +77,12 @@ class ConfocalDT(CountingDriver):
         )
 
     def configure(self, settings: ConfocalSettings) -> None:
-        """Compare the settings with the controller and send the rate where it is given.
+        """Compare the settings with the controller and send the rate if it is given.
 
         Raises
         ------
         InstrumentError
-            Another measuring range; a master value is set; the controller refuses.
+            The measuring range differs, a master value is set, or the controller refuses.
         """
         self._refuse_while_streaming()
         dialogue = self._commands()
@@ -92,8 +92,8 @@ class ConfocalDT(CountingDriver):
         master = setting(codec.MASTER, dialogue.command(codec.MASTER))
         if master not in ("", f"{codec.MASTER} NONE"):
             raise InstrumentError(
-                f"{self.address}: a master value is set ('{master}'), so that values do not count from the start of "
-                f"the range. Reset it: {codec.MASTER} NONE, or in the web page"
+                f"{self.address}: a master value is set ('{master}'), so that values are not relative to the start of "
+                f"the range. Reset it: {codec.MASTER} NONE, or on the web page"
             )
         if settings.rate is not None:
             dialogue.command(codec.rate_request(settings.rate))
@@ -101,7 +101,7 @@ class ConfocalDT(CountingDriver):
         self._range, self.settings = found, settings
 
     def read(self) -> float:
-        """Return one reading now, m; NaN where the sensor has none, with the reason in ``no_value``.
+        """Return the present reading, m; NaN if the sensor has none, with the reason in ``no_value``.
 
         Raises
         ------
@@ -114,7 +114,9 @@ class ConfocalDT(CountingDriver):
         self._refuse_while_streaming()
         block = self._one_block()
         if not block.intact:
-            raise ProtocolError(f"{self.address}: the block of a reading broke off, or stray bytes follow; read again")
+            raise ProtocolError(
+                f"{self.address}: the block of a reading is incomplete, or stray bytes follow; read again"
+            )
         values, codes = scale(block.values[:1, 0])
         self.no_value = REASONS[int(codes[0])]
         return float(values[0])
@@ -136,12 +138,12 @@ class ConfocalDT(CountingDriver):
         self._commands().command(OFF)
 
     def _refresh(self) -> bool:
-        """Switch the output off where values may wait, and open the data line again; return whether it was opened."""
+        """Switch the output off and open the data line again if values may wait; return whether it was opened."""
         if not self._stale:
             return False
         self._stop_values()
         self._data.reopen()
-        self._commands().command(codec.OUTPUT)  # meanwhile the controller accepts the connection
+        self._commands().command(codec.OUTPUT)  # by its answer the controller has accepted the connection
         self._stale = False
         return True
 
@@ -156,7 +158,7 @@ class ConfocalDT(CountingDriver):
     # ------------------------------------------------------------------ commands
 
     def _commands(self) -> Dialogue:
-        self.transport  # noqa: B018 - an error before it was opened
+        self.transport  # noqa: B018 - raises before open
         if self._dialogue is None:
             raise InstrumentError(f"{self.address}: the controller has not been set up")
         return self._dialogue

@@ -10,7 +10,7 @@ from errormotion.plugins import PluginSettings
 
 
 class ConfocalSettings(PluginSettings):
-    """Settings of one controller. What is not given stays as it is set in the controller."""
+    """Settings of one controller. Settings without a value are not changed in the controller."""
 
     measuring_range: Length | None = Field(
         default=None,
@@ -19,9 +19,9 @@ class ConfocalSettings(PluginSettings):
     )
     rate: Frequency | None = Field(
         default=None,
-        description="measuring rate, written to the controller in steps of 100 Hz; the model limits it",
+        description="measuring rate, written to the controller in steps of 100 Hz; limited by the model",
         ge=RATES[0],
         le=RATES[1],
     )
     noise: Length = Field(default=0.0, description="standard deviation of a single reading; 0: unknown", ge=0)
-    timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit for an answer", gt=0)

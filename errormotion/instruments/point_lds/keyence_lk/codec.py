@@ -1,12 +1,12 @@
 """Protocol of LK-G and LK-H controllers over RS-232C: lines of ASCII that end with a carriage return.
 
-A request is a command and its identifiers, separated by commas; the answer starts with the request, followed by
-the value: ``MS,01`` is answered by ``MS,01,+01.2345``. A refusal is ``ER,command,code``. One request at a time. A value
-has eight characters: a sign and seven digits with their point, or one of three texts that mean no value. The text
-does not state whether it is in mm or um: that is a setting of the controller, its smallest displayed unit.
+A request is a command and its identifiers, separated by commas; the answer starts with the request, followed by the
+value: ``MS,01`` is answered by ``MS,01,+01.2345``. A refusal is ``ER,command,code``. One request at a time. A value has
+eight characters: a sign and seven digits with a decimal point, or one of three texts that mean no value. The text does
+not state whether it is in mm or um: this depends on a setting of the controller, its smallest displayed unit.
 
-Formats, modes and errors of the LK-G3000 are those of the maker's manual (LK-G-M-NO5-E, pages 5-5 and 5-6), errors of
-the LK-G5000 those that clients of others list. Facts marked (m) are from memory; each is one line to correct.
+Formats, modes and errors of the LK-G3000 are from the maker's manual (LK-G-M-NO5-E, pages 5-5 and 5-6), errors of the
+LK-G5000 from other clients. Facts marked (m) are from memory; each is a single line to correct.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ LINE_END = b"\r"
 MAX_LINE_BYTES = 256
 """Longest line of an answer."""
 BITS_PER_BYTE = 10  # 8N1
-MEASURING, SETTING = "R0", "Q0"  # commands that change the mode, and the modes' names here
+MEASURING, SETTING = "R0", "Q0"  # commands that change the mode; also used as names of the modes
 ERROR = "ER"
 
 WIDTH = 8  # characters of a value
 NO_VALUE, OVER, UNDER = "XXXXXXXX", "+FFFFFFF", "-FFFFFFF"
 
-#: Why a reading has no value. The position in this list is its code; 0 = it has one.
+#: Why a reading has no value. The position in this list is its code; 0: it has a value.
 REASONS: tuple[str, ...] = ("", "no value", "over range", "under range", "garbled")
 ABSENT, ABOVE, BELOW, GARBLED = range(1, 5)
 _TEXTS: Mapping[str, int] = {NO_VALUE: ABSENT, OVER: ABOVE, UNDER: BELOW}
@@ -44,7 +44,7 @@ _MEANINGS = (
     (("88",), "timeout in the controller; retry"),
     (("99",), "another error; see the display of the controller"),
 )
-#: Meanings of errors. The LK-G3000 counts them from 00 (its manual), the LK-G5000 from 50 (clients of others).
+#: Meanings of errors. Codes of the LK-G3000 start at 00 (its manual), of the LK-G5000 at 50 (other clients).
 ERRORS: Mapping[str, str] = {code: meaning for codes, meaning in _MEANINGS for code in codes}
 
 
@@ -66,7 +66,7 @@ class Controller:
         return self.zero_off + self.output.format(output)
 
 
-#: LK-G5000 serves the heads LK-H and LK-G, LK-G3000 the heads LK-G.
+#: The LK-G5000 is for heads LK-H and LK-G, the LK-G3000 for heads LK-G.
 CONTROLLERS: Mapping[str, Controller] = {
     "LK-G5000": Controller("MS,", "{:02d}", 12, "WS,"),  # (m) zero
     "LK-G3000": Controller("M", "{:d}", 2, "W"),  # (m) zero
@@ -88,11 +88,11 @@ class Display:
 
     @property
     def largest(self) -> float:
-        """The largest value that the seven characters hold, m."""
+        """The largest value that the seven characters can represent, m."""
         return (10.0 ** (WIDTH - 2) - 1) * self.step
 
 
-#: By the unit of the last digit. Settings of six and of seven characters look alike in mm and um (m: the numbers).
+#: Displays by the unit of the last digit. The numbers are from memory (m).
 DISPLAYS: Mapping[str, Display] = {
     "0.01 mm": Display(0, 2, 1e-3),
     "0.001 mm": Display(1, 3, 1e-3),
@@ -103,7 +103,7 @@ DISPLAYS: Mapping[str, Display] = {
     "0.001 um": Display(6, 3, 1e-6),  # LK-G5000 only
 }
 
-DISPLAY_SETTING = "OI"  # (m) by its position in the list of settings
+DISPLAY_SETTING = "OI"  # (m) inferred from its position in the list of settings
 OFFSET_SETTING = "OF"
 NO_OFFSET = "+000000"
 
@@ -123,22 +123,22 @@ HEADS: Mapping[str, tuple[float, float]] = {
 }
 
 
-#: What a reading of the controller counts along the beam: the makers' setting is positive on the near side (m).
+#: Sign of a reading by the side on which the controller's readings are positive; default of the maker: near (m).
 SIGNS: Mapping[str, float] = {"near": -1.0, "far": 1.0}
 
 
 def encode(text: str) -> bytes:
-    """Return a request or an answer as bytes, with its end."""
+    """Return a request or an answer as bytes, with its line end."""
     return text.encode("ascii") + LINE_END
 
 
 def decode(line: bytes) -> str:
-    """Return the text of a line without its end.
+    """Return the text of a line without its line end.
 
     Raises
     ------
     ProtocolError
-        Other bytes than printable ASCII.
+        The line contains other bytes than printable ASCII.
     """
     body = line.removesuffix(LINE_END)
     if not all(0x20 <= byte < 0x7F for byte in body):
@@ -154,16 +154,16 @@ def parse_answer(request: str, text: str, header: str | None = None) -> str:
     request : str
         The request.
     text : str
-        The answer without its end.
+        The answer without its line end.
     header : str, optional
         Start of the answer; default: the request.
 
     Raises
     ------
     InstrumentError
-        The controller refuses; the message names the error.
+        The controller refuses; the message states the error.
     ProtocolError
-        Not the answer to that request.
+        The text is not the answer to this request.
     """
     if (code := error_code(request, text)) is not None:
         meaning = ERRORS.get(code, "unknown code")
@@ -177,9 +177,9 @@ def parse_answer(request: str, text: str, header: str | None = None) -> str:
 
 
 def error_code(request: str, text: str) -> str | None:
-    """Return the code of an error that answers a request; None where it is no error, or that of another request.
+    """Return the code of an error that answers a request; None if it is not an error, or answers another request.
 
-    The command that the error repeats is the first word of the request, or the name of the setting behind it.
+    The error repeats the first word of the request, or the name of the setting after it.
     """
     match text.split(","):
         case [word, command, code] if word == ERROR and command and code:
@@ -189,12 +189,12 @@ def error_code(request: str, text: str) -> str | None:
 
 
 def parse_value(text: str, display: Display) -> tuple[float, int]:
-    """Return a value in m, and the position in `REASONS` of why it is NaN.
+    """Return a value in m, and the position in `REASONS` of the reason if it is NaN.
 
     Raises
     ------
     ProtocolError
-        A value with other decimals than the display has: its unit is not known.
+        The value has another number of decimals than the display: its unit is unknown.
     """
     if reason := _TEXTS.get(text, 0):
         return float("nan"), reason
@@ -210,7 +210,7 @@ def parse_value(text: str, display: Display) -> tuple[float, int]:
 
 
 def format_value(value: float, display: Display) -> str:
-    """Return a value (m) as the controller sends it; NaN as no value, too many digits as out of range."""
+    """Return a value (m) as the controller sends it; NaN as no value, a value with too many digits as out of range."""
     if value != value:
         return NO_VALUE
     text = f"{value / display.unit:+z08.{display.decimals}f}"
@@ -220,18 +220,18 @@ def format_value(value: float, display: Display) -> str:
 
 
 def check_rate(rate: float, baudrate: int, controller: Controller) -> None:
-    """Refuse a rate (Hz) at which requests and answers do not fit through the line.
+    """Refuse a rate (Hz) that exceeds the capacity of the line.
 
     Raises
     ------
     InstrumentError
-        With the calculation.
+        The line is too slow; the message has the calculation.
     """
     request = len(encode(controller.measure_request(1)))
     answer = request + 1 + WIDTH
     needed = rate * (request + answer) * BITS_PER_BYTE
     if needed > baudrate:
         raise InstrumentError(
-            f"{rate:g} readings/s do not fit through {baudrate} baud: each takes {request} bytes of request and "
+            f"{rate:g} readings/s exceed {baudrate} baud: each takes {request} bytes of request and "
             f"{answer} of answer, x 10 bits (8N1) = {needed:.0f} bit/s. Lower the rate or raise the baud rate"
         )

@@ -47,7 +47,7 @@ class KeyenceLK(Driver):
     """A Keyence LK-G or LK-H laser displacement sensor over RS-232C.
 
     Readings are in m from the middle of the measuring range along the beam: negative nearer to the head, positive
-    beyond, whatever sign the controller shows; NaN where the sensor has none.
+    farther away, independent of the sign on the controller; NaN if the sensor has none.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class KeyenceLK(Driver):
     Attributes
     ----------
     no_value : str
-        Reason of the last reading where it is NaN, one of `codec.REASONS`; else empty.
+        Why the last reading is NaN, one of `codec.REASONS`; empty if it is valid.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -78,7 +78,7 @@ class KeyenceLK(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines: readings that differ from one another."""
+        """Return the subject of the conformance kit, whose readings differ."""
         readings = ",".join(f"{0.1 * number - 1.5:.1f}" for number in range(30))
         return InstrumentSubject(cls, f"sim://cframe?seed=3&readings={readings}")
 
@@ -94,11 +94,11 @@ class KeyenceLK(Driver):
 
     @property
     def mid_range(self) -> float:
-        """The reading in the middle of the range, m: readings count from there."""
+        """The reading in the middle of the range, m: readings are relative to it."""
         return 0.0
 
     def identify(self) -> Identity:
-        """Check that a controller answers. It reports no identity: model and serial number come from the settings."""
+        """Check that a controller answers. Model and serial number are those of the settings: it reports none."""
         self._enter(MEASURING)
         settings = self.settings
         return Identity(
@@ -110,12 +110,12 @@ class KeyenceLK(Driver):
         )
 
     def configure(self, settings: LKSettings) -> None:
-        """Compare the settings with the line and the controller, or send them, see ``set_up``.
+        """Compare the settings with the line and the controller, or send them; see ``set_up``.
 
         Raises
         ------
         InstrumentError
-            The rate does not fit through the line; the controller has another display unit or an offset, or refuses.
+            The rate exceeds the capacity of the line; the controller has another display unit or an offset, or refuses.
         """
         if self._streaming:
             raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
@@ -136,18 +136,18 @@ class KeyenceLK(Driver):
             self._enter(MEASURING)
         if settings.set_up == "set":
             request = CONTROLLERS[settings.controller].zero_off_request(settings.output)
-            self._query(request, header=request.split(",")[0])  # whether the output follows in the answer is not known
+            self._query(request, header=request.split(",")[0])  # whether the answer contains the output is unknown
         self.settings = settings
 
     def read(self) -> float:
-        """Return one reading now, m; NaN where the sensor has none, with the reason in ``no_value``.
+        """Return the present reading, m; NaN if the sensor has none, with the reason in ``no_value``.
 
         Raises
         ------
         InstrumentTimeoutError
             No answer within the time limit.
         InstrumentError
-            The controller refuses, with its error named; or it shows another unit than the settings state.
+            The controller refuses, and the message states its error; or it uses another unit than the settings state.
         """
         value, reason = self._measure()
         self.no_value = REASONS[reason]
@@ -156,7 +156,8 @@ class KeyenceLK(Driver):
     def stream(self, block: int | None = None) -> Iterator[Samples]:
         """Yield blocks of readings, requested one by one at ``rate``, until the caller stops.
 
-        The clock is this computer's. A simulated sensor is queried as fast as it answers: its clock is a virtual one.
+        The clock is that of this computer. A simulated sensor, whose clock is virtual, is queried as fast as it
+        answers.
 
         Parameters
         ----------
@@ -166,14 +167,14 @@ class KeyenceLK(Driver):
         Yields
         ------
         Samples
-            ``values`` (1, block) in m; ``invalid`` counts the NaN by `codec.REASONS`.
+            ``values`` (1, block) in m; ``invalid`` counts the NaN by reason, see `codec.REASONS`.
 
         Raises
         ------
         InstrumentTimeoutError
             No answer within the time limit.
         InstrumentError
-            The controller refuses; or its answers take longer than ``rate`` allows.
+            The controller refuses; or its answers are too slow for ``rate``.
         """
         size = block or max(1, round(BLOCK_SECONDS * self.rate))
         self._streaming = True
@@ -203,7 +204,7 @@ class KeyenceLK(Driver):
         return SIGNS[settings.positive] * value, reason
 
     def _query(self, request: str, header: str | None = None) -> str:
-        """Send a request and return the part of the answer after its header. Unread bytes are discarded before."""
+        """Discard unread bytes, send a request and return the part of the answer after its header."""
         if self._synchronised:
             discard_input(self.transport)
         else:
@@ -211,7 +212,7 @@ class KeyenceLK(Driver):
         self._synchronised = False
         self.transport.write(encode(request))
         text = decode(self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES))
-        self._synchronised = error_code(request, text) is not None  # a refusal is an answer as well
+        self._synchronised = error_code(request, text) is not None  # a refusal is also an answer
         answer = parse_answer(request, text, header)
         self._synchronised = True
         return answer
@@ -219,15 +220,16 @@ class KeyenceLK(Driver):
     def _enter(self, mode: str) -> None:
         """Set the mode of the controller.
 
-        Late answers and remains of damaged answers are discarded: afterwards the next answer
-        belongs to the next request.
+        Late answers and remains of damaged answers are discarded: the next answer then belongs to the next request.
         """
         self._synchronised = False
         self.transport.write(encode(mode))
         for _ in range(MAX_LATE_LINES):
             line = self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES)
             text = line.removesuffix(LINE_END).decode("ascii", errors="replace")
-            if text.endswith((mode, *(f"{ERROR},{mode},{code}" for code in STATE_ERRORS))):  # it was so already
+            if text.endswith(
+                (mode, *(f"{ERROR},{mode},{code}" for code in STATE_ERRORS))
+            ):  # the controller was already in this mode
                 self._synchronised = True
                 return
             if error_code(mode, text) is not None:

@@ -23,19 +23,19 @@ class LKSettings(PluginSettings):
     head: Head = Field(default="LK-H050", description="sensor head; the controller does not report it")
     serial_number: str = Field(default="", description="serial number of the head; the controller does not report it")
     controller: Literal["LK-G5000", "LK-G3000"] = Field(default="LK-G5000", description="generation of the controller")
-    output: int = Field(default=1, description="output (OUT) of the controller that shows the head", ge=1)
+    output: int = Field(default=1, description="output (OUT) of the controller for the head", ge=1)
     display: Unit = Field(default="0.0001 mm", description="smallest displayed unit of the controller")
     positive: Literal["near", "far"] = Field(
         default="near", description="side of the middle of the range on which the controller's readings are positive"
     )
     set_up: Literal["check", "set", "trust"] = Field(
         default="check",
-        description="check, set, or do not request (trust) the display unit and the offset of the controller",
+        description="check: compare display unit and offset of the controller; set: write them; trust: do neither",
     )
     rate: Frequency = Field(default=100.0, description="readings per second of a stream, requested one by one", gt=0)
     baudrate: int = Field(default=115200, description="baud rate of a serial line", gt=0)
     noise: Length = Field(default=0.1e-6, description="standard deviation of a single reading", ge=0)
-    timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit for an answer", gt=0)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:

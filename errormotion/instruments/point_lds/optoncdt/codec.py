@@ -1,11 +1,11 @@
 """Values of the optoNCDT on RS422: bytes to values and back.
 
-A value has 18 bits and travels as three bytes, tagged in their upper bits: ``L = 00 D5..D0``, ``M = 01 D11..D6``,
-``H = 10 D17..D12`` (1420 p. 84). With more than one value a sample, those behind the first have ``H = 11 D17..D12``.
-Distances use 16 bits, error values lie above. Answers to commands are ASCII text between the values and end with
-``->``; no character of a text has the top bit that every ``H`` has, so the two can always be distinguished.
+A value has 18 bits and is sent as three bytes, tagged in their upper bits: ``L = 00 D5..D0``, ``M = 01 D11..D6``, ``H =
+10 D17..D12`` (1420 p. 84). If a sample has several values, those after the first have ``H = 11 D17..D12``. Distances
+use 16 bits; error values are higher. Answers to commands are ASCII text between the values and end with ``->``. No
+character of a text has the top bit, which every ``H`` has, so that the two can always be distinguished.
 
-The bulk of the work is done by the compiled functions of `kernels`; this module holds the facts and the small cases.
+The compiled functions of `kernels` process streams; this module has the constants and the functions for single values.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from errormotion.errors import InstrumentError, ProtocolError
 SCALE = 1.02 / 65520  # x = (raw * SCALE - OFFSET) * range, from the start of the range: 2300 p. 94, 1420 p. 65
 OFFSET = 0.01
 LOWEST = 643  # first value of the measuring range; the last one depends on the model, see `models`
-MAX_DISTANCE_CODE = 65520  # end of the reserve behind the range: 1420 p. 65; 65519 on the 2300, p. 94
+MAX_DISTANCE_CODE = 65520  # end of the reserve after the range: 1420 p. 65; 65519 on the 2300, p. 94
 COUNTER_BITS = 18  # 2300 p. 86, 1420 p. 66
 BITS_PER_BYTE = 10  # 8N1
 BYTES_PER_VALUE = 3
@@ -33,7 +33,7 @@ ERROR_CODES: Mapping[int, str] = {  # 1420 p. 66
     262082: "laser off",
 }
 
-# Why a sample has no value. The position in this list is the code that the compiled functions use; 0 = it has one.
+# Why a sample has no value. The position in this list is the code in the compiled functions; 0: it has a value.
 REASONS: tuple[str, ...] = (
     "",
     "lost",
@@ -61,7 +61,7 @@ def distance(raw: int, measuring_range: float) -> float:
 
 
 def reason(raw: int, highest: int) -> str:
-    """Return why a raw value is no distance inside the measuring range, which ends at ``highest``; else empty."""
+    """Return why a raw value is not a distance within the measuring range, up to ``highest``; empty if it is."""
     if raw in ERROR_CODES:
         return ERROR_CODES[raw]
     if raw > MAX_DISTANCE_CODE:
@@ -72,14 +72,14 @@ def reason(raw: int, highest: int) -> str:
 
 
 def encode_value(raw: int, *, first: bool = True) -> bytes:
-    """Return the three bytes of an 18-bit value; ``first`` of its sample or behind the first."""
+    """Return the three bytes of an 18-bit value; ``first``: it is the first one of its sample."""
     if not 0 <= raw < 1 << COUNTER_BITS:
         raise ProtocolError(f"A value has 18 bits; found {raw}")
     return bytes((raw & 0x3F, 0x40 | raw >> 6 & 0x3F, (0x80 if first else 0xC0) | raw >> 12))
 
 
 def decode_value(triple: bytes) -> int:
-    """Return the 18-bit value of three bytes; ProtocolError where their tags are wrong."""
+    """Return the 18-bit value of three bytes; ProtocolError if their tags are wrong."""
     if len(triple) != BYTES_PER_VALUE or not _VALUE.fullmatch(triple):
         raise ProtocolError(f"Expected three bytes tagged 00, 01, 1x; found {triple.hex(' ')}")
     low, middle, high = triple
@@ -87,7 +87,7 @@ def decode_value(triple: bytes) -> int:
 
 
 def text_of(data: bytes) -> bytes:
-    """Return what is left of a stretch of bytes without the values in it."""
+    """Return bytes without the values in them."""
     return _VALUE.sub(b"", data)
 
 
@@ -97,18 +97,18 @@ def bytes_per_second(rate: float, *, counter: bool) -> float:
 
 
 def check_line(rate: float, baudrate: int, *, counter: bool) -> None:
-    """Refuse a rate (Hz) whose bytes do not fit through a serial line.
+    """Refuse a rate (Hz) that exceeds the capacity of a serial line.
 
     Raises
     ------
     InstrumentError
-        With the arithmetic.
+        The line is too slow; the message has the calculation.
     """
     needed = bytes_per_second(rate, counter=counter) * BITS_PER_BYTE
     if needed > baudrate:
         values = "2 values (distance and counter)" if counter else "1 value"
         raise InstrumentError(
-            f"{rate / 1000:g} kHz does not fit through {baudrate} baud: {rate:g} samples/s x {values} x 3 bytes "
+            f"{rate / 1000:g} kHz exceeds {baudrate} baud: {rate:g} samples/s x {values} x 3 bytes "
             f"x 10 bits (8N1) = {needed:.0f} bit/s. Lower the rate, raise the baud rate"
-            + (", or do without the counter" if counter else "")
+            + (", or set counter = false" if counter else "")
         )

@@ -1,9 +1,9 @@
 """Commands of the optoNCDT and their answers, as text.
 
 A command is a line of ASCII: its name and parameters, separated by spaces, ended by CR LF (LF is enough). Without
-parameters it asks for the present setting, and the answer can be sent again as a command (2300 p. 122, 1320 p. 82). The
-answer ends with the prompt ``->``. With ECHO ON, as delivered, the sensor repeats the command, with ``ok`` where it was
-executed (2300 p. 129, 1420 p. 98). Before the prompt an error starts with E and its number, a warning with W.
+parameters it requests the present setting, and the answer can be sent as a command (2300 p. 122, 1320 p. 82). The
+answer ends with the prompt ``->``. With ECHO ON, the default, the sensor repeats the command, with ``ok`` if it was
+executed (2300 p. 129, 1420 p. 98). Before the prompt, an error starts with E and its number, a warning with W.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from errormotion.errors import InstrumentError, ProtocolError
 PROMPT = b"->"
 LINE_END = b"\r\n"
 LONGEST_ANSWER = 1 << 15
-"""Bytes of text; HELP and PRINT, the longest, list some hundred lines."""
+"""Bytes of text; the longest answers, HELP and PRINT, have about a hundred lines."""
 MOST_LINES = 2048
 """Lines of an answer."""
 
 DONE = "ok"
-USER_HINT = ". Its user level may be USER, which may only read: log in on its web page, or set STDUSER PROFESSIONAL"
+USER_HINT = ". Its user level may be USER, which can only read: log in on its web page, or set STDUSER PROFESSIONAL"
 _ERROR = re.compile(r"(?:^|\s)(E\d{2,4}\b.*)")
 _RANGE = re.compile(r"\s*(\d{1,6}(?:\.\d{1,9})?)\s*mm\s*", re.IGNORECASE)
 _UNPRINTABLE = bytes(byte for byte in range(256) if byte not in b"\r\n\t" and not 0x20 <= byte < 0x7F)
@@ -42,9 +42,9 @@ def parse_answer(command: str, text: bytes) -> list[str]:
     Raises
     ------
     RefusedCommandError
-        The sensor refused the command; the message has its error text.
+        The sensor refused the command; the message contains its error text.
     ProtocolError
-        The answer is longer than any that the manuals describe.
+        The answer is longer than any answer that the manuals describe.
     """
     if len(text) > LONGEST_ANSWER:
         raise ProtocolError(f"The answer to '{command}' has {len(text)} bytes; expected {LONGEST_ANSWER} at most")
@@ -62,7 +62,7 @@ def parse_answer(command: str, text: bytes) -> list[str]:
 
 
 def _without_echo(command: str, line: str) -> str:
-    """Return a line without the repeated command and its ``ok``; an answer that repeats the name of a query stays."""
+    """Return a line without the repeated command and its ``ok``; unchanged if only the name of a query is repeated."""
     if line in (command, f"{command} {DONE}"):
         return ""
     if " " in command and line.startswith(f"{command} E"):
@@ -71,7 +71,7 @@ def _without_echo(command: str, line: str) -> str:
 
 
 def setting(command: str, answer: Sequence[str]) -> str:
-    """Return the answer to a query as a command that restores it, ``MEASRATE 4``; empty where it is none."""
+    """Return the answer to a query as a command that restores it, ``MEASRATE 4``; empty if it is none."""
     for line in answer:
         start = line.rfind(command)
         if start >= 0 and len(line) > start + len(command) + 1 and line[start + len(command)] == " ":
@@ -86,12 +86,12 @@ def parse_info(lines: Sequence[str]) -> dict[str, str]:
 
 
 def reported_range(facts: Mapping[str, str]) -> float | None:
-    """Return the measuring range that the sensor reports, m; None where it reports none.
+    """Return the measuring range that the sensor reports, m; None if it reports none.
 
     Raises
     ------
     ProtocolError
-        It reports one that is no length in mm.
+        The reported range is not a length in mm.
     """
     stated = facts.get("measuring range")
     if stated is None:
@@ -109,7 +109,7 @@ class Layout:
     Attributes
     ----------
     values : tuple of str
-        Their names.
+        Names of the values.
     """
 
     values: tuple[str, ...]
@@ -131,7 +131,7 @@ def parse_layout(lines: Sequence[str], *, counter: bool) -> Layout:
     Raises
     ------
     InstrumentError
-        The sensor sends other values than the distance, and the counter where it was asked for.
+        The sensor sends other values than the distance, and the counter if it was requested.
     """
     words = [word for line in lines for word in _WORD.findall(line.upper())]
     values = tuple(word for word in words if word not in _NO_VALUES)
@@ -139,6 +139,6 @@ def parse_layout(lines: Sequence[str], *, counter: bool) -> Layout:
     if set(values) != wanted or len(values) != len(wanted):
         raise InstrumentError(
             f"Expected the sensor to send {' and '.join(sorted(wanted, reverse=True))}; GETOUTINFO_RS422 lists "
-            f"'{' '.join(lines)[:200]}'. Switch the other values off in its web page, or restore its presets"
+            f"'{' '.join(lines)[:200]}'. Switch the other values off on its web page, or restore its presets"
         )
     return Layout(values)

@@ -1,4 +1,4 @@
-"""A stream's decoder: keeps what a split left over, follows the counter, fills gaps."""
+"""Decoder of a stream: stores incomplete values, checks the counter, fills gaps."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from errormotion.instruments.point_lds.optoncdt.codec import COUNTER_BITS, encod
 from errormotion.instruments.streaming import Chunk
 
 MAX_GAP_SAMPLES = 1 << (COUNTER_BITS - 1)
-"""Samples: half the counter's circle; more cannot be distinguished from a counter that ran backwards."""
+"""Samples: half the range of the counter; a larger gap cannot be distinguished from a counter that ran backwards."""
 
 
 class StreamDecoder:
-    """Turns the bytes of one stream, however they are split, into samples without gaps.
+    """Converts the bytes of one stream, however they are split, to samples without gaps.
 
     Parameters
     ----------
@@ -25,11 +25,11 @@ class StreamDecoder:
     highest : int
         Last raw value of the measuring range.
     counter : bool
-        Whether each sample brings its counter.
+        Whether each sample contains its counter.
     counter_first : bool
         Whether the counter precedes the distance.
     from_zero : bool
-        Whether the first sample has counter 0; else it is taken as it comes.
+        Whether the first sample has counter 0; otherwise its counter is the reference.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class StreamDecoder:
         self._counter = counter
         self._counter_first = counter_first
         self._rest = b""
-        self._waiting = np.empty(0, dtype=np.uint32)  # values that those behind them have to confirm
+        self._waiting = np.empty(0, dtype=np.uint32)  # values that the following ones have to confirm
         self._after_text = False
         self._next = 0
         self._state = np.zeros(kernels.STATE_SIZE, dtype=np.int64)
@@ -58,7 +58,7 @@ class StreamDecoder:
         Raises
         ------
         ProtocolError
-            The counter leaps by more than half its circle: the sensor has restarted, or the data are no samples.
+            The counter jumps by more than half its range: the sensor has restarted, or the data are not samples.
         """
         buffer = np.frombuffer(self._rest + data, dtype=np.uint8)
         values = np.empty(buffer.size // 3, dtype=np.uint32)
@@ -88,6 +88,6 @@ class StreamDecoder:
         return distances, reasons
 
     def warm_up(self) -> None:
-        """Compile everything now, so that the first samples find it ready."""
+        """Compile all functions now, so that the first samples are not delayed."""
         trial = StreamDecoder(1.0, highest=self._highest, counter=self._counter)
         trial(encode_value(1000) + encode_value(0, first=False))

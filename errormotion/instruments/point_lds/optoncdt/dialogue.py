@@ -1,4 +1,4 @@
-"""Commands and answers over one open connection, in step also after a late answer; settings to be restored."""
+"""Commands and answers over one open connection, synchronised after late answers; settings to be restored."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ QUIET = 0.1
 """Time without data after which no late answer is expected, s."""
 RESYNCHRONISATIONS = 3
 MAX_BUFFERED_BYTES = 1 << 24
-"""Bytes of text and values up to the end of one answer."""
-NOT_RESTORED = ("MASTERMV",)  # its setting would be taken from the present distance
+"""Largest number of bytes of text and values up to the end of one answer."""
+NOT_RESTORED = ("MASTERMV",)  # sending it would apply the present distance
 STREAMING = "OUTPUT RS422"
 MARKER = "ECHO"
-"""Query that is used for nothing else, so that its answer cannot be taken for another one."""
+"""Query that is used for nothing else, so that its answer cannot be mistaken for another one."""
 _MARKER_ANSWER = re.compile(rb"\bECHO (?:ON|OFF)\b")
 
 
@@ -41,14 +41,14 @@ class Dialogue:
     Parameters
     ----------
     exchange : callable
-        Gives the line for one request and its answer: `Driver.exchange`.
+        Context manager that yields the line for one request and its answer: `Driver.exchange`.
     timeout : float
         Time limit of an answer, s.
 
     Attributes
     ----------
     reader : Reader, optional
-        The thread that reads while values arrive; it finds the answers between them.
+        The thread that reads while values arrive; it separates the answers from them.
     lost : InstrumentError, optional
         Why no command can be sent any more.
     """
@@ -58,7 +58,7 @@ class Dialogue:
         self.reader: Reader | None = None
         self.lost: InstrumentError | None = None
         self._exchange = exchange
-        self._unanswered = False  # an answer may still come between the values, or later
+        self._unanswered = False  # an answer may still arrive, between the values or later
         self._before: dict[str, str] = {}
 
     def command(self, text: str) -> list[str]:
@@ -69,7 +69,7 @@ class Dialogue:
         InstrumentError
             The sensor refuses (`RefusedCommandError`), or the connection is lost.
         InstrumentTimeoutError
-            No answer. The next command resynchronises first: a late answer is not taken for another one.
+            No answer. The next command resynchronises first: a late answer is not mistaken for another one.
         """
         if self.lost is not None:
             raise InstrumentError(f"The connection is lost ({self.lost}); close and open it again")
@@ -86,7 +86,7 @@ class Dialogue:
         return parse_answer(text, answer)
 
     def synchronise(self, line: Transport) -> None:
-        """Discard late answers until the one to `MARKER` arrives.
+        """Discard late answers until the answer to `MARKER` arrives.
 
         Raises
         ------
@@ -94,7 +94,7 @@ class Dialogue:
             It does not arrive.
         """
         for _ in range(RESYNCHRONISATIONS):
-            with suppress(ProtocolError):  # the sensor streams: its values are no answers
+            with suppress(ProtocolError):  # the sensor streams: its values are not answers
                 await_quiet(line, QUIET)
             if _MARKER_ANSWER.search(self._answer(line, MARKER)):
                 self._unanswered = False
@@ -102,7 +102,7 @@ class Dialogue:
         raise _no_marker()
 
     def recover(self) -> None:
-        """Use the line again after it was lost; late answers are discarded ahead of the next command."""
+        """Use the line again after it was lost; late answers are discarded before the next command."""
         self.lost, self._unanswered = None, True
 
     def _answer(self, line: Transport, text: str) -> bytes:
@@ -110,7 +110,7 @@ class Dialogue:
         return text_of(line.read_until(PROMPT, limit=MAX_BUFFERED_BYTES, timeout=self.timeout))
 
     def _answer_in_stream(self, reader: Reader, text: str) -> bytes:
-        """Return the answer to a command, with any late one discarded."""
+        """Return the answer to a command; discard late answers."""
         for _ in range(RESYNCHRONISATIONS):
             if not self._unanswered:
                 return reader.query(text.encode("ascii") + LINE_END, self.timeout)
@@ -127,7 +127,7 @@ class Dialogue:
     # ------------------------------------------------------------------ settings
 
     def remember(self, name: str) -> str:
-        """Return a setting as it was when the session started, as a command; empty where the sensor states none."""
+        """Return a setting at the start of the session, as a command; empty if the sensor states none."""
         if name not in self._before:
             try:
                 self._before[name] = setting(name, self.command(name))
@@ -141,7 +141,7 @@ class Dialogue:
         self.command(command)
 
     def restore(self) -> None:
-        """Restore the changed settings, except the output of values on this line, which nobody reads any more."""
+        """Restore the changed settings, except the output of values, which the closed line could not receive."""
         before, self._before = self._before, {}
         for name, command in reversed(before.items()):
             if self.lost is not None or self._unanswered:

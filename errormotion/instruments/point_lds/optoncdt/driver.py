@@ -40,7 +40,7 @@ Array = np.ndarray[Any, Any]
 class OptoNCDT(Driver):
     """A Micro-Epsilon ILD1420 or ILD2300 point laser sensor over RS422 or TCP.
 
-    Distances are in m from the start of the measuring range; NaN where the sensor has none.
+    Distances are in m from the start of the measuring range; NaN if the sensor has none.
 
     Parameters
     ----------
@@ -65,15 +65,15 @@ class OptoNCDT(Driver):
     lost: tuple[int, ...] = (LOST, OVERRUN)
     _reader: Reader | None = None
     _dialogue: Dialogue
-    _range: float | None = None  # as the sensor reports it
+    _range: float | None = None  # as reported by the sensor
     _refused: list[str]
     _layout = Layout(())
     _termination = "TERMOFF"
-    _master = False  # sends pulses
+    _master = False  # whether it sends synchronisation pulses
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         return InstrumentSubject(cls, "sim://cframe?seed=3")
 
     @property
@@ -93,7 +93,7 @@ class OptoNCDT(Driver):
 
     @property
     def encoding(self) -> dict[str, Any]:
-        """Encoding that stores readings without loss: the 16-bit numbers of the wire."""
+        """Encoding that stores readings without loss: the 16-bit numbers that the sensor sends."""
         return {
             "dtype": "uint16",
             "scale_factor": SCALE * self._known_range,
@@ -130,15 +130,15 @@ class OptoNCDT(Driver):
         )
 
     def configure(self, settings: OptoSettings) -> None:
-        """Compare settings with the line and the sensor, and send them.
+        """Compare the settings with the line and the sensor, and send them.
 
-        Nothing is stored in the sensor, and `close` restores what it had.
+        Nothing is stored permanently in the sensor, and `close` restores its settings.
 
         Raises
         ------
         InstrumentError
-            The rate does not fit through the baud rate; another model or range answers; the sensor refuses, or sends
-            other values than the distance and the counter.
+            The rate exceeds the baud rate; model or range differ; the sensor refuses, or sends other values than the
+            distance and the counter.
         """
         settings.line_speed(self.address)
         self._refuse_while_streaming()
@@ -157,25 +157,26 @@ class OptoNCDT(Driver):
         self._layout = parse_layout(self.command("GETOUTINFO_RS422"), counter=settings.counter)
         if model.synchronises:
             self._termination = self._termination_of("SYNC")
-            dialogue.set(f"SYNC NONE {self._termination}")  # no pulses while the sensors of a frame are made ready
+            dialogue.set(f"SYNC NONE {self._termination}")  # no pulses while the sensors of a frame are configured
         self.settings, self._range, dialogue.timeout = settings, measured, settings.timeout
 
     def _termination_of(self, name: str) -> str:
-        """Return the termination of the line that the sensor has for a command; TERMOFF where it states none."""
+        """Return the line termination that the sensor reports for a command; TERMOFF if it reports none."""
         return "TERMON" if "TERMON" in self._open_dialogue.remember(name) else "TERMOFF"
 
     def command(self, text: str) -> list[str]:
         """Send a command and return the lines of the answer; works while data are streaming.
 
-        After a stream whose stop was not confirmed, the connection is opened again first, where there is one, and the
-        sensor is stopped and set up again.
+        If the stop of the last stream was not confirmed, a network connection is first opened again, and the sensor is
+        stopped and set up again.
 
         Raises
         ------
         InstrumentError
             The sensor refuses, or is not open.
         InstrumentTimeoutError
-            It does not answer. The next command resynchronises first: a late answer is not taken for another one.
+            The sensor does not answer. The next command resynchronises first: a late answer is not mistaken for another
+            one.
         """
         if self._open_dialogue.lost is not None and self._reader is None:
             self._recover()
@@ -197,13 +198,13 @@ class OptoNCDT(Driver):
         return self._dialogue
 
     def read(self) -> float:
-        """Return one distance now, m; NaN where the sensor has none."""
+        """Return the present distance, m; NaN if the sensor has none."""
         for samples in self.stream(block=1):
             return float(samples.values[0, 0])
         raise InstrumentError(f"{self.name}: the stream ended before its first sample")
 
     def stream(self, block: int | None = None) -> Iterator[Samples]:
-        """Yield blocks of samples until the caller stops; the end of the loop stops the sensor.
+        """Yield blocks of samples until the caller stops, which stops the sensor.
 
         Parameters
         ----------
@@ -240,8 +241,8 @@ class OptoNCDT(Driver):
         """Start the stream; samples are then read with ``fill``, at most ``block`` at once.
 
         With ``SLAVE`` no data arrive until the master starts, and the counter of the first sample is 0. A master is
-        first a slave without pulses, whose counter is reset, and becomes the master last: so its sample 0 is the one of
-        its first pulse, as on the slaves.
+        first configured as a slave without pulses, its counter is reset, and it becomes the master last, so that its
+        sample 0 belongs to its first pulse, as on the slaves.
         """
         from errormotion.instruments.point_lds.optoncdt.decoder import StreamDecoder
         from errormotion.instruments.streaming import Reader
@@ -288,14 +289,14 @@ class OptoNCDT(Driver):
         return 0.0 if self._reader is None else self._reader.host_time
 
     def drain(self) -> None:
-        """Discard all samples until ``stop``, so that the sensor need not wait."""
+        """Discard all samples until ``stop``, so that the sensor is not blocked."""
         if self._reader is not None:
             self._reader.drain()
 
     def stop(self, timeout: float | None = None) -> None:
         """Stop the stream and its thread; idempotent.
 
-        Where the sensor does not confirm the stop within ``timeout`` s, the next command stops and sets it up again.
+        If the sensor does not confirm the stop within ``timeout`` s, the next command stops it and sets it up again.
         """
         reader, self._reader = self._reader, None
         if reader is None:
@@ -305,7 +306,7 @@ class OptoNCDT(Driver):
         try:
             reader.stop(b"OUTPUT NONE" + LINE_END, self.settings.timeout if timeout is None else timeout)
             if master:
-                self.command(f"SYNC NONE {self._termination}")  # slaves start with the pulses of the next stream only
+                self.command(f"SYNC NONE {self._termination}")  # slaves must start with the pulses of the next stream
         except InstrumentError as error:
             reader.abandon()
             self._dialogue.lost = error
@@ -323,8 +324,8 @@ class OptoNCDT(Driver):
     def _start_session(self) -> None:
         self._range, self._refused, self._master = None, [], False
         self._dialogue = Dialogue(self.exchange, self.settings.timeout)
-        self._dialogue.remember("OUTPUT")  # refused where an earlier user has left half a line
-        self.command("OUTPUT NONE")  # it may have been streaming since it was switched on
+        self._dialogue.remember("OUTPUT")  # refused if an earlier client has left an incomplete line
+        self.command("OUTPUT NONE")  # it may stream since it was switched on
         try:
             self.configure(self.settings)
         except InstrumentError:

@@ -26,7 +26,7 @@ Array = np.ndarray[Any, Any]
 
 MASK = 0x3FFFF
 FOLLOWING = 1 << 18  # the value is not the first of its sample
-SUSPECT = 1 << 19  # bytes were discarded right before it: its first byte may be a stray
+SUSPECT = 1 << 19  # bytes were discarded immediately before it: its first byte may be a stray byte
 GARBLED_RAW = -1
 REASON_OF_CODE = np.array(ERROR_REASONS, dtype=np.uint8)
 
@@ -47,12 +47,12 @@ def split(data: Array, values: Array, text: Array, after_text: bool) -> tuple[in
     text : ndarray, uint8
         Receives all other bytes; room for ``data``.
     after_text : bool
-        Whether the bytes right before ``data`` were discarded.
+        Whether the bytes immediately before ``data`` were discarded.
 
     Returns
     -------
     consumed : int
-        Bytes used; up to two at the end may be the start of a value and have to come again with the next ones.
+        Bytes used; up to two at the end may be the start of a value and have to be passed again with the next ones.
     n_values, n_text : int
     after_text : bool
         For the next call.
@@ -80,14 +80,14 @@ def split(data: Array, values: Array, text: Array, after_text: bool) -> tuple[in
                 break
         text[n_text] = low
         n_text += 1
-        after_text = not prompt  # behind a prompt the values go on cleanly
+        after_text = not prompt  # after a prompt the next byte starts a value
         i += 1
     return i, n_values, n_text, after_text
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def look_ahead(counter: bool, counter_first: bool) -> int:
-    """Return the number of values behind a distance that have to be there before it is believed."""
+    """Return the number of values after a distance that are needed to confirm it."""
     if not counter:
         return 1
     return 2 if counter_first else 0
@@ -97,24 +97,25 @@ def look_ahead(counter: bool, counter_first: bool) -> int:
 def assemble(values: Array, counter: bool, counter_first: bool, state: Array, raws: Array, numbers: Array) -> int:
     """Pair distances with their counters and number the samples; return how many there are.
 
-    A counter that jumps is believed when the next sound sample is further on in the same direction round the 18 bits:
-    then samples were lost. Else the jump came from damaged bytes. Two distances that claim one counter are both
-    garbled, and so is a distance behind a counter that had none. Stray bytes show in the value behind them: a distance
-    that ends its sample is garbled where the next value is suspect or not the first of its sample, and behind a counter
-    also where the value after that is suspect or the first of its sample: a burst of five bytes can pose as one value.
+    A jump of the counter is accepted if the next undamaged sample continues in the same direction modulo 18 bits:
+    samples were lost. Otherwise damaged bytes caused the jump. Two distances with the same counter are both garbled,
+    and so is a distance after a counter without a distance. Stray bytes are detected by the value after them: a
+    distance that ends its sample is garbled if the next value is suspect or not the first of its sample, and, after a
+    counter, also if the value after the next is suspect or the first of its sample: a burst of five bytes can look like
+    one value.
 
     Parameters
     ----------
     values : ndarray, uint32
-        From `split`. Where a distance ends its sample, the last values are only looked at, and have to come again:
-        see `look_ahead`.
+        From `split`. If a distance ends its sample, the last values are not consumed, and have to be passed again: see
+        `look_ahead`.
     counter : bool
         Whether each sample is a distance and a counter, or a distance alone.
     counter_first : bool
         Whether the counter precedes the distance.
     state : ndarray, int64, (STATE_SIZE,)
-        Kept from call to call; NUMBER is the number of the next sample, BASE the counter of sample 0, ANCHORED whether
-        that is known (else the first sample that comes is number 0).
+        State between calls; NUMBER is the number of the next sample, BASE the counter of sample 0, ANCHORED whether
+        BASE is known (if not, the first sample is number 0).
     raws : ndarray, int32
         Receives the raw distances, GARBLED_RAW where damaged; room for ``values`` and one more.
     numbers : ndarray, int64
@@ -169,7 +170,7 @@ def assemble(values: Array, counter: bool, counter_first: bool, state: Array, ra
         ahead = (reading - state[BASE] - state[NUMBER]) & MASK
         garbled = raw == GARBLED_RAW
         if state[HAS_JUMP] and state[JUMP_AHEAD] < ahead:
-            if garbled:  # its counter may be damaged as well: no witness
+            if garbled:  # its counter may also be damaged: no confirmation
                 state[ORPHANS] += 1
                 continue
             state[NUMBER] += state[JUMP_AHEAD]
@@ -195,43 +196,43 @@ def assemble(values: Array, counter: bool, counter_first: bool, state: Array, ra
 def convert(
     raws: Array, numbers: Array, first: int, measuring_range: float, highest: int, distances: Array, reasons: Array
 ) -> None:
-    """Turn numbered raw values into distances on a gapless clock.
+    """Convert numbered raw values to distances, without gaps in the numbers.
 
     Parameters
     ----------
     raws, numbers : ndarray
         From `assemble`.
     first : int
-        Number of the first position of ``distances``.
+        Number of the first sample of ``distances``.
     measuring_range : float
         Unit of the result.
     highest : int
         Last raw value of the measuring range.
     distances : ndarray, float64
-        Receives distances from the start of the range, NaN where there is none.
+        Receives distances from the start of the range, NaN for no distance.
     reasons : ndarray, uint8
-        Receives the position in `codec.REASONS` of why not; 0 where there is a distance.
+        Receives the position in `codec.REASONS` of the reason for NaN; 0 for a distance.
     """
     slope, offset = SCALE * measuring_range, OFFSET * measuring_range
-    place = 0
+    k = 0
     for i in range(raws.size):
         here = numbers[i] - first
-        while place < here:
-            distances[place], reasons[place] = np.nan, LOST
-            place += 1
+        while k < here:
+            distances[k], reasons[k] = np.nan, LOST
+            k += 1
         raw = raws[i]
         if LOWEST <= raw <= highest:
-            distances[place], reasons[place] = raw * slope - offset, 0
+            distances[k], reasons[k] = raw * slope - offset, 0
         else:
-            distances[place] = np.nan
+            distances[k] = np.nan
             if raw < 0:
-                reasons[place] = GARBLED
+                reasons[k] = GARBLED
             elif raw < LOWEST:
-                reasons[place] = BELOW
+                reasons[k] = BELOW
             elif raw <= MAX_DISTANCE_CODE:
-                reasons[place] = ABOVE
+                reasons[k] = ABOVE
             elif FIRST_ERROR_CODE <= raw <= LAST_ERROR_CODE:
-                reasons[place] = REASON_OF_CODE[raw - FIRST_ERROR_CODE]
+                reasons[k] = REASON_OF_CODE[raw - FIRST_ERROR_CODE]
             else:
-                reasons[place] = UNKNOWN
-        place += 1
+                reasons[k] = UNKNOWN
+        k += 1

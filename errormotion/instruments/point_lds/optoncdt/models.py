@@ -1,6 +1,6 @@
 """Facts of the sensor families, with the page of the maker's manual for each.
 
-2300: *optoNCDT 2300 Instruction Manual*; 1420: *optoNCDT 1420 Instruction Manual*. What no page shows is marked (m).
+2300: *optoNCDT 2300 Instruction Manual*; 1420: *optoNCDT 1420 Instruction Manual*. Facts without a page are marked (m).
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ class Model:
     synchronises : bool
         Whether the sensor has the command SYNC.
     cleared : tuple of str
-        Commands that remove what an earlier user has left on and that would change the values or their sequence;
-        ``{termination}`` stands for the termination of the line that the sensor reports for this command.
+        Commands that reset settings of an earlier user which would change the values or their sequence;
+        ``{termination}`` stands for the line termination that the sensor reports for this command.
     optional : tuple of str
-        Commands of the same purpose whose grammar no page at hand shows for this family: a refusal is noted and does
-        not end the session.
+        Commands for the same purpose whose grammar is not documented for this family: a refusal is noted and does not
+        end the session.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Model:
     optional: tuple[str, ...]
 
     def rate_word(self, rate: float) -> str:
-        """Return the parameter of MEASRATE for a rate, Hz; InstrumentError where the family has no such rate."""
+        """Return the parameter of MEASRATE for a rate, Hz; InstrumentError if the family has no such rate."""
         for known, word in self.rates.items():
             if math.isclose(rate, known, rel_tol=1e-6):
                 return word
@@ -61,7 +61,7 @@ MODELS: Mapping[str, Model] = {
         # 8 kHz: newer sensors only (accepted by an ILD1420-50, project dawbarton/helic-daq); older ones refuse it.
         rates={250.0: "0.25", 500.0: "0.5", 1000.0: "1", 2000.0: "2", 4000.0: "4", 8000.0: "8"},
         ranges=(10e-3, 25e-3, 50e-3, 100e-3, 200e-3, 500e-3),  # 1420 p. 65
-        # 1420 p. 84 and 116: 9.6 kBaud to 1 MBaud; the steps between: (m)
+        # 1420 p. 84 and 116: 9.6 kBaud to 1 MBaud; the intermediate steps: (m)
         baudrates=(9600, 19200, 38400, 56000, 115200, 128000, 230400, 256000, 460800, 691200, 921600, 1000000),
         highest=64877,  # 1420 p. 65
         synchronises=False,  # not in the overview of commands, 1420 p. 94 ff.

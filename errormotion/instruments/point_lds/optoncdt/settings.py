@@ -18,13 +18,13 @@ DEFAULT_BAUDRATE = 921600
 
 
 class SensorSettings(PluginSettings):
-    """What the sensors of one frame have in common."""
+    """Settings that the sensors of one frame have in common."""
 
     model: Literal["ILD1420", "ILD2300"] = Field(default="ILD2300", description="sensor family")
-    rate: Frequency = Field(default=20e3, description="measuring rate; one of the model's")
+    rate: Frequency = Field(default=20e3, description="measuring rate; one of those of the model")
     baudrate: int | None = Field(
         default=None,
-        description="of a serial line, also behind a serial server; default: 921600 on a line, none on TCP",
+        description="baud rate of a serial line, also of a serial server; default: 921600 on a line, none on TCP",
     )
     noise: Length = Field(default=0.3e-6, description="standard deviation of a single sample", ge=0)
     timeout: Time = Field(default=1.0, description="time limit without data", gt=0)
@@ -35,7 +35,7 @@ class SensorSettings(PluginSettings):
         return self
 
     def _check_model(self) -> None:
-        """Check rate, range and baud rate against the model; ValueError states what it offers."""
+        """Check rate, range and baud rate against the model; ValueError states the possible values."""
         model = MODELS[self.model]
         try:
             model.rate_word(self.rate)
@@ -53,25 +53,25 @@ class SensorSettings(PluginSettings):
 
     @property
     def stated_range(self) -> float | None:
-        """The measuring range that the settings state, m; None where it is left to the sensor."""
+        """The measuring range that the settings state, m; None if the sensor reports it."""
         return None
 
     @property
     def with_counter(self) -> bool:
-        """Whether each distance comes with the sample counter."""
+        """Whether the sensor sends its counter with each distance."""
         return True
 
     def line_speed(self, address: str) -> int | None:
-        """Return the baud rate at an address, None where there is no serial line.
+        """Return the baud rate at an address, None if there is no serial line.
 
         Raises
         ------
         InstrumentError
-            The rate does not fit through.
+            The rate exceeds the capacity of the line.
         """
-        place = parse_address(address)
-        serial = place.scheme == "serial" or place.params.get("wire") == "pty"
-        speed = int(place.number("baudrate", self.baudrate or (DEFAULT_BAUDRATE if serial else 0)))
+        parsed = parse_address(address)
+        serial = parsed.scheme == "serial" or parsed.params.get("wire") == "pty"
+        speed = int(parsed.number("baudrate", self.baudrate or (DEFAULT_BAUDRATE if serial else 0)))
         if not speed:
             return None
         check_line(self.rate, speed, counter=self.with_counter)
@@ -87,15 +87,17 @@ class SensorSettings(PluginSettings):
 class OptoSettings(SensorSettings):
     """Settings of one sensor."""
 
-    range: Length | None = Field(default=None, description="measuring range; default: as the sensor reports")
-    counter: bool = Field(default=True, description="send the sample counter, which shows lost samples")
+    range: Length | None = Field(default=None, description="measuring range; default: as reported by the sensor")
+    counter: bool = Field(
+        default=True, description="whether the sensor sends its sample counter, which shows lost samples"
+    )
 
     @property
     def stated_range(self) -> float | None:
-        """The measuring range that the settings state, m; None where it is left to the sensor."""
+        """The measuring range that the settings state, m; None if the sensor reports it."""
         return self.range
 
     @property
     def with_counter(self) -> bool:
-        """Whether each distance comes with the sample counter."""
+        """Whether the sensor sends its counter with each distance."""
         return self.counter

@@ -1,1 +1,1 @@
-"""Simulated machines that take offsets, with the part that a machine must have: bound, slew limit, watchdog."""
+"""Simulated machines that accept offsets, with the functions required of a machine: limit, slew limit, watchdog."""

@@ -1,7 +1,7 @@
-"""The machine's part of online compensation: a bound, a slew limit, and a watchdog on the sign of life.
+"""The machine's part of online compensation: a limit, a slew limit, and a watchdog on the heartbeat.
 
-It is what a program in a PLC or a control has to do, and is shared by the simulated machines. Its clock is that of this
-computer unless the address has ``clock=0``; then time passes by `MachinePart.elapse` alone.
+It does what a program in a PLC or a control has to do; the simulated machines share it. Its clock is that of this
+computer, unless the address has ``clock=0``: then only `MachinePart.elapse` advances the time.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ Offset = tuple[float, float, float]
 
 
 class MachinePart:
-    """Takes offsets as a machine should.
+    """Applies offsets as required of a machine.
 
     Parameters
     ----------
     address : Address
-        With the parameters ``watchdog`` (default 3 s), ``slew`` (2e-6 m/s), ``limit`` (50e-6 m) and ``clock`` (1: its
-        time is that of this computer, 0: it stands).
+        With the parameters ``watchdog`` (default 3 s), ``slew`` (2e-6 m/s), ``limit`` (50e-6 m) and ``clock`` (1: the
+        clock of this computer; 0: stopped).
 
     Attributes
     ----------
     limit : float
-        Largest offset of each axis, m; an order beyond it is taken as far as the limit.
+        Largest offset of each axis, m; a larger request is reduced to it.
     slew : float
-        Fastest change of each axis, m/s.
+        Largest rate of change of each axis, m/s.
     watchdog : float
-        Time without a sign of life after which the offset ramps to zero, s.
+        Time without a heartbeat after which the offset ramps to zero, s.
     orders : int
-        Number of orders so far, whatever they said.
+        Number of requests so far, valid or not.
     busy, fault : str
-        Why the offset must not change, and why the machine takes none. With a fault the offset ramps to zero.
+        Why the offset must not change, and why the machine accepts none. With a fault the offset ramps to zero.
     """
 
     def __init__(self, address: Address) -> None:
@@ -55,20 +55,20 @@ class MachinePart:
 
     @property
     def offset(self) -> Offset:
-        """Offset of X, Y, Z in effect now, m."""
+        """Present offset of X, Y, Z, m."""
         with self._lock:
             self._advance(self._now())
             return self._offset
 
     def order(self, offset: Sequence[float], *, alive: bool = True) -> None:
-        """Take an order.
+        """Accept a requested offset.
 
         Parameters
         ----------
         offset : (3,)
-            m; an axis that is not finite keeps the last order.
+            m; an axis that is not finite keeps its last request.
         alive : bool
-            Whether the sign of life has changed.
+            Whether the heartbeat has changed.
         """
         with self._lock:
             now = self._now()
@@ -81,7 +81,7 @@ class MachinePart:
                 self._alive_until = now + self.watchdog
 
     def elapse(self, seconds: float) -> None:
-        """Let time pass on the machine, s, beyond that of the clock."""
+        """Advance the time of the machine, s, in addition to the clock."""
         with self._lock:
             self._elapsed += seconds
             self._advance(self._now())
@@ -90,7 +90,7 @@ class MachinePart:
         return (time.monotonic() * self._rate if self._rate else 0.0) + self._elapsed
 
     def _advance(self, now: float) -> None:
-        """Move towards the target while the sign of life holds, then towards zero."""
+        """Move towards the request while the heartbeat is valid, then towards zero."""
         if self.fault:
             self._alive_until = -math.inf
         if self._at < self._alive_until:

@@ -1,4 +1,4 @@
-"""An OPC UA server, of the package asyncua, whose machine takes offsets from its nodes."""
+"""An OPC UA server (package asyncua) whose machine applies offsets from its nodes."""
 
 from __future__ import annotations
 
@@ -25,16 +25,18 @@ WRITABLE = 3
 """Access level: can be read and written."""
 NAMESPACE = "urn:errormotion:machine"
 INDEX = 2
-"""Of the namespace of the nodes."""
+"""Index of the namespace of the nodes."""
 
 
 class SimulatedNodes:
-    """A machine whose nodes ``Offset.X`` to ``Z`` and ``Heartbeat`` are written.
+    """A machine with the nodes ``Offset.X`` to ``Z`` and ``Heartbeat`` for writing.
 
-    It states the offset in effect in ``Applied.X`` to ``Z``, and ``Stop`` and ``Busy``, in the namespace 2. Offsets are
-    Double in mm, the heartbeat is a UInt32, the states are Boolean. Parameters of the address: those of `MachinePart`.
+    The offset in effect is in ``Applied.X`` to ``Z``; further nodes are ``Stop`` and ``Busy``, all in namespace 2.
+    Offsets are Double in mm, the heartbeat is a UInt32, the states are Boolean. Parameters of the address: those of
+    `MachinePart`.
 
-    Faults beside those of all devices: ``unavailable`` (values have a bad status) and ``refused`` (no write is taken).
+    Faults in addition to those of all devices: ``unavailable`` (values have a bad status) and ``refused`` (writes are
+    refused).
 
     Attributes
     ----------
@@ -74,7 +76,7 @@ class SimulatedNodes:
             self._thread.end(self._stop())
 
     def report_delivered(self, samples: int) -> None:
-        """Take no note: nothing streams."""
+        """Do nothing: there is no stream."""
 
     @property
     def driver_settings(self) -> dict[str, Any]:
@@ -89,11 +91,11 @@ class SimulatedNodes:
         }
 
     def write(self, space: AddressSpace) -> None:
-        """Take the offset that the nodes hold."""
-        held = [self._held(space, f"Offset.{axis}") for axis in AXES]
-        beat = self._held(space, "Heartbeat")
+        """Apply the offset in the nodes."""
+        offset = [self._value(space, f"Offset.{axis}") for axis in AXES]
+        beat = self._value(space, "Heartbeat")
         alive, self._beat = beat != self._beat, beat
-        self.machine.order([value * MM for value in held], alive=alive)
+        self.machine.order([value * MM for value in offset], alive=alive)
 
     # ------------------------------------------------------------------ in the thread of the server
 
@@ -114,7 +116,7 @@ class SimulatedNodes:
         self._server, self._port = server, server.port
 
     def _add(
-        self, space: Space, held: AddressSpace, name: str, value: Any, kind: ua.VariantType, *, writable: bool
+        self, space: Space, addresses: AddressSpace, name: str, value: Any, kind: ua.VariantType, *, writable: bool
     ) -> None:
         node = self._id(name)
         title = ua.QualifiedName(name, ua.UInt16(INDEX))
@@ -122,7 +124,7 @@ class SimulatedNodes:
         space.variable(node, title, number(Ids.ObjectsFolder), data_type, ua.Variant(value, kind))
         if writable:
             for attribute in (AttributeIds.AccessLevel, AttributeIds.UserAccessLevel):
-                held[node].attributes[attribute].value = ua.DataValue(
+                addresses[node].attributes[attribute].value = ua.DataValue(
                     ua.Variant(ua.Byte(WRITABLE), ua.VariantType.Byte)
                 )
 
@@ -139,7 +141,7 @@ class SimulatedNodes:
     def _id(self, name: str) -> ua.NodeId:
         return ua.NodeId(ua.String(name), ua.Int16(INDEX))
 
-    def _held(self, space: AddressSpace, name: str) -> Any:
+    def _value(self, space: AddressSpace, name: str) -> Any:
         value = space.read_attribute_value(self._id(name), AttributeIds.Value).Value
         return value.Value if value is not None else None
 
@@ -150,7 +152,7 @@ class SimulatedNodes:
 
 
 class _Attributes(AttributeService):
-    """Reads and writes attributes; the machine takes what one request has written, as a whole.
+    """Reads and writes attributes; the machine applies the values of one request together.
 
     Parameters
     ----------
@@ -162,12 +164,12 @@ class _Attributes(AttributeService):
         super().__init__(space)
         self._space, self._device = space, device
 
-    async def write(self, params: ua.WriteParameters, user: User = User(role=UserRole.Admin)) -> list[ua.StatusCode]:  # noqa: B008 - as the base has it
+    async def write(self, params: ua.WriteParameters, user: User = User(role=UserRole.Admin)) -> list[ua.StatusCode]:  # noqa: B008 - as in the base class
         """Write attributes; return the status of each."""
-        own = any(each.NodeId.NamespaceIndex == INDEX for each in params.NodesToWrite)  # others: the server itself
-        if own and self._device.fault.kind == "refused":
+        ours = any(each.NodeId.NamespaceIndex == INDEX for each in params.NodesToWrite)  # others: the server itself
+        if ours and self._device.fault.kind == "refused":
             return [ua.StatusCode(ua.UInt32(StatusCodes.BadUserAccessDenied)) for _ in params.NodesToWrite]
         found = await super().write(params, user)
-        if own:
+        if ours:
             self._device.write(self._space)
         return found

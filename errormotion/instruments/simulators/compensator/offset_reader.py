@@ -1,4 +1,4 @@
-"""The reader of an offset file: a program on a control that takes offsets and states the one in effect."""
+"""The reader of an offset file: a program on a control that applies offsets and reports the one in effect."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from errormotion.instruments.simulators.faults import parse_fault
 from errormotion.instruments.transports import Address
 
 INTERVAL = 0.005
-"""Time between two looks at the file, s."""
+"""Interval between two checks of the file, s."""
 
 
 class SimulatedReader:
-    """Looks at an offset file again and again, and writes the offset in effect to another one.
+    """Reads an offset file periodically, and writes the offset in effect to another file.
 
-    Parameters of the address: ``folder`` (default: a new one, which `close` removes), and those of `MachinePart`.
+    Parameters of the address: ``folder`` (default: a new folder, which `close` removes), and those of `MachinePart`.
 
-    Faults: ``garbage`` (its file is damaged), ``missing`` (it writes none).
+    Faults: ``garbage`` (the written file is damaged), ``missing`` (no file is written).
 
     Attributes
     ----------

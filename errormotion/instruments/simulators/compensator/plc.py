@@ -1,4 +1,4 @@
-"""A PLC that takes offsets in holding registers: bound, slew limit and a watchdog on the heartbeat."""
+"""A PLC that accepts offsets in holding registers, with limit, slew limit and a watchdog on the heartbeat."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _SAME = ("type", "word_order")
 
 
 class SimulatedPlc(SimulatedModbusDevice):
-    """A PLC with the program that a machine needs.
+    """A PLC with the program that is required of a machine.
 
-    Registers: offsets, then the heartbeat; offsets in effect, a stop and a busy register, which it writes itself.
+    Registers: offsets, then the heartbeat; then offsets in effect, a stop and a busy register, which the PLC writes.
     Further parameters of the address: ``framing`` (``tcp`` or ``rtu``; default by ``wire``), ``unit`` (1), ``type``,
     ``word_order``, ``scale`` and ``function`` as in the settings of the compensator, ``first`` (0, the first register),
     and those of `MachinePart`.
 
-    Further faults: ``exception`` (a reply that refuses), ``unit`` (the answer of another device), ``short`` (the answer
-    breaks off), ``checksum`` (RTU).
+    Further faults: ``exception`` (an exception reply), ``unit`` (the answer of another device), ``short`` (an
+    incomplete answer), ``checksum`` (RTU).
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class SimulatedPlc(SimulatedModbusDevice):
         self._device = ModbusServer(self._framing, self._unit, 3, {first: last - first}, self._registers, self._written)
 
     def _registers(self) -> dict[int, int] | int:
-        """Return the registers now, or the code of a refusal."""
+        """Return the present registers, or the code of an exception."""
         if self.fault.hits("exception", self._answers):
             return FAILURE
         found, plc = dict(self._words), self._map
@@ -61,7 +61,7 @@ class SimulatedPlc(SimulatedModbusDevice):
         return found
 
     def _written(self, registers: Mapping[int, int]) -> int:
-        """Take registers; return 0, or the code of a refusal. Those that the PLC writes itself are refused."""
+        """Write registers; return 0, or the code of an exception. Registers that the PLC writes are refused."""
         if self.fault.hits("exception", self._answers):
             return FAILURE
         plc, size = self._map, SIZES[self._map.type]
@@ -93,5 +93,5 @@ def _settings(address: Address) -> dict[str, object]:
     try:
         RegisterSettings.model_validate(given)
     except ValidationError as error:
-        raise InstrumentError(f"The registers in '{address.url}' cannot be: {error.errors()[0]['msg']}") from None
+        raise InstrumentError(f"The registers in '{address.url}' are invalid: {error.errors()[0]['msg']}") from None
     return given

@@ -1,13 +1,14 @@
-"""A virtual machine under the real LinuxCNC, which probes the balls of the twin.
+"""A virtual machine under a real LinuxCNC, which probes the balls of the twin.
 
-The device forwards messages between the driver and the bridge. Before each order it sets the positions of the balls in
-HAL, less the error of the tip there, so that the servo thread of the machine trips at the positions of the twin.
-The world's clock advances with the real time of motion, and at once with ``elapse``.
+The device forwards messages between the driver and the bridge. Before each command it sets the positions of the balls
+in HAL, minus the error of the tip there, so that the probe in the servo thread trips at the positions of the twin. The
+world's clock advances with the real time of motion, and at once with ``elapse``.
 
-Parameters of the address besides the common ones: ``ready`` (1; 0 = in e-stop and not homed, as after power-on),
+Parameters of the address in addition to the common ones: ``ready`` (1; 0: in e-stop and not homed, as after power-on),
 ``unit`` (``mm`` or ``inch``, of the INI file), ``route`` (of a compensation: ``external`` or ``feedback``), ``limit``
-and ``slew`` (of a compensation, 50 um and 1 um/s), ``linger`` (10 s; time that LinuxCNC runs on after the last driver
-has closed; it always ends with the process), ``wait`` (90 s; for another simulated LinuxCNC on this computer to end).
+and ``slew`` (of a compensation, 50 um and 1 um/s), ``linger`` (10 s; time for which LinuxCNC continues after the last
+driver has closed; it always ends with the process), ``wait`` (90 s; time limit for the end of another simulated
+LinuxCNC on this computer).
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ from errormotion.instruments.transports import Address, Transport, open_transpor
 
 LINGER = 10.0  # s
 START_TIMEOUT = 90.0  # s
-LEAST_IDLE = 5.0  # s that LinuxCNC waits for its first driver, at least
+MIN_IDLE = 5.0  # s, minimum time for which LinuxCNC waits for its first driver
 OWN = "simulator"
-"""Prefix of the numbers of the simulator's own requests."""
+"""Prefix of the numbers of the simulator's requests."""
 ANSWER_TIMEOUT = 10.0  # s
 CHECK_INTERVAL = 0.1  # s between two checks whether the device is still open
 
@@ -48,7 +49,7 @@ Message = dict[str, Any]
 
 
 class Control:
-    """A running LinuxCNC, the world that it belongs to, and the devices that share it."""
+    """A running LinuxCNC, its world, and the devices that share it."""
 
     def __init__(self, world: VirtualWorld, address: Address) -> None:
         self.world = world
@@ -56,17 +57,15 @@ class Control:
         self.ready = bool(address.number("ready", 1))
         self.users = 0
         self.lock = threading.RLock()
-        self._seen: float | None = None  # time of the bridge up to which the world has followed
+        self._seen: float | None = None  # time of the bridge up to which the world's clock has advanced
         self._moving = False
         self._speed = 0.0
-        self.process = self._started(address)
+        self.process = self._start_process(address)
 
-    def _started(self, address: Address) -> LinuxCNCProcess:
+    def _start_process(self, address: Address) -> LinuxCNCProcess:
         machine, linger = self.world.machine, address.number("linger", LINGER)
         own = "--socket {folder}/bridge.sock --token {folder}/token --announce {folder}/bridge.json"
-        arguments = (
-            f"--compensate --idle {max(linger, LEAST_IDLE):g} --pins {PINS} {own}"  # LinuxCNC reads 255 characters
-        )
+        arguments = f"--compensate --idle {max(linger, MIN_IDLE):g} --pins {PINS} {own}"  # at most 255 characters
         ini = ini_text(
             self.world.name,
             machine.travel,
@@ -84,14 +83,14 @@ class Control:
         return LinuxCNCProcess(files, BRIDGE, wait=address.number("wait", START_TIMEOUT))
 
     def join(self, world: VirtualWorld) -> None:
-        """Register a device, and start again with another world."""
+        """Register a device; use its world if it is another one."""
         with self.lock:
             self.users += 1
             if self.world is not world:
                 self.world, self._seen, self._moving, self._speed = world, None, False, 0.0
 
     def leave(self, linger: float) -> None:
-        """Unregister a device; without ``linger`` LinuxCNC ends with the last one."""
+        """Unregister a device; without ``linger`` LinuxCNC ends with its last device."""
         with self.lock:
             self.users -= 1
             if linger <= 0 and self.users == 0:
@@ -107,7 +106,7 @@ class Control:
                     self.world.elapse(passed)
 
     def turn(self, speed: float) -> None:
-        """Set the speed of the twin's spindle to the commanded one."""
+        """Set the speed of the twin's spindle to the commanded speed."""
         with self.lock:
             if speed != self._speed:
                 self._speed = speed
@@ -118,8 +117,8 @@ class Control:
     def balls_for(self, start: list[float], target: list[float] | None, feed: float | None) -> dict[str, float]:
         """Return the pins with the present positions of the balls.
 
-        On the way from the start to the target the probe trips where the twin states, its scatter and the lobes of its
-        pre-travel included; elsewhere with its mean pre-travel.
+        On the path from the start to the target the probe trips where the twin does, with its scatter and the lobes of
+        its pre-travel; elsewhere with its mean pre-travel.
         """
         world, now = self.world, self.world.time
         machine, balls = world.machine, world.balls
@@ -128,11 +127,11 @@ class Control:
         centres = balls.centre - machine.probe_error(balls.centre, np.full(len(balls), now))
         reach = balls.radius + machine.probe.tip_radius - machine.probe.mean
         if target is not None:
-            contact, way = machine.contact(start, target, now, feed, balls=balls)
-            if contact is not None and way > 0:
-                distance = np.linalg.norm(contact - centres, axis=1)
-                nearest = int(np.argmin(np.abs(distance - reach)))
-                reach[nearest] = distance[nearest]
+            contact, distance = machine.contact(start, target, now, feed, balls=balls)
+            if contact is not None and distance > 0:
+                distances = np.linalg.norm(contact - centres, axis=1)
+                nearest = int(np.argmin(np.abs(distances - reach)))
+                reach[nearest] = distances[nearest]
         pins: dict[str, float] = {}
         for ball, (centre, radius) in enumerate(zip(centres.tolist(), reach.tolist(), strict=True)):
             pins |= pin_values(ball, tuple(centre), radius, inch=self.inch)
@@ -146,13 +145,13 @@ _lock = threading.Lock()
 
 
 def _compensated(address: Address) -> Compensated:
-    usual = Compensated()
-    limit, slew = address.number("limit", 1e6 * usual.limit), address.number("slew", 1e6 * usual.slew)
-    return Compensated(address.params.get("route", usual.route), 1e-6 * limit, 1e-6 * slew)
+    default = Compensated()
+    limit, slew = address.number("limit", 1e6 * default.limit), address.number("slew", 1e6 * default.slew)
+    return Compensated(address.params.get("route", default.route), 1e-6 * limit, 1e-6 * slew)
 
 
 def _control(world: VirtualWorld, address: Address) -> Control:
-    """Return the running LinuxCNC of a world; one that lingers after a world of the same kind is taken over.
+    """Return the running LinuxCNC of a world; reuse one that lingers after a world with the same parameters.
 
     Raises
     ------
@@ -174,7 +173,7 @@ def _end_unused() -> None:
     for key, control in list(_controls.items()):
         if control.users and control.process.running:
             raise InstrumentError(
-                f"A computer can run one LinuxCNC, and it runs for {key[0]} with seed {key[1]}; "
+                f"A computer can only run one LinuxCNC; it runs for {key[0]} with seed {key[1]}: "
                 "close that driver first, or use the same seed and parameters in both addresses"
             )
         control.process.end()
@@ -229,7 +228,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
         self._pump.start()
 
     def close(self) -> None:
-        """Disconnect; LinuxCNC ends a while after the last device. Idempotent."""
+        """Disconnect; LinuxCNC ends ``linger`` s after its last device. Idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -258,24 +257,24 @@ class SimulatedLinuxCNC(SimulatedDevice):
                 request = json.loads(line)
                 number, op = request["id"], request["op"]
             except (ValueError, KeyError, TypeError):
-                self._forward_line(line + b"\n")  # the bridge states what is wrong with it
+                self._forward_line(line + b"\n")  # the bridge answers with the error
                 continue
-            if op == "hello":  # a simulated machine has no secret
+            if op == "hello":  # a simulated machine needs no token
                 request |= self._greeting(request.get("control"), request.get("client"))
             self._requests[number] = op
             if op in ("elapse", "move_to", "probe", "run_program"):
-                self._ask_state(partial(self._prepared, request))
+                self._request_state(partial(self._prepared, request))
             else:
                 self._forward(request)
 
-    def _ask_state(self, then: Callable[[Message], None]) -> None:
+    def _request_state(self, then: Callable[[Message], None]) -> None:
         self._numbers += 1
         number = f"{OWN} {self._numbers}"
         self._then[number] = then
         self._forward({"id": number, "op": "state"})
 
     def _prepared(self, request: Message, state: Message) -> None:
-        """Forward an order for which the state had to be known."""
+        """Forward a command that depends on the state."""
         op, start = request["op"], state["commanded_position"]
         if op == "elapse" and not state["ordered"]:
             self._jump(request)
@@ -296,19 +295,19 @@ class SimulatedLinuxCNC(SimulatedDevice):
         if not self._controls:
             return
         if op == "probe":
-            self.world.tool = "probe"  # it comes by itself when it is needed
+            self.world.tool = "probe"  # mounted automatically for probing
         try:
             target = request.get("target") if op == "probe" else None
             pins = self._control.balls_for(start, target, request.get("feed"))
         except (ValueError, TypeError, ArithmeticError):
-            return  # no position, no feed: the bridge states so
+            return  # no position or no feed: the bridge answers with the error
         self._forward({"id": OWN, "op": "set_pins", "pins": pins})
 
     def _forward(self, request: Message) -> None:
         self._forward_line(json.dumps(request).encode() + b"\n")
 
     def _forward_line(self, line: bytes) -> None:
-        with suppress(InstrumentError):  # the other thread notices, and hangs up
+        with suppress(InstrumentError):  # the other thread detects this and disconnects
             self._bridge.write(line)
 
     def _greeting(self, control: Any, client: Any) -> Message:
@@ -317,7 +316,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
     # ------------------------------------------------------------------ from the bridge
 
     def _make_ready(self) -> None:
-        """Leave e-stop, switch on, home, and have the spindle at rest, before the driver comes."""
+        """Release the e-stop, switch on, home, and stop the spindle, before the driver connects."""
         self._wait_for("reset")
         self._wait_for("enable")
         if not self._wait_for("state")["homed"]:
@@ -331,7 +330,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
             if "beat" not in message:
                 break
         if not message["ok"]:
-            raise InstrumentError(f"The simulated LinuxCNC does not {op}: {message['error']}")
+            raise InstrumentError(f"The simulated LinuxCNC refuses '{op}': {message['error']}")
         return message["result"]
 
     def _carry_back(self) -> None:
@@ -367,7 +366,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
         if self._requests.get(number) == "hello":
             self._controls = bool(result and result["control"])
             self._requests.pop(number)
-            with self._server.lock:  # no answer that faults count
+            with self._server.lock:  # not an answer to which faults apply
                 self._server.send(json.dumps(message).encode() + b"\n")
             return
         if self._own_error:
@@ -389,4 +388,4 @@ class SimulatedLinuxCNC(SimulatedDevice):
         else:
             self.reply(line)
             if self.fault.kind == "disconnect" and self._answers > self.fault.at:
-                self._bridge.close()  # the bridge is to notice, too
+                self._bridge.close()  # so that the bridge also detects the loss

@@ -1,6 +1,6 @@
-"""The files with which LinuxCNC runs a virtual machine without hardware: its INI file and the balls in HAL.
+"""Files with which LinuxCNC runs a virtual machine without hardware: INI file, and the balls in HAL.
 
-The probe is made in the servo thread, behind the joints: for each ball the distance of the measured position from a
+The servo thread simulates the probe, after the joints: for each ball the distance of the measured position from a
 centre (``sum2``, ``hypot``) is compared with a reach (``comp``), and any of them trips the probe (``or2``).
 """
 
@@ -110,7 +110,7 @@ class Compensated:
     route : str
         ``external`` or ``feedback``.
     limit, slew, watchdog : float
-        Largest offset, m, its fastest change, m/s, and the time without a sign of life until it goes to zero, s.
+        Largest offset, m, its largest rate of change, m/s, and the time without a heartbeat until it ramps to zero, s.
     """
 
     route: str = "external"
@@ -131,7 +131,7 @@ def ini_text(
 ) -> str:
     """Return an INI file for axes X, Y, Z with travels in m, a rapid feed in m/s and a top speed in 1/min.
 
-    ``{folder}`` stands for the folder that it will be in.
+    ``{folder}`` stands for the folder of the file.
     """
     unit = 1000.0 / 25.4 if inch else 1000.0
     scale = 1 / 25.4 if inch else 1.0
@@ -170,7 +170,7 @@ def ini_text(
 
 
 def hal_text(balls: int) -> str:
-    """Return a HAL file with a probe that trips on any of so many balls, all of them far away to start with."""
+    """Return a HAL file with a probe that trips on any of a number of balls, all initially far away."""
     names = [f"{PINS}{i}" for i in range(balls)]
     sums = ",".join(f"{name}.{axis}" for name in names for axis in "xyz")
     lines = [
@@ -206,7 +206,7 @@ def hal_text(balls: int) -> str:
 
 
 def pin_values(ball: int, centre: tuple[float, float, float], reach: float, *, inch: bool = False) -> dict[str, float]:
-    """Return the HAL pins of a ball: where the tip is when it is at the centre, and how far off it trips, m."""
+    """Return the HAL pins of a ball: its centre, and the distance from there at which the probe trips, m."""
     unit = 1000.0 / 25.4 if inch else 1000.0
     name = f"{PINS}{ball}"
     offsets = {f"{name}.{axis}.offset": -unit * x for axis, x in zip("xyz", centre, strict=True)}

@@ -1,8 +1,8 @@
-"""The real LinuxCNC, started without hardware and ended with all its processes.
+"""A real LinuxCNC, started without hardware, and ended with all its processes.
 
-A computer can run one LinuxCNC: its realtime memory has a fixed name. A file is therefore locked while a simulated one
-runs (only its processes hold the lock), a second start waits for the end of the first, and another LinuxCNC, which may
-run a machine, is never changed.
+A computer can only run one LinuxCNC: its realtime memory has a fixed name. A file is therefore locked while a simulated
+one runs (only its processes hold the lock), a second start waits for the end of the first, and any other LinuxCNC,
+which may run a machine, is never changed.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ LOCK = Path("/tmp/errormotion-linuxcnc.lock")
 LINUXCNC_LOCK = Path("/tmp/linuxcnc.lock")
 FOLDER = "errormotion-linuxcnc-"
 MARKER_FILE = "processes"
-"""File in its folder that all of its processes, and no others, hold open."""
+"""File in its folder that its processes, and no others, keep open."""
 PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 NML = Path("/usr/share/linuxcnc/linuxcnc.nml")
 PROCESSES = ("milltask", "rtapi_app", "linuxcncsvr")
 MEMORY = ("0x48414c32", "0x90280a48", "0x48484c34", *(f"0x{key:x}" for key in range(1001, 1006)))
-"""Keys of the shared memory that LinuxCNC leaves when it is killed: HAL, RTAPI, and its messages."""
+"""Keys of the shared memory that a killed LinuxCNC leaves: HAL, RTAPI, and its messages."""
 MEMORY_TABLE = Path("/proc/sysvipc/shm")
 START_TIMEOUT = 15.0  # s for LinuxCNC to start
 END_TIMEOUT = 10.0  # s for LinuxCNC to end
 
 
 def why_not() -> str:
-    """Return the reason why LinuxCNC cannot be started; empty where it can."""
+    """Return why LinuxCNC cannot be started; empty if it can."""
     if shutil.which("linuxcnc") is None:
         return f"LinuxCNC is not installed on this computer; on Debian: apt install {PACKAGE}"
     if not NML.exists():
@@ -49,7 +49,7 @@ def why_not() -> str:
 
 
 def installed() -> str:
-    """Return the name and version of the LinuxCNC here; InstrumentError where its Python module does not load."""
+    """Return name and version of the installed LinuxCNC; InstrumentError if its Python module does not load."""
     done = subprocess.run(
         [PYTHON, "-c", "import hal, linuxcnc; print(linuxcnc.version)"], capture_output=True, text=True, check=False
     )
@@ -59,7 +59,7 @@ def installed() -> str:
 
 
 def for_doctor() -> str:
-    """Return the installed LinuxCNC, which only the simulation needs; InstrumentError for a broken installation."""
+    """Return the installed LinuxCNC, which is only needed for simulation; InstrumentError for a broken installation."""
     if shutil.which("linuxcnc") is None:
         return f"not installed; needed for sim://.../linuxcnc only: {why_not()}"
     if reason := why_not():
@@ -72,26 +72,27 @@ DOCTOR = {"LinuxCNC": for_doctor}
 
 
 class LinuxCNCProcess:
-    """A LinuxCNC that runs from the files of a folder.
+    """A LinuxCNC that runs with the files in a folder.
 
     Parameters
     ----------
     files : mapping of str to str
-        Files of the folder: name to text; ``linuxcnc.ini`` among them. ``{folder}`` in them is the folder.
+        Files of the folder, name to text, with ``linuxcnc.ini``. ``{folder}`` in them stands for the folder.
     bridge : Path
-        The display.
+        The bridge, used as the display.
     wait : float
         Longest wait for the end of another simulated LinuxCNC, s.
 
     Attributes
     ----------
     port : int
-        Of the bridge, on 127.0.0.1.
+        Port of the bridge on 127.0.0.1.
 
     Raises
     ------
     InstrumentError
-        Not installed; another one does not end in time; it does not start: with the end of its log.
+        LinuxCNC is not installed, another one does not end in time, or it does not start; the message has the end of
+        its log.
     """
 
     def __init__(self, files: dict[str, str], bridge: Path, *, wait: float = 60.0) -> None:
@@ -101,7 +102,7 @@ class LinuxCNCProcess:
         try:
             _refuse_beside_another()
             _remove_memory()
-            for left in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):  # of one whose process was killed
+            for left in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):  # left by a killed process
                 shutil.rmtree(left, ignore_errors=True)
             self.folder = Path(tempfile.mkdtemp(prefix=FOLDER))
             try:
@@ -111,7 +112,7 @@ class LinuxCNCProcess:
                 shutil.rmtree(self.folder, ignore_errors=True)
                 raise
         finally:
-            os.close(lock)  # its processes hold it now
+            os.close(lock)  # the processes of LinuxCNC now hold it
         atexit.register(self.end)
         try:
             self.socket, self._bridge = self._await()
@@ -122,7 +123,7 @@ class LinuxCNCProcess:
 
     @property
     def running(self) -> bool:
-        """Whether it still runs."""
+        """Whether LinuxCNC is running."""
         return self._child.poll() is None
 
     def end(self) -> None:
@@ -178,7 +179,7 @@ class LinuxCNCProcess:
             if not self.running or time.monotonic() > until:
                 why = "ended at once" if not self.running else f"did not start within {START_TIMEOUT:g} s"
                 log = (self.folder / "log.txt").read_text(errors="replace")
-                raise InstrumentError(f"LinuxCNC {why}; the end of its log:\n{log[-2000:]}")
+                raise InstrumentError(f"LinuxCNC {why}; end of its log:\n{log[-2000:]}")
             time.sleep(0.02)
         announced = json.loads(file.read_text())
         return Path(announced["socket"]), int(announced["pid"])
@@ -188,9 +189,8 @@ class LinuxCNCProcess:
     def _kill_the_rest(self) -> None:
         if self._child.poll() is None or _parts(self.folder):
             user = _user()
-            with suppress(
-                OSError, subprocess.TimeoutExpired
-            ):  # its realtime process belongs to root: it is stopped by a request
+            # the realtime process belongs to root, and is stopped by a request
+            with suppress(OSError, subprocess.TimeoutExpired):
                 subprocess.run(
                     ["rtapi_app", "exit"],
                     env={"HOME": str(self.folder), "PATH": PATH},
@@ -201,7 +201,7 @@ class LinuxCNCProcess:
                     group=user.pw_gid if user else None,
                 )
             _kill(_parts(self.folder))
-            with suppress(InstrumentError):  # where the next one has started already, the memory is its own
+            with suppress(InstrumentError):  # if the next one has already started, the memory belongs to it
                 lock = _lock(0.0)
                 _remove_memory()
                 os.close(lock)
@@ -213,7 +213,7 @@ def _user() -> pwd.struct_passwd | None:
 
 
 def _parts(of: Path | None = None) -> dict[int, str]:
-    """Return the processes of simulated LinuxCNCs, or of that in a folder, by name; they hold a file of it open.
+    """Return the processes of simulated LinuxCNCs, or of the one in a folder, by name, from their open marker files.
 
     Processes of other users are not visible.
     """
@@ -237,9 +237,9 @@ def _kill(processes: dict[int, str]) -> None:
 
 
 def _remove_memory() -> None:
-    """Remove what a LinuxCNC left that was killed; with the lock held, since the keys of a running one are the same.
+    """Remove the memory of a killed LinuxCNC. The lock must be held, since a running one has the same keys.
 
-    Messages found there by the next one would be taken for its own: its parts then wait in vain for each other.
+    The next LinuxCNC would otherwise read the old messages, and its processes would wait for one another.
     """
     left = {int(line.split()[0]) % 2**32 for line in MEMORY_TABLE.read_text().splitlines()[1:]}
     for key in MEMORY:
@@ -248,7 +248,7 @@ def _remove_memory() -> None:
 
 
 def _lock(wait: float) -> int:
-    """Return the locked file; InstrumentError where another simulated LinuxCNC does not end."""
+    """Return the locked file; InstrumentError if another simulated LinuxCNC does not end."""
     until, last_led = time.monotonic() + wait, time.monotonic()
     with suppress(FileExistsError):
         os.close(os.open(LOCK, os.O_CREAT | os.O_EXCL | os.O_RDONLY, 0o644))
@@ -268,7 +268,7 @@ def _lock(wait: float) -> int:
                 continue
             os.close(file)
             raise InstrumentError(
-                "A computer can run one LinuxCNC; another simulated one did not end in time, "
+                "A computer can only run one LinuxCNC; another simulated one did not end in time, "
                 f"in {wait:g} s. Close it, or wait longer with 'wait=' in the address"
             ) from None
 
@@ -280,7 +280,7 @@ def _refuse_beside_another() -> None:
         named = ", ".join(f"{name} ({pid})" for name, pid in sorted(found.items()))
         raise InstrumentError(f"A LinuxCNC that is not simulated runs on this computer: {named}")
     with suppress(OSError):
-        LINUXCNC_LOCK.unlink()  # left by one that was killed
+        LINUXCNC_LOCK.unlink()  # left by a killed LinuxCNC
 
 
 def _processes() -> dict[int, tuple[str, str]]:

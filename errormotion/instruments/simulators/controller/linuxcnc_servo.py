@@ -1,4 +1,4 @@
-"""The machine's part of online compensation in a simulated LinuxCNC: what its servo thread does, read by ``halcmd``."""
+"""The machine's part of online compensation in a simulated LinuxCNC: its servo thread, read by ``halcmd``."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from errormotion.errors import InstrumentError
 
 TIMEOUT = 10.0  # s
 HELD = "errormotion-hold-2.in1"
-"""Pin by which a program holds the offset."""
+"""Pin with which a program holds the offset."""
 
 
 class ServoThreadPart:
-    """The machine's part of a simulated LinuxCNC, as the conformance kit looks at it. Time passes by itself.
+    """The machine's part of a simulated LinuxCNC, for the conformance kit; its clock is real time.
 
     Parameters
     ----------
     unit : float
         Unit of length of LinuxCNC, m.
     slew, watchdog : float
-        m/s, s.
+        Slew limit, m/s, and time limit of the watchdog, s.
     stop : callable
         Stops the machine (e-stop).
 
@@ -39,17 +39,17 @@ class ServoThreadPart:
 
     @property
     def offset(self) -> tuple[float, float, float]:
-        """Offset of X, Y, Z in effect now, m."""
+        """Present offset of X, Y, Z, m."""
         x, y, z = (self._unit * float(self._hal(f"getp errormotion-limit-{axis}.out")) for axis in "xyz")
         return x, y, z
 
     def elapse(self, seconds: float) -> None:
-        """Let real time pass, s."""
+        """Wait in real time, s."""
         time.sleep(seconds)
 
     @property
     def busy(self) -> str:
-        """Why the offset must not change; a text holds it, as a program does."""
+        """Why the offset must not change; setting a text holds it, like a program."""
         return self._busy
 
     @busy.setter
@@ -63,7 +63,7 @@ class ServoThreadPart:
 
     @property
     def fault(self) -> str:
-        """Why the machine takes no offsets; a text stops it, and the next device switches it on again."""
+        """Why the machine accepts no offsets; setting a text stops it, and the next device switches it on again."""
         return self._fault
 
     @fault.setter
@@ -77,5 +77,5 @@ class ServoThreadPart:
             ["halcmd", "-s", "-f"], input="\n".join(lines), capture_output=True, text=True, timeout=TIMEOUT, check=False
         )
         if done.returncode:
-            raise InstrumentError(f"halcmd {lines[0]!r} fails: {done.stderr.strip()[:300]}")
+            raise InstrumentError(f"halcmd {lines[0]!r} failed: {done.stderr.strip()[:300]}")
         return done.stdout

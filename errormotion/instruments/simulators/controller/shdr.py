@@ -1,24 +1,24 @@
 """An SHDR adapter on the virtual machine: lines of text for an MTConnect agent, over TCP.
 
-After a connection it sends commands, the present value of everything, then what changes. A line is
-``time|key|value|key|value...``; conditions, messages, series, data sets and assets have lines of their own. It answers
-``* PING`` with ``* PONG`` and the heartbeat in ms. After a first ``* PING`` it closes a connection that is silent for
-two heartbeats. It ignores every other line.
+After a connection it sends commands, the present value of every key, then changes. A line is
+``time|key|value|key|value...``; conditions, messages, series, data sets and assets have separate lines. It answers ``*
+PING`` with ``* PONG`` and the heartbeat in ms. After a first ``* PING`` it closes a connection that is silent for two
+heartbeats. It ignores all other lines.
 
 Source: the descriptions of the adapter protocol, versions 1.4 and 2.0, of mtconnect/cppagent, and the recorded adapter
 of its demo device OKUMA.
 
-Parameters of the address beside those of every simulated device:
+Parameters of the address in addition to those of every simulated device:
 
-* ``style``, ``offset`` and ``series``: as of the simulated agent; default ``okuma``. Keys are the sources, names or
-  identifiers of its data items. Values have their native units: feeds of ``okuma`` are in mm/min
-* ``heartbeat``: in ms, 10000; 0 = ``* PING`` is ignored, as by adapters without heartbeat
+* ``style``, ``offset`` and ``series``: as for the simulated agent; default ``okuma``. Keys are the sources, names or
+identifiers of its data items. Values have their native units: feeds of ``okuma`` are in mm/min
+* ``heartbeat``: in ms, 10000; 0: ``* PING`` is ignored, as by adapters without heartbeat
 * ``device``: name before every key, ``device:key``
-* ``times``: ``absolute``, or ``none`` (lines begin with the separator)
+* ``times``: ``absolute``, or ``none`` (lines start with the separator)
 * ``assets=1``: a cutting tool in several lines
 
-Beyond the menu of `faults`: ``alarm`` (a fault condition), ``unavailable`` (the machine is off). ``fault_at`` counts
-lines, those of ``late`` too.
+In addition to `faults`: ``alarm`` (a fault condition), ``unavailable`` (the machine is off). ``fault_at`` counts lines,
+also for ``late``.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.loopback.serving import TcpServer
 
 HEARTBEAT = 10000
-"""What is stated in ``* PONG``, ms."""
+"""Heartbeat stated in ``* PONG``, ms."""
 POLL_INTERVAL = 0.02
-"""Time between two looks at the machine, s."""
+"""Interval between two readings of the machine, s."""
 LONGEST_LINE = 1024
-"""Of an agent, bytes."""
+"""Longest line of an agent, bytes."""
 _COMMANDS = ("shdrVersion: 2.0", "adapterVersion: 1.0", "mtconnectVersion: 2.0")
 _NATIVE = {("MILLIMETER/SECOND", "MILLIMETER/MINUTE"): 60.0}
 _ASSET = (
@@ -94,7 +94,7 @@ class SimulatedAdapter:
         self._prefix = f"{address.params['device']}:" if "device" in address.params else ""
         self._assets = bool(address.number("assets", 0))
         self._lines = 0
-        self._pinged: tuple[object, float] = (None, 0.0)  # connection and time of the last one
+        self._pinged: tuple[object, float] = (None, 0.0)  # connection and time of the last ``* PING``
         self._received = b""
         self._late = LateAnswer()
         self._ended = threading.Event()
@@ -118,7 +118,7 @@ class SimulatedAdapter:
         self._thread.start()
 
     def close(self) -> None:
-        """End the adapter; with the last device of its world the world ends."""
+        """End the adapter; the last device of a world also ends the world."""
         self._ended.set()
         self._late.close()
         self._server.close()
@@ -127,47 +127,47 @@ class SimulatedAdapter:
         self.world.detach(self)
 
     def report_delivered(self, samples: int) -> None:
-        """Take no note: an adapter follows the world's clock and never drives it."""
+        """Do nothing: an adapter follows the world's clock and never drives it."""
 
     # ------------------------------------------------------------------ lines
 
     def _run(self) -> None:
-        connection, shown = None, dict[str, Value]()
+        connection, sent = None, dict[str, Value]()
         while not self._ended.wait(POLL_INTERVAL):
             present = self._server.connection
             if present is None:
                 continue
             if present is not connection:
-                connection, shown = present, {}
+                connection, sent = present, {}
                 self._send_all(f"* {command}" for command in (*_COMMANDS, f"device: {self._device}"))
                 self._send_all(self._asset())
             pinged, last = self._pinged
             if pinged is connection and time.monotonic() - last > 2 * self._heartbeat / 1e3:
                 self._server.disconnect()
                 continue
-            self._send_all(self._changes(shown))
+            self._send_all(self._changes(sent))
 
-    def _changes(self, shown: dict[str, Value]) -> Iterator[str]:
-        """Yield the lines of what differs from what was shown, which becomes the present."""
+    def _changes(self, sent: dict[str, Value]) -> Iterator[str]:
+        """Yield lines of values that differ from those sent before, and update these."""
         faulty = self._lines >= self.fault.at
         alarm = "the machine is in alarm" if self.fault.kind == "alarm" and faulty else ""
         values = readings(self.world.commanded(), self._offset, alarm)
         stamp = clock_text(self.world.time) if self._timed else ""
         simple: list[str] = []
-        own_lines: list[str] = []
+        separate: list[str] = []
         for key, item in self._items.items():
             value = reading(values, item.source)
             if self.fault.kind == "unavailable" and faulty:
                 value = UNAVAILABLE
-            if shown.get(key) == value:
+            if sent.get(key) == value:
                 continue
-            shown[key] = value
+            sent[key] = value
             fields = f"{key}|{field_text(value, item)}"
             alone = item.category == "CONDITION" or "representation" in item.attributes or _kind(item) == "MESSAGE"
-            (own_lines if alone else simple).append(fields)
+            (separate if alone else simple).append(fields)
         if simple:
             yield "|".join((stamp, *simple))
-        yield from (f"{stamp}|{fields}" for fields in own_lines)
+        yield from (f"{stamp}|{fields}" for fields in separate)
 
     def _asset(self) -> Iterator[str]:
         if self._assets:
@@ -183,7 +183,7 @@ class SimulatedAdapter:
     def _send(self, line: str) -> None:
         number, fault = self._lines, self.fault
         self._lines += 1
-        if (fault.kind == "silence" and number >= fault.at) or fault.hits("drop", number):
+        if fault.suppresses(number):
             return
         if fault.kind == "disconnect" and number >= fault.at:
             self._server.disconnect()
@@ -191,16 +191,10 @@ class SimulatedAdapter:
         data = line.encode() + b"\n"
         if fault.hits("garbage", number):
             data = stray_bytes(self._rng) + data
-        if fault.kind == "late" and number == fault.at:
-            self._late.hold(self._server, data, self.fault.delay)
-            return
-        with self._server.lock:
-            self._late.release(self._server)
-            for piece in fault.pieces(data):
-                self._server.send(piece)
+        self._late.send(self._server, fault, number, data)
 
     def _on_connection(self) -> None:
-        """Forget an unfinished line of the previous connection."""
+        """Discard an incomplete line of the previous connection."""
         self._received = b""
 
     def _on_data(self, data: bytes) -> None:
@@ -233,7 +227,7 @@ def field_text(value: Value, item: DataItem) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return a value as it is written in a field: with quotes and backslashes where it has a separator."""
+    """Return a value as the text of a field: with quotes and backslashes if it contains a separator."""
     line = " ".join(text.split("\n"))
     if "|" not in line:
         return line

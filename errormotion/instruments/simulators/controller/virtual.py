@@ -17,10 +17,9 @@ MACHINE_FAULTS = ("alarm", "estop", "no_trip", "tripped")
 class SimulatedController(SimulatedDevice):
     """Answers requests in JSON lines.
 
-    Further parameters of the address: ``balls`` (number on the table; 4), and of faults, counted in requests:
-    ``alarm`` and ``estop`` (at request ``fault_at`` the machine goes into alarm, or emergency
-    stop), ``no_trip`` and ``tripped`` (from then on, for ``fault_for`` requests or permanently, the probe never trips,
-    or is stuck).
+    Further parameters of the address: ``balls`` (number on the table; 4). Further faults, counted in requests:
+    ``alarm`` and ``estop`` (at request ``fault_at`` the machine sets an alarm or the emergency stop), ``no_trip`` and
+    ``tripped`` (from then on, for ``fault_for`` requests or permanently, the probe never trips, or is stuck).
     """
 
     faults = ("silence", "split", "garbage", "drop", "disconnect", "late", *MACHINE_FAULTS)
@@ -45,14 +44,13 @@ class SimulatedController(SimulatedDevice):
         return json.dumps(reply).encode() + b"\n"
 
     def _apply_fault(self) -> None:
-        """Apply the fault of the machine that is due at this request."""
+        """Apply a fault of the machine at this request."""
         if self.fault.kind == "alarm" and self._answers == self.fault.at:
             self.world.raise_alarm("servo alarm (simulated)")
         if self.fault.kind == "estop" and self._answers == self.fault.at:
             self.world.press_estop()
         if self.fault.kind in ("no_trip", "tripped"):
-            since = self._answers - self.fault.at
-            broken = since >= 0 and not (self.fault.length and since >= self.fault.length)
+            broken = self.fault.affects(self.fault.kind, self._answers)
             how: Literal["open", "closed"] = "open" if self.fault.kind == "no_trip" else "closed"
             self.world.stuck = how if broken else None
 

@@ -1,7 +1,7 @@
 """A simulated attocube IDS3010: JSON-RPC over TCP, three beams to reflectors at the tool of the virtual machine.
 
-Written from the maker's published clients and from logs of real devices, without the driver: see the page of the
-device for the sources, and for what no source states (codes of errors, what happens to a count while a beam is broken).
+Written from the maker's published clients and from logs of real devices, without the driver: see the page of the device
+for the sources, and for assumptions (codes of errors, the count while a beam is broken).
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from errormotion.instruments.transports import Address
 
 END = b"\r\n"
 LONGEST = 4096
-"""Bytes of a request; more without an end are a parse error."""
+"""Largest request, bytes; a longer one without an end is a parse error."""
 PICOMETRES = 1e12  # per m
 AXES = 3
 SINGLE_MODE = -1
-"""The axis that the environmental unit expects: all of them."""
+"""The axis that the environmental unit expects: all axes."""
 
 IDLE, STARTING, RUNNING = "system idle", "measurement starting", "measurement running"
 ALIGN_STARTING, ALIGNING = "optics alignment starting", "optics alignment running"
@@ -41,11 +41,11 @@ TEXTS = {
     NO_CONTRAST: ("ERROR_CONTRAST", "The contrast is too low to start the measurement"),
     NO_UNIT: ("ERROR_ECU", "The environmental compensation unit is not connected"),
 }
-"""Name and message of each code: inventions, since no public source lists them."""
+"""Name and message of each code: assumptions, since no public source lists them."""
 
 
 class RefusedError(Exception):
-    """A function that the device refuses, with the code of the error."""
+    """The device refuses a function; ``code`` is the number of the error."""
 
     def __init__(self, code: int, *values: Any) -> None:
         super().__init__(code)
@@ -53,7 +53,7 @@ class RefusedError(Exception):
 
 
 class Beam:
-    """One measurement axis: its count, m, and whether its beam has been broken since the last clearing."""
+    """One measurement axis: its count, m, and whether its beam has been broken since it was last cleared."""
 
     def __init__(self, direction: np.ndarray[Any, Any], scene: TrackerScene, scale: float) -> None:
         self.direction, self.scene, self._factor = direction, scene, 1.0 + scale
@@ -62,15 +62,15 @@ class Beam:
         self._seen = 0.0
 
     def path(self, when: float) -> float:
-        """Return how far the reflector is away along the beam, m, as the device measures lengths."""
+        """Return the distance of the reflector along the beam, m, with the scale error of the device."""
         return float(self.scene.places(np.array([when]))[0] @ self.direction) * self._factor
 
     def start(self, when: float, distance: float) -> None:
-        """Start counting, at a distance (m) that the initialisation has found."""
+        """Start counting, at a distance (m) found by the initialisation."""
         self._seen, self.reference, self.count, self.broken = self.path(when), distance, 0.0, False
 
     def follow(self, when: float, broken: bool) -> None:
-        """Count up to a time; nothing is counted while the beam is broken, nor until it is cleared."""
+        """Count up to a time; a broken beam does not count until it is cleared."""
         now = self.path(when)
         self.broken = self.broken or broken
         if not self.broken:
@@ -78,24 +78,23 @@ class Beam:
         self._seen = now
 
     def reset(self) -> None:
-        """Count from here on."""
+        """Set the count to zero."""
         self.reference, self.count = self.reference + self.count, 0.0
 
 
 class SimulatedIds(SimulatedDevice):
-    """An IDS3010 whose three sensor heads look at reflectors on the tool of the virtual machine.
+    """An IDS3010 whose three sensor heads measure reflectors on the tool of the virtual machine.
 
-    Further parameters of the address, for the axes ``n`` 1 to 3: ``beam<n>`` (direction in machine coordinates in
-    which the displacement counts up; default X, Y, Z; plane mirrors, so that only the component along the beam
-    counts), ``lever<n>`` (m, m, m, from the tool to its reflector), ``distance<n>`` (m, to the head, 0.5), ``noise``
-    (m, 2e-10), ``scale`` (relative error of all lengths), ``init`` (s of real time that a start takes, 0.02),
-    ``contrast`` (permille, 840; a measurement does not start below 100), ``running`` (1: it measures already),
-    ``aligning`` (1: its alignment is in progress), ``passes`` (1 or 2), ``ecu`` (1: an environmental unit is
-    connected), ``api`` (1: an old firmware that knows no ``api`` in a request), and ``lever``, ``thermal``,
-    ``repeatability`` and ``air_...`` of `TrackerScene`.
+    Further parameters of the address, for the axes ``n`` 1 to 3: ``beam<n>`` (direction in machine coordinates in which
+    the displacement increases; default X, Y, Z; plane mirrors, so that only the component along the beam counts),
+    ``lever<n>`` (m, m, m, from the tool to its reflector), ``distance<n>`` (m, to the head, 0.5), ``noise`` (m, 2e-10),
+    ``scale`` (relative error of all lengths), ``init`` (real time of a start, s, 0.02), ``contrast`` (permille, 840; a
+    measurement does not start below 100), ``running`` (1: it is already measuring), ``aligning`` (1: its alignment is
+    in progress), ``passes`` (1 or 2), ``ecu`` (1: an environmental unit is connected), ``api`` (1: an old firmware
+    without ``api`` in requests), and ``lever``, ``thermal``, ``repeatability`` and ``air_...`` of `TrackerScene`.
 
-    Faults beyond the menu, from ``fault_at`` on, ``fault_for`` times: ``beam_broken`` (readings of the beams
-    ``broken``, default ``1,2,3``) and ``refuse`` (answers; ``code``, default 8, is the number of the error).
+    Further faults, from ``fault_at`` on, ``fault_for`` times: ``beam_broken`` (readings of the beams ``broken``,
+    default ``1,2,3``) and ``refuse`` (answers; ``code``, default 8, is the number of the error).
     """
 
     faults = ("silence", "split", "garbage", "drop", "disconnect", "late", "beam_broken", "refuse")
@@ -128,20 +127,20 @@ class SimulatedIds(SimulatedDevice):
         default = ",".join("1" if axis == each else "0" for each in range(AXES))
         direction = np.array(numbers(address, f"beam{axis + 1}", default))
         if direction.shape != (3,) or not np.linalg.norm(direction) > 0.0:
-            raise InstrumentError(f"'beam{axis + 1}' has three numbers, a direction")
+            raise InstrumentError(f"'beam{axis + 1}': expected a direction of three numbers")
         lever = address.params.get(f"lever{axis + 1}", address.params.get("lever", "0,0,0"))
-        rng = np.random.default_rng(abs(int(address.number("seed", 0))))  # alike for all: one machine arrives
+        rng = np.random.default_rng(abs(int(address.number("seed", 0))))  # the same for all axes: there is one machine
         scene = TrackerScene(self.world, replace(address, params={**address.params, "lever": lever}), rng)
         return Beam(direction / np.linalg.norm(direction), scene, address.number("scale", 0.0))
 
     # ------------------------------------------------------------------ requests
 
     def connection_opened(self) -> None:
-        """Forget an unfinished request of the previous connection."""
+        """Discard an incomplete request of the previous connection."""
         self._buffer = b""
 
     def _on_data(self, data: bytes) -> None:
-        """Answer a request as soon as its object is complete; what follows in the same segment spoils it."""
+        """Answer a request as soon as its object is complete; further bytes in the same segment make it invalid."""
         self._buffer += data
         text = self._buffer.strip()
         if not text:
@@ -168,11 +167,11 @@ class SimulatedIds(SimulatedDevice):
             return _line({"id": number, "jsonrpc": "2.0", "error": error})
         result = self._result(function, params)
         if old and len(result) == 2 and "Displacement" not in method and "Position" not in method:
-            result = result[1:]  # an old firmware gives the value alone
+            result = result[1:]  # an old firmware returns only the value
         return _line({"jsonrpc": "2.0", "id": number, "result": result})
 
     def _result(self, function: Callable[..., Sequence[Any]], params: Any) -> list[Any]:
-        if self.fault.kind == "refuse" and self._due(self._answers):
+        if self.fault.affects("refuse", self._answers):
             return [self._code]
         try:
             values = function(*params) if isinstance(params, list) else function(**params)
@@ -182,12 +181,8 @@ class SimulatedIds(SimulatedDevice):
         except TypeError:
             return [BAD_VALUE]
 
-    def _due(self, number: int) -> bool:
-        fault = self.fault
-        return number >= fault.at and (fault.length == 0 or number < fault.at + fault.length)
-
     def _function(self, method: str) -> Callable[..., Sequence[Any]] | None:
-        """Return what answers a method, such as ``_system_resetAxes`` for com.attocube.ids.system.resetAxes."""
+        """Return the function for a method, such as ``_system_resetAxes`` for com.attocube.ids.system.resetAxes."""
         for prefix, group in (
             ("com.attocube.ids.displacement.", "_displacement_"),
             ("com.attocube.ids.system.", "_system_"),
@@ -298,7 +293,7 @@ class SimulatedIds(SimulatedDevice):
         return self._beams[int(axis)]
 
     def _broken_now(self) -> set[int]:
-        return self._breaks if self.fault.kind == "beam_broken" and self._due(self._readings) else set()
+        return self._breaks if self.fault.affects("beam_broken", self._readings) else set()
 
     def _counts(self) -> list[int]:
         """Return the displacements, pm."""
@@ -434,11 +429,11 @@ class SimulatedIds(SimulatedDevice):
 
 
 def _object_end(text: bytes) -> int | None:
-    """Return where the first object of a text ends; None while it is open. What is no object ends at once."""
+    """Return the end of the first object of a text; None if it is incomplete; 0 if it is not an object."""
     if not text.startswith(b"{"):
         return 0
     depth, quoted, escaped = 0, False, False
-    for place, byte in enumerate(text):
+    for k, byte in enumerate(text):
         if quoted:
             quoted = escaped or byte != 0x22
             escaped = byte == 0x5C and not escaped
@@ -449,10 +444,10 @@ def _object_end(text: bytes) -> int | None:
         elif byte in b"}]":
             depth -= 1
             if depth == 0:
-                return place + 1
+                return k + 1
     return None
 
 
 def _line(reply: dict[str, Any]) -> bytes:
-    """Return a reply with its end, as compact as the device writes it."""
+    """Return a reply with its line end, in the compact form of the device."""
     return json.dumps(reply, separators=(",", ":"), allow_nan=False).encode() + END

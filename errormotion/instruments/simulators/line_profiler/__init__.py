@@ -1,1 +1,1 @@
-"""Simulated line profilers, and what lies before them."""
+"""Simulated line profilers and their surfaces."""

@@ -1,4 +1,4 @@
-"""The profiler in the gantry's spindle: a profile wherever the encoder of the Y axis triggers one."""
+"""The profiler in the gantry's spindle; profiles are triggered by the encoder of the Y axis."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.instruments.transports import Address
 from errormotion.twin.paths import Path
 
-EMPTY = 128  # profiles at once over nothing
-PACED = 8  # profiles at once at a pace
-REST = 0.1  # s without a profile in which the axis moves on nevertheless; longer, and it rests or goes back
+EMPTY = 128  # profiles in a block without an artefact below
+PACED = 8  # profiles in a block at a pace
+REST = 0.1  # longest time without a profile while the axis moves forward, s; longer: it rests or returns
 DISTURBANCES = ("none", "white", "full")
 _ROUNDING = 1e-6  # counts
 
@@ -25,17 +25,17 @@ Array = np.ndarray[Any, Any]
 
 
 class GantryProfiles:
-    """What the virtual gantry shows its profiler as the Y axis moves in the positive direction.
+    """Profiles of the virtual gantry as the Y axis moves in the positive direction.
 
-    Parameters of the address: ``artefacts`` (positions of the axis over them, m, joined by commas, or ``none``;
-    default: one every 200 mm), ``pocket`` (position of the axis over a circular pocket that the machine has cut, m;
-    default: no pocket), ``disturbances`` (``none``, ``white`` or ``full``), ``encoder_pitch`` (m for one count, 1e-6),
-    ``encoder_step`` (counts from profile to profile, 70), ``encoder_start`` (count at Y = 0).
+    Parameters of the address: ``artefacts`` (positions of the axis over them, m, separated by commas, or ``none``;
+    default: one every 200 mm), ``pocket`` (position of the axis over a circular pocket machined by the gantry, m;
+    default: no pocket), ``disturbances`` (``none``, ``white`` or ``full``), ``encoder_pitch`` (m per count, 1e-6),
+    ``encoder_step`` (counts between profiles, 70), ``encoder_start`` (count at Y = 0).
 
-    A trigger by command takes one profile where the axis is, at the time of the last profile.
+    A trigger by command takes one profile at the present position, with the time of the last profile.
 
-    At a pace the world's time goes on while a program that was started brings no profile, as that of a real machine;
-    who gives up meanwhile and streams again later has missed nothing but the rest.
+    With a pace, the time of the world continues while a started program triggers no profile, as on a real machine. A
+    client that reaches its time limit and streams again later misses no profile, only the time at rest.
 
     Parameters
     ----------
@@ -48,14 +48,14 @@ class GantryProfiles:
     Raises
     ------
     InstrumentError
-        Another machine, a parameter that makes no sense, pieces that overlap.
+        Another machine, an invalid parameter, or overlapping artefacts.
     """
 
     def __init__(self, address: Address, world: VirtualWorld, name: str) -> None:
         from errormotion.twin.sensors.profiler import Profiler
 
         if world.name != "gantry":
-            raise InstrumentError(f"'artefact=twin' in '{address.url}': only on sim://gantry is there a crossbeam")
+            raise InstrumentError(f"'artefact=twin' in '{address.url}': only sim://gantry has a crossbeam")
         self.channel = name
         self._world = world
         self._disturbances = _disturbances(address)
@@ -64,53 +64,53 @@ class GantryProfiles:
         self._step = int(address.number("encoder_step", 70))
         if not self._pitch > 0 or self._step < 1:
             raise InstrumentError(
-                f"'encoder_pitch' and 'encoder_step' in '{address.url}': expected a length in m above 0 and a whole "
-                f"number from 1 on; found {self._pitch:g} and {self._step}"
+                f"'encoder_pitch' and 'encoder_step' in '{address.url}': expected a length in m above 0 and an integer "
+                f"of at least 1; found {self._pitch:g} and {self._step}"
             )
         self._table = _table(address, world)
         self._began = 0.0
         self._times: list[float] = []  # of all profiles of the stream
         self._taken = 0
-        self._rested = 0.0  # time up to which nothing came, at a pace
+        self._rested = 0.0  # time until which there was no profile, at a pace
         self._triggers = threading.Semaphore(0)
-        self._by_command = 0  # profiles that were triggered so
-        trial = Profiler(8, 1e-4, disturbances=self._disturbances)  # compiled ahead of the first reading
+        self._by_command = 0  # number of profiles triggered by command
+        trial = Profiler(8, 1e-4, disturbances=self._disturbances)  # compiles before the first reading
         for target in self._table.targets[:1]:
             self._table.scan(target, trial, np.zeros(2), np.array([[0.0, 0.0, 0.0], [0.0, 1e-4, 0.0]]), (0,))
 
     @property
     def seen(self) -> float:
-        """Time of the last profile that the reader has passed on, s, or up to which none came."""
+        """Time of the last profile that the reader has processed, s, or until which there was none."""
         return max(self._times[self._taken - 1] if self._taken else self._began, self._rested)
 
     def count(self) -> int:
-        """Return what the encoder shows now."""
+        """Return the present count of the encoder."""
         return self._counted(self._world.path.place(self._world.time))
 
-    def _counted(self, place: Array) -> int:
-        return int(np.floor(float(place[1]) / self._pitch + _ROUNDING)) + self._start
+    def _counted(self, position: Array) -> int:
+        return int(np.floor(float(position[1]) / self._pitch + _ROUNDING)) + self._start
 
     def begin(self) -> None:
-        """Follow the axes from now on."""
+        """Start to follow the axes."""
         self._times, self._taken = [], 0
         self._began = self._rested = self._world.time
         self._triggers = threading.Semaphore(0)
         self._world.start_triggered(self)
 
     def report_delivered(self, profiles: int) -> None:
-        """Take note of how many profiles of the stream its reader has had."""
+        """Set the number of profiles of the stream that its reader has processed."""
         self._taken = min(profiles, len(self._times))
 
     def end(self) -> None:
-        """Let the world's clock stop where the reader is."""
+        """Stop the clock of the world at the position of the reader."""
         self._world.end_triggered(self)
 
     def trigger(self) -> None:
-        """Have one profile taken where the axis is."""
+        """Take one profile at the present position."""
         self._triggers.release()
 
     def lines(self, layout: ProfileLayout) -> Iterator[Lines | None]:
-        """Yield the profiles of what the machine runs, and of what it will be commanded to run."""
+        """Yield the profiles of the present path and of all paths that follow."""
         after = self._began
         path = None
         while True:
@@ -135,20 +135,20 @@ class GantryProfiles:
         return self._times[-1] if self._times else self._began
 
     def _commanded(self, layout: ProfileLayout) -> Iterator[Lines]:
-        """Yield a profile for each trigger by command that has come."""
+        """Yield one profile for each pending trigger by command."""
         from errormotion.twin.sensors.profiler import Profiler
 
         while self._triggers.acquire(blocking=False):
             times = np.array([max(self._last, self._rested)])
-            places = self._world.path.place(times)
+            positions = self._world.path.place(times)
             profiler, heights = Profiler(layout.points, layout.x_pitch, disturbances=self._disturbances), None
             self._by_command += 1
-            for _, target in self._table.runs(places[:, 1]):
+            for _, target in self._table.runs(positions[:, 1]):
                 if target is not None:
                     key = (self._world.seed, self._by_command)
-                    heights = self._table.scan(target, profiler, self._world.warm_time(times), places, key)
+                    heights = self._table.scan(target, profiler, self._world.warm_time(times), positions, key)
             self._times += times.tolist()
-            yield Lines(np.array([self._counted(places[0])]), heights, times)
+            yield Lines(np.array([self._counted(positions[0])]), heights, times)
 
     def _along(self, path: Path, layout: ProfileLayout, after: float) -> Iterator[Lines]:
         """Yield the profiles on a path after a time."""
@@ -158,9 +158,9 @@ class GantryProfiles:
         profiler = Profiler(layout.points, layout.x_pitch, disturbances=self._disturbances)
         for piece in path.pieces_forwards(after):
             counts, times = path.crossings(piece, self._pitch, self._start, self._step)
-            places = path.place(times)
-            places[:, 1] = (counts - self._start) * self._pitch
-            for run, target in self._table.runs(places[:, 1]):
+            positions = path.place(times)
+            positions[:, 1] = (counts - self._start) * self._pitch
+            for run, target in self._table.runs(positions[:, 1]):
                 size = EMPTY if target is None else CHUNK
                 for number, low in enumerate(range(run.start, run.stop, size)):
                     part = slice(low, min(low + size, run.stop))
@@ -172,11 +172,11 @@ class GantryProfiles:
                         of_scan = (self._world.seed, round(path.begin * 1e6), piece)
                         key = (*of_scan, round(target.position * 1e9), number)
                         warm = self._world.warm_time(times[part])
-                        heights = self._table.scan(target, profiler, warm, places[part], key)[new]
+                        heights = self._table.scan(target, profiler, warm, positions[part], key)[new]
                     yield Lines(counts[part][new], heights, times[part][new])
 
     def _parts(self, lines: Lines) -> Iterator[Lines]:
-        """Yield profiles in small blocks where there is a pace, else as they are."""
+        """Yield profiles in small blocks at a pace, otherwise unchanged."""
         n = lines.times.size
         size = n if self._world.pace is None else PACED
         for low in range(0, n, size):
@@ -203,7 +203,7 @@ def _table(address: Address, world: VirtualWorld) -> Any:
         given = [] if text is None or text == "none" else [float(y) for y in text.split(",")]
     except ValueError:
         raise InstrumentError(
-            f"'artefacts={text}' in '{address.url}': expected positions in m, joined by commas"
+            f"'artefacts={text}' in '{address.url}': expected positions in m, separated by commas"
         ) from None
     positions = default_positions(crossbeam.travel) if text is None else given
     pocket = address.number("pocket", 0.0) if "pocket" in address.params else None

@@ -1,4 +1,4 @@
-"""An LJ-X8000A on its two lines: answers commands, streams what lies before it.
+"""A simulated LJ-X8000A with two lines: one for commands, one for the stream of profiles.
 
 The commands are in `keyence_ljx_controller`, the layouts in `keyence_ljx_wire`.
 """
@@ -27,27 +27,28 @@ from errormotion.instruments.transports.loopback.stream_serving import NewestCon
 
 __all__ = ["SimulatedLJX", "packed"]
 
-LINES_AT_ONCE = 16  # profiles sent at once when running freely
+LINES_AT_ONCE = 16  # profiles in a block without a pace
 STARTING_TIME = 5.0  # s
 
 
 class SimulatedLJX(SimulatedDevice):
-    """A profiler that looks at a surface.
+    """A profiler that measures a surface.
 
-    Parameters of the address: ``artefact`` (``twin``, what stands on the gantry's table, see `gantry_profiles`;
-    or a name of `profile_sources.SOURCES`, of which profiles are taken at a rate), ``points`` (3200), ``pitch`` (m,
-    12.5e-6), ``intensity`` (0 or 1), ``trigger_start`` (0); where nothing triggers profiles, ``encoder_start`` (0),
-    ``encoder_step`` (counts from profile to profile, 25) and ``rate`` (profiles per second at ``pace=1``, 1000);
-    ``trigger`` (``external``, ``continuous`` or ``encoder``: the trigger mode as delivered; profiles come alike, but
-    only with ``external``, whose pulses come from the gantry's control or a generator, a command triggers one);
-    ``notice_delay`` (s from the last profile of a stream to the notice that ends it, 0); ``batch`` (0 or 1: whether
-    batch measurement is on as delivered) and ``batch_points`` (profiles of a batch as delivered, 1000).
+    Parameters of the address: ``artefact`` (``twin``: the artefacts on the gantry's table, see `gantry_profiles`; or a
+    name of `profile_sources.SOURCES`, a surface of which profiles are taken at a constant rate), ``points`` (3200),
+    ``pitch`` (m, 12.5e-6), ``intensity`` (0 or 1), ``trigger_start`` (0); for profiles at a constant rate,
+    ``encoder_start`` (0), ``encoder_step`` (counts between profiles, 25) and ``rate`` (profiles per second at
+    ``pace=1``, 1000); ``trigger`` (``external``, ``continuous`` or ``encoder``: the trigger mode as delivered; profiles
+    are the same in all modes, but only ``external``, with pulses from the gantry's control or a generator, permits a
+    trigger by command); ``notice_delay`` (s from the last profile of a stream to the notice that ends it, 0); ``batch``
+    (0 or 1: whether batch measurement is on as delivered) and ``batch_points`` (profiles of a batch as delivered,
+    1000).
 
     Parameters
     ----------
     address : Address
     source : ProfileSource, optional
-        The surface, instead of the one that the address names.
+        The surface; replaces that of the address.
     """
 
     faults = ("silence", "split", "garbage", "checksum", "out_of_range", "drop", "disconnect", "late")
@@ -109,7 +110,7 @@ class SimulatedLJX(SimulatedDevice):
 
     @property
     def layout(self) -> ProfileLayout:
-        """What the profiles of a stream would look like now."""
+        """Layout of the profiles of a stream with the present settings."""
         return self._controller.layout
 
     def close(self) -> None:
@@ -119,7 +120,7 @@ class SimulatedLJX(SimulatedDevice):
         super().close()
 
     def report_delivered(self, samples: int) -> None:
-        """Record how many profiles of the running stream its reader has had."""
+        """Set the number of profiles of the running stream that its reader has processed."""
         self._measuring.report_delivered(samples)
 
     def _break_down(self) -> None:
@@ -151,25 +152,19 @@ class SimulatedLJX(SimulatedDevice):
                 self._server.disconnect()
 
     def reply(self, data: bytes) -> None:
-        """Send an answer; garbage comes in the stream only."""
+        """Send an answer; garbage is only sent in the stream."""
         number = self._answers
         self._answers += 1
         if self.fault.kind == "silence" and self._mute:
             return
-        if self.fault.kind == "late" and number == self.fault.at:
-            self._late.hold(self._server, data, self.fault.delay)
-            return
-        with self._server.lock:
-            self._late.release(self._server)
-            for piece in self.fault.pieces(data):
-                self._server.send(piece)
+        self._late.send(self._server, self.fault, number, data)
 
     def answer(self, request: bytes) -> bytes:
         """Return the answer to one request."""
-        return self._controller.answer(request, self._obey)
+        return self._controller.answer(request, self._execute)
 
-    def _obey(self, opcode: int, arguments: bytes) -> Answer:
-        return self._controller.obey(opcode, arguments)
+    def _execute(self, opcode: int, arguments: bytes) -> Answer:
+        return self._controller.execute(opcode, arguments)
 
     @property
     def _feed(self) -> Feed:
@@ -198,4 +193,4 @@ def _trigger_mode(address: Address) -> int:
 
 
 def _ignore(data: bytes) -> None:
-    """Ignore what arrives on the stream's connection."""
+    """Ignore data received on the stream's connection."""

@@ -1,7 +1,7 @@
-"""The commands of an LJ-X8000A, and its state between them.
+"""The commands and the state of an LJ-X8000A.
 
 Commands and layouts are those of the maker's Linux library (LJX8_IF_Linux 1.0.0), return codes those of the maker's
-sample application for LJ-X8000A. What neither shows is on the device's page, under what is assumed.
+sample application for LJ-X8000A. What neither shows is listed on the device's page as assumed.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from errormotion.instruments.simulators.line_profiler.keyence_ljx_measuring impo
 from errormotion.instruments.simulators.line_profiler.keyence_ljx_wire import Answer, Code, ProfileLayout
 from errormotion.instruments.simulators.line_profiler.profile_sources import FreeRunning
 
-SET_SETTING = 0x32  # the only command of any length
-SAVING = 0.02  # s that the save area is accessed after something is saved
+SET_SETTING = 0x32  # the only command with a variable length
+SAVING = 0.02  # s for which the save area is busy after saving
 TEMPERATURES = (3512, 4108, 2967)  # hundredths of a degC
 
 
 class Controller:
-    """What answers the commands.
+    """The commands of a controller.
 
     Parameters
     ----------
     measuring : Measuring
     connected : callable
-        Returns whether there is a connection for the stream.
+        Returns whether the stream has a connection.
     serial : str
         Of the controller.
     points, kind : int
@@ -43,9 +43,9 @@ class Controller:
     Attributes
     ----------
     errors : list of int
-        System errors that are on.
+        Active system errors.
     restarts : bool
-        Whether it is to restart after the answer.
+        Whether it restarts after the answer.
     """
 
     def __init__(
@@ -73,19 +73,19 @@ class Controller:
 
     @property
     def layout(self) -> ProfileLayout:
-        """What the profiles of a stream would look like now."""
+        """Layout of the profiles of a stream with the present settings."""
         pitch = self._x_pitch * wire.LENGTH
         return ProfileLayout(0x5A00 + self._starts, self._kind, self._points, 1e-7, -(self._points // 2) * pitch, pitch)
 
     def restart(self) -> None:
-        """Begin again with what is saved."""
+        """Restart with the saved settings."""
         self.restarts = False
         self._measuring.reset()
         self._settings.restart()
         self._program, self._prepared, self.errors = 0, None, []
 
-    def answer(self, request: bytes, obey: Callable[[int, bytes], Answer]) -> bytes:
-        """Return the answer to one request; ``obey`` is `obey`, or wraps it."""
+    def answer(self, request: bytes, execute: Callable[[int, bytes], Answer]) -> bytes:
+        """Return the answer to one request; ``execute`` is `execute` or a wrapper of it."""
         opcode = request[16] if len(request) > 16 else 0
         code: int
         if request[4:8] != wire.PREFIX:
@@ -93,10 +93,10 @@ class Controller:
         elif len(request) < 20 or struct.unpack_from("<I", request, 12)[0] != len(request) - 16:
             code, data = Code.WRONG_LENGTH, b""
         else:
-            code, data = obey(opcode, request[20:])
+            code, data = execute(opcode, request[20:])
         return wire.reply(opcode, code, self._program, data)
 
-    def obey(self, opcode: int, arguments: bytes) -> Answer:
+    def execute(self, opcode: int, arguments: bytes) -> Answer:
         """Execute a command; return code and data of its answer."""
         if opcode not in self._commands:
             return Code.UNKNOWN, b""
@@ -105,7 +105,7 @@ class Controller:
         return command(arguments) if fits else (Code.WRONG_LENGTH, b"")
 
     def _table(self) -> dict[int, tuple[int, Callable[[bytes], Answer]]]:
-        """Return the commands: length of the arguments in bytes, and what is done."""
+        """Return the commands: length of the arguments in bytes, and the function."""
         return {
             0x02: (0, self._reboot),
             0x03: (0, self._reset),
@@ -260,7 +260,7 @@ class Controller:
         if not self._measuring.laser:
             return Code.LASER_OFF, b""
         if self._measuring.measuring:
-            return Code.OK, b""  # a batch that runs goes on
+            return Code.OK, b""  # a running batch continues
         started = self._measuring.start_batch(self.layout, self._setting(settings.BATCH_POINTS))
         return Code.OK if started else Code.WRONG_STATE, b""
 

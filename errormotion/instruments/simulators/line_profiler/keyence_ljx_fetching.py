@@ -14,7 +14,7 @@ COMMITTED = 0x80000000
 
 
 def single_profiles(memory: Memory, layout: ProfileLayout, arguments: bytes) -> Answer:
-    """Answer command 42: the newest, the oldest or stated profiles, where batch measurement is off."""
+    """Answer command 42: the newest, the oldest or stated profiles, if batch measurement is off."""
     bank, position, number, count, erase = struct.unpack("<4xBB2xIBB2x", arguments)
     if bank > 1 or position > FROM_STATED or not count or erase > 1:
         return Code.WRONG_PARAMETER, b""

@@ -1,4 +1,4 @@
-"""How a simulated LJ-X8000A measures: profiles of its feed go to its memory, and to the stream where one runs."""
+"""Measurement of a simulated LJ-X8000A: profiles of its feed are stored in its memory, and sent while a stream runs."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from errormotion.instruments.simulators.line_profiler.keyence_ljx_wire import Pr
 from errormotion.instruments.simulators.line_profiler.profile_sources import Feed, Lines
 from errormotion.instruments.transports.loopback.stream_serving import NewestConnectionServer
 
-POLL_INTERVAL = 0.01  # s between checks whether a profile is due
+POLL_INTERVAL = 0.01  # s between checks for a profile that is due
 GRAB_TIMEOUT = 2.0  # s
-SEND_TIMEOUT = 0.5  # s, for a connection that nobody reads any longer
+SEND_TIMEOUT = 0.5  # s, for a connection whose client no longer reads
 
 Array = np.ndarray[Any, Any]
 
@@ -38,9 +38,9 @@ class Measuring:
     trigger_start : int
         Trigger count of the first profile.
     notice_delay : float
-        s from the last profile of a stream to the notice that ends it.
+        Delay of the notice that ends a stream, s.
     on_break : callable
-        Called where the fault breaks the stream.
+        Called when the fault breaks the stream.
     rng : Generator
     """
 
@@ -63,48 +63,48 @@ class Measuring:
         self._name, self._line, self._fault, self._rng = name, line, fault, rng
         self._trigger_start, self._notice_delay, self._on_break = trigger_start, notice_delay, on_break
         self._position = 0  # number of the first profile of the run
-        self._here = self._taken = 0  # profiles of the run: measured, and taken by the reader
+        self._here = self._taken = 0  # profiles of the run: measured, and processed by the reader
         self._sent = 0  # profiles of the stream
         self._before = 0  # profiles of the stream before the run
-        self._unsent: tuple[int, int] | None = None  # batch and number of the first profile not sent yet
+        self._unsent: tuple[int, int] | None = None  # batch and number of the first unsent profile
         self._thread: threading.Thread | None = None
-        self._notifying: threading.Thread | None = None  # ends a stream that nothing feeds
+        self._notifying: threading.Thread | None = None  # ends a stream without a measurement
         self._starting, self._ending = threading.Lock(), threading.Lock()
         self._ended, self._stopping = threading.Event(), threading.Event()
 
     @property
     def trigger_count(self) -> int:
-        """What the trigger counter shows."""
+        """Present value of the trigger counter."""
         return int(self._trigger(self._position + self._here))
 
     @property
     def streaming(self) -> bool:
-        """Whether the stream runs; from the order to stop on it does not, although data may be under way."""
+        """Whether the stream runs; False from the command to stop on, although data may still be sent."""
         return self._streaming and not self._stopping.is_set()
 
     @property
     def measuring(self) -> bool:
-        """Whether profiles are being taken, or are about to be."""
+        """Whether a measurement is running or about to start."""
         thread = self._thread
         return thread is not None and not self._ended.is_set() and (thread.ident is None or thread.is_alive())
 
     def report_delivered(self, samples: int) -> None:
-        """Record how many profiles of the running stream its reader has had."""
+        """Set the number of profiles of the running stream that its reader has processed."""
         self._taken = max(0, samples - self._before)
         self.feed.report_delivered(self._taken)
 
-    # ------------------------------------------------------------------ orders
+    # ------------------------------------------------------------------ commands
 
     def has_unsent_or_kept(self) -> bool:
-        """Whether there is any profile in the memory."""
+        """Whether the memory contains a profile."""
         return any(batch.kept for batch in self.memory.batches)
 
     def start_stream(self, layout: ProfileLayout, position: int, batches: bool) -> bool:
-        """Start the stream; False where nothing can be measured now.
+        """Start the stream; False if a measurement cannot start now.
 
-        Position 0 starts behind what was sent last, 1 with the oldest profile kept, 2 with the next one.
+        Position 0 starts after the last profile sent, 1 with the oldest one kept, 2 with the next one measured.
         """
-        if self.measuring:  # a batch runs: from the next profile on
+        if self.measuring:  # a batch is running: start with its next profile
             self._sent = self._before = 0
             self._line.select()
             self._stopping.clear()
@@ -115,7 +115,7 @@ class Measuring:
         return self._start(layout, 0, backlog, measure=not batches, streaming=True)
 
     def start_batch(self, layout: ProfileLayout, points: int) -> bool:
-        """Start a batch; False where nothing can be measured now."""
+        """Start a batch; False if a measurement cannot start now."""
         started = self._start(layout, points, None, measure=True, streaming=self.streaming)
         if started:
             self.memory.open_batch()
@@ -141,13 +141,13 @@ class Measuring:
             self.feed.end()
 
     def start_pending(self) -> None:
-        """Start what an answered command has ordered; a stream that breaks at once must not swallow the answer."""
+        """Start the measurement of a command after its answer, so that a stream fault does not affect the answer."""
         with self._starting:
             if self._thread is not None and self._thread.ident is None:
                 self._thread.start()
 
     def grab(self, layout: ProfileLayout) -> None:
-        """Measure a few profiles at once, where nothing else measures."""
+        """Measure one block of profiles while no other measurement runs."""
         self.join()
         self.feed.begin()
         deadline = time.monotonic() + GRAB_TIMEOUT
@@ -206,14 +206,14 @@ class Measuring:
 
     def join(self) -> None:
         """Wait for the end of a measurement that is ending."""
-        with self._starting:  # a thread that is half started cannot be joined
+        with self._starting:  # a thread that is not yet started cannot be joined
             thread, self._thread = self._thread, None
         if thread is None or thread is threading.current_thread():
             return
         if thread.ident is not None:
             thread.join(SEND_TIMEOUT)
             for unblock in (self._line.drop_older, self._line.disconnect):
-                if thread.is_alive():  # it sends to a connection that nobody reads
+                if thread.is_alive():  # it sends on a connection whose client does not read
                     unblock()
                     thread.join(SEND_TIMEOUT)
             thread.join()
@@ -231,7 +231,7 @@ class Measuring:
             if self._measure(layout, limit):
                 if limit and self.memory.newest is not None:
                     self.memory.newest.committed = True
-                self._ended.set()  # ahead of the notice, behind which the client may start the next batch
+                self._ended.set()  # before the notice: after it, the client may start the next batch
                 if limit and self._streaming:
                     self._send(wire.notice(wire.BATCH_ENDED))
                 if self._stopping.is_set() or not limit:
@@ -241,7 +241,7 @@ class Measuring:
                 self.feed.end()
 
     def _measure(self, layout: ProfileLayout, limit: int) -> bool:
-        """Measure until it is stopped or the batch is complete; False where the stream breaks down."""
+        """Measure until it is stopped or the batch is complete; False if the stream breaks."""
         for lines in self.feed.lines(layout):
             if lines is None:
                 self._ended.wait(POLL_INTERVAL)
@@ -261,14 +261,13 @@ class Measuring:
     def _deliver(self, layout: ProfileLayout, lines: Lines) -> bool:
         fault, numbers = self._fault, self._sent + np.arange(lines.times.size)
         if fault.kind == "out_of_range" and lines.heights is not None:
-            last = fault.at + fault.length if fault.length else np.inf
-            beyond = (numbers >= fault.at) & (numbers < last)
+            beyond = fault.affects("out_of_range", numbers)
             lines = Lines(lines.encoder, np.where(beyond[:, None], np.nan, lines.heights), lines.times)
         rows = self._record(layout, lines)
         if not self._streaming:
             return True
         if fault.kind:
-            data = b"".join(self._spoilt(row, int(number)) for row, number in zip(rows, numbers, strict=True))
+            data = b"".join(self._faulty(row, int(number)) for row, number in zip(rows, numbers, strict=True))
         else:
             data = rows.astype("<u4", copy=False).tobytes()
         self._sent += len(rows)
@@ -282,7 +281,7 @@ class Measuring:
         return True
 
     def _record(self, layout: ProfileLayout, lines: Lines) -> Array:
-        """Return profiles as words, after they went to the memory."""
+        """Store profiles in the memory; return them as words."""
         triggers = self._trigger(self._position + self._here + np.arange(lines.times.size, dtype=np.int64))
         heights = lines.heights if self.laser else None
         rows = wire.packed(layout, heights, triggers, lines.encoder % (1 << 32))
@@ -317,7 +316,7 @@ class Measuring:
     def _trigger(self, number: Any) -> Any:
         return (self._trigger_start + number) % (1 << 32)
 
-    def _spoilt(self, words: Array, number: int) -> bytes:
+    def _faulty(self, words: Array, number: int) -> bytes:
         """Return the bytes of one profile with the fault that is due at it."""
         fault = self._fault
         if (fault.kind in ("silence", "disconnect") and number >= fault.at) or fault.hits("drop", number):
@@ -327,8 +326,8 @@ class Measuring:
             words[-1] ^= 1
         data = words.astype("<u4", copy=False).tobytes()
         if fault.hits("garbage", number):
-            place = int(self._rng.integers(0, len(data)))
-            data = data[:place] + stray_bytes(self._rng) + data[place:]
+            position = int(self._rng.integers(0, len(data)))
+            data = data[:position] + stray_bytes(self._rng) + data[position:]
         return data
 
 

@@ -1,4 +1,4 @@
-"""The memory of an LJ-X8000A: profiles measured one by one, or in batches."""
+"""The memory of an LJ-X8000A: single profiles, or batches."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_PROFILES = 2048
 
 @dataclass
 class Batch:
-    """Profiles that follow one another, numbered from 0.
+    """Successive profiles, numbered from 0.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class Memory:
         self._next = 0
 
     def open_batch(self) -> Batch:
-        """Return a new batch, after the one before has ended."""
+        """Start and return a new batch."""
         batch = Batch(self._next)
         self._next += 1
         self.batches.append(batch)
@@ -91,7 +91,7 @@ class Memory:
         return self.batches[-1] if self.batches else None
 
     def batch(self, number: int) -> Batch | None:
-        """Return a batch by its number; None where it is not kept."""
+        """Return a batch by its number; None if it is not kept."""
         return next((batch for batch in self.batches if batch.number == number), None)
 
     def add(self, rows: Array) -> None:

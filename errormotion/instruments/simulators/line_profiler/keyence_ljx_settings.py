@@ -1,4 +1,4 @@
-"""The settings of an LJ-X8000A: three levels, the environment, what is common, and sixteen programs.
+"""The settings of an LJ-X8000A on three levels: environment, common settings, and sixteen programs.
 
 Levels and types are those of the maker's header LJX8_IF_Linux.h; sizes of the blocks are those of the maker's sample
 (60, 20 and 10980 bytes).
@@ -23,18 +23,18 @@ EXTERNAL = 1
 MOST_BATCH_POINTS = 42000
 
 Target = tuple[int, int, int, bytes]
-"""Type, category, item, and the four bytes that state it further."""
+"""Type, category, item, and four bytes that specify the item."""
 
 
 class Settings:
     """The settings on their three levels.
 
-    A block of category FF and the items are kept apart: where an item lies in the block is in no public document.
+    A block of category FF and the items are stored separately: the layout of the block is not documented.
 
     Parameters
     ----------
     delivered : dict
-        (category, item) to bytes: what a program has as delivered.
+        (category, item) to bytes: settings of a program as delivered.
     """
 
     def __init__(self, delivered: dict[tuple[int, int], bytes]) -> None:
@@ -42,7 +42,7 @@ class Settings:
         self._levels: list[dict[Target, bytes]] = [{}, {}, {}]
 
     def read(self, level: int, target: Target) -> bytes | None:
-        """Return a setting; None where there is no such level or type."""
+        """Return a setting; None for an unknown level or type."""
         if level > SAVED or not _exists(target):
             return None
         kind, category, item, _ = target
@@ -52,9 +52,9 @@ class Settings:
         return data.ljust(size or max(4, -(-len(data) // 4) * 4), b"\0")
 
     def write(self, level: int, target: Target, data: bytes) -> bool:
-        """Write a setting to a level and those below it; False where level, type or value is not allowed.
+        """Write a setting to a level and those below it; False if level, type or value is invalid.
 
-        The maker's library sends 20 kB whatever the size of the setting: what exceeds it is left out.
+        The maker's library always sends 20 kB; bytes beyond the size of the setting are ignored.
         """
         if level > SAVED or not _exists(target) or not _allowed(target, data):
             return False
@@ -69,16 +69,16 @@ class Settings:
                 del each[target]
 
     def reflect(self, level: int) -> None:
-        """Take over the write area on the levels up to one."""
+        """Copy the write area to the levels up to ``level``."""
         for number in range(RUNNING, level + 1):
             self._levels[number] = dict(self._levels[WRITE])
 
     def rewrite(self, level: int) -> None:
-        """Set the write area to what is on another level."""
+        """Copy a level to the write area."""
         self._levels[WRITE] = dict(self._levels[level])
 
     def restart(self) -> None:
-        """Take over what is saved."""
+        """Copy the saved settings to all levels."""
         self._levels = [dict(self._levels[SAVED]) for _ in self._levels]
 
     def reset(self) -> None:
@@ -86,7 +86,7 @@ class Settings:
         self._levels = [{}, {}, {}]
 
     def value(self, program: int, item: tuple[int, int]) -> int:
-        """Return the number that a program runs with."""
+        """Return the running value of a setting of a program."""
         data = self.read(RUNNING, (PROGRAM_0 + program, *item, bytes(4)))
         return int.from_bytes((data or b"")[:4], "little")
 

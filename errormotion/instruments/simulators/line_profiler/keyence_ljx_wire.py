@@ -1,7 +1,7 @@
-"""What an LJ-X8000A puts on its lines: replies to commands, profiles, notices.
+"""Bytes that an LJ-X8000A sends: replies to commands, profiles, notices.
 
-Written from what the maker's Linux library reads and sends (LJX8_IF_Linux 1.0.0 and its ProfileDataConvert), not from
-this project's driver. All numbers are little-endian.
+Written from the maker's Linux library (LJX8_IF_Linux 1.0.0 and its ProfileDataConvert), not from this project's driver.
+All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ PROGRAMS = 16
 LARGEST_DATA = 20 * 1024
 """Bytes of data in the largest request, that of a setting."""
 LARGEST_REQUEST = 16 + 16 + LARGEST_DATA
-"""Bytes of the longest request; a longer one is not waited for."""
+"""Bytes of the longest request; a longer one ends the connection."""
 PREFIX = bytes.fromhex("0300F000")
 """Bytes 4..7 of a request to an LJ-X; the LJ-V7 has 01 at their start."""
 INTENSITY = 0x40
 """Bit of the kind of a profile: with intensities."""
 ONE_PROFILE = 0x01
-"""Bits of the kind of a profile other than 0x60 count its profiles: one."""
+"""Bits of the kind of a profile other than 0x60 are the number of profiles: one."""
 NO_HEIGHT = -(1 << 19) + 1
 """Raw 0x80001, invalid."""
 SMALLEST_HEIGHT = -(1 << 19) + 4
@@ -42,7 +42,7 @@ TRIGGER_WORD, ENCODER_WORD = 1, 2
 
 
 class Code(IntEnum):
-    """Return codes, byte 17 of a reply; the maker's library adds 0x8000. Some have a meaning for each command."""
+    """Return codes, byte 17 of a reply; the maker's library adds 0x8000. The meaning of some depends on the command."""
 
     OK = 0x00
     OTHER_MODEL = 0x21
@@ -69,7 +69,7 @@ Answer = tuple[int, bytes]
 
 @dataclass(frozen=True)
 class ProfileLayout:
-    """What the profiles of a stream look like.
+    """Layout of the profiles of a stream.
 
     ``z_unit``, ``x_start`` and ``x_pitch`` are in m.
     """
@@ -112,12 +112,12 @@ def notice(kind: int) -> bytes:
 
 
 def words_in(bits: int) -> int:
-    """Return how many 32-bit words hold so many bits."""
+    """Return the number of 32-bit words for a number of bits."""
     return -(-bits // 32)
 
 
 def as_fetched(rows: Array, layout: ProfileLayout) -> bytes:
-    """Return profiles as replies carry them: heights and intensities together end at a word, once."""
+    """Return profiles as in replies: heights and intensities together are padded to whole words."""
     body = words_in((30 if layout.with_intensity else 20) * layout.points)
     kept = np.concatenate([rows[:, : HEADER_WORDS + body], rows[:, -1:]], axis=1)
     return kept.astype("<u4").tobytes()
@@ -126,19 +126,19 @@ def as_fetched(rows: Array, layout: ProfileLayout) -> bytes:
 def packed(layout: Any, heights: Array | None, triggers: Array, encoder: Array) -> Array:
     """Return profiles as they are streamed, uint32, (n, words).
 
-    Fields of 20 bits, least significant bit first, follow one another without a gap: the heights, then two intensities
-    to a field, the first in its upper half. In the stream the room for both is rounded up to words separately.
+    Fields of 20 bits, least significant bit first, without gaps: the heights, then two intensities per field, the first
+    in its upper half. In the stream, heights and intensities are each padded to whole words.
 
     Parameters
     ----------
     layout : ProfileLayout
     heights : ndarray, (n, point), or None
-        m; NaN where there is none. None: nowhere.
+        m; NaN: missing. None: all are missing.
     triggers, encoder : ndarray, (n,)
         Counts, from 0 to 2**32 - 1.
     """
     n, points = triggers.size, layout.points
-    if heights is None:  # one of them, with the counts put in
+    if heights is None:  # one packed profile, repeated with the counts
         blank = packed(layout, np.full((1, points), np.nan), np.zeros(1, np.int64), np.zeros(1, np.int64))
         words = np.repeat(blank, n, axis=0)
     else:
@@ -158,7 +158,7 @@ def packed(layout: Any, heights: Array | None, triggers: Array, encoder: Array) 
 
 
 def _words(fields: Array) -> Array:
-    """Return 20-bit fields, (n, field), as words, (n, word): 8 fields to 5 words."""
+    """Return 20-bit fields, (n, field), as words, (n, word): 8 fields in 5 words."""
     n, count = fields.shape
     groups = -(-count // 8)
     f = np.zeros((n, 8 * groups), dtype=np.uint64)
@@ -174,7 +174,7 @@ def _words(fields: Array) -> Array:
 
 
 def quantised(heights: Array, unit: float) -> Array:
-    """Return heights in steps of ``unit``, int32; the code for 'invalid' where there is none, or it is out of range."""
+    """Return heights in steps of ``unit``, int32; the code for 'invalid' if missing or out of range."""
     steps = np.rint(heights / unit)
     fits = (steps >= SMALLEST_HEIGHT) & (steps < 1 << 19)  # False for NaN
     return np.where(fits, steps, NO_HEIGHT).astype(np.int32)

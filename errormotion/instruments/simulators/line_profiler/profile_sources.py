@@ -1,7 +1,7 @@
-"""What lies before a simulated line profiler, and when it takes a profile of it.
+"""Sources of the profiles of a simulated line profiler.
 
-A `Feed` yields the profiles of a stream one after another. A `FreeRunning` one takes them at a rate from a surface:
-anything that returns the heights along its line. The feed of a machine's axis is in `gantry_profiles`.
+A `Feed` yields the profiles of a stream. `FreeRunning` takes them at a constant rate from a `ProfileSource`, which
+returns the heights along the line. The feed of a machine's axis is in `gantry_profiles`.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Lines:
-    """Profiles that follow one another.
+    """Successive profiles.
 
     Attributes
     ----------
     encoder : ndarray, int64, (n,)
         Counts, without overflow.
     heights : ndarray, float64, (n, point), or None
-        m; NaN where there is none. None: there is nothing at all.
+        m; NaN: missing. None: all are missing.
     times : ndarray, float64, (n,)
-        When, s.
+        Times, s.
     """
 
     encoder: Array
@@ -39,22 +39,22 @@ class Lines:
 
 
 class Feed(Protocol):
-    """Where the profiles of a stream come from."""
+    """Source of the profiles of a stream."""
 
     def count(self) -> int:
-        """Return what the encoder shows now."""
+        """Return the present count of the encoder."""
 
     def begin(self) -> None:
-        """Start a stream; InstrumentError where that cannot be now."""
+        """Start a stream; InstrumentError if it cannot start now."""
 
     def lines(self, layout: ProfileLayout) -> Iterator[Lines | None]:
-        """Yield the profiles of a stream when they are due; None where nothing is to come for now."""
+        """Yield the profiles of a stream when they are due; None if no profile is due."""
 
     def trigger(self) -> None:
-        """Have one profile taken now, where nothing else takes them; called while a stream runs."""
+        """Take one profile now if profiles are triggered by command; called while a stream runs."""
 
     def report_delivered(self, profiles: int) -> None:
-        """Take note of how many profiles of the stream its reader has had."""
+        """Set the number of profiles of the stream that its reader has processed."""
 
     def end(self) -> None:
         """End the stream. Idempotent."""
@@ -66,7 +66,7 @@ class Clock:
     Parameters
     ----------
     pace : callable
-        Returns simulated seconds per second; None where real time is not waited for.
+        Returns simulated seconds per second; None: without waiting.
     begin : float
         Simulated time now, s.
     """
@@ -83,34 +83,34 @@ class Clock:
 
 
 class ProfileSource(Protocol):
-    """A surface that is moved below a profiler."""
+    """A surface that moves below a profiler."""
 
     def profile(self, encoder_count: int, n_points: int, x: Array) -> Array:
-        """Return what the profiler sees at an encoder count, its noise included.
+        """Return the profile at an encoder count, including noise.
 
         Parameters
         ----------
         encoder_count : int
-            Pulses since the encoder's zero, without overflow.
+            Counts since the encoder's zero, without overflow.
         n_points : int
         x : ndarray, float64, (n_points,)
-            Where on the line the points are, m.
+            Positions of the points on the line, m.
 
         Returns
         -------
         heights : ndarray, float64, (n_points,)
-            m; NaN where the profiler has none.
+            m; NaN: missing.
         """
 
 
 class FreeRunning:
-    """A surface of which a profile is taken at a rate; whatever moves it moves it evenly.
+    """Profiles of a uniformly moving surface at a constant rate.
 
     Parameters
     ----------
     source : ProfileSource
     start, step : int
-        Encoder count of the first profile, and from profile to profile.
+        Encoder count of the first profile, and counts between profiles.
     rate : float
         Profiles per simulated second.
     at_once : int
@@ -142,7 +142,7 @@ class FreeRunning:
         return self._start + self._step * (self._first + self._sent)
 
     def begin(self) -> None:
-        """Go on behind the last profile that the reader of the stream before has had."""
+        """Continue after the last profile that the reader of the previous stream has processed."""
         self._first += self._taken or self._sent
         self._sent = self._taken = 0
 
@@ -160,20 +160,20 @@ class FreeRunning:
             yield Lines(counts, heights, times)
 
     def trigger(self) -> None:
-        """Do nothing: profiles come anyhow."""
+        """Do nothing: profiles are taken without triggers."""
 
     def report_delivered(self, profiles: int) -> None:
-        """Take note of how many profiles of the stream its reader has had."""
+        """Set the number of profiles of the stream that its reader has processed."""
         self._taken = profiles
 
     def end(self) -> None:
-        """Do nothing: nothing waits for the end."""
+        """Do nothing."""
 
 
 class SweptSurface:
-    """A smooth free-form surface, 1 mm high, that the feed moves through the line.
+    """A smooth free-form surface, 1 mm high, that moves below the profiler.
 
-    The same heights, noise included, whenever the same encoder count is requested.
+    Heights and noise are reproducible for each encoder count.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ class SweptSurface:
     noise : float
         Standard deviation of the height of one point, m.
     count : float
-        Feed for one encoder pulse, m.
+        Feed per encoder count, m.
     """
 
     WAVES = 6
@@ -202,17 +202,17 @@ class SweptSurface:
         return np.asarray(np.sin(np.multiply.outer(x, along) + across * y + phase) @ self._amplitude)
 
     def profile(self, encoder_count: int, n_points: int, x: Array) -> Array:
-        """Return what the profiler sees at an encoder count, its noise included."""
+        """Return the profile at an encoder count, including noise."""
         noise = np.random.default_rng([self._seed, encoder_count % (1 << 64)]).standard_normal(n_points)
         return self.height(x, encoder_count * self._count) + self._noise * noise
 
 
-#: Surfaces by the name that an address gives; each is made from the seed.
+#: Surfaces by their name in an address; each is created from the seed.
 SOURCES: dict[str, Callable[[int], ProfileSource]] = {"swept": SweptSurface}
 
 
 def make_source(name: str, seed: int, sources: Mapping[str, Callable[[int], ProfileSource]] = SOURCES) -> ProfileSource:
-    """Return a surface by its name; InstrumentError names those there are."""
+    """Return a surface by its name; InstrumentError lists the known names."""
     if name not in sources:
         raise InstrumentError(f"'artefact={name}': expected one of {', '.join(sorted({*sources, 'twin'}))}")
     return sources[name](seed)

@@ -16,10 +16,10 @@ Array = np.ndarray[Any, Any]
 
 
 class DataPortDevice(SimulatedDevice):
-    """A controller whose line ``data`` (in ``urls``) has the measured values.
+    """A controller that sends the measured values on the line ``data`` (in ``urls``).
 
-    Faults from the menu: ``silence``, ``split``, ``garbage`` (stray bytes between blocks), ``out_of_range``, ``drop``
-    (frames are missing, as the counter shows), ``disconnect`` (of the data port): they count frames; ``late`` counts
+    Faults of the menu: ``silence``, ``split``, ``garbage`` (stray bytes between blocks), ``out_of_range``, ``drop``
+    (missing frames, which the counter shows) and ``disconnect`` (of the data port) are counted in frames, ``late`` in
     answers.
     """
 
@@ -31,7 +31,7 @@ class DataPortDevice(SimulatedDevice):
     def _open_data_port(
         self, address: Address, set_up: Callable[[Address], None], on_connection: Callable[[], None]
     ) -> None:
-        """Set the controller up and open its second port; InstrumentError where the address has wrong parameters."""
+        """Set the controller up and open its second port; InstrumentError if the address has invalid parameters."""
         self._mute = self.fault.kind == "silence" and self.fault.from_the_start
         try:
             set_up(address)
@@ -43,20 +43,13 @@ class DataPortDevice(SimulatedDevice):
         self.urls = {"data": self._data.url}
         self.port = int(self._data.url.rsplit(":", 1)[1])
 
-    def _beyond_range(self, numbers: Array) -> Array:
-        """Return which of these frames the fault ``out_of_range`` concerns."""
-        fault = self.fault
-        if fault.kind != "out_of_range":
-            return np.zeros(numbers.shape, dtype=bool)
-        return np.asarray((numbers >= fault.at) & ((fault.length == 0) | (numbers < fault.at + fault.length)))
-
     def _sent_frames(self, numbers: Array) -> Array:
-        """Return which of these frames are sent before silence or the end of the connection."""
+        """Return for each frame whether it precedes the fault ``silence`` or ``disconnect``."""
         before = self.fault.kind not in ("silence", "disconnect")
         return np.asarray(before | (numbers < self.fault.at))
 
     def _transmit(self, data: bytes, numbers: Array) -> bool:
-        """Send the bytes of these frames, with the fault of the line; return whether more can follow."""
+        """Send the bytes of these frames with the fault of the line; return whether more can be sent."""
         fault = self.fault
         heard = all(self._data.send(piece) for piece in fault.pieces(data))
         reached = bool((numbers >= fault.at).any())
@@ -80,4 +73,4 @@ class BeamStream:
 
 
 def _ignore(data: bytes) -> None:
-    """Nothing is received on the data port."""
+    """Ignore data received on the data port."""

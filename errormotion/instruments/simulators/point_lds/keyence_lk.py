@@ -1,4 +1,4 @@
-"""An LK-G5000 or LK-G3000 controller on its RS-232C line, with what the virtual machine's sensor sees.
+"""A simulated LK-G5000 or LK-G3000 controller on RS-232C; it measures in the virtual machine.
 
 The commands are in `keyence_lk_grammar`.
 """
@@ -15,27 +15,27 @@ from errormotion.instruments.simulators.point_lds.keyence_lk_commands import Com
 from errormotion.instruments.transports import Address
 
 STILL = 1.2345e-3
-"""What a head reads that has no position on the machine, m."""
+"""Reading of a head that is not mounted on the machine, m."""
 SIGNS = {"near": -1.0, "far": 1.0}
-"""Sign of a value for a reading that grows with the distance, by the side on which values are positive."""
+"""Sign of the value of a reading that increases with the distance, by the side on which values are positive."""
 MOST_WAITING = 1024
-"""Bytes kept of a command whose end has not arrived."""
+"""Largest number of bytes kept of an incomplete command."""
 
 
 class SimulatedKeyenceLK(SimulatedDevice):
     """A controller with one head.
 
-    It reads what the world's point sensor reads of the target that is set there, from the middle of the range on; it
-    has no value without a target. Where the address names no device it looks at a plate that never moves until then.
+    It measures the target that is set in the world, from the middle of the range; without a target it has no value. If
+    the address names no device, it measures a stationary plate until a target is set.
 
-    Further parameters of the address: ``readings`` (mm along the beam, joined by commas: taken one after the other
-    instead of the world's; ``nan`` is no value), ``head`` (LK-H050), ``controller`` (LK-G5000), ``output`` (1: the
-    output that shows the head), ``outputs`` (number of active outputs; default: up to that one), ``display`` (number
-    of the display unit, 2), ``positive`` (near or far), ``offset`` (mm, in the controller's settings), ``zero`` (mm,
-    set on its panel).
+    Further parameters of the address: ``readings`` (mm along the beam, separated by commas: used in turn instead of
+    readings of the world; ``nan`` is no value), ``head`` (LK-H050), ``controller`` (LK-G5000), ``output`` (number of
+    the output of the head, 1), ``outputs`` (number of active outputs; default: ``output``), ``display`` (number of the
+    display unit, 2), ``positive`` (near or far), ``offset`` (mm, in the controller's settings), ``zero`` (mm, set on
+    its panel).
 
-    Faults beyond the menu: ``over_range``, ``under_range``, and ``error``, where ``code`` (default: that of an unknown
-    command) is answered to every request from ``fault_at`` on.
+    Faults in addition to the menu: ``over_range``, ``under_range``, and ``error``: the answer to every request from
+    ``fault_at`` on is the error ``code`` (default: that of an unknown command).
     """
 
     faults = (
@@ -70,8 +70,8 @@ class SimulatedKeyenceLK(SimulatedDevice):
         self._sign = SIGNS[address.params.get("positive", "near")]
         texts = address.params.get("readings", "")
         self._readings = cycle([1e-3 * float(text) for text in texts.split(",")] if texts else ())
-        self._given = bool(texts)
-        self._on_the_desk = not address.path
+        self._has_readings = bool(texts)
+        self._unmounted = not address.path
         self._commands = Commands(controller, self._value, output=output, outputs=outputs, display=display)
         self._commands.offset = 1e-3 * address.number("offset", 0)
         self._commands.zero = 1e-3 * address.number("zero", 0)
@@ -81,27 +81,27 @@ class SimulatedKeyenceLK(SimulatedDevice):
         self._buffer = self._buffer[:MOST_WAITING]
 
     def answer(self, request: bytes) -> bytes:
-        """Return the answer to one request; a line feed ahead of it, behind the last carriage return, is ignored."""
+        """Return the answer to one request; a line feed after the previous carriage return is ignored."""
         text = request.lstrip(b"\n").decode("ascii", errors="replace").upper()
         header, errors = text.split(",")[0], self._commands.controller.errors
         if self.fault.kind == "error" and self._answers >= self.fault.at:
             code = self.params.get("code", errors[grammar.Mistake.COMMAND])
             return _line(f"ER,{header},{code}")
         try:
-            return _line(self._commands.obey(text))
+            return _line(self._commands.execute(text))
         except MistakeError as mistake:
             return _line(f"ER,{header},{errors[mistake.kind]}")
 
     def _value(self) -> float | str:
-        """Return what the head reads, m, or the text of a value that is none."""
-        for fault, shown in (
+        """Return the value of the head, m, or the text that replaces a missing value."""
+        for fault, text in (
             ("out_of_range", grammar.NO_VALUE),
             ("over_range", grammar.OVER),
             ("under_range", grammar.UNDER),
         ):
-            if self.fault.kind == fault and self._faulty():
-                return shown
-        reading = self._seen()
+            if self.fault.affects(fault, self._answers):
+                return text
+        reading = self._reading()
         if math.isnan(reading):
             return grammar.NO_VALUE
         value = self._sign * reading
@@ -109,17 +109,13 @@ class SimulatedKeyenceLK(SimulatedDevice):
             return grammar.OVER if value > 0 else grammar.UNDER
         return value
 
-    def _seen(self) -> float:
-        """Return what the head reads along its beam, m."""
-        if self._given:
+    def _reading(self) -> float:
+        """Return the reading of the head along its beam, m."""
+        if self._has_readings:
             return next(self._readings)
-        if self._on_the_desk and self.world.stand.target is None:
+        if self._unmounted and self.world.stand.target is None:
             return STILL
         return self.world.read_point(self.name)
-
-    def _faulty(self) -> bool:
-        count = self._answers - self.fault.at
-        return count >= 0 and (self.fault.length == 0 or count < self.fault.length)
 
 
 def _line(text: str) -> bytes:

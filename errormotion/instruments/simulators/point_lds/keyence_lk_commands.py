@@ -1,4 +1,4 @@
-"""The commands of an LK controller, and its state between them."""
+"""The commands and the state of an LK controller."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from errormotion.instruments.simulators.point_lds.keyence_lk_grammar import Cont
 
 GENERAL, COMMUNICATION = "R0", "Q0"
 MOST_STORED = 65536
-"""Values of a data storage; fewer than in the device, which holds 1.2 million."""
+"""Capacity of the data storage in values; the device stores 1.2 million."""
 
 
 Command = Callable[[list[str]], str]
-"""Returns the answer to a command from the words behind it."""
+"""Returns the answer to a command from its parameters."""
 Outputs = Callable[[list[str]], list[int]]
-"""Returns the outputs that words name."""
+"""Returns the output numbers in the parameters."""
 
 
 class MistakeError(Exception):
-    """A command that is answered by an error."""
+    """A command that is answered with an error."""
 
     def __init__(self, kind: Mistake) -> None:
         super().__init__(kind.name)
@@ -28,15 +28,15 @@ class MistakeError(Exception):
 
 
 class Commands:
-    """What answers the commands.
+    """The commands of a controller.
 
     Parameters
     ----------
     controller : Controller
     value : callable
-        Returns what the head reads, m, or the text of a value that is none.
+        Returns the value of the head, m, or the text that replaces a missing value.
     output, outputs : int
-        Output that shows the head, and number of active outputs.
+        Output of the head, and number of active outputs.
     display : int
         Display unit.
 
@@ -54,14 +54,14 @@ class Commands:
         self._value = value
         self._output, self._outputs, self._display = output, outputs, display
         self._mode = GENERAL
-        self._held: str | None = None  # what is shown while timing is on
+        self._held: str | None = None  # value while timing is on
         self._program = 0
         self._stored: list[str] = []
         self._written: dict[tuple[str, str, str], list[str]] = {}
         several = controller.digits == 2
         self._commands: Mapping[str, Command] = self._of_g5000() if several else self._of_g3000()
 
-    def obey(self, text: str) -> str:
+    def execute(self, text: str) -> str:
         """Return the answer to a command, without its end."""
         word, *words = text.split(",")
         if word in (GENERAL, COMMUNICATION) and not words:
@@ -109,10 +109,10 @@ class Commands:
             "DQ": lambda words: self._done("DQ", words),
         }
         for digit, chosen in (("0", [1, 2]), ("1", [1]), ("2", [2])):
-            none_behind = partial(self._none_but, result=chosen)
-            commands[f"M{digit}"] = partial(self._measure, f"M{digit}", none_behind)
-            commands[f"V{digit}"] = partial(self._act, self._set_zero, f"V{digit}", none_behind)
-            commands[f"W{digit}"] = partial(self._act, self._clear_zero, f"W{digit}", none_behind)
+            no_words = partial(self._none_but, result=chosen)
+            commands[f"M{digit}"] = partial(self._measure, f"M{digit}", no_words)
+            commands[f"V{digit}"] = partial(self._act, self._set_zero, f"V{digit}", no_words)
+            commands[f"W{digit}"] = partial(self._act, self._clear_zero, f"W{digit}", no_words)
         return commands | self._of_both()
 
     def _of_both(self) -> dict[str, Command]:
@@ -130,13 +130,13 @@ class Commands:
     # ------------------------------------------------------------------ identifiers
 
     def _none_but(self, words: list[str], result: list[int]) -> list[int]:
-        """Return a result, after a check that nothing follows the command."""
+        """Return a result if the command has no parameters."""
         if words:
             raise MistakeError(Mistake.COUNT)
         return result
 
     def _done(self, header: str, words: list[str]) -> str:
-        """Return the answer to a command that changes nothing here."""
+        """Return the answer to a command without effect in the simulator."""
         self._none_but(words, [])
         return header
 
@@ -150,21 +150,21 @@ class Commands:
         return words[0]
 
     def _number(self, words: list[str]) -> int:
-        """Return the output that one word names."""
+        """Return the output number in one word."""
         number = int(self._word(words, self.controller.digits))
         if not 1 <= number <= self._outputs:
             raise MistakeError(Mistake.RANGE)
         return number
 
     def _one_or_both(self, words: list[str]) -> list[int]:
-        """Return the outputs that a digit names, 0 for both."""
+        """Return the output numbers for one digit; 0: both."""
         word = self._word(words, 1)
         if word not in "012":
             raise MistakeError(Mistake.RANGE)
         return [1, 2] if word == "0" else [int(word)]
 
     def _flagged(self, words: list[str]) -> list[int]:
-        """Return the outputs that a row of flags names, the first one first."""
+        """Return the output numbers of a sequence of flags, starting with output 1."""
         flags = self._word(words, self.controller.outputs)
         chosen = [k for k, flag in enumerate(flags, 1) if flag == "1"]
         if set(flags) - set("01") or not chosen or chosen[-1] > self._outputs:
@@ -189,10 +189,10 @@ class Commands:
         return action(header, outputs(words))
 
     def _values(self, header: str, words: list[str], outputs: list[int]) -> str:
-        return ",".join([header, *words, *map(self._shown, outputs)])
+        return ",".join([header, *words, *map(self._value_of, outputs)])
 
-    def _shown(self, output: int) -> str:
-        """Return what an output shows."""
+    def _value_of(self, output: int) -> str:
+        """Return the value of an output."""
         if output != self._output:
             return grammar.NO_VALUE
         return self._held if self._held is not None else self._fresh()
@@ -220,14 +220,14 @@ class Commands:
         return word
 
     def _time(self, word: str, switch: list[str], outputs: list[int]) -> str:
-        """Hold what is shown while timing is on."""
+        """Hold the value while timing is on."""
         on = self._switch(switch) == "1"
         if self._output in outputs:
             self._held = self._fresh() if on else None
         return word
 
     def _statistics(self, output: int) -> str:
-        """Return limits, mean, largest, smallest, difference, deviation and four counts: of no values."""
+        """Return limits, mean, largest, smallest, difference, deviation and four counts of an empty statistic."""
         return ",".join(["DO", str(output), *[grammar.NO_VALUE] * 7, *["0"] * 4])
 
     def _lock(self, words: list[str]) -> str:
@@ -245,9 +245,9 @@ class Commands:
 
     @property
     def _points(self) -> int:
-        name, place = (grammar.STORAGE, 0) if self.controller.digits == 2 else ("CI", 1)
+        name, index = (grammar.STORAGE, 0) if self.controller.digits == 2 else ("CI", 1)
         setting = next(each for each in self.controller.settings if each.name == name)
-        return int(self._written.get((name, "", ""), list(setting.delivered))[place])
+        return int(self._written.get((name, "", ""), list(setting.delivered))[index])
 
     def _store(self, words: list[str]) -> str:
         self._none_but(words, [])
@@ -266,7 +266,7 @@ class Commands:
         return ",".join(["AO", *self._stored])
 
     def _storage_status(self, words: list[str]) -> str:
-        """Return whether values are being stored, and how many there are of each output."""
+        """Return whether values are being stored, and the number of stored values of each output."""
         width = 7 if self.controller.digits == 2 else 5
         counts = [len(self._stored) if k == self._output else 0 for k in self._all(words)]
         return ",".join(["AN", "0", *(f"{count:0{width}d}" for count in counts)])
@@ -274,7 +274,7 @@ class Commands:
     # ------------------------------------------------------------------ settings
 
     def _setting(self, words: list[str]) -> tuple[Setting, str, list[str]]:
-        """Return a setting, the number of its output or head, and the words behind."""
+        """Return a setting, the number of its output or head, and the remaining words."""
         if not words or not words[0]:
             raise MistakeError(Mistake.COUNT)
         found = self.controller.find(words)
@@ -298,11 +298,10 @@ class Commands:
             elif setting.name == grammar.OFFSET:
                 steps = round(self.offset / unit * 10**decimals)
                 values = [f"{steps:+07d}"]
-        shown = [self._checked(value) for value in values]
-        return ",".join(["SR", *words, *shown])
+        return ",".join(["SR", *words, *map(self._formatted, values)])
 
-    def _checked(self, value: str) -> str:
-        """Return a value in the form of a check: setting values have a point."""
+    def _formatted(self, value: str) -> str:
+        """Return a value as it is read back: signed values have a decimal point."""
         return grammar.steps_text(int(value), self._display) if value[0] in "+-" else value
 
     def _write(self, words: list[str]) -> str:

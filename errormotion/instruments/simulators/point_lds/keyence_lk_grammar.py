@@ -1,8 +1,8 @@
-"""What LK-G5000 and LK-G3000 controllers understand on RS-232C: commands, settings, formats, errors.
+"""Commands, settings, formats and errors of LK-G5000 and LK-G3000 controllers on RS-232C.
 
 Formats and the errors of the LK-G3000: LK-G Series user's manual (LK-G-M-NO5-E) p. 5-5 and 5-6. Commands and errors of
-the LK-G5000, and the names of settings: as clients of others send and list them, see the page of the device. What no
-public document shows is on that page, under what is assumed.
+the LK-G5000, and the names of settings: from other clients, see the page of the device. What is not in a public
+document is listed on that page as assumed.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ WIDTH = 7
 
 
 class Mistake(Enum):
-    """What a controller answers an error to."""
+    """Reason for which a controller answers with an error."""
 
     COMMAND = auto()
     STATE = auto()
@@ -88,7 +88,7 @@ class Controller:
     programs: int = 8
 
     def find(self, words: list[str]) -> tuple[Setting, list[str]] | None:
-        """Return the setting that words begin with, and the words behind its name; None for an unknown one."""
+        """Return the setting that the words start with and the words after its name; None if it is unknown."""
         for setting in self.settings:
             head = [setting.name, setting.part] if setting.part else [setting.name]
             if words[: len(head)] == head:
@@ -103,7 +103,7 @@ DISPLAY, OFFSET, STORED, STORAGE = "OI", "OF", "OK", "CD"
 
 
 def _unknown(names: str, *, per_output: bool = True) -> tuple[Setting, ...]:
-    """Return settings of which only the name is known: a number."""
+    """Return settings of which only the name is known; their value is a number."""
     pairs = (word.partition(":") for word in names.split())
     return tuple(Setting(name, part, per_output) for name, _, part in pairs)
 
@@ -169,7 +169,7 @@ CONTROLLERS: Mapping[str, Controller] = {each.name: each for each in (LK_G5000, 
 
 
 def value_text(value: float, display: int) -> str:
-    """Return a value (m) as it is sent: its sign and seven characters, zeros in front."""
+    """Return a value (m) as it is sent: its sign and seven characters with leading zeros."""
     unit, decimals = DISPLAYS[display]
     text = f"{abs(value) / unit:0{WIDTH}.{decimals}f}"
     if len(text) > WIDTH:
@@ -179,12 +179,12 @@ def value_text(value: float, display: int) -> str:
 
 
 def steps_text(steps: int, display: int) -> str:
-    """Return a setting value as it is sent: its sign, six digits, and a point among them."""
+    """Return a setting value as it is sent: its sign and six digits with a decimal point."""
     decimals = DISPLAYS[display][1]
     digits = f"{abs(steps):06d}"
     return f"{'-' if steps < 0 else '+'}{digits[:-decimals]}.{digits[-decimals:]}"
 
 
 def fits(form: str, text: str) -> bool:
-    """Whether a word has a form."""
+    """Whether a word matches a form."""
     return re.fullmatch(form, text, re.ASCII) is not None

@@ -1,4 +1,4 @@
-"""Five simulated laser sensors around the bar of one virtual machine, on its clock."""
+"""Five simulated laser sensors around the bar of a virtual machine, on its clock."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 
 
 class SimulatedFrame:
-    """Five sensors; parameters of the address and faults are those of each of them.
+    """Five sensors; parameters of the address and faults apply to each of them.
 
     Attributes
     ----------
     url : str
         Address of the first sensor.
     urls : dict of str to str
-        Those of the others, by channel.
+        Addresses of the other sensors, by channel.
     """
 
     faults = SimulatedOptoNCDT.faults

@@ -5,7 +5,7 @@ Written from the public manuals of such devices, not from the driver: esd CAN-CB
 profile), WIKA D-20-9 (contents, object 0x2330), SIKO AP10 (p. 49, TPDO parameters), Bonfiglioli ACU (p. 69, order of
 mapping), ABB FCAN-01 (p. 126-129, SDO), JUMO 902910 CANtrans T (p. 16, emergency 5030h of a broken sensor).
 
-Assumed, as no document shows it: what a broken input reads (a Pt100 input's limits), that a TPDO by event without event
+Assumptions without a source: the reading of a broken input (a limit of a Pt100 input); a TPDO by event without event
 timer is not sent.
 """
 
@@ -48,7 +48,10 @@ CIA_404_ANALOGUE_INPUTS = 0x00020194
 PT100 = 30  # sensor type
 CELSIUS, KELVIN, FAHRENHEIT = 0x2D, 0x05, 0xAC  # numerator of a unit, CiA 303-2
 NOT_VALID, OVER_RANGE, UNDER_RANGE = 0x01, 0x02, 0x04
-LOWEST, HIGHEST = -200.715, 853.498  # degC, of a Pt100 input; a broken one shows the upper, a shorted one the lower
+LOWEST, HIGHEST = (
+    -200.715,
+    853.498,
+)  # degC, limits of a Pt100 input; a broken one reads the upper, a shorted one the lower
 ZERO = int.from_bytes(b"zero", "little")  # signature of the autozero
 MOST_DIGITS = 3
 VALUES = {"float": (0x6130, "f32"), "int16": (0x7130, "i16"), "int32": (0x9130, "i32")}
@@ -60,24 +63,24 @@ class SimulatedCanopen:
     """A CiA 404 node whose inputs are temperature sensors of the machine.
 
     Further parameters of the address: ``node`` (1), ``bus`` (``virtual``, or ``udp_multicast`` with ``group`` and
-    ``port``, which crosses processes), ``heartbeat`` (s, 0.1), ``sensors``, ``open``, ``shorted``, ``noise`` (see
-    `simulators.thermometers`), ``code`` (of the abort).
+    ``port``, between processes), ``heartbeat`` (s, 0.1), ``sensors``, ``open``, ``shorted``, ``noise`` (see
+    `temperatures`), ``code`` (of the abort).
 
-    Which objects the node has: ``values`` (``float``, ``int16``, ``int32``, several joined by commas), ``digits``
-    (content of 0x6132; 1), ``unit`` (content of 0x6131; ``none``: without it, degC), ``status`` (``array``,
-    ``single``: 0x6150 without sub-indices, ``none``), ``pdo`` (``event``, ``sync``, ``timer`` with ``event_timer``
-    in ms, 50, ``off``: switched off, ``none``: no TPDO), ``state`` after power-on (``operational``: it starts by
-    itself, as WIKA's object 0x2330 has it do; ``pre-operational``: it waits for a master).
+    Objects of the node: ``values`` (``float``, ``int16``, ``int32``, several separated by commas), ``digits`` (content
+    of 0x6132; 1), ``unit`` (content of 0x6131; ``none``: without it, degC), ``status`` (``array``, ``single``: 0x6150
+    without sub-indices, ``none``), ``pdo`` (``event``, ``sync``, ``timer`` with ``event_timer`` in ms, 50, ``off``:
+    switched off, ``none``: no TPDO), ``state`` after power-on (``operational``: it starts by itself, as with WIKA's
+    object 0x2330; ``pre-operational``: it waits for a master).
 
-    Faults: ``silence``, ``garbage``, ``drop``, ``out_of_range``, ``late`` as of all devices, counted over SDO answers
+    Faults: ``silence``, ``garbage``, ``drop``, ``out_of_range``, ``late`` as for all devices, counted over SDO answers
     and PDOs (``late`` is an SDO answer); ``abort`` (the node refuses), ``bus_off`` (the controllers leave the bus; for
-    ``unplugged_for`` seconds nothing is answered), ``stopped`` (the node goes to the state STOPPED), ``unplugged`` (see
-    `simulators.thermometers`; it boots when it is back).
+    ``unplugged_for`` seconds nothing is answered), ``stopped`` (the node enters the state STOPPED), ``unplugged`` (see
+    `temperatures`; it boots when the power returns).
 
     Attributes
     ----------
     url : str
-        Where the node is.
+        Address of the node.
     """
 
     faults: tuple[str, ...] = (
@@ -103,7 +106,7 @@ class SimulatedCanopen:
         state = _choices(address, "state", "operational", ("operational", "pre-operational"))[0]
         self._answers = 0
         self._was_late = False
-        self._held: tuple[float, int, bytes] | None = None  # time, s, and frame of the answer that is late
+        self._delayed: tuple[float, int, bytes] | None = None  # time, s, and frame of the delayed answer
         node, seed = address.whole("node", 1, 127), int(address.number("seed", 0))
         self._rng = np.random.default_rng([abs(seed), *(address.path or "thermometer").encode()])
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
@@ -133,14 +136,14 @@ class SimulatedCanopen:
         self._server.start()
 
     def close(self) -> None:
-        """End the device; with the last one of its world the world ends."""
+        """End the device; the last device of a world also ends the world."""
         server, self._server = self._server, None
         if server is not None:
             server.close()
         self.world.detach(self)
 
     def report_delivered(self, samples: int) -> None:
-        """Take no note: a node does not stream."""
+        """Do nothing: a node does not stream."""
 
     def _dictionary(self, n: int) -> Dictionary:
         objects, serial = Dictionary(), self.world.seed & 0xFFFFFFFF
@@ -164,7 +167,7 @@ class SimulatedCanopen:
         return objects
 
     def _tpdos(self, node: int, pdo: str, event_timer: int) -> list[Tpdo]:
-        """Return the TPDOs as delivered: the first kind of value of all inputs, then the status."""
+        """Return the default TPDOs: the first format of the values of all inputs, then the status."""
         index, kind = VALUES[self._values[0]]
         n = len(self._inputs.names)
         size = 16 if kind == "i16" else 32
@@ -233,17 +236,17 @@ class SimulatedCanopen:
     def _due(self, now: float) -> float:
         if self._absent():
             return now + 1.0
-        if self._held and now >= self._held[0]:
+        if self._delayed and now >= self._delayed[0]:
             self._send_held()
-        return min(self._slave.due(now), self._held[0] if self._held else math.inf)
+        return min(self._slave.due(now), self._delayed[0] if self._delayed else math.inf)
 
     def _send_held(self) -> None:
-        held, self._held = self._held, None
+        held, self._delayed = self._delayed, None
         if held and self._server is not None:
             self._server.send(*held[1:])
 
     def _absent(self) -> bool:
-        """Whether the node is without power; it boots where it is back."""
+        """Whether the node has no power; boot it when the power returns."""
         if self._away.now():
             return True
         if self._away.returns():
@@ -251,7 +254,7 @@ class SimulatedCanopen:
         return False
 
     def _outgoing(self, can_id: int, data: bytes) -> None:
-        """Send a frame, with the fault that is due on SDO answers and PDOs."""
+        """Send a frame; SDO answers and PDOs with the fault that applies to them."""
         server = self._server
         if server is None or self._away.now():
             return
@@ -267,11 +270,11 @@ class SimulatedCanopen:
         if can_id >= FIRST_SDO_ANSWER:
             self._send_held()
             if self.fault.kind == "late" and number >= self.fault.at and not self._was_late:
-                self._was_late, self._held = True, (time.monotonic() + self.fault.delay, can_id, data)
+                self._was_late, self._delayed = True, (time.monotonic() + self.fault.delay, can_id, data)
                 return
         if self.fault.kind == "stopped" and number >= self.fault.at:
             self._slave.enter(STOPPED)
-        elif (self.fault.kind == "silence" and number >= self.fault.at) or self.fault.hits("drop", number):
+        elif self.fault.suppresses(number):
             return
         elif self.fault.hits("garbage", number):
             server.send(can_id, self._rng.integers(0, 256, self._rng.integers(1, 8), dtype=np.uint8).tobytes())
@@ -313,5 +316,5 @@ def _bus(address: Address) -> dict[str, Any] | None:
         "interface": kind,
         "channel": address.params.get("group", "239.74.163.2"),
         "port": int(address.number("port", 43113)),
-        "hop_limit": 0,  # it stays on this computer
+        "hop_limit": 0,  # only on this computer
     }

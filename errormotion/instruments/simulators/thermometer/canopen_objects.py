@@ -23,10 +23,10 @@ WRONG_STATE = 0x08000022
 NO_DATA = 0x08000024
 
 FORMATS = {"u8": "<B", "u16": "<H", "u32": "<I", "i16": "<h", "i32": "<i", "f32": "<f"}
-LONGEST_OBJECT = 256  # bytes; what a client writes beyond it is refused
+LONGEST_OBJECT = 256  # bytes; longer data of a client are refused
 
 
-class Refused(Exception):  # noqa: N818 - the device refuses, it has not failed
+class Refused(Exception):  # noqa: N818 - a refusal is not a failure
     """The device answers with an SDO abort.
 
     Attributes
@@ -42,7 +42,7 @@ class Refused(Exception):  # noqa: N818 - the device refuses, it has not failed
 
 @dataclass(frozen=True)
 class Entry:
-    """One sub-index of an object.
+    """A sub-index of an object.
 
     Attributes
     ----------
@@ -51,9 +51,9 @@ class Entry:
     read : callable, optional
         Returns the present value; None: write-only.
     write : callable, optional
-        Takes a new value, raises `Refused`; None: read-only.
+        Sets a new value, may raise `Refused`; None: read-only.
     mappable : bool
-        Whether a TPDO may carry it.
+        Whether a TPDO may contain it.
     """
 
     kind: str
@@ -62,7 +62,7 @@ class Entry:
     mappable: bool = False
 
     def encode(self, value: Any) -> bytes:
-        """Return a value as it goes over the bus, little-endian."""
+        """Return a value as bytes on the bus, little-endian."""
         return str(value).encode("ascii") if self.kind == "text" else struct.pack(FORMATS[self.kind], value)
 
     @property
@@ -84,7 +84,7 @@ class Dictionary:
         self._indices.add(index)
 
     def constant(self, index: int, kind: str, value: Any) -> None:
-        """Add a variable that never changes."""
+        """Add a constant variable."""
         self.add(index, 0, Entry(kind, lambda: value))
 
     def array(self, index: int, entries: list[Entry]) -> None:
@@ -94,7 +94,7 @@ class Dictionary:
             self.add(index, k, entry)
 
     def find(self, index: int, subindex: int) -> Entry:
-        """Return an entry; `Refused` where there is none."""
+        """Return an entry; `Refused` if it does not exist."""
         entry = self._entries.get((index, subindex))
         if entry is None:
             raise Refused(NO_SUBINDEX if index in self._indices else NO_OBJECT)
@@ -108,7 +108,7 @@ class Dictionary:
         return entry.encode(entry.read())
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Take the bytes of a new value."""
+        """Set a value from bytes."""
         entry = self.find(index, subindex)
         if entry.write is None:
             raise Refused(READ_ONLY)
@@ -137,14 +137,14 @@ class SdoServer:
         self._expected = 0
 
     def answer(self, request: bytes) -> bytes | None:
-        """Return the answer to a request of 8 bytes; None where there is none."""
-        if len(request) != 8:  # an SDO has 8 bytes; others are not for this service
+        """Return the answer to a request of 8 bytes; None without an answer."""
+        if len(request) != 8:  # an SDO has 8 bytes; other frames are not for this service
             return None
         command = request[0] >> 5
         if command in (1, 2, 5, 6):
             self._object = (int.from_bytes(request[1:3], "little"), request[3])
         try:
-            if command == 4:  # the client ends its transfer
+            if command == 4:  # the client aborts its transfer
                 self._end()
                 return None
             steps = {0: self._next_in, 1: self._begin_in, 2: self._begin_out, 3: self._next_out}
@@ -155,7 +155,7 @@ class SdoServer:
             self._end()
             return b"\x80" + self._name() + refusal.code.to_bytes(4, "little")
 
-    def _begin_out(self, request: bytes) -> bytes:  # noqa: ARG002 - the steps are alike
+    def _begin_out(self, request: bytes) -> bytes:  # noqa: ARG002 - signature of all steps
         self._end()
         data = self._dictionary.read(*self._object)
         if 0 < len(data) <= 4:

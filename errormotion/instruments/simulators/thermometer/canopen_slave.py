@@ -37,13 +37,13 @@ class Tpdo:
     Attributes
     ----------
     cob_id : int
-        With bit 31 where it is switched off, bit 30 where remote frames are not answered.
+        COB-ID, with bit 31 if it is switched off, and bit 30 if remote frames are not answered.
     kind : int
         Transmission type: 0 to 240 on SYNC, 254 and 255 by event.
     event_timer : int
         Milliseconds; 0: none.
     inhibit : int
-        Shortest interval, 100 us.
+        Minimum interval, in units of 100 us.
     mapping : list of int
         Index, sub-index and bits of each object.
     used : int
@@ -66,7 +66,7 @@ class Tpdo:
 
 
 class Slave:
-    """What a node does on the bus; not thread-safe.
+    """The communication of a node; not thread-safe.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Slave:
     heartbeat : float
         Period after power-on, s; 0: none.
     autonomous : bool
-        Whether it goes to OPERATIONAL by itself.
+        Whether it enters OPERATIONAL by itself.
     errors : tuple of int, optional
         Emergency code and error register that are reported after each boot.
     """
@@ -109,7 +109,7 @@ class Slave:
         self._add_objects()
 
     def boot(self) -> None:
-        """Start as after power-on: boot-up message, then PRE-OPERATIONAL (or OPERATIONAL where it is autonomous)."""
+        """Start as after power-on: boot-up message, then PRE-OPERATIONAL, or OPERATIONAL if it is autonomous."""
         for tpdo, (cob_id, kind, timer, mapping, used) in zip(self._tpdos, self._defaults, strict=True):
             tpdo.cob_id, tpdo.kind, tpdo.event_timer, tpdo.used, tpdo.inhibit = cob_id, kind, timer, used, 0
             tpdo.mapping[:] = mapping
@@ -122,14 +122,14 @@ class Slave:
             self.report(*self._at_boot)
 
     def enter(self, state: int) -> None:
-        """Change the state; in OPERATIONAL the event timers run, and SYNC is heard."""
+        """Change the state; in OPERATIONAL the event timers run, and SYNC is processed."""
         entered, self.state = state != self.state, state
         for tpdo in self._tpdos:
             if entered:
                 self._restart(tpdo)
 
     def report(self, code: int, register: int) -> None:
-        """Send an emergency; code 0: the errors are gone."""
+        """Send an emergency; code 0: no errors."""
         self._register = register
         if code:
             self._errors = [code, *self._errors][:OLDEST_ERRORS]
@@ -137,7 +137,7 @@ class Slave:
             self._send(0x80 + self.node, code.to_bytes(2, "little") + bytes((register, 0, 0, 0, 0, 0)))
 
     def receive(self, can_id: int, data: bytes, remote: bool) -> None:
-        """Take a frame from the bus."""
+        """Process a frame from the bus."""
         if remote:
             self._answer_remote(can_id)
         elif can_id == 0:
@@ -150,7 +150,7 @@ class Slave:
                 self._send(0x580 + self.node, answer)
 
     def due(self, now: float) -> float:
-        """Send what is due at a time (`time.monotonic`, s) and return the time of the next."""
+        """Send the messages due at a time (`time.monotonic`, s) and return the time of the next one."""
         if now >= self._next_heartbeat:
             self._next_heartbeat = max(self._next_heartbeat + self._heartbeat / 1000, now)
             self._send(0x700 + self.node, bytes((self.state,)))
@@ -179,15 +179,15 @@ class Slave:
 
     def _answer_remote(self, can_id: int) -> None:
         for tpdo in self._tpdos:
-            asked = tpdo.valid and not tpdo.cob_id & NO_REMOTE and can_id == tpdo.cob_id & 0x7FF
-            if asked and self.state == OPERATIONAL:
+            requested = tpdo.valid and not tpdo.cob_id & NO_REMOTE and can_id == tpdo.cob_id & 0x7FF
+            if requested and self.state == OPERATIONAL:
                 self._transmit(tpdo)
 
     def _transmit(self, tpdo: Tpdo) -> None:
         timed = tpdo.kind >= 254 and tpdo.event_timer
         tpdo.due = time.monotonic() + max(tpdo.event_timer / 1e3, tpdo.inhibit / 1e4) if timed else math.inf
         mapped = [(each >> 16, each >> 8 & 0xFF) for each in tpdo.mapping[: tpdo.used]]
-        with suppress(Refused):  # a value that the device cannot give: the PDO does not go out
+        with suppress(Refused):  # a value is not available: the PDO is not sent
             if mapped:
                 self._send(tpdo.cob_id & 0x7FF, b"".join(self._dictionary.read(*each) for each in mapped))
 
@@ -214,8 +214,8 @@ class Slave:
         for k in range(MOST_MAPPED):
             add(0x1A00 + number, k + 1, Entry("u32", partial(_mapped, tpdo, k), partial(self._map, tpdo, k)))
 
-    def _error(self, place: int) -> int:
-        return self._errors[place] if place < len(self._errors) else 0
+    def _error(self, k: int) -> int:
+        return self._errors[k] if k < len(self._errors) else 0
 
     def _clear_errors(self, value: int) -> None:
         if value:
@@ -228,7 +228,7 @@ class Slave:
 
     def _set_cob_id(self, tpdo: Tpdo, value: int) -> None:
         changed = (value ^ tpdo.cob_id) & ~INVALID
-        if tpdo.valid and not value & INVALID and changed:  # an ID changes only while the PDO is switched off
+        if tpdo.valid and not value & INVALID and changed:  # an ID may only change while the PDO is switched off
             raise Refused(WRONG_STATE)
         if value & FRAME_29_BIT or not 0x181 <= value & 0x7FF <= 0x57F or value & 0x1FFFF800:
             raise Refused(VALUE_OUT_OF_RANGE)
@@ -236,7 +236,7 @@ class Slave:
         self._restart(tpdo)
 
     def _set_kind(self, tpdo: Tpdo, value: int) -> None:
-        if 240 < value < 254:  # 252 and 253, by remote frame alone, are not offered
+        if 240 < value < 254:  # 252 and 253, only by remote frame, are not supported
             raise Refused(VALUE_OUT_OF_RANGE)
         tpdo.kind = value
         self._restart(tpdo)
@@ -265,15 +265,15 @@ class Slave:
             raise Refused(NOT_MAPPABLE)
         tpdo.used = value
 
-    def _map(self, tpdo: Tpdo, place: int, value: int) -> None:
+    def _map(self, tpdo: Tpdo, k: int, value: int) -> None:
         if tpdo.valid or tpdo.used:  # the mapping is written while sub-index 0 is 0
             raise Refused(WRONG_STATE)
         if value:
             entry = self._dictionary.find(value >> 16, value >> 8 & 0xFF)
             if not entry.mappable or entry.bits != value & 0xFF:
                 raise Refused(NOT_MAPPABLE)
-        tpdo.mapping[place] = value
+        tpdo.mapping[k] = value
 
 
-def _mapped(tpdo: Tpdo, place: int) -> int:
-    return tpdo.mapping[place]
+def _mapped(tpdo: Tpdo, k: int) -> int:
+    return tpdo.mapping[k]

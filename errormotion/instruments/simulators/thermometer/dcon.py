@@ -16,7 +16,7 @@ from errormotion.instruments.simulators.thermometer.temperatures import Inputs, 
 from errormotion.instruments.transports import Address
 
 LONGEST_LINE = 64
-"""Bytes of a request without an end after which the module waits for the next line."""
+"""Longest request, bytes; a longer one is discarded up to the next line."""
 FORMATS = ("engineering", "percent", "hexadecimal")
 TYPE_T = 0x10
 
@@ -25,9 +25,9 @@ class SimulatedDcon(SimulatedDevice):
     """An ICP DAS I-7018 or Advantech ADAM-4018 whose thermocouples measure temperatures of the machine.
 
     Further parameters of the address: ``sensors``, ``open``, ``noise`` and ``unplugged_for`` (see
-    `simulators.thermometers`), ``unit`` (1), ``checksum`` (0 or 1), ``model`` (``7018``, ``4018``), ``format``
+    `temperatures`), ``unit`` (1), ``checksum`` (0 or 1), ``model`` (``7018``, ``4018``), ``format``
     (``engineering``, ``percent``, ``hexadecimal``), ``type`` (code of the input range, 16: type T), ``enabled`` (bits
-    of the enabled channels; those with a sensor), ``init`` (1: INIT* was grounded at power on).
+    of the enabled channels; default: those with a sensor), ``init`` (1: INIT* was grounded at power on).
     """
 
     faults: tuple[str, ...] = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "late", "unplugged")
@@ -55,10 +55,10 @@ class SimulatedDcon(SimulatedDevice):
             )
         type_code = address.whole("type", TYPE_T, 255)
         if type_code not in SPANS[model]:
-            raise InstrumentError(f"'type' in '{address.url}': a {model} has no input range {type_code}")
+            raise InstrumentError(f"'type' in '{address.url}': expected an input range of a {model}; found {type_code}")
         if len(self._inputs.names) > CHANNELS:
             raise InstrumentError(
-                f"'sensors' in '{address.url}': a module has {CHANNELS} inputs; found {len(self._inputs.names)} sensors"
+                f"'sensors' in '{address.url}': expected at most {CHANNELS} sensors; found {len(self._inputs.names)}"
             )
         return Module(
             self._temperatures,
@@ -73,7 +73,7 @@ class SimulatedDcon(SimulatedDevice):
         )
 
     def answer(self, request: bytes) -> bytes:
-        """Return the answer to one request; empty where the module is silent."""
+        """Return the answer to one request; empty if the module does not answer."""
         text = self._module.answer(request)
         if text is None:
             return b""
@@ -83,7 +83,7 @@ class SimulatedDcon(SimulatedDevice):
         return text.encode("latin-1") + LINE_END
 
     def connection_opened(self) -> None:
-        """Forget an unfinished request of the previous connection."""
+        """Discard an incomplete request of the previous connection."""
         super().connection_opened()
         self._discarding = False
 
@@ -93,7 +93,7 @@ class SimulatedDcon(SimulatedDevice):
         return [float("nan") if far or i in self._inputs.open else t for i, t in enumerate(readings)]
 
     def _terminals(self) -> float:
-        """Return the temperature of the terminals: that of the ambient sensor of the machine, or the first one."""
+        """Return the temperature of the terminals: that of the machine's ambient sensor, or of the first sensor."""
         machine = self.world.machine
         known = machine.temperature_sensors
         return float(machine.temperatures([self.world.time])[0, known.index("ambient") if "ambient" in known else 0])

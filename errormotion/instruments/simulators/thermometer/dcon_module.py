@@ -1,10 +1,9 @@
-"""A thermocouple module with the DCON protocol: its settings, and what it answers to each line.
+"""A thermocouple module with the DCON protocol: its settings, and its answer to each line.
 
 Sources: ICP DAS I-7011, I-7018 User Manual, rev. B1.0, p. 17 to 62 (commands of the I-7018, ``?AA``, silence);
 Advantech ADAM 4000 Series User's Manual, p. 5-4 to 5-23 and appendix B (ADAM-4018, inputs out of bounds, ranges,
-formats); ADLINK NuDAM ND-6000 User's Manual, p. 41 and 88 (bits of the format, formats); ICP DAS I-7088 User Manual,
-p. 17 and 153 (checksum, upper case, INIT*). What no document shows is listed in
-``docs/reference/devices/dcon_temperature.md``.
+formats); ADLINK NuDAM ND-6000 User's Manual, p. 41 and 88 (bits of the format, formats); ICP DAS I-7088 User Manual, p.
+17 and 153 (checksum, upper case, INIT*). ``docs/reference/devices/dcon_temperature.md`` lists the assumptions.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class Span:
     lowest, highest : float
         degC, or mV.
     decimals : int
-        Digits behind the point in engineering units.
+        Digits after the point in engineering units.
     thermocouple : bool
         Whether the module linearises a thermocouple; else it measures the voltage.
     volts : bool
@@ -104,8 +103,8 @@ def sum_of_characters(text: str) -> str:
     return f"{sum(text.encode('latin-1')) % 256:02X}"
 
 
-def written(value: float, span: Span, form: int, model: Model = "7018") -> str:
-    """Return one reading as the module writes it: degC or mV of the input, NaN for an open one."""
+def format_reading(value: float, span: Span, form: int, model: Model = "7018") -> str:
+    """Return one reading in the format of the module, from degC or mV of the input, NaN for an open input."""
     under, over = OUT_OF_RANGE[model][form]
     if math.isnan(value):
         return over
@@ -130,7 +129,7 @@ class Module:
     Parameters
     ----------
     inputs : callable
-        Returns the temperatures of the inputs now, degC; NaN where an input is open.
+        Returns the present temperatures of the inputs, degC; NaN for an open input.
     clock : callable
         Returns the time, s.
     cold_junction : callable
@@ -175,17 +174,17 @@ class Module:
     # ------------------------------------------------------------------ lines
 
     def answer(self, line: bytes) -> str | None:
-        """Return the answer to a line without its end, with its checksum; None where the module is silent."""
+        """Return the answer to a line, both without line end; None if the module does not answer."""
         text = line.decode("latin-1")
         if self._checked:
             text, sent = text[:-2], text[-2:]
             if sent != sum_of_characters(text):
                 return None
         checked = self._checked
-        answer = self._obey(text)
+        answer = self._execute(text)
         return None if answer is None else answer + (sum_of_characters(answer) if checked else "")
 
-    def _obey(self, text: str) -> str | None:
+    def _execute(self, text: str) -> str | None:
         self._watch()
         if text == "~**" and self._model == "7018":
             self._last_ok = self._clock()
@@ -195,24 +194,24 @@ class Module:
         leading, rest = text[0], text[3:]
         if not (leading == "~" and rest.startswith("O")) and rest != rest.upper():
             return None
-        own = f"{self._address:02X}"
+        address = f"{self._address:02X}"
         if leading == "#":
             return self._read(rest)
         if leading == "%":
             return self._configure(rest) if len(rest) == 8 else None
-        obey, length = self._command(leading, rest[:1])
+        execute, length = self._command(leading, rest[:1])
         if not rest:
             return None
-        if obey is None:
-            return f"?{own}"
+        if execute is None:
+            return f"?{address}"
         parameter = rest[1:]
         if length is not None and len(parameter) != length:
             return None
-        data = obey(parameter)
-        return f"?{own}" if data is None else data if data.startswith(">") else f"!{data}"
+        data = execute(parameter)
+        return f"?{address}" if data is None else data if data.startswith(">") else f"!{data}"
 
     def _command(self, leading: str, code: str) -> tuple[Callable[[str], str | None] | None, int | None]:
-        """Return the method of a command and the length of its parameter; None: of any length."""
+        """Return the method of a command and the length of its parameter; None: any length."""
         dollar: dict[str, tuple[Callable[[str], str | None], int | None]] = {
             "2": (self._read_configuration, 0),
             "3": (self._read_cold_junction, 0),
@@ -255,10 +254,10 @@ class Module:
 
     def _write(self, temperature: float) -> str:
         span = SPANS[self._model][self._type]
-        shown = temperature + self._offset
+        value = temperature + self._offset
         if not span.thermocouple:
-            shown = SEEBECK * (temperature - self._cold_junction())
-        return written(shown, span, self._form & FORMAT_BITS, self._model)
+            value = SEEBECK * (temperature - self._cold_junction())
+        return format_reading(value, span, self._form & FORMAT_BITS, self._model)
 
     def _read_cold_junction(self, _: str) -> str:
         return f">{_signed(self._cold_junction() + self._offset, 1)}"
@@ -306,7 +305,7 @@ class Module:
     # ------------------------------------------------------------------ host watchdog
 
     def _watch(self) -> None:
-        """Set the flag when the host has been silent for too long; the watchdog then is off."""
+        """Set the flag if the host has been silent for too long; the watchdog is then off."""
         if self._watching and self._clock() - self._last_ok > self._interval * WATCHDOG_STEP:
             self._watching, self._timed_out = False, True
 

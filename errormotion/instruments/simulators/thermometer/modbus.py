@@ -1,4 +1,4 @@
-"""A thermometer with Modbus on the virtual machine, on a network connection or a serial line that can fail."""
+"""A thermometer with Modbus on the virtual machine, with a network connection or a serial line."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ _SAME = ("map", "type", "function", "first", "stride", "word_order", "byte_order
 
 
 class SimulatedModbus(SimulatedModbusDevice):
-    """A device whose registers are temperature sensors of the machine.
+    """A device whose registers contain temperatures of the machine's sensors.
 
     Further parameters of the address: ``framing`` (``tcp`` or ``rtu``; default by ``wire``), ``map``, ``type``,
     ``function``, ``first``, ``stride``, ``word_order``, ``byte_order``, ``scale``, ``offset``, ``open_from``,
-    ``thermocouples`` (joined by commas) as in the settings of the instrument; ``sensors`` (names of the twin's
-    sensors, joined by commas), ``open`` and ``shorted`` (numbers of inputs, from 0), ``unit`` (1), ``code`` (of the
+    ``thermocouples`` (separated by commas) as in the settings of the instrument; ``sensors`` (names of the twin's
+    sensors, separated by commas), ``open`` and ``shorted`` (numbers of inputs, from 0), ``unit`` (1), ``code`` (of the
     exception reply).
 
-    Further faults: ``exception`` (a reply that refuses), ``unit`` (the answer of another device), ``short`` (the
-    answer breaks off), ``unplugged`` (see `simulators.thermometers`; old
-    connections are dead then).
+    Further faults: ``exception`` (an exception reply), ``unit`` (the answer of another device), ``short`` (an
+    incomplete answer), ``unplugged`` (see `temperatures`; old connections are then closed).
     """
 
     faults: tuple[str, ...] = (
@@ -55,13 +54,13 @@ class SimulatedModbus(SimulatedModbusDevice):
             super()._on_data(data)
 
     def _blocks(self) -> dict[int, int]:
-        """Return the registers that the device has: those of its channels, and what lies between."""
+        """Return the registers of the device: those of its channels, and all between them."""
         addresses = self._settings.addresses
         first = min(addresses)
         return {first: max(addresses) + words_of(self._settings.type) - first}
 
     def _registers(self) -> dict[int, int] | int:
-        """Return the registers now, or the code of a refusal."""
+        """Return the present registers, or the code of an exception."""
         if self.fault.hits("exception", self._answers):
             return self._code
         found: dict[int, int] = {}
@@ -89,7 +88,7 @@ class SimulatedModbus(SimulatedModbusDevice):
 
 
 def _each(value: float | tuple[float, ...], i: int) -> float:
-    """Return the value of one channel, where one holds for all or there is one for each."""
+    """Return the value for one channel, from one for all channels or one for each."""
     if not isinstance(value, tuple):
         return value
     return value[i if len(value) > 1 else 0]
@@ -107,4 +106,4 @@ def _settings(address: Address, names: tuple[str, ...]) -> ModbusSettings:
     try:
         return ModbusSettings.model_validate({**given, "channels": names})
     except ValidationError as error:
-        raise InstrumentError(f"The register map in '{address.url}' cannot be: {error.errors()[0]['msg']}") from None
+        raise InstrumentError(f"The register map in '{address.url}' is invalid: {error.errors()[0]['msg']}") from None

@@ -1,21 +1,21 @@
-"""Numbers in 16-bit registers, as a device writes them: 16 or 32 bits, in either order of words and of bytes."""
+"""Numbers in 16-bit registers: 16 or 32 bits, in either order of words and of bytes."""
 
 from __future__ import annotations
 
 import math
 import struct
 
-#: Format and bits of each kind of number.
+#: Format and bits of each type of number.
 KINDS = {"u16": ("H", 16), "i16": ("h", 16), "u32": ("I", 32), "i32": ("i", 32), "f32": ("f", 32)}
 
 
 def words_of(kind: str) -> int:
-    """Return the number of registers that a number of this kind takes."""
+    """Return the number of registers of a number of this type."""
     return KINDS[kind][1] // 16
 
 
 def to_registers(value: float, kind: str, *, word_order: str = "big", byte_order: str = "big") -> list[int]:
-    """Return the registers of a number; integers are rounded and limited to the range of their kind."""
+    """Return the registers that represent a number; integers are rounded and limited to the range of their type."""
     letter, bits = KINDS[kind]
     if kind == "f32":
         data = struct.pack(">f", value)

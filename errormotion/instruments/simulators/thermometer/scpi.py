@@ -1,13 +1,13 @@
 """A data acquisition unit with SCPI commands (Agilent/Keysight 34970A) on the virtual machine.
 
-The grammar is that of SCPI-1999: long and short forms in any case, several commands in one line joined by ``;``, where
-a command without a leading ``:`` continues the path of the one before. The commands are those of a scan of
-temperatures in the 34970A User's Guide, chapter 5 (Remote Interface Reference); the errors those of its chapter 6.
-From memory, and not from a page that was seen: the numbers 111, 112, 113 and 305, the length of the error queue (10),
-and the answer of ``SYSTem:CTYPe?``.
+The grammar is that of SCPI-1999: long and short forms in upper or lower case, several commands in one line separated by
+``;``, where a command without a leading ``:`` continues the path of the previous one. The commands are those of a scan
+of temperatures in the 34970A User's Guide, chapter 5 (Remote Interface Reference); the errors those of its chapter 6.
+From memory are the numbers 111, 112, 113 and 305, the length of the error queue (10), and the answer of
+``SYSTem:CTYPe?``.
 
-Slot 1 holds a multiplexer 34901A: channels 101 to 120; a measurement with four wires takes channel n (101 to 110) and
-n + 10. Its inputs are the sensors of the address, from channel 101 on; a channel beyond them is open.
+Slot 1 has a multiplexer 34901A: channels 101 to 120; a measurement with four wires uses channels n (101 to 110) and n +
+10. Its inputs are the sensors of the address, from channel 101 on; the other channels are open.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CARD = "HEWLETT-PACKARD,34901A,0,2.3"
 CHANNELS = range(101, 121)
 QUEUE = 10
 LONGEST = 4096
-"""Bytes of a line that are kept."""
+"""Largest number of bytes of a line that are used."""
 OVERLOAD = 9.9e37
 PROBES: dict[str, tuple[str, ...]] = {
     "TC": tuple("BEJKNRST"),
@@ -58,7 +58,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "TEMPerature:TRANsducer:TCouple:RJUNction:TYPE": ("INT", "EXT", "FIX"),
     "TEMPerature:TRANsducer:TCouple:CHECk": ("OFF", "ON", "0", "1"),
 }
-"""Settings of channels that take a word; the first is the one after a reset."""
+"""Settings of channels with a word as value; the first one is the value after a reset."""
 NUMBERS: dict[str, tuple[float, float, float]] = {
     "TEMPerature:NPLCycles": (0.02, 200.0, 1.0),
     "TEMPerature:TRANsducer:RTD:RESistance": (49.0, 2100.0, 100.0),
@@ -67,14 +67,14 @@ NUMBERS: dict[str, tuple[float, float, float]] = {
     "TEMPerature:TRANsducer:FRTD:RESistance:REFerence": (49.0, 2100.0, 100.0),
     "ROUTe:CHANnel:DELay": (0.0, 60.0, 0.0),
 }
-"""Settings of channels that take a number: lowest, highest, and the one after a reset."""
+"""Settings of channels with a number as value: lowest, highest, and value after a reset."""
 Command = tuple[Callable[[list[str]], str | None], int, int]
-"""Function of the parameters, and their least and largest number."""
+"""Function of the parameters, and their smallest and largest number."""
 _FIELDS = ("ALARm", "CHANnel", "TIME", "UNIT")
 
 
 class _RefusedError(Exception):
-    """An error for the queue, by its number."""
+    """An error for the error queue, with its number."""
 
 
 class SimulatedScpiUnit(SimulatedDevice):
@@ -98,7 +98,7 @@ class SimulatedScpiUnit(SimulatedDevice):
             raise
 
     def answer(self, request: bytes) -> bytes:
-        """Return the answers to one line, joined by ``;``; empty where nothing was queried."""
+        """Return the answers to one line, separated by ``;``; empty without a query."""
         answers: list[str] = []
         path = ""
         for unit in _units(request[:LONGEST].decode("ascii", errors="replace").strip()):
@@ -109,12 +109,12 @@ class SimulatedScpiUnit(SimulatedDevice):
                 full = header.lstrip(":")
                 if not header.startswith("*"):
                     path = full.rpartition(":")[0]
-                said = self._obey(full, parameters)
+                result = self._execute(full, parameters)
             except _RefusedError as refusal:
                 self._queue(int(str(refusal)))
                 break
-            if said is not None:
-                answers.append(said)
+            if result is not None:
+                answers.append(result)
         return (";".join(answers) + "\r\n").encode() if answers else b""
 
     def reply(self, data: bytes) -> None:
@@ -146,7 +146,7 @@ class SimulatedScpiUnit(SimulatedDevice):
 
     # ------------------------------------------------------------------ commands
 
-    def _obey(self, header: str, parameters: list[str]) -> str | None:
+    def _execute(self, header: str, parameters: list[str]) -> str | None:
         for form, (function, least, most) in self._commands().items():
             if _fits(header, form):
                 if len(parameters) < least:
@@ -157,7 +157,7 @@ class SimulatedScpiUnit(SimulatedDevice):
         raise _RefusedError(-113)
 
     def _commands(self) -> dict[str, Command]:
-        """Return the commands: header, with its short form in capitals, to function and numbers of parameters."""
+        """Return the commands: header, with the short form in capitals, to function and numbers of parameters."""
         found: dict[str, Command] = {
             "*IDN?": (lambda _: IDENTITY, 0, 0),
             "*RST": (self._restart, 0, 0),
@@ -191,11 +191,11 @@ class SimulatedScpiUnit(SimulatedDevice):
             found[name] = (partial(self._set, name), 1, 2)
             found[f"{name}?"] = (partial(self._get, name), 0, 1)
         for name in _FIELDS:
-            found[f"FORMat:READing:{name}"] = (partial(self._show, name), 1, 1)
-            found[f"FORMat:READing:{name}?"] = (partial(self._shown, name), 0, 0)
+            found[f"FORMat:READing:{name}"] = (partial(self._set_field, name), 1, 1)
+            found[f"FORMat:READing:{name}?"] = (partial(self._get_field, name), 0, 0)
         for name in self._values:
-            found[name] = (partial(self._trigger, name), 1, 1)
-            found[f"{name}?"] = (partial(self._triggered, name), 0, 0)
+            found[name] = (partial(self._set_trigger, name), 1, 1)
+            found[f"{name}?"] = (partial(self._get_trigger, name), 0, 0)
         return found
 
     def _restart(self, _: list[str]) -> None:
@@ -216,7 +216,7 @@ class SimulatedScpiUnit(SimulatedDevice):
         return CARD if parameters[0] == "100" else "HEWLETT-PACKARD,0,0,0"
 
     def _configure(self, parameters: list[str]) -> None:
-        """Take probe, type and channels; the scan list becomes these channels."""
+        """Set probe and type of channels, which become the scan list."""
         channels = _channels(parameters[-1])
         probe = next((name for name in ("TCouple", "RTD", "FRTD", "THERmistor") if _fits(parameters[0], name)), "")
         short = {"TCouple": "TC", "THERmistor": "THER"}.get(probe, probe)
@@ -270,30 +270,30 @@ class SimulatedScpiUnit(SimulatedDevice):
         usual = WORDS[name][0] if name in WORDS else f"{NUMBERS[name][2]:+.8E}"
         return ",".join(self._set_to.get((name, channel), usual) for channel in channels)
 
-    def _show(self, name: str, parameters: list[str]) -> None:
+    def _set_field(self, name: str, parameters: list[str]) -> None:
         value = parameters[0].upper()
         if value not in ("ON", "OFF", "0", "1"):
             raise _RefusedError(-224)
         self._fields[name] = value in ("ON", "1")
 
-    def _shown(self, name: str, _: list[str]) -> str:
+    def _get_field(self, name: str, _: list[str]) -> str:
         return str(int(self._fields[name]))
 
-    def _trigger(self, name: str, parameters: list[str]) -> None:
+    def _set_trigger(self, name: str, parameters: list[str]) -> None:
         self._values[name] = parameters[0].upper()
 
-    def _triggered(self, name: str, _: list[str]) -> str:
+    def _get_trigger(self, name: str, _: list[str]) -> str:
         return self._values[name]
 
     def _initiate(self, _: list[str]) -> None:
         if not self._scan:
             raise _RefusedError(113)
-        self._readings = self._scanned()
+        self._readings = self._scan_inputs()
 
     def _fetch(self) -> str:
         if not self._readings:
             raise _RefusedError(-230)
-        return ",".join(self._written(channel, value) for channel, value in self._readings)
+        return ",".join(self._format(channel, value) for channel, value in self._readings)
 
     def _read(self, _: list[str]) -> str:
         self._initiate([])
@@ -301,7 +301,7 @@ class SimulatedScpiUnit(SimulatedDevice):
 
     # ------------------------------------------------------------------ readings
 
-    def _scanned(self) -> list[tuple[int, float]]:
+    def _scan_inputs(self) -> list[tuple[int, float]]:
         temperatures = self._inputs.temperatures(self.world.time, self._rng)
         far = self.fault.hits("out_of_range", self._answers)
         found = []
@@ -311,7 +311,7 @@ class SimulatedScpiUnit(SimulatedDevice):
             found.append((channel, OVERLOAD if broken else _in_unit(temperatures[i], self._unit.get(channel, "C"))))
         return found
 
-    def _written(self, channel: int, value: float) -> str:
+    def _format(self, channel: int, value: float) -> str:
         parts = [f"{value:+.8E}"]
         if self._fields["UNIT"]:
             parts[0] += f" {self._unit.get(channel, 'C')}"
@@ -325,11 +325,11 @@ class SimulatedScpiUnit(SimulatedDevice):
 
 
 def _nothing(_: list[str]) -> None:
-    """Obey a command that changes nothing here."""
+    """Execute a command without effect here."""
 
 
 def _units(line: str) -> list[str]:
-    """Return the commands of a line, which ``;`` separates outside of quotes and brackets."""
+    """Return the commands of a line, which ``;`` separates outside quotes and brackets."""
     return [unit.strip() for unit in re.findall(r"(?:\"[^\"]*\"|\([^)]*\)|[^;])+", line) if unit.strip()]
 
 
@@ -342,7 +342,7 @@ def _split(unit: str) -> tuple[str, list[str]]:
 
 
 def _fits(header: str, form: str) -> bool:
-    """Whether a header is the long or the short form of a command, part by part; ``SENSe`` may be left out."""
+    """Whether a header is the long or the short form of a command, part by part; ``SENSe`` may be omitted."""
     given, parts = header.upper().split(":"), form.split(":")
     if given[0] in ("SENS", "SENSE"):
         given = given[1:]
@@ -375,7 +375,7 @@ def _channels(text: str, *, empty: bool = False) -> list[int]:
 
 
 def _block(text: str) -> str:
-    """Return a text as a definite-length block, as the query of the scan list answers."""
+    """Return a text as a definite-length block, as in the answer to the query of the scan list."""
     return f"#2{len(text):02d}{text}" if len(text) < 100 else f"#3{len(text):03d}{text}"
 
 

@@ -1,4 +1,4 @@
-"""What the simulated thermometers share: which sensors of the machine they read, and being unplugged for a time."""
+"""Common parts of the simulated thermometers: the sensors of the machine, and a temporary loss of power."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ NOISE = 0.02  # degC, one sigma
 class Inputs:
     """The inputs of a thermometer: sensors of the machine, some of them broken.
 
-    Parameters of the address: ``sensors`` (names, joined by commas), ``open`` and ``shorted`` (numbers of inputs from
-    0, joined by commas), ``noise`` (degC).
+    Parameters of the address: ``sensors`` (names, separated by commas), ``open`` and ``shorted`` (numbers of inputs
+    from 0, separated by commas), ``noise`` (degC).
 
     Attributes
     ----------
     names : tuple of str
-        Of the sensors.
+        Names of the sensors.
     open, shorted : frozenset of int
         Inputs without a sensor, and with a shorted one.
     """
@@ -35,14 +35,14 @@ class Inputs:
         known = machine.temperature_sensors
         self.names = tuple(address.params.get("sensors", DEFAULT_SENSORS).split(","))
         if unknown := [name for name in self.names if name not in known]:
-            raise InstrumentError(f"The machine has the sensors {', '.join(known)}; found {', '.join(unknown)}")
+            raise InstrumentError(f"Expected sensors of the machine, {', '.join(known)}; found {', '.join(unknown)}")
         self.open, self.shorted = (_numbers(address, key, len(self.names)) for key in ("open", "shorted"))
         self._machine, self._noise = machine, address.number("noise", NOISE)
-        self._places = [known.index(name) for name in self.names]
+        self._indices = [known.index(name) for name in self.names]
 
     def temperatures(self, time: float, rng: np.random.Generator) -> list[float]:
-        """Return what good sensors read at a time of the world, degC."""
-        truth = self._machine.temperatures([time])[0, self._places]
+        """Return readings of intact sensors at a time of the world, degC."""
+        truth = self._machine.temperatures([time])[0, self._indices]
         return [float(t) for t in truth + self._noise * rng.standard_normal(truth.size)]
 
 
@@ -58,15 +58,15 @@ def _numbers(address: Address, key: str, n: int) -> frozenset[int]:
 
 
 class Unplugging:
-    """``fault=unplugged``: from answer ``fault_at`` on the thermometer is without power for ``unplugged_for`` seconds.
+    """``fault=unplugged``: from answer ``fault_at`` on the thermometer has no power for ``unplugged_for`` seconds.
 
-    Meanwhile it does not answer; without ``unplugged_for`` it stays away.
+    Meanwhile it does not answer; without ``unplugged_for`` it remains off.
 
     Parameters
     ----------
     address : Address
     kinds : sequence of str
-        Faults that start and end so.
+        Faults that start and end in this way.
     """
 
     def __init__(self, address: Address, kinds: Sequence[str] = ("unplugged",)) -> None:
@@ -76,25 +76,25 @@ class Unplugging:
         self._since = math.nan
 
     def begins(self, answers: int) -> bool:
-        """Whether it starts now, when ``answers`` have been given; True only once."""
+        """Whether the fault starts now, after a number of ``answers``; True only once."""
         if not self._wanted or answers < self._at:
             return False
         self._wanted, self._since = False, time.monotonic()
         return True
 
     def now(self) -> bool:
-        """Whether it is unplugged."""
+        """Whether the thermometer is unplugged."""
         return time.monotonic() < self._since + self._length
 
     def returns(self) -> bool:
-        """Whether it is back since it was queried last; True only once."""
+        """Whether the power has returned since the last call; True only once."""
         if self._since != self._since or self.now():
             return False
         self._since = math.nan
         return True
 
     def keeps_from(self, answers: int, server: Server) -> bool:
-        """Whether what comes in now gets no answer; back again, the device knows nothing of an old connection."""
+        """Whether received data are not answered; when the power returns, an old connection is closed."""
         self.begins(answers)
         if self.now():
             return True

@@ -1,1 +1,1 @@
-"""The virtual world that simulated devices share: its clock, its machine in motion, its targets and trackers."""
+"""The virtual world that simulated devices share: clock, motion of the machine, targets and trackers."""

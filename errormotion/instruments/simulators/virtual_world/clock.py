@@ -1,11 +1,11 @@
-"""The clock of a virtual world, and the thread that makes the samples of all channels in lockstep.
+"""The clock of a virtual world, and the thread that produces the samples of all channels in lockstep.
 
-The clock advances only while samples stream, evenly spaced or wherever a moving axis triggers them, or when it is set;
-unless it is set to tick, for a monitor of a machine that receives no orders.
-Real time is waited for only where a pace is given: a block of samples is made for every streaming channel, then
-sent, and sending waits for the readers. The time of the world is that of the last sample that its readers have handed
-over, so that other readings (a temperature) belong to it, although the samples under way are further on; and when
-the streams end, the world goes on from there.
+The clock advances only while samples stream, evenly spaced or triggered by a moving axis, or when it is set; unless it
+is set to tick, for a monitor of a machine that receives no commands. The clock only waits for real time if a pace is
+given: a block of samples is produced for every streaming channel, then sent, and sending waits for the readers. The
+time of the world is that of the last sample that its readers have delivered, so that other readings (a temperature)
+belong to this time, although later samples have already been produced; when the streams end, the world continues from
+this time.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from errormotion.instruments.simulators.virtual_world.streams import Stream, Tri
 
 Array = np.ndarray[Any, Any]
 
-BLOCK = 4096  # samples made at once when running freely
-PACED_BLOCK = 0.01  # s, when running at a pace
+BLOCK = 4096  # samples produced at once when running freely
+PACED_BLOCK = 0.01  # s of samples produced at once when running at a pace
 
 
 class SampleClock:
@@ -32,11 +32,11 @@ class SampleClock:
     Attributes
     ----------
     name : str
-        Of the world.
+        Name of the world.
     pace : float or None
-        Simulated seconds per second; None = as fast as the readers.
+        Simulated seconds per second; None: as fast as the readers.
     ticking : float or None
-        Simulated seconds per second while nothing streams; None = the clock stops.
+        Simulated seconds per second while nothing streams; None: the clock stops.
     """
 
     name: str
@@ -44,9 +44,9 @@ class SampleClock:
     def __init__(self) -> None:
         self.pace: float | None = None
         self.ticking: float | None = None
-        self._wound = time.monotonic()  # when the ticks were counted last
-        self._front = 0.0  # time up to which samples have been made
-        self._making = 0.0  # time up to which they are being made
+        self._wound = time.monotonic()  # real time at which the ticks were last counted
+        self._front = 0.0  # time up to which samples have been produced
+        self._making = 0.0  # time up to which samples are being produced
         self._settings_of_clock = 0
         self._streams: list[Stream] = []
         self._armed: list[Stream] = []  # slaves that wait for their master
@@ -82,7 +82,7 @@ class SampleClock:
         self._settings_of_clock += 1
 
     def _next_instant(self) -> float:
-        """Return the first time for which no sample is made or under way: orders take effect from then on."""
+        """Return the first time without a sample produced or in progress: commands take effect from then on."""
         return float(max(self._front, self._making, self.time))
 
     @property
@@ -101,7 +101,7 @@ class SampleClock:
             raise InstrumentError(f"Cannot {what} while {', '.join(names)} stream; stop the streams first")
 
     def _forget_streams(self) -> threading.Thread | None:
-        """Remove all streams, and let the thread end; return it, to be joined."""
+        """Remove all streams, so that the thread ends; return the thread for joining."""
         self._streams.clear()
         self._armed.clear()
         self._triggered.clear()
@@ -112,7 +112,7 @@ class SampleClock:
     # ------------------------------------------------------------------ streams
 
     def start_stream(self, stream: Stream) -> None:
-        """Start making samples: at once, for a slave when its master starts, for a master with all its slaves."""
+        """Start producing samples: at once, for a slave when its master starts, for a master with all its slaves."""
         with self._change:
             if stream.sync == "SLAVE":
                 self._armed.append(stream)
@@ -131,7 +131,7 @@ class SampleClock:
             self._change.notify_all()
 
     def end_stream(self, stream: Stream) -> None:
-        """Make no more samples for this channel, nor for the slaves of a master; a block in the making may come."""
+        """Stop samples of this channel, and of the slaves of a master; a block in progress may still be sent."""
         with self._change:
             if stream in self._armed:
                 self._armed.remove(stream)
@@ -146,12 +146,12 @@ class SampleClock:
                     self._set_clock(seen)
 
     def start_triggered(self, stream: TriggeredStream) -> float:
-        """Let a device follow the axes; return the time from which on.
+        """Register a device that the axes trigger; return the time from which it is triggered.
 
         Raises
         ------
         InstrumentError
-            Devices with a clock of their own stream.
+            Devices with their own sample clock are streaming.
         """
         with self._change:
             if self._streams:
@@ -161,7 +161,7 @@ class SampleClock:
             return now
 
     def end_triggered(self, stream: TriggeredStream) -> None:
-        """Let the clock stop where the device's reader is. Idempotent."""
+        """Remove the device, and stop the clock at the last sample that its reader has delivered; idempotent."""
         with self._change:
             if stream in self._triggered:
                 seen = self.time
@@ -189,13 +189,13 @@ class SampleClock:
                 until = self._making = (fastest.position + size) / fastest.rate
             self._make(streams, until)
             with self._change:
-                if self._settings_of_clock == setting:  # the clock has not been set meanwhile
+                if self._settings_of_clock == setting:  # the clock was not set meanwhile
                     self._front = until
             if pace is not None:
                 time.sleep(max(0.0, wall + (until - began) / pace - time.monotonic()))
 
     def _make(self, streams: Sequence[Stream], until: float) -> None:
-        """Make the samples of all streams before a time; channels on one clock in one go."""
+        """Produce the samples of all streams before a time, of channels on one clock together."""
         groups: dict[tuple[float, int], list[Stream]] = {}
         for stream in streams:
             groups.setdefault((stream.rate, stream.position), []).append(stream)
@@ -216,5 +216,5 @@ class SampleClock:
 
 
 def _first_sample(time: float, rate: float) -> int:
-    """Return the number of the first sample at or after a time, rounding errors aside."""
+    """Return the number of the first sample at or after a time, apart from rounding errors."""
     return int(np.ceil(time * rate - 1e-6))

@@ -1,4 +1,4 @@
-"""The machine behind ``sim://machine``: the one that the bench file describes in its table ``[machine]``."""
+"""The machine of ``sim://machine``, which the bench file describes in its table ``[machine]``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def describe(machine: MachineDescription | None) -> None:
 
 
 def described(name: str) -> str | MachineDescription:
-    """Return the machine behind a name in a simulated address.
+    """Return the machine for a name in a simulated address.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Motion of the axes of a virtual world: steps of a sphere, NC programs, straight moves, and the touch probe.
 
-The time of a program passes with samples or by ``elapse``. The time of a straight move and of a touch passes at once.
+During a program, samples or ``elapse`` advance the time. A straight move and a touch advance it at once.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from errormotion.errors import ErrormotionError, InstrumentError
 from errormotion.instruments.simulators.virtual_world.clock import SampleClock
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret, title
-from errormotion.instruments.simulators.virtual_world.printing import Block, Order
+from errormotion.instruments.simulators.virtual_world.printing import Block, PortCommand
 from errormotion.twin import Event, StepProgram
 from errormotion.twin.paths import Path
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 Array = np.ndarray[Any, Any]
 
 TOOLS = ("bar", "sphere", "probe")
-LEAD_IN = (0.5, 2.5)  # s between an order and the first motion: unknown to the driver
+LEAD_IN = (0.5, 2.5)  # s between a command and the first motion: unknown to the driver
 _ROUNDING = 1e-9  # m
 
 
 class Motion(SampleClock):
-    """A clock, and axes that move.
+    """A clock, and moving axes.
 
     Attributes
     ----------
@@ -41,17 +41,17 @@ class Motion(SampleClock):
     path : Path
         Path of the axes without a step program.
     program : str
-        Title of the NC program that was started last; empty after other motions.
+        Title of the last NC program; empty after other motions.
     balls : Balls
-        Balls on the table; obstacles for the probe only.
+        Balls on the table; obstacles only for the probe.
     alarms : list of str
         Texts of the alarms; while there are any, nothing moves.
     estop : bool
         Whether the emergency stop is pressed.
     stuck : {"open", "closed"} or None
-        A fault of the probe: it never trips, or always.
-    port_output : list of (float, Order)
-        What NC programs send to the printer port, with the times, s.
+        A fault of the probe: it never trips, or is always tripped.
+    port_output : list of (float, PortCommand)
+        Output of NC programs to the printer port, with its times, s.
     """
 
     seed: int
@@ -67,15 +67,15 @@ class Motion(SampleClock):
         self.alarms: list[str] = []
         self.estop = False
         self.stuck: Literal["open", "closed"] | None = None
-        self.port_output: list[tuple[float, Order]] = []
+        self.port_output: list[tuple[float, PortCommand]] = []
         self._programs = 0
         self._program_events: list[Event] = []
-        self._warm_up: float | None = None  # time at which it started
+        self._warm_up: float | None = None  # time at which the warm-up started
 
-    # ------------------------------------------------------------------ orders
+    # ------------------------------------------------------------------ commands
 
     def mount(self, tool: str) -> None:
-        """Put the bar, the sphere or the touch probe into the spindle."""
+        """Mount the bar, the sphere or the touch probe in the spindle."""
         if tool not in TOOLS:
             raise InstrumentError(f"Expected the tool 'bar', 'sphere' or 'probe'; found '{tool}'")
         with self._change:
@@ -86,7 +86,7 @@ class Motion(SampleClock):
     def run_steps(
         self, start: Sequence[float], direction: Sequence[float], step: float, count: int, dwell: float, travel: float
     ) -> StepProgram:
-        """Step the sphere along a line; the motion starts a short and unknown time from now."""
+        """Step the sphere along a line; the motion starts after a short and unknown time."""
         with self._change:
             if self.tool != "sphere":
                 raise InstrumentError("Only the sphere can be stepped; mount it first")
@@ -97,13 +97,13 @@ class Motion(SampleClock):
             return self.motion
 
     def run_program(self, text: str) -> Path:
-        """Run an NC program, see `nc_program`; the motion starts a short and unknown time from now."""
+        """Run an NC program, see `nc_program`; the motion starts after a short and unknown time."""
         with self._change:
             self._refuse_to_move()
-            place, begin = self.path.place(self.time), self._start_of_motion()
+            start, begin = self.path.place(self.time), self._start_of_motion()
             actions = ProgramActions(self, begin)
             try:
-                path = interpret(text, tuple(place), self.machine.travel, self.machine.rapid, actions)
+                path = interpret(text, tuple(start), self.machine.travel, self.machine.rapid, actions)
             except ErrormotionError:
                 actions.undo()
                 self._programs -= 1
@@ -116,25 +116,25 @@ class Motion(SampleClock):
             return self.path
 
     def move_to(self, position: Sequence[float], feed: float | None = None) -> float:
-        """Move the axes in a straight line, at a feed in m/s or in rapid; return how long that takes, s.
+        """Move the axes in a straight line, at a feed in m/s or in rapid; return the duration, s.
 
-        The time passes at once, or with the samples while any stream. A probe that trips on the way stops the machine
-        and puts it into alarm.
+        The move advances the time at once, or, while sensors stream, their samples do. A probe that trips during the
+        move stops the machine and sets an alarm.
         """
         with self._change:
             self._refuse_to_move()
             goal, feed = self._within_travel(position), self._possible_feed(feed)
             begin, start = self._next_instant(), np.array(self.position())
-            place = self.obstacle(start, goal, begin, feed)
-            if place is not None:
-                self._go(start, place, begin, feed)
-                way = float(np.linalg.norm(place - start))
-                self.raise_alarm(f"the probe has tripped during a move, after {way * 1e3:.3f} mm")
+            contact = self.obstacle(start, goal, begin, feed)
+            if contact is not None:
+                self._go(start, contact, begin, feed)
+                distance = float(np.linalg.norm(contact - start))
+                self.raise_alarm(f"the probe has tripped during a move, after {distance * 1e3:.3f} mm")
                 self._refuse_in_alarm()
             return self._go(start, goal, begin, feed)
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
-        """Move the touch probe in a straight line until it trips, or to the target; the time passes at once.
+        """Move the touch probe in a straight line until it trips, or to the target; this advances the time at once.
 
         Parameters
         ----------
@@ -146,12 +146,13 @@ class Motion(SampleClock):
         Returns
         -------
         dict
-            ``tripped``, ``position`` (where it has tripped and is now, m; None) and ``time`` (s).
+            ``tripped``, ``position`` (of the trip, where the tip now is, m; else None) and ``time`` (s).
 
         Raises
         ------
         InstrumentError
-            It is tripped before it moves, the spindle turns, something streams or moves, alarm, out of travel.
+            The probe is tripped before it moves, the spindle turns, a device streams, the machine moves or is in alarm,
+            or the target is out of travel.
         """
         with self._change:
             self._refuse_while_streaming("probe")
@@ -165,28 +166,28 @@ class Motion(SampleClock):
             ):
                 raise InstrumentError("The probe is tripped before it moves; remove the contact or repair the probe")
             self.tool = "probe"
-            place = self.trip(start, goal, begin, feed)
-            self._go(start, goal if place is None else place, begin, feed)
+            contact = self.trip(start, goal, begin, feed)
+            self._go(start, goal if contact is None else contact, begin, feed)
             return {
-                "tripped": place is not None,
-                "position": None if place is None else [float(x) for x in place],
+                "tripped": contact is not None,
+                "position": None if contact is None else [float(x) for x in contact],
                 "time": self.time,
             }
 
     def trip(self, start: Array, goal: Array, time: float, feed: float) -> Array | None:
-        """Return where the probe trips on a straight way, m; None: never. The start where it is tripped there."""
+        """Return where the probe trips on a straight path, m; None: never; the start if it is already tripped."""
         if self.stuck:
             return start if self.stuck == "closed" else None
         return self.machine.contact(start, goal, time, feed, balls=self.balls)[0]
 
     def obstacle(self, start: Array, goal: Array, time: float, feed: float) -> Array | None:
-        """Return where a probe in the spindle runs into a ball that it does not move off, m."""
+        """Return where a probe in the spindle collides with a ball, m, unless it moves away from it; None: nowhere."""
         if self.tool != "probe":
             return None
         return self.machine.contact(start, goal, time, feed, balls=self.balls, leaving=True)[0]
 
     def stop(self) -> None:
-        """Abort all motion: the axes rest from now on. The spindle stays as it is."""
+        """Abort all motion of the axes; the spindle is not affected."""
         with self._change:
             now = self._next_instant()
             if self.motion is not None and now < self.motion.end:
@@ -194,20 +195,20 @@ class Motion(SampleClock):
             elif now < self.path.end:
                 self.path = self.path.cut(now)
                 self.machine.forget(self._program_events, now)
-                self.port_output = [each for each in self.port_output if each[0] <= now]  # the same objects
+                self.port_output = [each for each in self.port_output if each[0] <= now]  # keeps the objects
                 if self._warm_up is not None and self._warm_up > now:
                     self._warm_up = None
             self.program = ""
 
     def raise_alarm(self, text: str) -> None:
-        """Go into alarm: the axes rest, and nothing moves until `reset_alarms`."""
+        """Set an alarm: the axes stop, and nothing moves until `reset_alarms`."""
         with self._change:
             self.stop()
             if text not in self.alarms:
                 self.alarms.append(text)
 
     def reset_alarms(self) -> None:
-        """Leave alarm and emergency stop; nothing starts to move by itself."""
+        """Clear alarm and emergency stop; this starts no motion."""
         with self._change:
             self.alarms.clear()
             self.estop = False
@@ -235,9 +236,9 @@ class Motion(SampleClock):
         goal = np.array(position, dtype=float)
         if goal.shape != (3,) or not np.isfinite(goal).all():
             raise InstrumentError(f"Expected a position X, Y, Z in m; found {position!r}")
-        for (axis, (low, high)), place in zip(self.machine.travel.items(), goal, strict=True):
-            if not low - _ROUNDING <= place <= high + _ROUNDING:
-                raise InstrumentError(f"{axis} travels from {low:g} to {high:g} m; found {place:g}")
+        for (axis, (low, high)), x in zip(self.machine.travel.items(), goal, strict=True):
+            if not low - _ROUNDING <= x <= high + _ROUNDING:
+                raise InstrumentError(f"{axis} travels from {low:g} to {high:g} m; found {x:g}")
         return goal
 
     def _possible_feed(self, feed: float | None) -> float:
@@ -247,17 +248,17 @@ class Motion(SampleClock):
         return chosen
 
     def commanded_speed(self, time: float) -> float:
-        """Return the spindle speed that is commanded at a time, 1/min."""
+        """Return the commanded spindle speed at a time, 1/min."""
         raise NotImplementedError
 
     def turn(self, speed: float, time: float) -> Event | None:
-        """Turn the spindle at a speed from a time on; return the event in the machine's schedule, None without one."""
+        """Turn the spindle at a speed from a time on; return the event in the machine's schedule, if any."""
         raise NotImplementedError
 
     # ------------------------------------------------------------------ position
 
     def _go(self, start: Array, goal: Array, begin: float, feed: float) -> float:
-        """Go in a straight line; return how long it takes, s."""
+        """Move in a straight line; return the duration, s."""
         duration = float(np.linalg.norm(goal - start)) / feed
         if duration > 0:
             times, places = np.array([begin, begin + duration]), np.array([start, goal])
@@ -289,26 +290,28 @@ class Motion(SampleClock):
         return [float(x) for x in place]
 
     def _sphere(self, time: float) -> Array:
-        """Return the position at which the sphere rests at a time, or has rested last, m."""
+        """Return the position of the sphere at a time, or its last position at rest, m."""
         if self.motion is None:
             return self.path.place(time)
-        place = max(int(np.searchsorted(self.motion.arrivals, time, side="right")) - 1, 0)
-        return np.asarray(self.motion.places[place])
+        step = max(int(np.searchsorted(self.motion.arrivals, time, side="right")) - 1, 0)
+        return np.asarray(self.motion.places[step])
 
     @property
     def printed(self) -> list[tuple[float, str]]:
         """Lines of NC programs, without leading blanks, with the times at which they are printed, s."""
-        return [(time, order.text("fanuc", "none")) for time, order in self.port_output if isinstance(order, Block)]
+        return [
+            (time, command.text("fanuc", "none")) for time, command in self.port_output if isinstance(command, Block)
+        ]
 
     def feed(self) -> float:
-        """Return how fast the axes move now, m/s; NaN while the sphere is stepped."""
+        """Return the present feed, m/s; NaN while the sphere is stepped."""
         return float("nan") if self.stepping else self.path.feed(self.time)
 
     def warm_time(self, times: ArrayLike) -> Array:
-        """Return how long the axes have been warming up at times of the world's clock, s; 0 before they started.
+        """Return the duration of the warm-up of the axes at times of the world's clock, s; 0 before its start.
 
-        This is the time on which the thermal errors of the gantry's crossbeam depend. It starts with the first move of
-        a program that warms up (`Path.warm_up`) and then counts on.
+        The thermal errors of the gantry's crossbeam depend on this time. It starts with the first move of a warm-up
+        program (`Path.warm_up`) and then continues.
         """
         times = np.asarray(times, dtype=float)
         with self._change:
@@ -317,16 +320,16 @@ class Motion(SampleClock):
 
 
 class ProgramActions:
-    """Actions of an NC program beside its path; see `nc_program.Peripherals`."""
+    """Actions of an NC program in addition to its path; see `nc_program.Peripherals`."""
 
     def __init__(self, world: Motion, begin: float) -> None:
         self._world, self._begin = world, begin
         self._tool = world.tool
         self.events: list[Event] = []
-        self.port_output: list[tuple[float, Order]] = []
+        self.port_output: list[tuple[float, PortCommand]] = []
 
     def pass_by(self, start: Array, goal: Array, feed: float, time: float) -> None:
-        """Refuse a move on which the probe would run into a ball."""
+        """Refuse a move on which the probe would collide with a ball."""
         if self._world.obstacle(start, goal, self._begin + time, feed) is not None:
             raise InstrumentError("the probe would trip on this path")
 
@@ -335,8 +338,8 @@ class ProgramActions:
         if speed := self._world.commanded_speed(self._begin + time):
             raise InstrumentError(f"the spindle turns at {speed:g} /min; M5 first")
         self._world.tool = "probe"
-        place = self._world.trip(start, goal, self._begin + time, feed)
-        return goal if place is None else place
+        contact = self._world.trip(start, goal, self._begin + time, feed)
+        return goal if contact is None else contact
 
     def spindle(self, speed: float, time: float) -> None:
         """Turn the spindle."""
@@ -345,12 +348,12 @@ class ProgramActions:
         if speed and self._world.tool == "probe":
             self._world.tool = "bar"
 
-    def print(self, order: Order, time: float) -> None:
+    def print(self, command: PortCommand, time: float) -> None:
         """Open or close the printer port, or send a block, at a time of the program."""
-        self.port_output.append((self._begin + time, order))
+        self.port_output.append((self._begin + time, command))
 
     def clock(self, time: float) -> float:
-        """Return the world's time, s."""
+        """Return the time of the world, s."""
         return self._begin + time
 
     def undo(self) -> None:

@@ -1,8 +1,8 @@
-"""What a control prints: the grammar of ``DPRNT[...]`` and the characters that two makers' controls send for it.
+"""Printing by a control: the grammar of ``DPRNT[...]`` and the characters that controls of two makers send.
 
-Sources: Haas 96-8000 rev. AC, May 2010, p. 116 (text, formats, rounding, leading spaces, growing fields); NCT
-2000M/99M Programmer's Manual, p. 193 (digits before and behind the point, ISO code with even parity, line feed). The
-form of FANUC is from memory; the page of the device that reads the lines lists what is assumed.
+Sources: Haas 96-8000 rev. AC, May 2010, p. 116 (text, formats, rounding, leading spaces, growing fields); NCT 2000M/99M
+Programmer's Manual, p. 193 (digits before and after the point, ISO code with even parity, line feed). The format of
+FANUC is from memory; the documentation of the driver ``dprnt`` lists the assumptions.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Literal
 
 from errormotion.errors import InstrumentError
 
-MOST_PLACES = 8  # of a number, before and behind its point together
+MOST_DIGITS = 8  # largest number of digits, before and after the point together
 
 Control = Literal["haas", "fanuc"]
 Zeros = Literal["blank", "none"]
@@ -26,7 +26,7 @@ _TEXT = re.compile(r"[A-Z0-9+\-/* ]*")
 
 @dataclass(frozen=True)
 class Number:
-    """A variable of a block: its value, and its places before and behind the point."""
+    """A variable of a block: its value, and its digits before and after the point."""
 
     value: float
     whole: int
@@ -40,16 +40,16 @@ class Block:
     parts: tuple[str | Number, ...]
 
     def text(self, control: Control = "haas", zeros: Zeros = "blank") -> str:
-        """Return the characters without the end of the block, as a control of a maker writes them.
+        """Return the characters that a control sends, without the end of the block.
 
-        ``zeros`` is for FANUC: leading zeros as blanks, with a place for the sign, or not at all.
+        ``zeros`` is for FANUC: leading zeros as blanks, with a blank for the sign, or omitted.
         """
         return "".join(
             part.replace("*", " ") if isinstance(part, str) else _written(part, control, zeros) for part in self.parts
         )
 
 
-Order = Block | Literal["POPEN", "PCLOS"]
+PortCommand = Block | Literal["POPEN", "PCLOS"]
 
 
 def parse_block(template: str, value_of: Callable[[str], float]) -> Block:
@@ -65,33 +65,28 @@ def parse_block(template: str, value_of: Callable[[str], float]) -> Block:
     Raises
     ------
     InstrumentError
-        A character that a control cannot print, a variable without a format, a format with no or too many places.
+        A character that a control cannot print, a variable without a format, or a format with no or too many digits.
     """
     parts: list[str | Number] = []
-    place = 0
-    while place < len(template):
-        if number := _NUMBER.match(template, place):
+    k = 0
+    while k < len(template):
+        if number := _NUMBER.match(template, k):
             parts.append(_number(number, value_of))
-            place = number.end()
-        elif text := _matched(template, place):
+            k = number.end()
+        elif (found := _TEXT.match(template, k)) and (text := found[0]):
             parts.append(text)
-            place += len(text)
-        elif template[place] == "#":
-            raise InstrumentError(f"'{template[place:][:12]}': expected a variable with its format, such as #5061[53]")
+            k += len(text)
+        elif template[k] == "#":
+            raise InstrumentError(f"'{template[k:][:12]}': expected a variable with its format, such as #5061[53]")
         else:
-            raise InstrumentError(f"'{template[place]}' cannot be printed; expected letters, digits, + - / and *")
+            raise InstrumentError(f"'{template[k]}' cannot be printed; expected letters, digits, + - / and *")
     return Block(tuple(parts))
-
-
-def _matched(template: str, place: int) -> str:
-    found = _TEXT.match(template, place)
-    return found[0] if found else ""
 
 
 def _number(found: re.Match[str], value_of: Callable[[str], float]) -> Number:
     whole, decimals = int(found[2]), int(found[3])
-    if not 0 < whole + decimals <= MOST_PLACES:
-        raise InstrumentError(f"'{found[0]}': expected 1 to {MOST_PLACES} places in all; found {whole + decimals}")
+    if not 0 < whole + decimals <= MOST_DIGITS:
+        raise InstrumentError(f"'{found[0]}': expected 1 to {MOST_DIGITS} digits in all; found {whole + decimals}")
     return Number(value_of(found[1]), whole, decimals)
 
 
@@ -111,5 +106,5 @@ def _written(number: Number, control: Control, zeros: Zeros) -> str:
 
 
 def in_iso_code(text: bytes) -> bytes:
-    """Return characters in ISO code: seven bits, and the eighth so that their number of ones is even."""
+    """Return characters in ISO code: seven bits, and an eighth for even parity."""
     return bytes(code | (code.bit_count() & 1) << 7 for code in text)

@@ -11,9 +11,9 @@ import numpy as np
 class Stream(Protocol):
     """A channel that receives samples.
 
-    ``start`` and ``position`` are the numbers of its first and next sample since time 0, ``taken`` is the number
-    that its reader has delivered, None where unknown. A stream that has ``ended`` receives no more. Its readings count
-    from the start of its ``measuring_range`` (m).
+    ``start`` and ``position`` are the numbers of its first and next sample since time 0, ``taken`` is the number that
+    its reader has delivered, None if unknown. A stream that has ``ended`` receives no further samples. Its readings are
+    relative to the start of its ``measuring_range`` (m).
     """
 
     rate: float
@@ -33,9 +33,9 @@ class Stream(Protocol):
 
 
 class TriggeredStream(Protocol):
-    """A device that samples where a moving axis triggers it.
+    """A device that a moving axis triggers.
 
-    ``seen`` is the time of the last sample that its reader has passed on, None before the first one.
+    ``seen`` is the time of the last sample that its reader has delivered, None before the first one.
     """
 
     @property
@@ -49,10 +49,10 @@ class TriggeredStream(Protocol):
 
 @runtime_checkable
 class Carried(Protocol):
-    """A simulated device that is carried from station to station beside the machine."""
+    """A simulated device that is moved between stations beside the machine."""
 
     def carry_to(self, position: Sequence[float]) -> None:
-        """Move it near a position in machine coordinates, m, and let it lock on to its reflector again."""
+        """Move it near a position in machine coordinates, m, and lock it on to its reflector again."""
 
 
 class Device(Protocol):

@@ -19,10 +19,10 @@ Array = np.ndarray[Any, Any]
 
 
 class TargetStand:
-    """Holds one target, or none, and returns the readings of the machine's point sensor.
+    """A stand with one target or none, and the readings of the machine's point sensor.
 
-    Every point sensor in the world is then that one on the stage, whatever its name: one that counts from the middle
-    of a range of its own, or one that counts from the start.
+    With a target, every point sensor in the world is the one on the stage, independent of its name; its readings are
+    relative to the middle of its range, or to the start of a given range.
 
     Parameters
     ----------
@@ -31,38 +31,38 @@ class TargetStand:
     Attributes
     ----------
     target : Plane, CheckBar or None
-    order : dict or None
-        What was requested: ``kind``, and of a plane ``inclination`` and ``rotation``, rad.
+    requested : dict or None
+        The request: ``kind``, and for a plane ``inclination`` and ``rotation``, rad.
     """
 
     def __init__(self, machine: VirtualMachine) -> None:
         self.target: Target | None = None
-        self.order: dict[str, Any] | None = None
+        self.requested: dict[str, Any] | None = None
         self._machine = machine
         self._settings = 0  # each setting of the gauge has other deviations
 
     def put(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
-        """Put ``"plane"`` (with its angles, rad) or ``"bar"`` before the sensors, or take away what is there (None).
+        """Place ``"plane"`` (with its angles, rad) or ``"bar"`` in front of the sensors, or remove the target (None).
 
         Raises
         ------
         InstrumentError
-            No such target, or angles that are missing or do not belong to it.
+            The target is unknown, or its angles are missing or not expected.
         """
         plane = kind == "plane"
         if kind not in (None, "plane", "bar"):
             raise InstrumentError(f"Expected the target 'plane', 'bar' or None; found {kind!r}")
         if [angle is not None for angle in (inclination, rotation)] != [plane, plane]:
             raise InstrumentError(
-                f"Expected inclination and rotation (rad) for a plane only; found {kind!r}, {inclination}, {rotation}"
+                f"Expected inclination and rotation (rad) only with a plane; found {kind!r}, {inclination}, {rotation}"
             )
         if inclination is not None and rotation is not None:
             face = self._machine.sine_gauge.face(float(inclination), float(rotation), self._settings)
             self.target = face
-            self.order = {"kind": kind, "inclination": float(inclination), "rotation": float(rotation)}
+            self.requested = {"kind": kind, "inclination": float(inclination), "rotation": float(rotation)}
         else:
             self.target = self._machine.check_bar if kind == "bar" else None
-            self.order = {"kind": kind} if kind else None
+            self.requested = {"kind": kind} if kind else None
         self._settings += 1
 
     def read(self, name: str, times: Array, stage: Array, first: int, measuring_range: float | None = None) -> Array:
@@ -79,12 +79,12 @@ class TargetStand:
         first : int
             Number of the first reading.
         measuring_range : float, optional
-            Of a sensor that counts from the start of its range, m; where not given, it counts from mid-range.
+            Range of a sensor whose readings are relative to the start of its range, m; default: relative to mid-range.
 
         Returns
         -------
         ndarray, (n,)
-            m; minus or plus infinity before or behind the range, NaN where there is nothing.
+            m; minus or plus infinity before or behind the range, NaN without a target in the beam.
         """
         if self.target is None:
             return np.full(len(times), np.nan)

@@ -1,8 +1,8 @@
-"""What a tracker beside a virtual machine sees: a reflector at the tool, through air.
+"""The scene of a tracker beside a virtual machine: a reflector at the tool, measured through air.
 
-The reflector is at the commanded position plus the machine's true volumetric error there, plus what the tracker's
-address requests beyond that. All positions are in machine coordinates; the tracker is at ``station`` and is turned
-about z by ``heading``.
+The reflector is at the commanded position plus the machine's true volumetric error there, plus further errors that the
+tracker's address states. All positions are in machine coordinates; the tracker is at ``station`` and is rotated about z
+by ``heading``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def refraction_index(temperature: float, pressure: float, humidity: float) -> fl
     Parameters
     ----------
     temperature, pressure, humidity : float
-        degC, Pa, %; agrees with Ciddor's formula to some 1e-8 in a workshop.
+        degC, Pa, %; agrees with Ciddor's formula to about 1e-8 in a workshop.
     """
     wave = WAVELENGTH**-2
     standard = 1e-8 * (8342.54 + 2406147.0 / (130.0 - wave) + 15998.0 / (38.9 - wave))
@@ -41,29 +41,29 @@ def refraction_index(temperature: float, pressure: float, humidity: float) -> fl
 
 
 def numbers(address: Address, name: str, default: str) -> tuple[float, ...]:
-    """Return a parameter of several numbers, joined by commas."""
+    """Return a parameter of several numbers, separated by commas."""
     text = address.params.get(name, default)
     try:
         return tuple(float(word) for word in text.split(","))
     except ValueError:
         raise InstrumentError(
-            f"'{name}' in '{address.url}': expected numbers joined by commas; found '{text}'"
+            f"'{name}' in '{address.url}': expected numbers separated by commas; found '{text}'"
         ) from None
 
 
 class TrackerScene:
-    """A reflector at the tool of a virtual machine, as a tracker beside it sees it.
+    """A reflector at the tool of a virtual machine, measured by a tracker beside it.
 
     Parameters
     ----------
     world : VirtualWorld
     address : Address
         ``station`` (m, m, m), ``heading`` (rad), ``lever`` (m, m, m: from the tool to the reflector), ``thermal`` (1:
-        the machine's thermal errors move it as well), ``repeatability`` (m, one sigma per direction, again at each
-        commanded position), ``air_temperature`` (degC, else the machine's surroundings), ``air_pressure`` (Pa),
+        with the thermal errors of the machine), ``repeatability`` (m, one sigma per direction, drawn at each commanded
+        position), ``air_temperature`` (degC; default: the machine's surroundings), ``air_pressure`` (Pa),
         ``air_humidity`` (%).
     rng : Generator
-        For the repeatability.
+        Random numbers for the repeatability.
     """
 
     def __init__(self, world: VirtualWorld, address: Address, rng: np.random.Generator) -> None:
@@ -71,7 +71,7 @@ class TrackerScene:
         self.station = np.array(numbers(address, "station", STATION))
         self.lever = np.array(numbers(address, "lever", "0,0,0"))
         if self.station.shape != (3,) or self.lever.shape != (3,):
-            raise InstrumentError(f"'station' and 'lever' in '{address.url}' have three numbers each, x,y,z in m")
+            raise InstrumentError(f"'station' and 'lever' in '{address.url}': expected three numbers each, x,y,z in m")
         heading = address.number("heading", 0.0)
         c, s = np.cos(heading), np.sin(heading)
         self._turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])  # from the tracker's frame to the machine's
@@ -94,7 +94,7 @@ class TrackerScene:
         return temperature, pressure, humidity
 
     def places(self, times: Array) -> Array:
-        """Return where the reflector truly is, m, (n, 3) for times (n,) of the world's clock, s."""
+        """Return true positions of the reflector, m, (n, 3), at times (n,) of the world's clock, s."""
         machine = self.world.machine
         commanded = np.atleast_2d(self.world.path.place(times) if self.world.motion is None else self.world.position())
         twist = machine.geometry.twist(commanded)
@@ -104,7 +104,7 @@ class TrackerScene:
         return np.broadcast_to(moved + self._arrived(commanded[-1]), (len(times), 3))
 
     def _arrived(self, place: Array) -> Array:
-        """Return by how much the machine misses the position at which it has arrived, m."""
+        """Return the error of repeatability at the position at which the machine has arrived, m."""
         if self._repeatability == 0:
             return np.zeros(3)
         if self._arrival is None or not np.array_equal(self._arrival[0], place):

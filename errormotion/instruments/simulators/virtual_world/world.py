@@ -34,10 +34,10 @@ class VirtualWorld(Motion):
     Parameters
     ----------
     name : str
-        Kind of the machine, ``cframe`` or ``gantry``; ``machine`` for the one that the bench describes.
+        Type of the machine, ``cframe`` or ``gantry``; ``machine`` for the one that the bench describes.
     seed : int
     warm : bool
-        Whether the sensors were switched on long ago.
+        Whether the sensors have been on long enough to be stable.
 
     Attributes
     ----------
@@ -56,8 +56,8 @@ class VirtualWorld(Motion):
         self._compile()
         super().__init__()
         self.stand = TargetStand(self.machine)
-        self._readings = 0  # by command
-        self._ordered: float | None = None  # spindle speed ordered while the heat follows a schedule
+        self._readings = 0  # number of readings by command
+        self._commanded: float | None = None  # commanded spindle speed while the heat follows a schedule
         self._follows: tuple[Event, ...] | None = None
         self._devices: set[Device] = set()
 
@@ -68,14 +68,14 @@ class VirtualWorld(Motion):
         self.machine.distances(0, 1, 1e3, tool="sphere", motion=resting)
 
     def attach(self, device: Device, pace: float | None = None) -> None:
-        """Register a device; ``pace`` holds for the whole world."""
+        """Register a device; ``pace`` applies to the whole world."""
         with self._change:
             self._devices.add(device)
             if pace is not None:
                 self.pace = pace
 
     def detach(self, device: Device) -> None:
-        """Unregister a device; with the last one the world ends."""
+        """Unregister a device; the world ends with its last device."""
         with self._change:
             self._devices.discard(device)
             empty = not self._devices
@@ -102,9 +102,9 @@ class VirtualWorld(Motion):
     # ------------------------------------------------------------------ heat and time
 
     def start(self, schedule: Sequence[Event]) -> None:
-        """Start again at time 0, cold, with a schedule.
+        """Restart with a cold machine at time 0, with a schedule.
 
-        A world that follows a schedule (`follow`) goes on at its time; this one has to be a part of the other.
+        A world that follows a schedule (`follow`) continues at its time; this schedule has to be a part of the other.
         """
         with self._change:
             self._refuse_while_streaming("start a schedule")
@@ -116,12 +116,10 @@ class VirtualWorld(Motion):
             self._restart(0.0, self.path.place(self.time))
 
     def follow(self, schedule: Sequence[Event], time: float) -> None:
-        """Warm up by a schedule from time 0 on, whatever the devices order, and set the clock, also back.
+        """Warm up by a schedule from time 0 on, and set the clock to a time, s, which may be earlier than now.
 
-        The axes are then at zero.
-
-        Several measurements thus meet one machine in the same state at the same time. An order to the spindle turns it,
-        and does not change the heat.
+        The axes are then at zero. Several measurements thus find the machine in the same state at the same time. A
+        command to the spindle turns it, and does not change the heat.
         """
         if not 0 <= time < np.inf:
             raise InstrumentError(f"Expected a time of at least 0 s; found {time} s")
@@ -129,7 +127,7 @@ class VirtualWorld(Motion):
             self._refuse_while_streaming("set the clock")
             self._refuse_in_alarm()
             self.machine.start(schedule)
-            self._follows, self._ordered = self.machine.state.schedule.events, None
+            self._follows, self._commanded = self.machine.state.schedule.events, None
             self._restart(float(time), ORIGIN)
 
     def _refuse_others(self, schedule: Sequence[Event]) -> None:
@@ -140,26 +138,26 @@ class VirtualWorld(Motion):
             if not any(replace(each, time=0.0) == replace(event, time=0.0) for each in known):
                 found = "; ".join(map(str, known)) or "nothing"
                 raise InstrumentError(
-                    f"The schedule of the machine states what happens: expected {event} at {at:g} s in it; found "
-                    f"{found}. State the same events in both"
+                    f"The machine follows a schedule: expected {event} at {at:g} s in it; found {found}. State the "
+                    "same events in both schedules"
                 )
 
-    def _restart(self, time: float, place: ArrayLike) -> None:
+    def _restart(self, time: float, position: ArrayLike) -> None:
         """Set the clock, with the axes at rest and nothing in progress."""
         self._set_clock(time)
-        self.motion, self.path, self.program, self._warm_up = None, Path.resting(place), "", None
+        self.motion, self.path, self.program, self._warm_up = None, Path.resting(position), "", None
         self.port_output, self._program_events = [], []
 
     def elapse(self, seconds: float) -> None:
-        """Let simulated time pass without samples."""
+        """Advance the simulated time without samples."""
         if not seconds >= 0:
             raise InstrumentError(f"Expected a time of at least 0 s; found {seconds} s")
         with self._change:
-            self._refuse_while_streaming("let time pass")
+            self._refuse_while_streaming("advance the time")
             self._set_clock(self.time + seconds)
 
     def spindle(self, speed: float) -> None:
-        """Turn the spindle at a speed, 1/min, from now on; 0 stops it. It heats the machine accordingly."""
+        """Turn the spindle at a speed, 1/min, which heats the machine; 0 stops it."""
         with self._change:
             if speed:
                 self._refuse_in_alarm()
@@ -168,18 +166,18 @@ class VirtualWorld(Motion):
                 self.tool = "bar"
 
     def turn(self, speed: float, time: float) -> Event | None:
-        """Turn the spindle at a speed from a time on; return the event in the machine's schedule, None without one."""
+        """Turn the spindle at a speed from a time on; return the event in the machine's schedule, if any."""
         if self._follows is not None:
             if not 0 <= speed <= self.machine.top_speed:
                 raise InstrumentError(f"The spindle turns at up to {self.machine.top_speed:g} /min; found {speed:g}")
-            self._ordered = speed
+            self._commanded = speed
             return None
         event = Event(time, spindle_speed=speed)
         self.machine.command(event)
         return event
 
     def press_estop(self) -> None:
-        """Press the emergency stop: axes and spindle stop, and what was scheduled for the spindle is off."""
+        """Press the emergency stop: axes and spindle stop, and the schedule of the spindle is cancelled."""
         with self._change:
             self.estop = True
             self.stop()
@@ -187,15 +185,15 @@ class VirtualWorld(Motion):
 
     @property
     def sensors_on_for(self) -> float:
-        """How long the sensors have been on, s."""
+        """Time since the sensors were switched on, s."""
         return self.machine.sensors_on_for + self.time
 
     # ------------------------------------------------------------------ state of the controller
 
     def commanded_speed(self, time: float) -> float:
-        """Return the spindle speed that is commanded at a time, 1/min."""
-        if self._ordered is not None:
-            return self._ordered
+        """Return the commanded spindle speed at a time, 1/min."""
+        if self._commanded is not None:
+            return self._commanded
         speeds = [event.spindle_speed for event in self._events(time) if event.spindle_speed is not None]
         return float(speeds[-1]) if speeds else 0.0
 
@@ -203,13 +201,13 @@ class VirtualWorld(Motion):
         return [event for event in self.machine.state.schedule.events if event.time <= time]
 
     def commanded(self) -> dict[str, Any]:
-        """Return what a controller displays."""
+        """Return the state that a controller displays."""
         with self._change:
             now, moving = self.time, self.stepping or self.running
             compensation = {"X": True, "Y": True, "Z": True}
             for event in self._events(now):
                 compensation.update(event.compensation or {})
-            speed = float(self.machine.spindle_speed(now)[0]) if self._ordered is None else self._ordered
+            speed = float(self.machine.spindle_speed(now)[0]) if self._commanded is None else self._commanded
             position = self.position()
             return {
                 "time": now,
@@ -229,13 +227,13 @@ class VirtualWorld(Motion):
                 "alarms": [*(["emergency stop"] if self.estop else []), *self.alarms],
                 "compensation": compensation,
                 "tool": self.tool,
-                **({"target": self.stand.order} if self.stand.order else {}),
+                **({"target": self.stand.requested} if self.stand.requested else {}),
             }
 
     # ------------------------------------------------------------------ targets, trackers, sensors
 
     def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
-        """Put a target before the point sensors, see `TargetStand.put`; from then on they ride on the stage."""
+        """Place a target in front of the point sensors, see `TargetStand.put`; they are then on the stage."""
         with self._change:
             self._refuse_while_streaming("change the target")
             self._refuse_while_moving()
@@ -245,19 +243,19 @@ class VirtualWorld(Motion):
                 self.motion, self.path = None, here
 
     def set_station(self, position: Sequence[float]) -> None:
-        """Have the trackers beside the machine carried to a position in its coordinates, m."""
+        """Move the trackers beside the machine to a position in its coordinates, m."""
         trackers = [device for device in self._devices if isinstance(device, Carried)]
         if not trackers:
             raise InstrumentError("This machine has no tracker; open one first, at the same machine and seed")
         with self._change:
-            self._refuse_while_streaming("carry a tracker")
+            self._refuse_while_streaming("move a tracker")
         for tracker in trackers:
             tracker.carry_to(position)
 
     def read_point(self, name: str) -> float:
-        """Return what a point sensor with a range about zero reads now, m.
+        """Return the present reading of a point sensor with a range about zero, m.
 
-        Minus or plus infinity before or behind its range; NaN without a target, and where the beam misses it.
+        Minus or plus infinity before or behind its range; NaN without a target, or if the beam misses it.
         """
         with self._change:
             self._readings += 1
@@ -283,18 +281,18 @@ def world(name: str = "cframe", seed: int = 0, *, warm: bool = True) -> VirtualW
         key = (name, int(seed), warm)
         machine = described(name)
         if key in _worlds and not isinstance(machine, str) and _worlds[key].machine.description != machine:
-            _worlds[key].end()  # of another bench
+            _worlds[key].end()  # belongs to another bench
         if key not in _worlds:
             _worlds[key] = VirtualWorld(name, int(seed), warm=warm)
         return _worlds[key]
 
 
 def let_time_pass(name: str, seed: int, seconds: float, *, warm: bool = True) -> None:
-    """Let time pass in the world of a machine and seed, where there is one and nothing streams in it."""
+    """Advance the time in the world of a machine and seed, if it exists and no device streams."""
     with _lock:
         found = _worlds.get((name, seed, warm))
     if found is not None:
-        with suppress(InstrumentError):  # its samples are its clock
+        with suppress(InstrumentError):  # samples advance its clock
             found.elapse(seconds)
 
 

@@ -1,1 +1,1 @@
-"""Resistance thermometers and thermocouples behind a data acquisition unit with SCPI commands."""
+"""Resistance thermometers and thermocouples at a data acquisition unit with SCPI commands."""

@@ -1,6 +1,6 @@
 """Texts of a SCPI data acquisition unit: channel lists, readings, identities, entries of the error queue.
 
-Every function is linear in the length of the text, which is at most `LONGEST`, and raises nothing but ProtocolError.
+Every function is linear in the length of the text, at most `LONGEST`, and raises only ProtocolError.
 """
 
 from __future__ import annotations
@@ -12,26 +12,26 @@ from collections.abc import Sequence
 from errormotion.errors import ProtocolError
 
 LINE_END = b"\n"
-"""End of a command; an answer ends with it, on a serial line after a carriage return."""
+"""End of a command and of an answer; on a serial line an answer has a carriage return before it."""
 LONGEST = 16384
-"""Longest answer, bytes: 120 channels with 27 characters each are 3240."""
+"""Longest answer, bytes; 120 channels with 27 characters each need 3240."""
 OVERLOAD = 9.9e37
 """Absolute value of a reading that is beyond the range of its input."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]{1,20}(?:\.[0-9]{0,20})?|\.[0-9]{1,20})(?:[eE][+-]?[0-9]{1,3})?")
 _CHANNEL = re.compile(r"[0-9]{3,4}")
 _ERROR = re.compile(r'([+-]?[0-9]{1,5}),"([^"]{0,300})"')
-_NAME = re.compile(r"[A-Za-z]{2}")  # of a maker; a reading has one letter at most
+_NAME = re.compile(r"[A-Za-z]{2}")  # of a maker; a reading has at most one letter
 _BLOCK = re.compile(r"#([1-4])")
 
 
 def encode(command: str) -> bytes:
-    """Return a command as bytes with its end."""
+    """Return a command as bytes, with its line end."""
     return command.encode("ascii") + LINE_END
 
 
 def decode(line: bytes) -> str:
-    """Return the text of an answer without its end; ProtocolError where it is not printable ASCII."""
+    """Return the text of an answer without its line end; ProtocolError if it is not printable ASCII."""
     text = line.removesuffix(LINE_END).removesuffix(b"\r")
     if len(text) > LONGEST or any(not 0x20 <= byte <= 0x7E for byte in text):
         raise ProtocolError(f"Expected a line of printable ASCII; found {text[:60]!r}")
@@ -55,7 +55,7 @@ def parse_channels(text: str) -> list[int]:
     Raises
     ------
     ProtocolError
-        Not such a block, or its length is wrong.
+        The text is not such a block, or its length is wrong.
     """
     match = _BLOCK.match(text)
     digits = text[2 : 2 + int(match[1])] if match else ""
@@ -79,12 +79,12 @@ def parse_identity(text: str) -> tuple[str, str, str, str]:
 
 
 def parse_error(text: str) -> tuple[int, str]:
-    """Return number and text of an entry of the error queue, such as ``-113,"Undefined header"``; number 0 is none.
+    """Return number and text of an entry of the error queue, such as ``-113,"Undefined header"``; number 0: no error.
 
     Raises
     ------
     ProtocolError
-        Anything else.
+        The answer has another format.
     """
     match = _ERROR.fullmatch(text)
     if match is None:
@@ -93,14 +93,14 @@ def parse_error(text: str) -> tuple[int, str]:
 
 
 def parse_readings(text: str) -> list[tuple[int, float]]:
-    """Return the channels and readings of a scan whose format is reading and channel, such as ``+2.1E+01,101``.
+    """Return channels and readings of a scan, whose format is reading and channel, such as ``+2.1E+01,101``.
 
-    A reading that is beyond the range is infinite, with its sign.
+    A reading beyond the range is infinite, with its sign.
 
     Raises
     ------
     ProtocolError
-        Anything else.
+        The answer has another format.
     """
     cells = text.split(",")
     pairs = list(zip(cells[::2], cells[1::2], strict=False))

@@ -9,9 +9,8 @@ from typing import ClassVar, TypeVar
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.thermometer.scpi import codec
 from errormotion.instruments.thermometer.scpi.settings import ScpiSettings
-from errormotion.instruments.thermometer.sensors import GOOD, OPEN, OUT_OF_RANGE, Thermometer
+from errormotion.instruments.thermometer.sensors import GOOD, OPEN, OUT_OF_RANGE, LineThermometer
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.reconnecting import open_reconnecting
 from errormotion.plugins import Identity, InstrumentInfo
 
 T = TypeVar("T")
@@ -19,16 +18,16 @@ T = TypeVar("T")
 MAX_ERRORS = 32
 """Largest number of entries that are read from the error queue; the units have 10 or 20."""
 MAX_LATE = 32
-"""Largest number of late answers that are discarded until the identity is answered."""
+"""Largest number of late answers that are discarded before the identity."""
 
 
-class ScpiTemperature(Thermometer):
-    """Resistance thermometers and thermocouples behind a data acquisition unit with SCPI commands.
+class ScpiTemperature(LineThermometer):
+    """Resistance thermometers and thermocouples at a data acquisition unit with SCPI commands.
 
-    Opening sets channels and scan list in the unit (``CONF:TEMP``, ``ROUT:SCAN``), which clears its stored readings and
+    Opening sets channels and scan list of the unit (``CONF:TEMP``, ``ROUT:SCAN``), which clears its stored readings and
     its error queue; with the setting ``setup = false`` only the format of the readings is set. A reading is one scan
-    (``READ?``) whose values carry their channels. After an error the unit is synchronised and set again: late answers
-    are discarded until it answers its identity.
+    (``READ?``), whose values contain their channels. After an error the unit is synchronised and set up again: late
+    answers are discarded until it returns its identity.
 
     Parameters
     ----------
@@ -42,14 +41,14 @@ class ScpiTemperature(Thermometer):
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
         id="scpi_temperature",
         kind="thermometer",
-        summary="Pt100 (4-wire) and thermocouples behind an SCPI data acquisition unit (34970A, 34972A, DAQ970A)",
+        summary="Pt100 (4-wire) and thermocouples at an SCPI data acquisition unit (34970A, 34972A, DAQ970A)",
         status="simulated_only",
         simulator="errormotion.instruments.simulators.thermometer.scpi:SimulatedScpiUnit",
     )
     Settings: ClassVar[type[ScpiSettings]] = ScpiSettings
     settings: ScpiSettings
     unit_errors: tuple[str, ...] = ()
-    """Entries of the unit's error queue when it was set last: left by an earlier user or by a reading that failed."""
+    """Entries of the unit's error queue when it was last set up, from an earlier client or from a failed reading."""
     _ready = False
 
     def identify(self) -> Identity:
@@ -58,7 +57,7 @@ class ScpiTemperature(Thermometer):
         if model not in self.settings.models:
             raise InstrumentError(
                 f"{self.address}: expected one of {', '.join(self.settings.models)}; found a {maker} {model}. Add it "
-                "to 'models' where it has the same commands"
+                "to 'models' if it has the same commands"
             )
         return Identity(
             manufacturer=maker,
@@ -70,12 +69,12 @@ class ScpiTemperature(Thermometer):
         )
 
     def configure(self, settings: ScpiSettings) -> None:
-        """Use other settings from the next reading on; it sets the unit again."""
+        """Use other settings from the next reading on, which sets up the unit again."""
         self.settings = settings
         self._ready = False
 
     def errors(self) -> list[str]:
-        """Read the error queue of the unit, which empties it; each entry such as ``-113 Undefined header``."""
+        """Read and empty the error queue of the unit; return entries such as ``-113 Undefined header``."""
         found = []
         for _ in range(MAX_ERRORS):
             number, text = self._query("SYST:ERR?", codec.parse_error)
@@ -88,17 +87,14 @@ class ScpiTemperature(Thermometer):
         if not self._ready:
             self._prepare()
         try:
-            readings = self._scanned()
+            readings = self._query("READ?", self._by_channel)
         except InstrumentError:
             self._ready = False
             raise
         return {
-            name: self._judged(index, readings[number])
+            name: self._evaluate(index, readings[number])
             for index, (name, number) in enumerate(zip(self.channels, self.settings.numbers, strict=True))
         }
-
-    def _scanned(self) -> dict[int, float]:
-        return self._query("READ?", self._by_channel)
 
     def _by_channel(self, text: str) -> dict[int, float]:
         """Return the readings of a scan by channel; ProtocolError unless each channel has one."""
@@ -111,15 +107,15 @@ class ScpiTemperature(Thermometer):
             )
         return dict(pairs)
 
-    def _judged(self, index: int, reading: float) -> tuple[float, str]:
-        """Return temperature (degC) and flag of a reading (degC); above its range a sensor is taken for open."""
+    def _evaluate(self, index: int, reading: float) -> tuple[float, str]:
+        """Return temperature (degC) and flag of a reading (degC); above its range a sensor counts as open."""
         if math.isinf(reading):
             return math.nan, OPEN if reading > 0 else OUT_OF_RANGE
         value = self.settings.corrected(index, reading)
         return value, GOOD if self.settings.lowest <= value <= self.settings.highest else OUT_OF_RANGE
 
     def _prepare(self) -> None:
-        """Set the unit, and report what it refuses."""
+        """Set up the unit; InstrumentError if it refuses a command."""
         self.unit_errors = tuple(self.errors())
         self._set("*CLS")
         if self._serial:
@@ -137,7 +133,7 @@ class ScpiTemperature(Thermometer):
         self._ready = True
 
     def _set(self, command: str) -> None:
-        """Send a command, and raise what the unit puts into its error queue; this also paces a serial line."""
+        """Send a command, and raise an error of the unit's error queue; waiting for it also paces a serial line."""
         with self.exchange() as line:
             line.write(codec.encode(command))
             line.write(codec.encode("SYST:ERR?"))
@@ -157,7 +153,7 @@ class ScpiTemperature(Thermometer):
             raise InstrumentTimeoutError(f"'{command}': {error}") from None
 
     def resynchronise(self) -> None:
-        """Discard late answers; those that are later still come before the identity of the unit.
+        """Discard late answers; even later ones precede the identity of the unit.
 
         Raises
         ------
@@ -175,19 +171,9 @@ class ScpiTemperature(Thermometer):
             return
         raise ProtocolError(f"{self.address}: expected the identity of the unit; found {MAX_LATE} other lines")
 
-    def _connect(self) -> Transport:
-        return open_reconnecting(
-            self.address,
-            simulator=self.info.simulator,
-            record=self._record,
-            timeout=self.settings.timeout,
-            retry=self.settings.retry,
-            baudrate=self.settings.baudrate,
-        )
-
     @property
     def _serial(self) -> bool:
-        """Whether the unit is on a serial line, where it has a remote mode of its own."""
+        """Whether the unit is on a serial line, which has a remote mode."""
         return str(getattr(self.transport, "recorded_address", self.address)).startswith("serial:")
 
     def _start_session(self) -> None:

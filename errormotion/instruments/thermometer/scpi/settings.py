@@ -1,4 +1,4 @@
-"""Settings of a data acquisition unit with SCPI commands: channels, sensors, and the commands that state them."""
+"""Settings of a data acquisition unit with SCPI commands: channels, sensors, and the commands that set them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Sensor = Literal[
     "FRTD 85", "FRTD 91", "RTD 85", "RTD 91", "TC B", "TC E", "TC J", "TC K", "TC N", "TC R", "TC S", "TC T"
 ]
 MODELS = ("34970A", "34972A", "34980A", "DAQ970A", "DAQ973A")
-"""Models whose manuals describe the commands that are used here."""
+"""Models whose manuals describe the commands of the driver."""
 
 
 class ScpiSettings(ThermometerSettings):
     """Settings of a SCPI data acquisition unit.
 
-    A temperature is ``scale * reading + offset``, by the calibration of its sensor.
+    A temperature is ``scale * reading + offset``, from the calibration of its sensor.
     """
 
     inputs: tuple[int, ...] = Field(
@@ -30,12 +30,13 @@ class ScpiSettings(ThermometerSettings):
     )
     sensors: tuple[Sensor, ...] = Field(
         default=("FRTD 85",),
-        description="one for all channels or one for each: FRTD is a resistance thermometer with four wires, RTD with "
-        "two, 85 the coefficient of IEC 60751 (Pt100); TC a thermocouple and its type",
+        description="types of sensors, one for all channels or one for each: FRTD is a resistance thermometer with "
+        "four wires, RTD with two, 85 the coefficient of IEC 60751 (Pt100); TC a thermocouple and its type",
         min_length=1,
     )
     resistance: float | tuple[float, ...] = Field(
-        default=100.0, description="of resistance thermometers at 0 degC, ohm, 49 to 2100; one for all or for each"
+        default=100.0,
+        description="resistance at 0 degC of resistance thermometers, ohm, 49 to 2100; one for all or for each",
     )
     power_cycles: Literal["0.02", "0.2", "1", "2", "10", "20", "100", "200"] | None = Field(
         default=None, description="integration time of a reading in cycles of the mains; default: that of the unit (1)"
@@ -43,22 +44,24 @@ class ScpiSettings(ThermometerSettings):
     open_check: bool = Field(default=True, description="whether the unit checks thermocouples for a broken wire")
     reference_junction: Literal["internal", "external"] | Temperature = Field(
         default="internal",
-        description="of thermocouples: 'internal' (sensor in the module), 'external' (a channel of the unit), or its "
-        "temperature, -20 to 80 degC",
+        description="reference junction of thermocouples: 'internal' (sensor in the module), 'external' (a channel of "
+        "the unit), or its temperature, -20 to 80 degC",
     )
-    scale: float | tuple[float, ...] = Field(default=1.0, description="factor to the readings; one for all or for each")
-    offset: float | tuple[float, ...] = Field(default=0.0, description="K, added to the readings; for all or for each")
+    scale: float | tuple[float, ...] = Field(default=1.0, description="factor of the readings; one for all or for each")
+    offset: float | tuple[float, ...] = Field(
+        default=0.0, description="K, added to the readings; one for all or for each"
+    )
     lowest: Temperature = Field(default=-273.15, description="temperatures below are out of range")
     highest: Temperature = Field(default=2500.0, description="temperatures above are out of range")
     setup: bool = Field(
         default=True,
-        description="whether channels and scan list are set in the unit, which clears its stored readings; otherwise "
-        "its scan list is used and must have these inputs",
+        description="whether channels and scan list of the unit are set, which clears its stored readings; otherwise "
+        "its scan list is used and must contain these inputs",
     )
     models: tuple[str, ...] = Field(default=MODELS, description="models that are accepted", min_length=1)
-    baudrate: int = Field(default=9600, description="of a serial line, where its URL has none", gt=0)
-    timeout: Time = Field(default=5.0, description="time limit of an answer, in which a scan must end", gt=0)
-    retry: Time = Field(default=1.0, description="least interval between two attempts to connect again", ge=0)
+    baudrate: int = Field(default=9600, description="baud rate of a serial line, if its URL states none", gt=0)
+    timeout: Time = Field(default=5.0, description="time limit for an answer, also for a complete scan", gt=0)
+    retry: Time = Field(default=1.0, description="minimum interval between two attempts to connect again", ge=0)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -68,7 +71,7 @@ class ScpiSettings(ThermometerSettings):
         if wrong := [each for each in self.numbers if not 101 <= each <= 8999]:
             raise ValueError(f"'inputs': expected slot and channel, such as 101 or 1001; found {wrong[0]}")
         if len(set(self.numbers)) != n:
-            raise ValueError("'inputs' has a channel twice; each name needs its own")
+            raise ValueError("'inputs' has a channel twice; expected a different one for each name")
         for name in ("sensors", "resistance", "scale", "offset"):
             value = getattr(self, name)
             if isinstance(value, tuple) and len(value) not in (1, n):
@@ -127,10 +130,10 @@ class ScpiSettings(ThermometerSettings):
         """Return the commands that set the format of readings: the reading and its channel."""
         return ("FORM:READ:ALAR OFF", "FORM:READ:CHAN ON", "FORM:READ:TIME OFF", "FORM:READ:UNIT OFF")
 
-    def _groups(self, of_each: Sequence[T]) -> Iterator[tuple[T, list[int]]]:
-        """Yield each different value with its channels, in ascending order."""
-        for value in dict.fromkeys(of_each):
-            yield value, sorted(number for number, own in zip(self.numbers, of_each, strict=True) if own == value)
+    def _groups(self, values: Sequence[T]) -> Iterator[tuple[T, list[int]]]:
+        """Yield each distinct value with its channels in ascending order."""
+        for value in dict.fromkeys(values):
+            yield value, sorted(number for number, each in zip(self.numbers, values, strict=True) if each == value)
 
     def _each(self, value: Any) -> tuple[Any, ...]:
         """Return one value for each channel."""

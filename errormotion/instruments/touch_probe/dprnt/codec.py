@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from errormotion.errors import ProtocolError
 
 LONGEST_LINE = 256
-"""Longest line, bytes; three positions, a time and a label have some 80."""
+"""Longest line, bytes; three positions, a time and a label have about 80."""
 _NUMBER = r"[-+]?+\s*+(?:\d++\.?+\d*+|\.\d++)"
 PATTERN = (
     r"(?:N\s*+(?P<number>\d++)\s*+|[A-MO-W]\w*+\s++)?"
@@ -23,8 +23,8 @@ PATTERN = (
 )
 """Default pattern of a line: number of the touch or a label, position, time.
 
-No part of it is matched in a second way (possessive quantifiers), so that the time grows with the length of the line.
-The two optional groups are not possessive: Python before 3.11.5 accepts parts of such a group.
+Its possessive quantifiers prevent backtracking, so that the time grows with the length of the line. The two optional
+groups are not possessive: Python before 3.11.5 accepts parts of such a group.
 """
 
 _CONTROL = bytes(range(32)) + b"\x7f%"  # characters of POPEN and PCLOS around the lines
@@ -33,7 +33,7 @@ MM, MILLISECONDS = 1e-3, 1e-3
 
 @dataclass(frozen=True)
 class Line:
-    """One printed line: position (m), number of the touch (None where not printed), time (s; NaN where not printed)."""
+    """One printed line: position (m), number of the touch (None if not printed), time (s; NaN if not printed)."""
 
     position: tuple[float, float, float]
     number: int | None = None
@@ -54,7 +54,7 @@ def from_iso_code(raw: bytes) -> bytes:
 
 
 def text_of(raw: bytes) -> str:
-    """Return a line as text, without control characters; empty where nothing is left.
+    """Return a line as text, without control characters; empty if nothing is left.
 
     Raises
     ------

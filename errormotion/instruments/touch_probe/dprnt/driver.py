@@ -9,15 +9,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, Line, from_iso_code, parse_line, text_of
 from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, touch_of
 from errormotion.instruments.touch_probe.dprnt.settings import DprntSettings
-from errormotion.instruments.touch_probe.settings import corrected, refuse_unmapped
+from errormotion.instruments.touch_probe.probe import Probe, corrected, refuse_unmapped
 from errormotion.instruments.touch_probe.touching import NOT_MADE, NOWHERE
-from errormotion.instruments.transports import Transport, open_transport
 from errormotion.instruments.transports.quiet import discard_input
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
@@ -31,7 +29,7 @@ _TIMES = {"ms": 1e-3, "s": 1.0}
 log = logging.getLogger(__name__)
 
 
-class Dprnt(Driver):
+class Dprnt(Probe, Driver):
     """Lines that a macro prints, one for each touch, over a serial line or TCP.
 
     Parameters
@@ -45,10 +43,10 @@ class Dprnt(Driver):
     Attributes
     ----------
     last : Contact or None
-        The last one.
+        The last contact.
     unreadable, repeated, missing, late : int
         Number of unreadable lines, lines printed twice, touches without a line, and lines of a cycle that had ended in
-        an error, since the driver was made.
+        an error, since the driver was created.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -68,31 +66,13 @@ class Dprnt(Driver):
 
     def __init__(self, address: str, settings: DprntSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)
-        self.last: Contact | None = None
         self.unreadable = self.repeated = self.missing = self.late = 0
-        self._contacts = 0
-        self._map: PretravelMap | None = None
         self._before: Line | None = None  # the last line
-        self._ahead: Line | None = None  # the first line of the next cycle, where one has come
+        self._ahead: Line | None = None  # the first line of the next cycle, if received
         self._unfinished_from = 0  # touch at which the last cycle ended in an error; else 0
 
-    @property
-    def tip_radius(self) -> float:
-        """Radius of the tip, m."""
-        return self.settings.tip_radius
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of one touch, m; NaN where unknown."""
-        return self.settings.touch_noise
-
-    @property
-    def pretravel(self) -> PretravelMap | None:
-        """The map that corrects contacts; None without one."""
-        return self._map
-
     def identify(self) -> Identity:
-        """Return the identity as the settings state it: a printer has no identity."""
+        """Return the identity stated in the settings: printed lines have none."""
         return Identity(
             manufacturer=self.settings.control,
             model="DPRNT",
@@ -100,11 +80,6 @@ class Dprnt(Driver):
             simulated=self.transport.simulated,
             details={"address": self.address, "tip_radius": self.tip_radius},
         )
-
-    def configure(self, settings: DprntSettings) -> None:
-        """Use other settings from now on."""
-        self._map = settings.pretravel_map()
-        self.settings = settings
 
     def read(self) -> dict[str, Any]:
         """Return ``contacts``, ``unreadable``, ``repeated``, ``missing``, ``late`` so far, and the last ``contact``.
@@ -165,11 +140,11 @@ class Dprnt(Driver):
                 self._before = line
             for _ in range(due, index):
                 self.missing += 1
-                yield self._kept(Contact(NOWHERE, float("nan"), NOT_MADE))
+                yield self._keep(Contact(NOWHERE, float("nan"), NOT_MADE))
             if index < len(touches):
                 touch = touches[index]
                 contact = contact_of(line, touch, self.settings.free, self.settings.at_target)
-                yield self._kept(corrected(self._map, touch, contact))
+                yield self._keep(corrected(self._map, touch, contact))
             due = index + 1
 
     def _next(self, timeout: float, unreadable: int) -> Line:
@@ -201,24 +176,10 @@ class Dprnt(Driver):
                         f"The last one: {error}"
                     ) from error
 
-    def _kept(self, contact: Contact) -> Contact:
-        self.last = contact
-        self._contacts += not contact.flag
-        return contact
-
-    def _connect(self) -> Transport:
-        return open_transport(
-            self.address,
-            simulator=self.info.simulator,
-            recorder=self._record,
-            timeout=self.settings.timeout,
-            baudrate=self.settings.baudrate,
-        )
-
     def _start_session(self) -> None:
         self._map = self.settings.pretravel_map()
         self._before = self._ahead = None
         self._unfinished_from = 0
 
     def _end_session(self) -> None:
-        discard_input(self.transport)  # what PCLOS sends after the last line: a recording is read to its end
+        discard_input(self.transport)  # characters of PCLOS after the last line, so that a recording is read to its end

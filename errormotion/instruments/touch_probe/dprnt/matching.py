@@ -16,8 +16,8 @@ REPEATED = -1
 def touch_of(line: Line, touches: list[Touch], due: int, last: Line | None, first: int, margin: float) -> int:
     """Return the number of the touch (from 0) that a line belongs to, or `REPEATED`.
 
-    A printed number determines the touch; numbers continue or start again from cycle to cycle. Without a number it is
-    the next touch on whose path the position is. A touch before ``due`` belongs to the next cycle.
+    A printed number determines the touch; numbers continue or restart from cycle to cycle. Without a number, the line
+    belongs to the next touch whose path has this position. A touch before ``due`` belongs to the next cycle.
 
     Raises
     ------
@@ -30,8 +30,8 @@ def touch_of(line: Line, touches: list[Touch], due: int, last: Line | None, firs
         index: int = (line.number - first) % len(touches)
         if not is_on_path(line, touches[index], margin):
             raise InstrumentError(
-                f"touch {line.number} was printed at {_shown(line)}, which is not on the path of touch {index + 1}; "
-                "check that program and touches agree, and the unit of lengths"
+                f"touch {line.number} was printed at {_text(line)}, which is not on the path of touch {index + 1}; "
+                "check that program and touches agree, and the unit"
             )
         return index
     candidates = [*range(due, len(touches)), *range(due)]
@@ -41,7 +41,7 @@ def touch_of(line: Line, touches: list[Touch], due: int, last: Line | None, firs
         return REPEATED
     if not found:
         raise InstrumentError(
-            f"a contact was printed at {_shown(line)}, which is on the path of no touch; check that program and "
+            f"a contact was printed at {_text(line)}, which is on the path of no touch; check that program and "
             "touches agree, and the unit of lengths"
         )
     return found[0]
@@ -49,17 +49,17 @@ def touch_of(line: Line, touches: list[Touch], due: int, last: Line | None, firs
 
 def is_on_path(line: Line, touch: Touch, margin: float) -> bool:
     """Whether a position is on the path of a touch, to a margin (m)."""
-    start, way = np.array(touch.start), np.subtract(touch.target, touch.start)
+    start, path = np.array(touch.start), np.subtract(touch.target, touch.start)
     offset = np.array(line.position) - start
-    along = np.clip(offset @ way / (way @ way), 0.0, 1.0)
-    return bool(np.linalg.norm(offset - along * way) <= margin)
+    along = np.clip(offset @ path / (path @ path), 0.0, 1.0)
+    return bool(np.linalg.norm(offset - along * path) <= margin)
 
 
 def contact_of(line: Line, touch: Touch, free: float, at_target: float) -> Contact:
     """Return the contact of a printed position; a skip move without a contact ends at its target."""
-    way = np.subtract(touch.target, touch.start)
-    length = float(np.linalg.norm(way))
-    along = float(np.subtract(line.position, touch.start) @ way) / length
+    path = np.subtract(touch.target, touch.start)
+    length = float(np.linalg.norm(path))
+    along = float(np.subtract(line.position, touch.start) @ path) / length
     if along >= length - at_target:
         return Contact(NOWHERE, line.time, NO_TRIP)
     if along < free:
@@ -67,6 +67,6 @@ def contact_of(line: Line, touch: Touch, free: float, at_target: float) -> Conta
     return Contact(line.position, line.time)
 
 
-def _shown(line: Line) -> str:
+def _text(line: Line) -> str:
     x, y, z = (1e3 * value for value in line.position)
     return f"X {x:.3f} Y {y:.3f} Z {z:.3f} mm"

@@ -20,14 +20,14 @@ class DprntSettings(ProbeSettings):
     )
     length_unit: Literal["mm", "in"] = Field(default="mm", description="unit of printed positions")
     time_unit: Literal["ms", "s"] = Field(default="ms", description="unit of printed times")
-    first_number: int = Field(default=1, description="number of the first touch, where touches are numbered", ge=0)
+    first_number: int = Field(default=1, description="number of the first touch, if touches are numbered", ge=0)
     margin: Length = Field(default=1e-3, description="largest distance of a position from the path of its touch", gt=0)
     free: Length = Field(default=0.2e-3, description="first part of a path, in which a trip counts as false", ge=0)
     at_target: Length = Field(
-        default=5e-6, description="distance from the target within which a touch ended without a trip", ge=0
+        default=5e-6, description="distance from the target within which a touch counts as one without a trip", ge=0
     )
-    start_timeout: Time = Field(default=600.0, description="time limit of the first line of a cycle", gt=0)
-    timeout: Time = Field(default=60.0, description="time limit from line to line", gt=0)
+    start_timeout: Time = Field(default=600.0, description="time limit for the first line of a cycle", gt=0)
+    timeout: Time = Field(default=60.0, description="time limit from one line to the next", gt=0)
     most_unreadable: int = Field(
         default=10, description="largest accepted number of unreadable lines in one cycle", ge=0
     )
@@ -37,8 +37,8 @@ class DprntSettings(ProbeSettings):
     code: Literal["ascii", "iso"] = Field(
         default="ascii", description="characters: ASCII, or ISO code, with even parity in the eighth bit"
     )
-    baudrate: int = Field(default=4800, description="of a serial line", gt=0)
-    control: str = Field(default="FANUC", description="name of the control, for the record")
+    baudrate: int = Field(default=4800, description="baud rate of a serial line", gt=0)
+    control: str = Field(default="FANUC", description="name of the control, written to the identity")
 
     @field_validator("pattern")
     @classmethod

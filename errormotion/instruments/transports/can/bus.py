@@ -1,8 +1,8 @@
-"""CAN: opening the CANopen node that an address names.
+"""CAN: opening the CANopen node at an address.
 
-``can://socketcan/can0?node=5`` names an interface of python-can, a channel and the node. Further parameters go to
-python-can: ``bitrate=250000``, ``port=43113``. ``can://udp_multicast/239.74.163.2?node=5`` is a bus that crosses
-processes, ``can://virtual/NAME?node=5`` one inside this process; ``sim://`` and ``replay://`` as for every transport.
+``can://socketcan/can0?node=5`` states an interface of python-can, a channel and the node. Further parameters are passed
+to python-can: ``bitrate=250000``, ``port=43113``. ``can://udp_multicast/239.74.163.2?node=5`` is a bus between
+processes, ``can://virtual/NAME?node=5`` one within this process; ``sim://`` and ``replay://`` as for every transport.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ def open_can(
     timeout: float = 1.0,
     retry: float = 1.0,
 ) -> CanNode:
-    """Open the CANopen node that an address names; its ``node`` takes precedence over the argument.
+    """Open the CANopen node at an address; its ``node`` takes precedence over the argument.
 
     Parameters
     ----------
     url : str
         See the module.
     node, timeout, retry
-        As in `CanNode`.
+        See `CanNode`.
     simulator : str, optional
-        ``module:Class`` of the simulator behind ``sim://``.
+        ``module:Class`` of the simulator for ``sim://``.
     record : Path, optional
         File to which every frame of this node is recorded.
 
     Raises
     ------
     InstrumentError
-        No such bus, no address of a CAN bus, or an invalid node number.
+        The bus cannot be opened, the address is not that of a CAN bus, or the node number is invalid.
     """
     address = parse_address(url)
     if address.scheme == "replay":

@@ -1,7 +1,7 @@
-"""A CAN bus: frames out, frames in by identifier, and the loss of the bus; live or from a recording.
+"""A CAN bus: sending frames, receiving frames by identifier, and loss of the bus; live or from a recording.
 
-A recording holds the frames that somebody waits for: four bytes of identifier, as SocketCAN has them (bit 29: an error
-frame), then the data. `MARK` is no frame: it says that from there on the driver waits for new frames.
+A recording contains the frames of subscribed identifiers: four bytes of identifier, as in SocketCAN (bit 29: an error
+frame), then the data. `MARK` is not a frame: it states that the driver waits for new frames from there on.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayEr
 from errormotion.instruments.transports.address import Address, parse_address
 from errormotion.instruments.transports.recording import Recorder, ReplayTransport
 
-logging.getLogger("can").addHandler(logging.NullHandler())  # its messages are those of the errors raised here
+logging.getLogger("can").addHandler(logging.NullHandler())  # errors raised here contain its messages
 
 ERROR_FRAME = 0x20000000
 BUS_OFF = 0x40
-"""In the identifier of an error frame: the controller has left the bus."""
+"""Bit in the identifier of an error frame: the controller is off the bus."""
 MARK = b"\xff\xff\xff\xff"
-_CYCLE = 0.05  # s that closing may wait for the listening thread
+_CYCLE = 0.05  # s, time limit for one receive of the listening thread, for which closing waits
 _REPLAY_INTERVAL = 0.001  # s
 
 Receive = Callable[[bytes], None]
@@ -31,7 +31,7 @@ Reset = Callable[[], None]
 
 
 class Network:
-    """The frames of a bus.
+    """A bus that sends and receives frames.
 
     Parameters
     ----------
@@ -53,18 +53,18 @@ class Network:
         self.failed = ""
         self._recorder = recorder
         self._receivers: dict[int, Receive] = {}
-        self._order = threading.Lock()  # a frame is received either before one is sent, or after it
+        self._order = threading.Lock()  # sending and receiving of frames exclude each other
         self._stopped = threading.Event()
         self._open(address)
         self._thread = threading.Thread(target=self._listen, name="can-listen", daemon=True)
         self._thread.start()
 
     def subscribe(self, identifier: int, receive: Receive) -> None:
-        """Have frames of an identifier passed to ``receive(data)``, in the listening thread."""
+        """Pass frames with an identifier to ``receive(data)``, in the listening thread."""
         self._receivers[identifier] = receive
 
     def unsubscribe(self, identifier: int) -> None:
-        """Ignore frames of an identifier from now on."""
+        """Ignore frames with an identifier from now on."""
         self._receivers.pop(identifier, None)
 
     def send(self, identifier: int, data: bytes, reset: Reset | None = None) -> None:
@@ -75,7 +75,7 @@ class Network:
         identifier : int
         data : bytes
         reset : callable, optional
-            Called after all frames that came before this one were received, and before any other.
+            Called after all frames before this one were received, and before any later frame.
 
         Raises
         ------
@@ -90,14 +90,14 @@ class Network:
             self._put(identifier, data)
 
     def mark(self, reset: Reset) -> None:
-        """Call ``reset`` as in `send`, and state in the recording that from there on new frames are awaited."""
+        """Call ``reset`` as in `send`, and record that the driver waits for new frames from there on."""
         with self._order:
             self._play_due()
             reset()
             self._note_sent(MARK)
 
     def close(self) -> None:
-        """Leave the bus; idempotent."""
+        """Close the connection to the bus; idempotent."""
         self._stopped.set()
         self._thread.join()
         self._end()
@@ -132,7 +132,7 @@ class Network:
             self._recorder.frame("W", frame)
 
     def _play_due(self) -> None:
-        """Receive what a recording has before the next frame that is sent."""
+        """Receive the frames that a recording has before the next frame that is sent."""
 
     def _on_frame(self, identifier: int, data: bytes) -> None:
         receive = self._receivers.get(identifier)
@@ -149,12 +149,12 @@ class Network:
             self.failed = "the controller is bus-off"
 
     def _end(self) -> None:
-        with suppress(can.CanError, OSError):  # it is not used again
+        with suppress(can.CanError, OSError):  # it is not used any further
             self._bus.shutdown()
 
 
 class ReplayedNetwork(Network):
-    """Plays the frames of a recorded session."""
+    """Replays the frames of a recorded session."""
 
     def __init__(self, frames: ReplayTransport) -> None:
         self._frames = frames
@@ -181,7 +181,7 @@ class ReplayedNetwork(Network):
             self._play_due()
 
     def _play_due(self) -> None:
-        with suppress(InstrumentTimeoutError, ReplayError):  # the next one follows a request, or all are played
+        with suppress(InstrumentTimeoutError, ReplayError):  # the next one follows a request, or there is none
             while frame := self._frames.read(timeout=0.0):
                 identifier = int.from_bytes(frame[:4], "big")
                 if identifier & ERROR_FRAME:
@@ -191,5 +191,5 @@ class ReplayedNetwork(Network):
 
 
 def to_bytes(identifier: int, data: bytes) -> bytes:
-    """Return a frame as it is recorded."""
+    """Return a frame in the format of a recording."""
     return identifier.to_bytes(4, "big") + data

@@ -1,4 +1,4 @@
-"""One CANopen node on a bus: its entries by SDO, its PDOs, its state, its emergencies."""
+"""A CANopen node on a bus: entries by SDO, PDOs, state, emergencies."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from errormotion.instruments.transports.can.sdo import SdoClient, SdoRefusal
 from errormotion.instruments.transports.lost import Reopened
 
 MOST_PDOS = 8
-"""Number of transmit PDOs that are looked at: four as every node may have them, and further ones."""
+"""Number of transmit PDOs that are examined: the four standard ones and further ones."""
 START = 1
-"""Command of the network management: go to OPERATIONAL."""
+"""Command of the network management to enter OPERATIONAL."""
 _NMT, _EMERGENCY, _ANSWERS, _REQUESTS, _HEARTBEAT = 0x000, 0x080, 0x580, 0x600, 0x700
 _BOOTED = 0
-_STATES = {_BOOTED: "PRE-OPERATIONAL", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}  # after its boot-up too
+_STATES = {_BOOTED: "PRE-OPERATIONAL", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}  # also after its boot-up
 Result = TypeVar("Result")
 
 
 class CanNode(Transport):
-    """One CANopen node; a bus that was lost is opened again, see `transports.lost`.
+    """A CANopen node; a bus that was lost is opened again, see `transports.lost`.
 
     Parameters
     ----------
@@ -52,19 +52,19 @@ class CanNode(Transport):
     node : int
         Node number, 1 to 127.
     timeout : float
-        Time limit of an answer, s.
+        Time limit for an answer, s.
     retry : float
-        Least time between two attempts to open the bus, s.
+        Minimum interval between two attempts to open the bus, s.
     simulated : bool
     end : callable, optional
-        Called when this is closed.
+        Called when the node is closed.
 
     Attributes
     ----------
     boots : int
-        Number of boot-up messages, and of buses opened again: what was read of the node before may have changed.
+        Number of boot-up messages, and of buses opened again, after each of which entries of the node may have changed.
     emergency : int
-        Code of the last emergency message; 0: none, or over.
+        Code of the last emergency message; 0: none, or the emergency has ended.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class CanNode(Transport):
         self.emergency = 0
         self._state = ""
         self._sdo = SdoClient(self._request, timeout)
-        self._fresh: dict[int, bytes] = {}  # first PDOs of each identifier since the last request for new ones
+        self._fresh: dict[int, bytes] = {}  # first PDO of each identifier since the last request for new ones
         self._news = threading.Condition()
         self._awaited: tuple[int, ...] = ()
         self._bus, self._end = Reopened(url, self._opened, retry), end
@@ -103,7 +103,7 @@ class CanNode(Transport):
 
     @property
     def late(self) -> int:
-        """Number of SDO answers that were ignored, as they came too late or belonged to another request."""
+        """Number of SDO answers that were ignored because they were late or belonged to another request."""
         return self._sdo.late
 
     # ------------------------------------------------------------------ entries
@@ -118,7 +118,7 @@ class CanNode(Transport):
         InstrumentTimeoutError
             The node does not answer; the message states its last heartbeat.
         ProtocolError
-            An answer that is none.
+            The answer is invalid.
         InstrumentError
             The bus is off or lost; a later call opens it again.
         """
@@ -133,7 +133,7 @@ class CanNode(Transport):
             raise ProtocolError(f"{self._where}, {what}: {error}") from None
 
     def unsigned(self, index: int, subindex: int = 0, size: int = 4) -> int:
-        """Return an entry that is an unsigned number of 1 to ``size`` bytes; errors as of `upload`.
+        """Return an entry that is an unsigned number of 1 to ``size`` bytes; errors as for `upload`.
 
         A node that does not state the size of its entries sends 4 bytes; those beyond ``size`` have no meaning.
         """
@@ -148,11 +148,11 @@ class CanNode(Transport):
     # ------------------------------------------------------------------ network management, PDOs
 
     def start_node(self) -> None:
-        """Send the node to OPERATIONAL."""
+        """Set the node to OPERATIONAL."""
         self._guarded(lambda: self._bus.get().send(_NMT, bytes((START, self.node))))
 
     def transmit_pdos(self) -> list[TransmitPdo]:
-        """Return the PDOs that the node sends, as its object dictionary states them; errors as of `upload`."""
+        """Return the PDOs that the node sends, by its object dictionary; errors as for `upload`."""
         found: list[TransmitPdo] = []
         for number in range(MOST_PDOS):
             try:
@@ -170,37 +170,37 @@ class CanNode(Transport):
         return found
 
     def sync_identifier(self) -> int:
-        """Return the identifier of SYNC; errors as of `upload`."""
+        """Return the identifier of SYNC; errors as for `upload`."""
         try:
             return self.unsigned(SYNC_IDENTIFIER) & 0x7FF
         except SdoRefusal:
             return SYNC
 
     def await_pdos(self, identifiers: Iterable[int]) -> None:
-        """Receive the PDOs of these identifiers from now on, and no others."""
+        """Receive only the PDOs with these identifiers from now on."""
         self._awaited = tuple(identifiers)
         self._guarded(lambda: self._subscribe_pdos(self._bus.get()))
 
     def fresh_pdos(
         self, identifiers: Sequence[int], timeout: float, syncs: int = 0, sync: int = SYNC
     ) -> dict[int, bytes]:
-        """Return the first frame of each identifier that comes after this call.
+        """Return the first frame with each identifier after this call.
 
         Parameters
         ----------
         identifiers : sequence of int
-            As in `await_pdos`.
+            See `await_pdos`.
         timeout : float
             Time limit, s.
         syncs : int
-            Number of SYNC messages to send, one after another; the others wait for those of another producer.
+            Number of SYNC messages to send; 0: wait for those of another producer.
         sync : int
             Identifier of SYNC.
 
         Raises
         ------
         InstrumentTimeoutError
-            Not all have come.
+            Not all PDOs were received in time.
         InstrumentError
             The bus is off or lost.
         """

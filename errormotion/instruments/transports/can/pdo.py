@@ -1,4 +1,4 @@
-"""PDOs of CANopen: when a node sends which objects, and where they are in a frame.
+"""PDOs of CANopen: the objects that a node sends, when it sends them, and their positions in a frame.
 
 Source: CiA 301, objects 0x1800 ff. (communication) and 0x1A00 ff. (mapping).
 """
@@ -14,11 +14,11 @@ COMMUNICATION, MAPPING = 0x1800, 0x1A00
 SYNC_IDENTIFIER = 0x1005
 """Object with the identifier of SYNC."""
 SYNC = 0x80
-"""Identifier of SYNC where a node does not state it."""
+"""Identifier of SYNC, if a node does not state it."""
 COB_ID, TRANSMISSION, INHIBIT, EVENT_TIMER = 1, 2, 3, 5
 """Subindices of the communication objects."""
 MOST_ENTRIES = 64
-"""Objects of one PDO; more than 64 stand for other kinds of PDO."""
+"""Largest number of objects of a PDO; larger numbers mean other types of PDO."""
 FRAME_BITS = 64
 _INVALID, _EXTENDED = 1 << 31, 1 << 29
 _LARGEST_CYCLIC = 240
@@ -27,13 +27,13 @@ _EVENT = (254, 255)
 
 @dataclass(frozen=True)
 class Mapped:
-    """Where an object is in a frame.
+    """Position of an object in a frame.
 
     Attributes
     ----------
     index, subindex : int
     offset, bits : int
-        First bit, from the lowest of the first byte on, and number of bits.
+        First bit, counted from the lowest bit of the first byte, and number of bits.
     """
 
     index: int
@@ -42,7 +42,7 @@ class Mapped:
     bits: int
 
     def data(self, frame: bytes) -> bytes:
-        """Return the bytes of the object, its bits at the lowest ones.
+        """Return the bytes of the object, right-aligned.
 
         Raises
         ------
@@ -63,9 +63,9 @@ class TransmitPdo:
     Attributes
     ----------
     number : int
-        From 1 on.
+        Number of the PDO, from 1.
     identifier : int
-        Of its frames, 11 bits.
+        Identifier of its frames, 11 bits.
     transmission : int
         0: at a SYNC after an event, 1 to 240: at every n-th SYNC, 254 and 255: after an event or the timer.
     event_timer : float
@@ -90,27 +90,27 @@ class TransmitPdo:
         return self.transmission in _EVENT and self.event_timer > 0
 
     def place(self, index: int, subindex: int) -> Mapped | None:
-        """Return where an object is; None where it is not in this PDO."""
+        """Return the position of an object; None if it is not in this PDO."""
         return next((each for each in self.mapped if (each.index, each.subindex) == (index, subindex)), None)
 
 
 def decode_identifier(number: int) -> int | None:
-    """Return the identifier of a PDO; None where the PDO is switched off, or has one of 29 bits."""
+    """Return the identifier of a PDO; None if the PDO is switched off, or its identifier has 29 bits."""
     return None if number & (_INVALID | _EXTENDED) else number & 0x7FF
 
 
 def decode_mapping(entries: Sequence[int]) -> tuple[Mapped, ...]:
-    """Return where the objects of a PDO are.
+    """Return the positions of the objects of a PDO.
 
     Parameters
     ----------
     entries : sequence of int
-        As in 0x1A00 ff.: index, subindex and number of bits, from the highest byte on.
+        Entries of 0x1A00 ff.: index, subindex and number of bits, most significant byte first.
 
     Raises
     ------
     ProtocolError
-        Objects without bits, or more than a frame holds.
+        An object has no bits, or the objects exceed a frame.
     """
     mapped: list[Mapped] = []
     offset = 0

@@ -2,9 +2,9 @@
 
 Source: CiA 301 (application layer). A transfer is expedited (up to 4 bytes in one frame) or in segments of 7 bytes.
 
-A node that answers late must not shift later readings: an answer counts only where it has the index and subindex of the
-request. After a timeout the client first reads an entry that it has not read before (`BARRIERS`, in turn) and ignores
-everything until its answer: a server answers in the order of the requests, so that nothing older can follow.
+A late answer must not be read as the answer to a later request: an answer is only accepted with the index and subindex
+of the request. After a timeout the client first reads another entry (`BARRIERS`, in turn) and ignores all answers until
+its answer: a server answers in the order of the requests, so that no older answer can follow.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ FRAME_BYTES = 8
 LONGEST_TRANSFER = 1024
 """Longest entry that is read, bytes."""
 LONGEST_TIME = 10
-"""Longest duration of a transfer in segments, in time limits of one answer."""
+"""Longest duration of a transfer in segments, as a multiple of the time limit for one answer."""
 MOST_STRAY = 64
-"""Number of frames that are ignored at most while an answer is awaited."""
+"""Largest number of frames that are ignored while the client waits for an answer."""
 BARRIERS = ((0x1001, 0), (0x1018, 1), (0x1000, 0))
 """Entries that every node has (error register, vendor, device type)."""
 NO_OBJECT, NO_SUBINDEX, TIMED_OUT, GENERAL = 0x06020000, 0x06090011, 0x05040000, 0x08000000
@@ -65,8 +65,8 @@ _UPLOAD, _SEGMENT, _ABORT = 0x40, 0x60, 0x80
 _TOGGLE = 0x10
 
 
-class SdoRefusal(InstrumentError):  # noqa: N818 - that is what it is
-    """A node aborts the transfer.
+class SdoRefusal(InstrumentError):  # noqa: N818 - a refusal is an answer
+    """The node has aborted the transfer.
 
     Attributes
     ----------
@@ -81,22 +81,22 @@ class SdoRefusal(InstrumentError):  # noqa: N818 - that is what it is
 
 
 def upload_request(index: int, subindex: int) -> bytes:
-    """Return the frame that asks for an entry."""
+    """Return the frame that requests an entry."""
     return struct.pack("<BHB4x", _UPLOAD, index, subindex)
 
 
 def segment_request(toggle: int) -> bytes:
-    """Return the frame that asks for the next segment; ``toggle`` 0 or 1."""
+    """Return the frame that requests the next segment; ``toggle`` 0 or 1."""
     return bytes((_SEGMENT | toggle << 4, 0, 0, 0, 0, 0, 0, 0))
 
 
 def abort_request(index: int, subindex: int, code: int) -> bytes:
-    """Return the frame with which the client ends a transfer."""
+    """Return the frame by which the client aborts a transfer."""
     return struct.pack("<BHBI", _ABORT, index, subindex, code)
 
 
 def upload_reply(frame: bytes, index: int, subindex: int) -> bytes | int | None:
-    """Return what a node answers to a request for an entry.
+    """Return the answer of a node to a request for an entry.
 
     Returns
     -------
@@ -109,14 +109,14 @@ def upload_reply(frame: bytes, index: int, subindex: int) -> bytes | int | None:
     SdoRefusal
         The node aborts.
     ProtocolError
-        No answer of this kind.
+        The frame is not such an answer.
     """
     if len(frame) != FRAME_BYTES:
         raise ProtocolError(f"an SDO answer has {FRAME_BYTES} bytes; found {frame.hex(' ') or 'none'}")
     command, at, sub, number = struct.unpack("<BHBI", frame)
     kind = command & 0xE0
     if kind not in (_UPLOAD, _ABORT):
-        raise ProtocolError(f"{frame.hex(' ')} is no answer to an SDO upload")
+        raise ProtocolError(f"{frame.hex(' ')} is not an answer to an SDO upload")
     if (at, sub) != (index, subindex):
         return None
     if kind == _ABORT:
@@ -134,7 +134,7 @@ def segment_reply(frame: bytes, toggle: int) -> tuple[bytes, bool] | None:
     SdoRefusal
         The node aborts.
     ProtocolError
-        No answer of this kind.
+        The frame is not such an answer.
     """
     if len(frame) != FRAME_BYTES:
         raise ProtocolError(f"an SDO answer has {FRAME_BYTES} bytes; found {frame.hex(' ') or 'none'}")
@@ -150,21 +150,21 @@ def segment_reply(frame: bytes, toggle: int) -> tuple[bytes, bool] | None:
 
 
 class SdoClient:
-    """Reads entries of one node's object dictionary.
+    """Reads entries of the object dictionary of a node.
 
     Parameters
     ----------
     send : callable
-        ``send(frame, reset)`` sends a request, and calls ``reset`` between the frames before it and those after it.
+        ``send(frame, reset)`` sends a request, and calls ``reset`` after all frames received before it.
     timeout : float
-        Time limit of an answer, s.
+        Time limit for an answer, s.
 
     Attributes
     ----------
     answers : queue.Queue
-        Frames that the node has sent; the receiving thread fills it.
+        Frames from the node, added by the receiving thread.
     late : int
-        Number of answers that were ignored, as they came after their time or belonged to another request.
+        Number of answers that were ignored because they were late or belonged to another request.
     """
 
     def __init__(self, send: Callable[[bytes, Callable[[], None] | None], None], timeout: float) -> None:
@@ -185,18 +185,18 @@ class SdoClient:
         InstrumentTimeoutError
             No answer within the time limit.
         ProtocolError
-            An answer that is none.
+            The answer is invalid.
         """
         if not self._settled:
             self._settle((index, subindex))
         return self._exchange(index, subindex)
 
-    def _settle(self, asked: tuple[int, int]) -> None:
+    def _settle(self, requested: tuple[int, int]) -> None:
         """Wait until no answer to an earlier request can follow."""
         barrier = next(self._barriers)
-        if barrier == asked:
+        if barrier == requested:
             barrier = next(self._barriers)
-        with suppress(SdoRefusal):  # an answer as well
+        with suppress(SdoRefusal):  # a refusal is also an answer
             self._exchange(*barrier)
 
     def _exchange(self, index: int, subindex: int) -> bytes:
@@ -226,24 +226,24 @@ class SdoClient:
     def _segments(self, index: int, subindex: int, size: int) -> bytes:
         """Return the data that follow in segments."""
         if size > LONGEST_TRANSFER:
-            raise self._ended(index, subindex, f"announced {size} bytes; expected at most {LONGEST_TRANSFER}")
+            raise self._ended(index, subindex, f"expected at most {LONGEST_TRANSFER} bytes; the node announced {size}")
         data, toggle = b"", 0
         last = time.monotonic() + LONGEST_TIME * self.timeout
         while True:
             self._send(segment_request(toggle), None)
             found = segment_reply(self._next(min(last, time.monotonic() + self.timeout)), toggle)
             if found is None:
-                raise self._ended(index, subindex, "a segment of another transfer came")
+                raise self._ended(index, subindex, "received a segment of another transfer")
             data += found[0]
             if len(data) > LONGEST_TRANSFER:
-                raise self._ended(index, subindex, f"more than {LONGEST_TRANSFER} bytes came")
+                raise self._ended(index, subindex, f"received more than {LONGEST_TRANSFER} bytes")
             if found[1]:
                 break
             if not found[0]:
-                raise self._ended(index, subindex, "a segment without data came")
+                raise self._ended(index, subindex, "received a segment without data")
             toggle ^= 1
         if size and len(data) != size:
-            raise ProtocolError(f"0x{index:04X}:{subindex} announced {size} bytes; {len(data)} came")
+            raise ProtocolError(f"0x{index:04X}:{subindex}: expected {size} bytes; received {len(data)}")
         return data
 
     def _ended(self, index: int, subindex: int, why: str) -> ProtocolError:

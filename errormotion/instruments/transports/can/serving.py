@@ -1,4 +1,4 @@
-"""The device end of a CAN bus for the simulators: frames in, frames out, on a python-can bus."""
+"""The device end of a python-can bus, for simulators: receiving and sending frames."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ import can
 
 from errormotion.instruments.transports.can.bus import BUS_OFF
 
-LONGEST_WAIT = 0.05  # s, between two looks at the clock
+LONGEST_WAIT = 0.05  # s, between two checks of the clock
 _channels = itertools.count(1)
 
 
 class CanServer:
-    """A device's controller on a bus of 11-bit identifiers.
+    """A device on a bus with 11-bit identifiers.
 
-    One thread calls ``received`` and ``due``; nothing else sends after `start`.
+    One thread calls ``received`` and ``due``; after `start`, only these may send.
 
     Parameters
     ----------
     node : int
         Number of the node in the address.
     received : callable
-        ``received(can_id, data, remote)`` takes a frame of another participant.
+        ``received(can_id, data, remote)`` processes a frame of another participant.
     due : callable
-        ``due(now)`` does what is to be done at a time of `time.monotonic`, s, and returns the time of its next task.
+        ``due(now)`` performs the tasks due at a time of `time.monotonic`, s, and returns the time of the next task.
     bus : mapping, optional
-        Arguments of `can.Bus`; default: a bus of its own inside this process.
+        Arguments of `can.Bus`; default: a new bus within this process.
 
     Attributes
     ----------
@@ -60,11 +60,11 @@ class CanServer:
         self._thread.start()
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a data frame of at most 8 bytes; a bus that does not take it loses it."""
+        """Send a data frame of at most 8 bytes; it is lost if the bus does not accept it."""
         self._send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
     def send_bus_off(self) -> None:
-        """Have every controller on the bus report that it is bus-off."""
+        """Make every controller on the bus report that it is bus-off."""
         self._send(can.Message(arbitration_id=BUS_OFF, is_error_frame=True, is_extended_id=False, data=bytes(8)))
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Answers of an HTTP/1.x server as they come in: head and body, bounded in size and in time (RFC 9112).
+"""Reading of HTTP/1.x answers: head and body, with limits of size and time (RFC 9112).
 
 Longest line of a head: 8192 bytes, of the head of a part 4096; at most 100 lines of a head or trailer; a chunk size has
 at most 8 digits.
@@ -26,16 +26,16 @@ class CutOffError(ProtocolError):
 
 
 Read = Callable[[float], bytes]
-"""``read(timeout)`` returns bytes as soon as there are any, no bytes at the end of the connection."""
+"""``read(timeout)`` returns bytes as soon as any are available, no bytes at the end of the connection."""
 
 
 class Input:
-    """Bytes of one connection, taken apart into lines and blocks.
+    """Bytes of one connection, as lines and blocks.
 
     Attributes
     ----------
     deadline : float
-        Time (`time.monotonic`, s) at which reading fails; infinite: only the time limit without data counts.
+        Time (`time.monotonic`, s) at which reading fails; infinite: only the time limit without data applies.
     """
 
     def __init__(self, read: Read, url: str, timeout: float) -> None:
@@ -46,7 +46,7 @@ class Input:
 
     @property
     def waiting(self) -> bool:
-        """Whether bytes have come in that were not used."""
+        """Whether received bytes have not been used."""
         return bool(self._buffer)
 
     def fill(self) -> bool:
@@ -73,7 +73,7 @@ class Input:
             raise InstrumentTimeoutError(f"{self._url}: the answer was not complete within the time limit") from None
 
     def line(self) -> bytes | None:
-        """Return the next line without its end; None at the end of the connection."""
+        """Return the next line without its line end; None at the end of the connection."""
         start = 0
         while (end := self._buffer.find(b"\n", start)) < 0:
             start = len(self._buffer)
@@ -100,7 +100,7 @@ class Input:
 
 
 class Head:
-    """The head of an answer, and the means to read its body.
+    """The head of an answer, with methods to read its body.
 
     Parameters
     ----------
@@ -112,16 +112,16 @@ class Head:
     ----------
     status : int
     headers : mapping of str to str
-        By lower-case name; the last one where a name occurs twice.
+        By lower-case name; the last one if a name occurs twice.
     closes : bool
         Whether the connection ends with this answer.
 
     Raises
     ------
     ProtocolError
-        No answer of HTTP, or a body of unknown length or coding.
+        The data are not an HTTP answer, or the body has an unknown length or coding.
     EOFError
-        The connection ended before the answer began.
+        The connection ended before the answer.
     """
 
     def __init__(self, source: Input, url: str) -> None:
@@ -132,7 +132,7 @@ class Head:
             if self.status >= 200:
                 break
         else:
-            raise ProtocolError(f"{url}: expected an HTTP answer; found only preliminary ones")
+            raise ProtocolError(f"{url}: expected a final HTTP answer; found only interim ones")
         connection = self.headers.get("connection", "").lower()
         coding = self.headers.get("transfer-encoding", "identity").strip().lower()
         if coding not in ("identity", "chunked"):
@@ -148,16 +148,16 @@ class Head:
 
     @property
     def missing(self) -> int:
-        """Bytes of the body, of stated length, that have not come."""
+        """Number of bytes of a body with a stated length that have not been received."""
         return 0 if self._chunked or math.isinf(self._left) else int(self._left)
 
     def body(self, limit: int) -> bytes:
-        """Return the whole body.
+        """Return the complete body.
 
         Raises
         ------
         ProtocolError
-            Larger than ``limit`` bytes, or cut off.
+            The body is larger than ``limit`` bytes, or incomplete.
         """
         found = bytearray()
         while data := self.some(limit + 1 - len(found)):
@@ -165,7 +165,7 @@ class Head:
             if len(found) > limit:
                 raise ProtocolError(f"{self._url}: the answer is larger than {limit} bytes")
         if self.missing:
-            raise ProtocolError(f"{self._url}: the answer is cut off, {self.missing} bytes before its end")
+            raise ProtocolError(f"{self._url}: the answer is incomplete: {self.missing} bytes are missing")
         return bytes(found)
 
     def some(self, most: int) -> bytes:
@@ -174,7 +174,7 @@ class Head:
             return b""
         data = self._source.some(min(most, int(self._left))) if self._left < math.inf else self._source.some(most)
         if self._chunked and not data:
-            raise CutOffError(f"{self._url}: the answer is cut off within a chunk")
+            raise CutOffError(f"{self._url}: the answer is incomplete: it ends within a chunk")
         self._left -= len(data)
         return data
 
@@ -195,7 +195,7 @@ class Head:
     def _chunk_line(self) -> bytes:
         line = self._source.line()
         if line is None:
-            raise CutOffError(f"{self._url}: the answer is cut off between two chunks")
+            raise CutOffError(f"{self._url}: the answer is incomplete: it ends between two chunks")
         return line
 
     def _length(self) -> float:
@@ -227,7 +227,7 @@ def header_fields(next_line: Callable[[], bytes | None], url: str) -> dict[str, 
     Raises
     ------
     ProtocolError
-        More than `MOST_HEAD_LINES`, two different lengths, or the end of the connection.
+        There are more than `MOST_HEAD_LINES` lines or two different lengths, or the connection ended.
     """
     found: dict[str, str] = {}
     for _ in range(MOST_HEAD_LINES + 1):
@@ -245,14 +245,14 @@ def header_fields(next_line: Callable[[], bytes | None], url: str) -> dict[str, 
 
 
 class Lines:
-    """The body of an answer of many parts: lines and blocks of stated size."""
+    """The body of a multipart answer, as lines and blocks of stated size."""
 
     def __init__(self, answer: Head, url: str) -> None:
         self._answer, self._url = answer, url
         self._buffer = bytearray()
 
     def line(self) -> bytes | None:
-        """Return the next line without its end; None at the end of the body."""
+        """Return the next line without its line end; None at the end of the body."""
         start = 0
         while (end := self._buffer.find(b"\n", start)) < 0:
             start = len(self._buffer)
@@ -261,13 +261,13 @@ class Lines:
                     f"{self._url}: expected a header line of a part; found {bytes(self._buffer[:80])!r}"
                 )
             if not self._more(MOST_PART_LINE_BYTES):
-                return None  # what is left of a line belongs to nothing
+                return None  # an incomplete line is ignored
         line = bytes(self._buffer[:end]).rstrip(b"\r")
         del self._buffer[: end + 1]
         return line
 
     def block(self, size: int) -> bytes | None:
-        """Return exactly ``size`` bytes; None where the body ends before."""
+        """Return exactly ``size`` bytes; None if the body ends before."""
         while len(self._buffer) < size:
             if not self._more(max(MOST_PART_LINE_BYTES, size - len(self._buffer))):
                 return None
@@ -276,7 +276,7 @@ class Lines:
         return data
 
     def _more(self, most: int) -> bool:
-        """Wait for bytes; False at the end of the body, or of the connection: an agent may end within a stream."""
+        """Wait for bytes; return False at the end of the body, or of the connection, which may end during a stream."""
         try:
             data = self._answer.some(most)
         except CutOffError:

@@ -1,8 +1,8 @@
-"""Requests to an HTTP server, one after another on one connection that is opened again when the server closes it.
+"""Requests to an HTTP server on one connection, which is opened again after the server has closed it.
 
-Only GET, bodies of a limited size, and streams of many parts are available. Each answer, and each part of a stream,
-has a time limit from its first byte to its last; each line, head and body has a size limit. Sessions are recorded and
-played back like those of every other transport; the end of a connection is recorded as a frame without bytes.
+Only GET, bodies of limited size, and multipart streams are available. Each answer, and each part of a stream, has a
+time limit from its first byte to its last; each line, head and body has a size limit. Sessions are recorded and
+replayed like those of every other transport; the end of a connection is recorded as a frame without bytes.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from errormotion.instruments.transports.tcp import TcpTransport
 
 PORT = 80
 MAX_BODY_BYTES = 16 << 20
-"""Default limit of the size of a body, bytes."""
+"""Default size limit of a body, bytes."""
 _MOST_BLANK_LINES = 16
-"""Between two parts of a stream."""
+"""Largest number of blank lines between two parts of a stream."""
 _MOST_DIGITS = 12
-"""Of the size of a part."""
+"""Largest number of digits of the size of a part."""
 _ANSWER_TIMEOUTS = 10.0
-"""Time limit of a complete answer, in multiples of the time limit without data."""
+"""Time limit for a complete answer, as a multiple of the time limit without data."""
 
 
 @dataclass(frozen=True)
@@ -51,21 +51,21 @@ class HttpTransport(Transport):
     url : str
         ``http://host:port/path``, ``sim://``, ``replay://file``.
     simulator : str, optional
-        ``module:Class`` of the simulator behind ``sim://``.
+        ``module:Class`` of the simulator for ``sim://``.
     recorder : Recorder or path, optional
-        Where every frame of the session is written.
+        File or recorder to which every frame of the session is written.
     timeout : float
         Time limit without data, s.
 
     Attributes
     ----------
     target : Address
-        Address of the server; of a recording the address that was recorded.
+        Address of the server; for a recording the recorded address.
 
     Raises
     ------
     InstrumentError
-        Another scheme, no answer, no simulator, a recording that exists already.
+        Another scheme, no answer, no simulator, or the recording already exists.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class HttpTransport(Transport):
         Raises
         ------
         InstrumentTimeoutError
-            No answer, or one that is not complete within ten times the time limit without data.
+            No answer, or an incomplete one within ten times the time limit without data.
         ProtocolError
             The answer is not HTTP, or its body is larger than ``limit``.
         InstrumentError
@@ -124,24 +124,24 @@ class HttpTransport(Transport):
         except BaseException:
             self._disconnect()
             raise
-        if response.closes or source.waiting:  # bytes after the answer: the next one would not be the right one
+        if response.closes or source.waiting:  # bytes after the answer would be read as the next one
             self._disconnect()
         return Answer(response.status, _content_type(response), body)
 
     def parts(
         self, path: str, query: Mapping[str, str] | None = None, *, limit: int = MAX_BODY_BYTES
     ) -> Iterator[bytes]:
-        """Request a stream of many parts, and yield the body of each as it arrives.
+        """Request a multipart stream, and yield the body of each part as it arrives.
 
-        An answer of one part only is yielded as one body. The connection is closed with the iterator; the next request
-        opens another one.
+        An answer that is not multipart is yielded as one body. The connection is closed with the iterator; the next
+        request opens another one.
 
         Raises
         ------
         InstrumentTimeoutError
-            As of `get`; each part must be complete within ten times the time limit after its first line.
+            See `get`; each part must be complete within ten times the time limit after its first line.
         ProtocolError, InstrumentError
-            As of `get`, while the stream is read. When the server ends the stream, the iterator ends.
+            See `get`. The iterator ends when the server ends the stream.
         """
         response, source = self._response(path, query, keep=False)
         try:
@@ -156,9 +156,9 @@ class HttpTransport(Transport):
             self._disconnect()
 
     def _part(self, source: Input, lines: Lines, boundary: bytes, limit: int) -> bytes | None:
-        """Return the next part of a stream; None when it is over."""
-        source.deadline = math.inf  # between two parts only the time limit without data counts
-        for _ in range(_MOST_BLANK_LINES + 1):  # the end of the part before
+        """Return the next part of a stream; None at its end."""
+        source.deadline = math.inf  # between two parts only the time limit without data applies
+        for _ in range(_MOST_BLANK_LINES + 1):  # blank lines after the preceding part
             line = lines.line()
             if line != b"":
                 break
@@ -176,7 +176,7 @@ class HttpTransport(Transport):
         return lines.block(size)
 
     def _response(self, path: str, query: Mapping[str, str] | None, *, keep: bool) -> tuple[Head, Input]:
-        """Send a request and return the answer, its head read, and the bytes that follow it."""
+        """Send a request; return the answer, whose head has been read, and the bytes that follow."""
         target = quote(path) + (f"?{urlencode(query)}" if query else "")
         host = f"{self.target.host}:{self.target.port}" if self.target.port else self.target.host
         request = (
@@ -212,13 +212,13 @@ class HttpTransport(Transport):
         except _EndedError:
             return b""
 
-    # ------------------------------------------------------------------ the line beneath
+    # ------------------------------------------------------------------ the connection
 
     def _connected(self) -> Transport:
         if self._line is None:
-            there = self._address if self._device is None else parse_address(self._device.url)
-            port = PORT if there.port is None else there.port
-            self._line = TcpTransport(Address(self.url, "tcp", there.host, port), timeout=self.timeout)
+            server = self._address if self._device is None else parse_address(self._device.url)
+            port = PORT if server.port is None else server.port
+            self._line = TcpTransport(Address(self.url, "tcp", server.host, port), timeout=self.timeout)
             self._fresh = True
         return self._line
 
@@ -252,7 +252,7 @@ class HttpTransport(Transport):
         return data
 
     def _lost(self, error: InstrumentError) -> Any:
-        """Record that the connection is lost."""
+        """Record the loss of the connection, and raise an error."""
         if self._address.scheme == "replay":
             raise error
         if self._recorder is not None:
@@ -282,7 +282,7 @@ def _content_type(response: Head) -> str:
 
 
 def _boundary(response: Head) -> bytes:
-    """Return the boundary between the parts; empty where the answer is not of many parts."""
+    """Return the boundary between the parts; empty if the answer is not multipart."""
     if not _content_type(response).startswith("multipart/"):
         return b""
     for word in response.headers["content-type"].split(";")[1:]:

@@ -18,12 +18,12 @@ Respond = Callable[[str, Mapping[str, str]], Iterator[bytes] | None]
 
 
 class HttpServer:
-    """Answers GET requests on any number of connections, where `serving.placed` says, else on a free port of loopback.
+    """Answers GET requests on any number of connections, where `serving.placed` states, else on a free loopback port.
 
     Parameters
     ----------
     name : str
-        For the names of the threads.
+        Name for the threads.
     respond : callable
         ``respond(path, query)`` returns the answer with its header in pieces; an empty piece, or None instead
         of the pieces, closes the connection. It is called in the thread of the connection.
@@ -52,8 +52,8 @@ class HttpServer:
 
             def handle(self) -> None:
                 with suppress(OSError, ValueError):
-                    while (asked := _request(self)) is not None and not outer.ended.is_set():
-                        pieces = respond(*asked)
+                    while (request := _request(self)) is not None and not outer.ended.is_set():
+                        pieces = respond(*request)
                         if pieces is None:
                             return
                         for piece in pieces:
@@ -69,7 +69,7 @@ class HttpServer:
 
         class Server(socketserver.ThreadingTCPServer):
             allow_reuse_address = True
-            daemon_threads = False  # so that closing waits for them
+            daemon_threads = False  # closing waits for them
 
         host, port = listening_at()
         try:
@@ -98,7 +98,7 @@ class HttpServer:
 
 
 def _request(handler: socketserver.StreamRequestHandler) -> tuple[str, dict[str, str]] | None:
-    """Return path and query of the next request; None where the client has closed or sent something else."""
+    """Return path and query of the next request; None if the client has disconnected or sent something else."""
     words = handler.rfile.readline(_MAX_LINE_BYTES).decode("latin-1").split()
     for _ in range(_MAX_HEADERS):
         if handler.rfile.readline(_MAX_LINE_BYTES) in (b"\r\n", b"\n", b""):

@@ -1,1 +1,1 @@
-"""The end of the device: servers of simulators on loopback, and the transport to them."""
+"""Servers of simulated devices on loopback, and the transport to them."""

@@ -1,7 +1,7 @@
-"""The device's end of a connection, for the simulators: on a free port of loopback, or where an address says.
+"""Servers of simulated devices, on a free port of loopback or at the port and host in an address.
 
-The parameters ``port`` and ``host`` of a ``sim://`` address hold for every server that the simulator makes: the first
-one listens at ``port``, a further line of the same device at the next one.
+The parameters ``port`` and ``host`` of a ``sim://`` address apply to every server of the simulator: the first one
+listens at ``port``, a further line of the same device at the next port.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from errormotion.instruments.transports.address import Address
 LOOPBACK = "127.0.0.1"
 ANY_HOST = "0.0.0.0"
 ACCEPT_POLL = 0.002
-"""Interval at which a client is looked for, s."""
+"""Interval between two checks for a client, s."""
 SEND_BUFFER = 32768
-"""Bytes: bounds how far a virtual clock runs ahead of its reader."""
+"""Size of the buffer, bytes; limits how far a virtual clock runs ahead of its reader."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
 class Placement:
-    """Where the servers of one simulated device listen.
+    """Host and port of the servers of one simulated device.
 
     Attributes
     ----------
     host : str
         Name or address of an interface of this computer.
     port : int
-        Of the next server; 0: any free one.
+        Port of the next server; 0: any free one.
     """
 
     host: str = LOOPBACK
@@ -52,12 +52,12 @@ _placement: ContextVar[Placement | None] = ContextVar("placement", default=None)
 
 @contextmanager
 def placed(address: Address) -> Iterator[None]:
-    """Have the servers that are made in this context listen where an address says; see the module.
+    """Make the servers that are created in this context listen at the port and host in an address; see the module.
 
     Raises
     ------
     InstrumentError
-        ``port`` is no port.
+        ``port`` is not a port number.
     """
     placement = Placement(address.params.get("host", LOOPBACK), address.whole("port", 0, 65535))
     token = _placement.set(placement)
@@ -68,13 +68,13 @@ def placed(address: Address) -> Iterator[None]:
 
 
 def standing_alone() -> bool:
-    """Whether the servers that are made now have a stated port: their device outlives its clients."""
+    """Whether the servers that are created now have a stated port, so that their device outlives its clients."""
     placement = _placement.get()
     return placement is not None and placement.port > 0
 
 
 def listening_at() -> tuple[str, int]:
-    """Return host and port of the server that is made now; the next one gets the next port."""
+    """Return host and port for the next server to be created; the one after it gets the next port."""
     placement = _placement.get() or Placement()
     port = placement.port
     if port:
@@ -97,14 +97,14 @@ def not_listening(host: str, port: int, error: Exception) -> InstrumentError:
 
 
 class Server(ABC):
-    """One device's end of a wire, with a thread that passes received bytes on.
+    """Server of one device, with a thread that passes received bytes on.
 
     Attributes
     ----------
     url : str
         Address for the driver.
     lock : threading.RLock
-        Held while bytes go out, so that two senders do not mix theirs.
+        Held while bytes are sent, so that the bytes of two senders are not mixed.
     """
 
     url: str
@@ -139,19 +139,19 @@ class Server(ABC):
 
     @property
     def connection(self) -> object:
-        """The present connection: another object after the next one was opened."""
+        """The present connection: a different object for each connection."""
         return self
 
     @abstractmethod
     def send(self, data: bytes | memoryview) -> bool:
-        """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
+        """Send all bytes, waiting while the buffers of the reader are full; False without a connection."""
 
     @abstractmethod
     def disconnect(self) -> None:
-        """Drop the present connection; another one may come."""
+        """Drop the present connection; clients can connect again."""
 
     def _deliver(self, data: bytes) -> None:
-        """Pass bytes on. A device that stands alone outlives what it cannot answer: it hangs up."""
+        """Pass bytes on. After an error, a device with a stated port disconnects its client and continues."""
         try:
             self._on_data(data)
         except Exception:
@@ -172,12 +172,12 @@ def _nothing() -> None:
 
 
 class TcpServer(Server):
-    """Listens where `placed` says, else on a free port of loopback; one connection at a time.
+    """Listens where `placed` states, else on a free port of loopback; one connection at a time.
 
     Attributes
     ----------
     connections : int
-        Connections accepted so far.
+        Number of connections accepted so far.
     """
 
     def __init__(
@@ -203,16 +203,17 @@ class TcpServer(Server):
         return self._line
 
     def await_connection(self, timeout: float) -> bool:
-        """Wait for a connection; False where there is none within ``timeout`` s.
+        """Wait for a connection; return False without one within ``timeout`` s.
 
-        A new connection may not be accepted yet; on a line that only sends, nothing else shows it.
+        A new connection may not have been accepted yet; on a line that only sends, nothing else indicates it.
         """
         return self._connected.wait(timeout)
 
     def await_present_client(self, timeout: float) -> bool:
-        """Wait for a connection whose other side has not closed it; False where there is none within ``timeout`` s.
+        """Wait for a connection that the client has not closed; return False without one within ``timeout`` s.
 
-        For a line that only sends: a client that has left, and one that has come since, may not have been noticed yet.
+        For a line that only sends: that a client has disconnected, or another one has connected, may not have been
+        detected.
         """
         end = time.monotonic() + timeout
         while (left := end - time.monotonic()) > 0:
@@ -223,7 +224,7 @@ class TcpServer(Server):
         return False
 
     def send(self, data: bytes | memoryview) -> bool:
-        """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
+        """Send all bytes, waiting while the buffers of the reader are full; False without a connection."""
         with self.lock:
             line = self._line
             if line is None:
@@ -235,8 +236,8 @@ class TcpServer(Server):
             return True
 
     def disconnect(self) -> None:
-        """Drop the present connection; another one may come."""
-        line = self._line  # no lock: a sender may hold it while it waits for a reader that has closed
+        """Drop the present connection; clients can connect again."""
+        line = self._line  # no lock: a sender may hold it while it waits for a reader that has disconnected
         if line is not None:
             try:
                 line.shutdown(socket.SHUT_RDWR)
@@ -295,14 +296,14 @@ class PtyServer(Server):
     def __init__(
         self, name: str, on_data: Callable[[bytes], None], on_connection: Callable[[], None] | None = None
     ) -> None:
-        import termios  # only where there are terminals
+        import termios  # only available on systems with terminals
         import tty
 
         super().__init__(name, on_data, on_connection)
-        self._near, self._far = os.openpty()  # the far end stays open here, else its first close ends the line
+        self._near, self._far = os.openpty()  # the far end remains open here, since its last close would end the line
         tty.setraw(self._far)
         flags = termios.tcgetattr(self._far)
-        flags[4] = flags[5] = termios.B0  # no driver has set it
+        flags[4] = flags[5] = termios.B0  # not set by a driver yet
         termios.tcsetattr(self._far, termios.TCSANOW, flags)
         os.set_blocking(self._near, False)
         self._cut = False
@@ -310,7 +311,7 @@ class PtyServer(Server):
 
     @property
     def baudrate(self) -> int:
-        """Baud rate to which a driver has set the line; 0 before."""
+        """Baud rate that a driver has set; 0 before."""
         import termios
 
         code = termios.tcgetattr(self._far)[5]
@@ -320,7 +321,7 @@ class PtyServer(Server):
         return rates.get(code, 0)
 
     def send(self, data: bytes | memoryview) -> bool:
-        """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
+        """Send all bytes, waiting while the buffers of the reader are full; False without a connection."""
         view = memoryview(data)
         with self.lock:
             while len(view) and not (self._ended.is_set() or self._cut):
@@ -357,12 +358,12 @@ class PtyServer(Server):
 def make_server(
     wire: str, name: str, on_data: Callable[[bytes], None], on_connection: Callable[[], None] | None = None
 ) -> Server:
-    """Return a server for ``wire``: ``tcp`` or ``pty``; InstrumentError for another one.
+    """Return a server for ``wire``, ``tcp`` or ``pty``; InstrumentError for another value.
 
-    ``on_data`` is called with received bytes, ``on_connection`` ahead of those of a new TCP connection.
+    ``on_data`` is called with received bytes, ``on_connection`` at the start of a TCP connection.
     """
     if wire == "tcp":
         return TcpServer(name, on_data, on_connection)
     if wire == "pty":
         return PtyServer(name, on_data, on_connection)
-    raise InstrumentError(f"A simulated device has 'wire=tcp' or 'wire=pty'; found 'wire={wire}'")
+    raise InstrumentError(f"Expected 'wire=tcp' or 'wire=pty' for a simulated device; found 'wire={wire}'")

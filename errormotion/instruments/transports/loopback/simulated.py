@@ -12,15 +12,15 @@ from errormotion.instruments.transports.serial_line import SerialTransport
 from errormotion.instruments.transports.tcp import TcpTransport
 
 RECEIVE_BUFFER = 65536
-"""Bytes: bounds how far a virtual clock runs ahead of its reader."""
+"""Size of the buffer, bytes; limits how far a virtual clock runs ahead of its reader."""
 
 
 class SimulatedTransport(Transport):
-    """A connection to a simulator that lives in this process and ends with the connection.
+    """A connection to a simulator, which runs in this process and ends with the connection.
 
-    ``simulator(address)`` starts the device, see `load_simulator`; the object has ``url`` (a ``tcp://`` or ``serial://``
-    address on this machine), ``close()`` and ``report_delivered(samples)``. A device with several lines has ``urls`` of
-    the further ones, by name.
+    ``simulator(address)`` starts the device, see `load_simulator`; the object has ``url`` (a ``tcp://`` or
+    ``serial://`` address on this machine), ``close()`` and ``report_delivered(samples)``. A device with several lines
+    has ``urls`` with the further ones by name.
     """
 
     simulated = True
@@ -32,7 +32,7 @@ class SimulatedTransport(Transport):
         self._inner = self._connect(self._device.url)
 
     def further(self, name: str) -> Transport:
-        """Open a further line of the same device; InstrumentError where it has none of this name."""
+        """Open a further line of the same device; InstrumentError if it has none with this name."""
         urls = getattr(self._device, "urls", {})
         if name not in urls:
             raise InstrumentError(f"The simulated device at {self.url} has no line '{name}'; it has: {', '.join(urls)}")
@@ -51,7 +51,7 @@ class SimulatedTransport(Transport):
         except BaseException:
             self._device.close()
             raise
-        line.url = self.url  # messages state the address of the bench file
+        line.url = self.url  # messages state the address in the bench file
         return line
 
     def _send(self, data: bytes) -> None:
@@ -66,7 +66,7 @@ class SimulatedTransport(Transport):
         return self._inner.reopen()
 
     def report_delivered(self, samples: int) -> None:
-        """Report the reader's progress to the simulator."""
+        """Report the number of samples that the caller has received to the simulator."""
         self._device.report_delivered(samples)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The device's end of a line that only sends, with several connections: a stream goes to the newest one."""
+"""Server of a line that only sends, with several connections: it sends to the newest one."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from collections.abc import Callable
 from errormotion.instruments.transports.loopback.serving import TcpServer
 
 MOST_CONNECTIONS = 16
-"""Number of connections kept open; beyond it the oldest one is closed."""
+"""Largest number of open connections; beyond it the oldest one is closed."""
 
 
 class NewestConnectionServer(TcpServer):
-    """Listens on a free port of 127.0.0.1; data go to the connection that was the newest at `select`.
+    """Sends data to the connection that was the newest at `select`.
 
-    Others stay open and receive nothing, as clients expect that open a connection for each measurement.
+    Others remain open and receive nothing, as expected by clients that open a connection for each measurement.
     """
 
     def __init__(self, name: str, on_data: Callable[[bytes], None]) -> None:
@@ -26,7 +26,7 @@ class NewestConnectionServer(TcpServer):
         self._accepting = threading.Lock()
 
     def accept_pending(self) -> bool:
-        """Accept the connections that wait; whether there is any connection now."""
+        """Accept pending connections; return whether there is any connection."""
         with self._accepting:
             while not self._ended.is_set():
                 try:
@@ -48,13 +48,13 @@ class NewestConnectionServer(TcpServer):
             self._line = self._lines[-1] if self._lines else None
 
     def drop_older(self) -> None:
-        """End the connections before the newest one, so that a sender that waits for one of them goes on."""
+        """End all connections but the newest one, so that a sender that waits for one of them continues."""
         with self._accepting:
             for line in self._lines[:-1]:
                 _shut(line)
 
     def disconnect(self) -> None:
-        """Drop all connections; others may come."""
+        """Drop all connections; clients can connect again."""
         with self._accepting:
             for line in self._lines:
                 _shut(line)

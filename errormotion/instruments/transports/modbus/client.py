@@ -1,13 +1,13 @@
-"""Modbus: registers that are read and written on one line.
+"""Modbus client: reading and writing registers on one line.
 
 * ``modbus+tcp://192.168.0.9:502?unit=1`` Modbus TCP
 * ``modbus+rtu:///dev/ttyUSB0?baudrate=9600&unit=1`` RTU on a serial line, 8N1
 * ``modbus+rtu-tcp://192.168.0.9:4001?unit=1`` RTU frames through a serial server
 * ``sim://cframe/logger?framing=rtu`` a simulated device; ``replay://session.rec`` a recorded session
 
-The frames are own code (`modbus.codec`) over the byte transports, so that a session can be recorded and played
-back, and faults can be distinguished. `pymodbus`, whose client owns its socket and waits without a time limit after a
-wrong checksum, is used in tests only.
+The frames are implemented here (`modbus.codec`) over the byte transports, so that sessions can be recorded and
+replayed, and faults can be distinguished. `pymodbus`, whose client owns its socket and waits without a time limit after
+a wrong checksum, is only used in tests.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from errormotion.instruments.transports.recording import read_recording
 
 QUIET_INTERVAL = 0.05  # s without a byte after which a transmission has ended
 MAX_STRAY_BYTES = 512  # largest number of bytes discarded after a damaged answer
-MAX_LATE_ANSWERS = 8  # skipped after a timeout
+MAX_LATE_ANSWERS = 8  # largest number of answers skipped after a timeout
 READ_HOLDING = 3
 
 Encode = Callable[[int], bytes]
@@ -63,7 +63,7 @@ class ModbusLine(Transport):
     Attributes
     ----------
     framing, unit
-        As given.
+        See the parameters.
     repeated : int
         Number of repeated requests.
     """
@@ -74,7 +74,7 @@ class ModbusLine(Transport):
         self.framing, self.unit, self.repeated = framing, unit, 0
         self._line, self._retries, self._number = line, retries, 0
         self._unanswered_at: float | None = None
-        self._passed_over = False  # whether the last request without an answer was that of `_skip_late_answers`
+        self._passed_over = False  # whether the last unanswered request was that of `_skip_late_answers`
 
     def registers(self, function: int, register: int, count: int) -> list[int]:
         """Return ``count`` registers from ``register`` on, by function 3 (holding) or 4 (input).
@@ -82,9 +82,9 @@ class ModbusLine(Transport):
         Raises
         ------
         ModbusRefusal
-            An exception reply.
+            The device answers with an exception.
         ProtocolError
-            A damaged answer, also in the last retry: stray bytes, a wrong checksum, another unit, too short.
+            A damaged answer, also in the last retry: stray bytes, wrong checksum, another unit, too short.
         InstrumentTimeoutError
             No answer within the time limit.
         InstrumentError
@@ -100,11 +100,12 @@ class ModbusLine(Transport):
     def write_registers(self, register: int, values: Sequence[int], *, function: int = WRITE_SEVERAL) -> None:
         """Write registers from ``register`` on: one by function 6, up to 123 by function 16 (the default).
 
-        A damaged answer leaves open whether they were written; the retries write the same once more.
+        After a damaged answer it is unknown whether they were written; the retries write the same values again.
 
         Raises
         ------
-        As `registers`.
+        ModbusRefusal, ProtocolError, InstrumentTimeoutError, InstrumentError
+            See `registers`.
         """
         self._repeated(
             f"function {function} of unit {self.unit} for {len(values)} registers from {register} on",
@@ -121,7 +122,7 @@ class ModbusLine(Transport):
                 if attempt == self._retries:
                     raise
                 self.repeated += 1
-        raise AssertionError  # the loop has ended by itself
+        raise AssertionError  # not reached
 
     def _exchange(self, what: str, encode: Encode, decode: Decode, prepare: Callable[[], None]) -> list[int]:
         prepare()
@@ -144,11 +145,11 @@ class ModbusLine(Transport):
             raise
 
     def _await_late_answer(self, function: int, register: int, count: int) -> None:
-        """Discard unread bytes; after a timeout, make sure that no late answer is taken for the next one.
+        """Discard unread bytes; after a timeout, ensure that no late answer is mistaken for the next one.
 
-        An RTU frame has no number. What arrives within a further time limit is discarded. If nothing arrives, another
-        number of registers is read, so that its answer and one that is later still differ in length. A device that does
-        not answer that is sent the next request without it.
+        An RTU frame has no number. Bytes that arrive within a further time limit are discarded. If none arrive, another
+        number of registers is read, so that its answer and an even later one differ in length. If the device does not
+        answer this request, the next request is sent without it.
         """
         since, self._unanswered_at = self._unanswered_at, None
         if since is None or self.framing == "tcp":
@@ -160,7 +161,7 @@ class ModbusLine(Transport):
                     return
             except ProtocolError:
                 raise
-            except InstrumentError:  # the connection was dropped: the answer is lost with it
+            except InstrumentError:  # the connection was dropped, and the answer with it
                 return
             if not self._passed_over:
                 self._skip_late_answers(function, register, 1 if count > 1 else 2)
@@ -170,7 +171,7 @@ class ModbusLine(Transport):
             raise
 
     def _skip_late_answers(self, function: int, register: int, count: int) -> None:
-        """Request a number of registers and skip answers until that to this request, or its refusal."""
+        """Request a number of registers and skip answers until the answer to this request, or its refusal."""
         self._line.write(encode_request(self.framing, self.unit, function, register, count))
         end = time.monotonic() + self.timeout
         for _ in range(MAX_LATE_ANSWERS):
@@ -184,7 +185,7 @@ class ModbusLine(Transport):
         raise ProtocolError(f"{self.url}: {MAX_LATE_ANSWERS} answers to earlier requests; expected one")
 
     def _frame(self, end: float) -> bytes:
-        """Return one answer, of the length that its start states."""
+        """Return one answer, with the length stated in its start."""
         data = b""
         while lacking := missing(self.framing, data):
             try:
@@ -200,7 +201,7 @@ class ModbusLine(Transport):
         return data
 
     def _settle(self) -> None:
-        """Wait until the line is quiet, so that the next answer is not taken for the rest of this one."""
+        """Wait until the line is quiet, so that the rest of this answer is not mistaken for the next one."""
         count = 0
         with suppress(InstrumentError):
             while count < MAX_STRAY_BYTES:
@@ -228,21 +229,21 @@ def open_modbus(
     retries: int = 0,
     baudrate: int | None = None,
 ) -> ModbusLine:
-    """Open the Modbus line that an address names; its ``unit`` and ``baudrate`` take precedence.
+    """Open the Modbus line at an address; its ``unit`` and ``baudrate`` take precedence.
 
     Parameters
     ----------
     url : str
         See the module.
     unit, retries
-        As in `ModbusLine`.
+        See `ModbusLine`.
     simulator, record, timeout, retry, baudrate
-        As in `open_reconnecting`.
+        See `open_reconnecting`.
 
     Raises
     ------
     InstrumentError
-        No device answers, or no address for Modbus.
+        No device answers, or the address is not for Modbus.
     """
     address = parse_address(url)
     device = original(address)
@@ -264,7 +265,7 @@ def framing_of(address: Address) -> Framing:
         serial = address.params.get("wire") == "pty"
         framing = address.params.get("framing", "rtu" if serial else "tcp")
         if framing not in ("tcp", "rtu") or (serial and framing == "tcp"):
-            raise InstrumentError(f"'framing' in '{address.url}': expected 'tcp', or 'rtu'; on a pty 'rtu' only")
+            raise InstrumentError(f"'framing' in '{address.url}': expected 'tcp' or 'rtu', and 'rtu' on a pty")
         return "rtu" if framing == "rtu" else "tcp"
     if address.scheme not in MODBUS:
         raise InstrumentError(
@@ -275,7 +276,7 @@ def framing_of(address: Address) -> Framing:
 
 
 def _of_bytes(address: Address) -> Address:
-    """Return the address of the byte transport; its URL remains that of the bench file."""
+    """Return the address of the byte transport; its URL remains that in the bench file."""
     if address.scheme == "modbus+rtu":
         return replace(address, scheme="serial")
     return replace(address, scheme="tcp") if address.scheme in MODBUS else address

@@ -1,4 +1,4 @@
-"""Modbus frames: registers are read (functions 3 and 4) and written (6 and 16), in the framings RTU and TCP (MBAP).
+"""Modbus frames for reading (functions 3 and 4) and writing (6 and 16) registers, in the framings RTU and TCP (MBAP).
 
 After the Modbus application protocol 1.1b3 and the serial line guide 1.02. Pure functions from bytes to numbers.
 """
@@ -27,7 +27,7 @@ LONGEST_FRAME: Mapping[str, int] = {"tcp": 260, "rtu": 256}
 """Bytes of the longest frame by framing."""
 WRITE_ONE, WRITE_SEVERAL = 6, 16
 MOST_WRITTEN = 123
-"""Registers of one request of function 16."""
+"""Largest number of registers in one request of function 16."""
 _HEAD = 7  # bytes of an MBAP header
 _MAX_MBAP_LENGTH = 254  # bytes after its length field
 
@@ -43,7 +43,7 @@ def crc16(data: bytes) -> bytes:
 
 
 def encode_request(framing: Framing, unit: int, function: int, register: int, count: int, number: int = 0) -> bytes:
-    """Return the request for ``count`` registers from ``register`` on; ``number`` distinguishes TCP's transactions."""
+    """Return the request for ``count`` registers from ``register`` on; ``number`` identifies a TCP transaction."""
     return _frame(framing, unit, struct.pack(">BHH", function, register, count), number)
 
 
@@ -55,7 +55,7 @@ def encode_write(
     Raises
     ------
     ValueError
-        The function writes no registers, or not so many.
+        The function does not write this number of registers.
     """
     count = len(values)
     if function == WRITE_ONE and count == 1:
@@ -81,16 +81,15 @@ def _frame(framing: Framing, unit: int, pdu: bytes, number: int) -> bytes:
 
 
 def missing(framing: Framing, data: bytes) -> int:
-    """Return the number of bytes that an incomplete answer still lacks, as far as its start shows."""
+    """Return the number of bytes that an incomplete answer still needs, as far as known from its start."""
     if framing == "rtu":
         size = 5 if len(data) < 3 or data[1] & 0x80 else 8 if data[1] in (WRITE_ONE, WRITE_SEVERAL) else 5 + data[2]
     elif len(data) < _HEAD - 1:
         size = _HEAD + 2
     else:
         protocol, length = struct.unpack(">HH", data[2:6])
-        size = (
-            6 + length if not protocol and length <= _MAX_MBAP_LENGTH else 0
-        )  # else no header: no further bytes are expected
+        valid = not protocol and length <= _MAX_MBAP_LENGTH
+        size = 6 + length if valid else 0  # no further bytes are expected without a header
     return max(size - len(data), 0)
 
 
@@ -102,41 +101,41 @@ def decode_answer(
     Raises
     ------
     ProtocolError
-        Too short, a wrong checksum, another unit, another function, another number of registers.
+        The answer is too short, or its checksum, unit, function or number of registers is wrong.
     ModbusRefusal
-        An exception reply.
+        The device answers with an exception.
     """
     pdu = _pdu(framing, data, unit, function, number)
     if pdu is None:
         return None
     if pdu[1] != 2 * count or len(pdu) != 2 + 2 * count:
-        raise ProtocolError(f"Expected {count} registers; found {len(pdu) - 2} bytes: {_shown(data)}")
+        raise ProtocolError(f"Expected {count} registers; found {len(pdu) - 2} bytes: {_hex(data)}")
     return list(struct.unpack(f">{count}H", pdu[2:]))
 
 
 def decode_written(
     framing: Framing, data: bytes, unit: int, function: int, register: int, values: Sequence[int], number: int = 0
 ) -> list[int] | None:
-    """Return the values once a complete answer confirms that they were written; None as in `decode_answer`.
+    """Return the values if a complete answer confirms that they were written; None as in `decode_answer`.
 
     Raises
     ------
     ProtocolError
-        Too short, a wrong checksum, another unit, another function, other registers than those written.
+        The answer is too short, or its checksum, unit, function or registers are wrong.
     ModbusRefusal
-        An exception reply.
+        The device answers with an exception.
     """
     pdu = _pdu(framing, data, unit, function, number)
     if pdu is None:
         return None
     expected = struct.pack(">BHH", function, register, values[0] if function == WRITE_ONE else len(values))
     if pdu != expected:
-        raise ProtocolError(f"Expected the confirmation {expected.hex(' ')}; found {_shown(data)}")
+        raise ProtocolError(f"Expected the confirmation {expected.hex(' ')}; found {_hex(data)}")
     return list(values)
 
 
-class ModbusRefusal(InstrumentError):  # noqa: N818 - that is what it is
-    """The device refuses a request.
+class ModbusRefusal(InstrumentError):  # noqa: N818 - a refusal is an answer
+    """The device has refused a request.
 
     Attributes
     ----------
@@ -150,26 +149,26 @@ class ModbusRefusal(InstrumentError):  # noqa: N818 - that is what it is
 
 
 def _pdu(framing: Framing, data: bytes, unit: int, function: int, number: int) -> bytes | None:
-    """Return the function code and what follows; None for the late answer to an earlier request (TCP only)."""
+    """Return the function code and the bytes after it; None for the late answer to an earlier request (TCP only)."""
     found = _unframed_rtu(data) if framing == "rtu" else _unframed_tcp(data, number)
     if found is None:
         return None
-    came, pdu = found
-    if came != unit:
-        raise ProtocolError(f"Expected an answer of unit {unit}; found that of unit {came}: {_shown(data)}")
+    answered, pdu = found
+    if answered != unit:
+        raise ProtocolError(f"Expected an answer of unit {unit}; found that of unit {answered}: {_hex(data)}")
     if pdu[0] == function | 0x80 and len(pdu) == 2:
         raise ModbusRefusal(pdu[1], f"Function {function} of unit {unit}")
     if pdu[0] != function:
-        raise ProtocolError(f"Expected an answer to function {function}; found {_shown(data)}")
+        raise ProtocolError(f"Expected an answer to function {function}; found {_hex(data)}")
     return pdu
 
 
 def _unframed_rtu(data: bytes) -> tuple[int, bytes]:
     if len(data) < 5:
         raise ProtocolError(f"Expected a Modbus answer of at least 5 bytes; found {data.hex(' ') or 'nothing'}")
-    if data[-2:] != (right := crc16(data[:-2])):
+    if data[-2:] != (expected := crc16(data[:-2])):
         raise ProtocolError(
-            f"The answer {_shown(data)} has the checksum {data[-2:].hex(' ')}; expected {right.hex(' ')}"
+            f"The answer {_hex(data)} has the checksum {data[-2:].hex(' ')}; expected {expected.hex(' ')}"
         )
     return data[0], data[1:-2]
 
@@ -177,15 +176,15 @@ def _unframed_rtu(data: bytes) -> tuple[int, bytes]:
 def _unframed_tcp(data: bytes, number: int) -> tuple[int, bytes] | None:
     if len(data) < _HEAD + 2:
         raise ProtocolError(f"Expected a Modbus answer of at least {_HEAD + 2} bytes; found {data.hex(' ')}")
-    came, protocol, length, unit = struct.unpack(">HHHB", data[:_HEAD])
+    answered, protocol, length, unit = struct.unpack(">HHHB", data[:_HEAD])
     if protocol or length != len(data) - 6:
-        raise ProtocolError(f"Expected the header of a Modbus answer; found {_shown(data)}")
-    if came != number:
-        if (number - came) % (1 << 16) < 1 << 15:
+        raise ProtocolError(f"Expected the header of a Modbus answer; found {_hex(data)}")
+    if answered != number:
+        if (number - answered) % (1 << 16) < 1 << 15:
             return None
-        raise ProtocolError(f"Expected the answer to transaction {number}; found that to {came}")
+        raise ProtocolError(f"Expected the answer to transaction {number}; found that to {answered}")
     return unit, data[_HEAD:]
 
 
-def _shown(data: bytes) -> str:
+def _hex(data: bytes) -> str:
     return data[:24].hex(" ") + (" ..." if len(data) > 24 else "")

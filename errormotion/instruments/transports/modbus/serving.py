@@ -1,4 +1,4 @@
-"""The device's end of a Modbus line: requests to read and to write registers in, answers out.
+"""Modbus server for simulators: answers requests to read and to write registers.
 
 After the Modbus application protocol V1.1b3 (PDUs, exceptions), the guide to Modbus messaging on TCP/IP V1.0b (MBAP)
 and the guide to Modbus over serial line V1.02 (RTU). It shares no code with the client.
@@ -18,16 +18,16 @@ ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
 MAX_REGISTERS = 125
 MAX_RTU_BYTES = 256
 PARTIAL_LIFETIME = 0.5
-"""Silence on a serial line after which a request that is not complete is dropped, s.
+"""Time without data on a serial line after which an incomplete request is dropped, s.
 
 A serial line ends a frame after 3.5 characters of silence (4 ms at 9600 baud). Connections on loopback do not keep such
-times, so that a frame ends by its length and this limit only drops remains.
+times: a frame ends by its length, and this limit only drops remains.
 """
 
-_MBAP = 7  # bytes of the header, the unit included
+_MBAP = 7  # bytes of the header, with the unit
 _LENGTHS = (2, 254)  # smallest and largest value of its length field: unit, function, at most 252 bytes of data
-_DIRECT_UNITS = (0, 255)  # address a TCP device whatever its unit
-_BROADCAST = 0  # of a serial line: never answered
+_DIRECT_UNITS = (0, 255)  # address a TCP device with any unit
+_BROADCAST = 0  # on a serial line: never answered
 # Bytes of an RTU request by function, checksum included: fixed, or (fixed part, position of a count of further bytes).
 _RTU_SIZES: Mapping[int, int | tuple[int, int]] = {
     **dict.fromkeys((1, 2, 3, 4, 5, 6, 8), 8),
@@ -68,14 +68,14 @@ def checksum(data: bytes) -> bytes:
 
 
 class ModbusServer:
-    """Answers requests of registers, however their bytes are split or joined.
+    """Answers requests for registers, however their bytes are split or joined.
 
     Parameters
     ----------
     framing : str
         ``tcp`` or ``rtu``.
     unit : int
-        Address of the device. Requests to others are not answered; on TCP those to 0 and 255 are.
+        Address of the device. Requests to others are not answered, except to 0 and 255 on TCP.
     function : int
         3 (holding registers) or 4 (input registers); every other function is refused with exception 1.
     blocks : mapping of int to int
@@ -89,8 +89,8 @@ class ModbusServer:
     Attributes
     ----------
     lost : bool
-        A header states an impossible length, so that the start of the next request is unknown: the connection is to be
-        closed. ``reset`` clears it.
+        Whether a header has stated an impossible length, so that the start of the next request is unknown and the
+        connection has to be closed. ``reset`` clears it.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class ModbusServer:
         self.lost = False
 
     def reset(self) -> None:
-        """Forget the bytes of an incomplete request, as for a new connection."""
+        """Discard the bytes of an incomplete request, as for a new connection."""
         self._rest, self.lost = b"", False
 
     def receive(self, data: bytes) -> Iterator[bytes]:
@@ -128,7 +128,7 @@ class ModbusServer:
     # ------------------------------------------------------------------ TCP
 
     def _split_tcp(self) -> bytes | None:
-        """Return the next whole request; None where there is none yet."""
+        """Return the next complete request; None if there is none yet."""
         if self.lost or len(self._rest) < _MBAP - 1:
             return None
         length = int.from_bytes(self._rest[4:6], "big")
@@ -151,7 +151,7 @@ class ModbusServer:
     # ------------------------------------------------------------------ RTU
 
     def _split_rtu(self) -> bytes | None:
-        """Return the next request with a right checksum; None where there is none yet. Other bytes are dropped."""
+        """Return the next request with a valid checksum; None if there is none yet. Other bytes are dropped."""
         while len(self._rest) >= 2:
             size = self._rtu_size(self._rest)
             if size is None:
@@ -173,19 +173,19 @@ class ModbusServer:
         size = _RTU_SIZES.get(data[1])
         if not isinstance(size, tuple):
             return size
-        fixed, place = size
-        return fixed + (data[place] if len(data) > place else 1)
+        fixed, position = size
+        return fixed + (data[position] if len(data) > position else 1)
 
     def _checked_sizes(self) -> Iterator[int]:
-        """Yield the sizes at which the bytes so far are a request of an unknown function with a right checksum."""
+        """Yield the sizes at which the bytes so far are a request of an unknown function with a valid checksum."""
         crc = 0xFFFF
         for size, byte in enumerate(self._rest[:MAX_RTU_BYTES], 1):
             crc = _crc(bytes((byte,)), crc)
-            if size >= 4 and not crc:  # the CRC of a frame with its own CRC is 0
+            if size >= 4 and not crc:  # the CRC of a frame including its CRC is 0
                 yield size
 
     def _next_known(self) -> int:
-        """Drop what precedes the next whole request of a known function; return that request's size, 0 without one."""
+        """Drop the bytes before the next request of a known function; return the size of the request, 0 without one."""
         for start in range(1, len(self._rest) - 3):
             size = self._rtu_size(self._rest[start:])
             if size is not None and _is_frame(self._rest[start : start + size]):

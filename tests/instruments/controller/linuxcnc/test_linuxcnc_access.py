@@ -1,4 +1,4 @@
-"""The bridge as a process of its own, and who gets in: beside it stands a LinuxCNC that is a fake."""
+"""The bridge as a separate process, and access to it, with a fake LinuxCNC."""
 
 import http.client
 import json
@@ -59,7 +59,7 @@ Start = Callable[..., dict[str, Any]]
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Return what starts a bridge in a home of its own; its announcement is returned."""
+    """Return a function that starts a bridge in a separate home folder and returns its announcement."""
     (tmp_path / "linuxcnc.py").write_text(LINUXCNC)
     (tmp_path / "hal.py").write_text(HAL)
     started: list[subprocess.Popen[bytes]] = []
@@ -92,7 +92,7 @@ def commands(folder: Path) -> list[str]:
 
 
 def closed_without_answer(line: socket.socket) -> bool:
-    """Return whether the other end closes without a word."""
+    """Return whether the other end closes without sending anything."""
     line.settimeout(10)
     try:
         return line.recv(100) == b""
@@ -111,7 +111,7 @@ def test_by_default_it_listens_on_a_socket_of_its_user(start: Start, tmp_path: P
         for each in Path(f"/proc/{reported['pid']}/fd").iterdir()
         if (link := os.readlink(each)).startswith("socket:")
     }
-    assert not [row for row in listening if row[9] in inodes]  # no TCP unless it is asked for
+    assert not [row for row in listening if row[9] in inodes]  # no TCP unless requested
     settings = LinuxCNCSettings(token_file=tmp_path / ".errormotion" / "linuxcnc.token")
     with LinuxCNC(f"unix://{path}", settings) as machine:
         assert machine.state()["enabled"]
@@ -120,7 +120,7 @@ def test_by_default_it_listens_on_a_socket_of_its_user(start: Start, tmp_path: P
     assert commands(tmp_path) == []
 
 
-def test_a_web_page_is_not_answered_and_moves_nothing(start: Start, tmp_path: Path) -> None:
+def test_a_web_page_gets_no_answer_and_moves_nothing(start: Start, tmp_path: Path) -> None:
     port = start("--port", "0")["port"]
     body = b"".join(encode_request(k, op, {}) for k, op in enumerate(("reset", "enable", "home")))
     for method, content in (("POST", body), ("GET", b""), ("OPTIONS", b"")):
@@ -168,14 +168,14 @@ def test_a_token_that_others_can_read_is_not_used(start: Start, tmp_path: Path) 
     assert b"nobody else can read" in again.stderr
 
 
-def test_without_a_token_the_message_says_what_to_do(start: Start, tmp_path: Path) -> None:
+def test_without_a_token_the_message_states_the_remedy(start: Start, tmp_path: Path) -> None:
     port = start("--port", "0")["port"]
-    with pytest.raises(InstrumentError, match=r"expected the token.*Copy that file.*'token_file'"):
+    with pytest.raises(InstrumentError, match=r"expected the token.*Copy this file.*'token_file'"):
         LinuxCNC(f"tcp://127.0.0.1:{port}", LinuxCNCSettings(token_file=tmp_path / "none")).open()
     wrong = tmp_path / "wrong"
     wrong.write_text("x" * 64)
     wrong.chmod(0o600)
-    with pytest.raises(InstrumentError, match=r"the token is not that of this bridge.*Copy that file"):
+    with pytest.raises(InstrumentError, match=r"the token is not valid for this bridge.*Copy this file"):
         LinuxCNC(f"tcp://127.0.0.1:{port}", LinuxCNCSettings(token_file=wrong)).open()
 
 

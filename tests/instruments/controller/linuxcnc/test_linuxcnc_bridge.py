@@ -1,4 +1,4 @@
-"""The bridge with a LinuxCNC that is a fake: what goes wrong, and what comes in."""
+"""The bridge with a fake LinuxCNC: faults, and requests."""
 
 import asyncio
 import json
@@ -22,7 +22,7 @@ AXIS = {"min_position_limit": -100.0, "max_position_limit": 100.0}
 
 
 class FakeLinuxCNC:
-    """LinuxCNC's module, and the machine behind it: every line of MDI is carried out at once."""
+    """LinuxCNC's module with its machine: every line of MDI is executed at once."""
 
     STATE_ESTOP, STATE_ESTOP_RESET, STATE_OFF, STATE_ON = 1, 2, 3, 4
     MODE_MANUAL, MODE_AUTO, MODE_MDI = 1, 2, 3
@@ -122,7 +122,7 @@ class FakeLinuxCNC:
 
 
 class Inline:
-    """Sends commands without a process of its own."""
+    """Sends commands without a separate process."""
 
     def __init__(self, fake: FakeLinuxCNC) -> None:
         self.fake = fake
@@ -173,7 +173,7 @@ class Wire:
             self.welcome = self.answers.get_nowait()
 
     def feed(self, data: bytes) -> None:
-        """Have bytes arrive at the bridge."""
+        """Send bytes to the bridge."""
         if not self.closed:
             self.client.data_received(data)
 
@@ -223,7 +223,7 @@ Test = Callable[[Wire, FakeLinuxCNC, Bridge], Coroutine[Any, Any, None]]
 
 @pytest.fixture
 def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Test], None]:
-    """Return what runs a test with a client at a bridge; LinuxCNC is given less time than in earnest."""
+    """Return a function that runs a test with a client of a bridge; time limits of LinuxCNC are shorter than in use."""
     monkeypatch.setattr(module, "ACCEPT_TIMEOUT", 0.2)
     monkeypatch.setattr(module, "CHANGE_TIMEOUT", 0.1)
     monkeypatch.setattr(module, "TEXT_TIMEOUT", 0.05)
@@ -288,7 +288,7 @@ def test_the_first_line_that_is_no_request_ends_the_connection_and_not_the_bridg
 
 
 @pytest.mark.parametrize("data", [b"G", b"POST / HT", b"\x16\x03\x01", b"OPTIONS * HTTP/1.1\r\n", b"\n"])
-def test_what_looks_like_another_protocol_is_not_waited_for(play: Callable[[Test], None], data: bytes) -> None:
+def test_another_protocol_is_refused_without_waiting(play: Callable[[Test], None], data: bytes) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         browser = Wire(bridge, greets=False)
         browser.feed(data)
@@ -340,7 +340,9 @@ def test_without_the_token_nothing_is_answered(play: Callable[[Test], None], fir
     play(test)
 
 
-def test_a_stranger_has_little_time(play: Callable[[Test], None], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unauthorised_client_has_a_short_time_limit(
+    play: Callable[[Test], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "HELLO_TIMEOUT", 0.05)
 
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
@@ -352,7 +354,7 @@ def test_a_stranger_has_little_time(play: Callable[[Test], None], monkeypatch: p
     play(test)
 
 
-def test_a_request_without_end_is_hung_up_on(play: Callable[[Test], None]) -> None:
+def test_an_endless_request_ends_the_connection(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         other = Wire(bridge)
         for _ in range(9):
@@ -363,7 +365,7 @@ def test_a_request_without_end_is_hung_up_on(play: Callable[[Test], None]) -> No
     play(test)
 
 
-def test_the_65th_client_is_refused_and_strangers_take_no_place(play: Callable[[Test], None]) -> None:
+def test_the_65th_client_is_refused_and_unauthorised_ones_are_not_counted(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         strangers = [Wire(bridge, greets=False) for _ in range(100)]
         assert sum(not each.closed for each in strangers) == module.MAX_STRANGERS
@@ -377,7 +379,7 @@ def test_the_65th_client_is_refused_and_strangers_take_no_place(play: Callable[[
     play(test)
 
 
-def test_a_burst_of_strangers_leaves_time_for_the_first_request(
+def test_many_unauthorised_connections_leave_time_for_the_first_request(
     play: Callable[[Test], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "STRANGER_TIME", 60.0)
@@ -438,7 +440,7 @@ def test_a_program_has_several_connections_with_its_control(play: Callable[[Test
     play(test)
 
 
-def test_who_did_not_ask_for_control_only_reads(play: Callable[[Test], None]) -> None:
+def test_a_client_without_control_only_reads(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         await wire.disconnect()
         reader = Wire(bridge, control=False)
@@ -502,10 +504,10 @@ def test_an_estop_waits_for_a_few_requests_of_others_only(play: Callable[[Test],
     play(test)
 
 
-def test_a_flood_of_stops_is_one_stop(play: Callable[[Test], None]) -> None:
+def test_many_stop_requests_are_one_stop(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         sent: list[str] = []
-        under_way: asyncio.Future[int] = asyncio.get_running_loop().create_future()  # LinuxCNC takes its time
+        under_way: asyncio.Future[int] = asyncio.get_running_loop().create_future()  # LinuxCNC is slow
         bridge.stops = SimpleNamespace(send=lambda name, *_: (sent.append(name), under_way)[1])  # type: ignore[assignment]
         flood = Flood(bridge, control=False)
         flood.data = Flood.data.replace(b"state", b"stop")
@@ -519,7 +521,7 @@ def test_a_flood_of_stops_is_one_stop(play: Callable[[Test], None]) -> None:
     play(test)
 
 
-# ---------------------------------------------------------------------- orders
+# ---------------------------------------------------------------------- commands
 
 
 @pytest.mark.parametrize(
@@ -551,7 +553,7 @@ def test_a_flood_of_stops_is_one_stop(play: Callable[[Test], None]) -> None:
         ("set_pins", {"pins": {"spindle.0.speed-in": 1}}, "not among those that clients may set"),
     ],
 )
-def test_wrong_orders_are_refused_in_words(
+def test_wrong_commands_are_refused_with_a_text(
     play: Callable[[Test], None], op: str, arguments: dict[str, Any], said: str
 ) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
@@ -578,7 +580,7 @@ def test_the_state_is_in_metres_whatever_the_ini_file_has(play: Callable[[Test],
     play(test)
 
 
-def test_of_a_linuxcnc_that_is_starting_nothing_is_reported(play: Callable[[Test], None]) -> None:
+def test_nothing_is_reported_while_linuxcnc_is_starting(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.values.linear_units = 0.0
         assert "still starting" in await wire.ask("state")
@@ -586,7 +588,7 @@ def test_of_a_linuxcnc_that_is_starting_nothing_is_reported(play: Callable[[Test
     play(test)
 
 
-def test_messages_are_no_alarms_but_errors_are(play: Callable[[Test], None]) -> None:
+def test_messages_are_not_alarms_but_errors_are(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.texts = [(fake.OPERATOR_TEXT, "hello"), (fake.OPERATOR_ERROR, "joint 1 following error")]
         assert (await wire.ask("state"))["alarms"] == ["joint 1 following error"]
@@ -597,7 +599,7 @@ def test_messages_are_no_alarms_but_errors_are(play: Callable[[Test], None]) -> 
 
 
 def test_an_error_without_a_text_is_an_error_all_the_same(play: Callable[[Test], None]) -> None:
-    """Another display may have taken the text: it is the position that reports."""
+    """Another display may have read the text; the error follows from the position."""
 
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         assert "stopped before its goal, at 0.0000, 0.0000, 0.0000 mm" in await wire.ask(
@@ -607,7 +609,7 @@ def test_an_error_without_a_text_is_an_error_all_the_same(play: Callable[[Test],
     play(test)
 
 
-def test_the_text_of_an_error_may_come_late(play: Callable[[Test], None]) -> None:
+def test_the_text_of_an_error_may_be_late(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.on_mdi = lambda line: asyncio.get_running_loop().call_later(0.02, fake.error, "too bad")  # type: ignore[assignment,return-value]
         assert (await wire.ask("move_to", position=[0, 0, 0.1])).endswith(
@@ -617,7 +619,7 @@ def test_the_text_of_an_error_may_come_late(play: Callable[[Test], None]) -> Non
     play(test)
 
 
-def test_units_are_set_on_a_line_before_and_put_back(play: Callable[[Test], None]) -> None:
+def test_units_are_set_before_reading_and_restored(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.values.gcodes = (200, 910, 940)
         fake.on_mdi = moving_to(fake, (0.0, 0.0, 100.0))
@@ -652,7 +654,7 @@ def test_probing_is_in_the_work_frame_and_its_result_is_not(play: Callable[[Test
         ({"task_state": FakeLinuxCNC.STATE_OFF}, "is off"),
         ({"homed": (1, 0, 1)}, "not homed"),
         ({"joints": 0}, "not homed"),
-        ({"interp_state": FakeLinuxCNC.INTERP_READING}, "this bridge has not ordered"),
+        ({"interp_state": FakeLinuxCNC.INTERP_READING}, "this bridge has not started"),
         ({"probe_val": 1}, "tripped before it moves"),
         ({"spindle": ({"speed": 9.0, "direction": 1},)}, "spindle turns"),
     ],
@@ -668,7 +670,7 @@ def test_probes_with_a_machine_that_is_ready_only(
     play(test)
 
 
-def test_an_e_stop_by_hand_breaks_a_move_off(play: Callable[[Test], None]) -> None:
+def test_a_manual_emergency_stop_interrupts_a_move(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.on_mdi = lambda line: setattr(fake.values, "task_state", fake.STATE_ESTOP)
         assert "move to was aborted: e-stop" in await wire.ask("move_to", position=[0, 0, 0.1])
@@ -679,7 +681,7 @@ def test_an_e_stop_by_hand_breaks_a_move_off(play: Callable[[Test], None]) -> No
     play(test)
 
 
-def test_an_order_that_linuxcnc_never_takes_is_given_up(play: Callable[[Test], None]) -> None:
+def test_a_command_that_linuxcnc_never_accepts_is_aborted(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.deaf = True
         assert "does not respond: change of mode" in await wire.ask("move_to", position=[0, 0, 0.1])
@@ -695,12 +697,12 @@ def test_the_e_stop_that_stays_pressed_is_reported(play: Callable[[Test], None])
         fake.values.task_state = fake.STATE_ESTOP
         assert "check the buttons" in await wire.ask("reset")
         fake.values.task_state = fake.STATE_OFF
-        assert "stays off" in await wire.ask("enable")
+        assert "remains off" in await wire.ask("enable")
 
     play(test)
 
 
-def test_a_homing_that_fails_says_why(play: Callable[[Test], None]) -> None:
+def test_a_failed_homing_has_a_reason(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.values.homed = (0, 0, 0)
         fake.home = lambda joint: fake.error("no home switch")  # type: ignore[method-assign]
@@ -709,7 +711,7 @@ def test_a_homing_that_fails_says_why(play: Callable[[Test], None]) -> None:
     play(test)
 
 
-def test_an_order_beats_until_it_ends_and_others_wait_their_turn(play: Callable[[Test], None]) -> None:
+def test_a_command_sends_heartbeats_until_it_ends_and_others_wait(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.on_mdi = lambda line: setattr(fake.values, "interp_state", fake.INTERP_READING)
         wire.send("move_to", position=[0, 0, 0.1])
@@ -726,7 +728,7 @@ def test_an_order_beats_until_it_ends_and_others_wait_their_turn(play: Callable[
     play(test)
 
 
-def test_a_client_that_hangs_up_takes_its_motion_with_it(play: Callable[[Test], None]) -> None:
+def test_a_client_that_disconnects_ends_its_motion(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         other = Wire(bridge)
         fake.on_run = lambda: setattr(fake.values, "interp_state", fake.INTERP_READING)
@@ -749,7 +751,7 @@ def test_a_client_that_hangs_up_takes_its_motion_with_it(play: Callable[[Test], 
         ("spindle", {"speed": 100}),
     ],
 )
-def test_what_is_broken_off_before_it_began_does_not_begin(
+def test_commands_aborted_before_their_start_do_not_start(
     play: Callable[[Test], None], op: str, arguments: dict[str, Any]
 ) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
@@ -767,7 +769,7 @@ def test_what_is_broken_off_before_it_began_does_not_begin(
     play(test)
 
 
-def test_waiting_ends_by_a_stop(play: Callable[[Test], None]) -> None:
+def test_a_stop_ends_waiting(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         assert await wire.ask("elapse", seconds=0.01) is None
         wire.send("elapse", seconds=100)
@@ -780,7 +782,7 @@ def test_waiting_ends_by_a_stop(play: Callable[[Test], None]) -> None:
     play(test)
 
 
-def test_an_error_of_linuxcncs_own_module_is_an_answer(play: Callable[[Test], None]) -> None:
+def test_an_error_of_the_linuxcnc_module_is_an_answer(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         def broken() -> None:
             raise OSError("emcStatus buffer invalid")
@@ -814,7 +816,7 @@ def test_no_pin_is_set_where_one_is_refused(play: Callable[[Test], None]) -> Non
     play(test)
 
 
-def test_a_long_program_comes_in_parts(play: Callable[[Test], None], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_program_is_received_in_parts(play: Callable[[Test], None], monkeypatch: pytest.MonkeyPatch) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         texts: list[str] = []
         fake.on_run = lambda: texts.append(Path(fake.values.file).read_text())
@@ -863,7 +865,7 @@ def test_a_rapid_move_keeps_the_limit_of_the_feed(play: Callable[[Test], None], 
 # ---------------------------------------------------------------------- token and socket
 
 
-def test_the_token_is_made_once_and_only_its_user_can_read_it(tmp_path: Path) -> None:
+def test_the_token_is_created_once_and_only_its_user_can_read_it(tmp_path: Path) -> None:
     path = tmp_path / "own" / "token"
     token = module.own_token(path)
     assert len(token) == 64
@@ -890,7 +892,7 @@ def test_a_folder_that_others_can_write_is_refused(tmp_path: Path) -> None:
         module.unix_socket(tmp_path / "socket")
 
 
-def test_a_token_behind_a_link_or_too_short_is_refused(tmp_path: Path) -> None:
+def test_a_token_that_is_a_link_or_too_short_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "own" / "token"
     module.own_token(path)
     link = path.with_name("link")
@@ -909,14 +911,14 @@ def test_the_socket_is_its_users_and_one_bridge_listens(tmp_path: Path) -> None:
         line.listen()
         with pytest.raises(FileExistsError, match="another bridge"):
             module.unix_socket(path)
-    module.unix_socket(path).close()  # left by one that was killed
+    module.unix_socket(path).close()  # left by a killed process
     path.unlink()
     path.write_text("no socket")
     with pytest.raises(FileExistsError, match="remove the file"):
         module.unix_socket(path)
 
 
-# ---------------------------------------------------------------------- sending in processes of their own
+# ---------------------------------------------------------------------- sending in separate processes
 
 
 def test_commands_are_sent_by_another_process_and_a_lost_one_ends_the_bridge(
@@ -939,7 +941,7 @@ def test_commands_are_sent_by_another_process_and_a_lost_one_ends_the_bridge(
         await sender.connect(lost.set)
         slow, after = sender.send("mdi", "G0 X0"), sender.send("abort")
         await asyncio.sleep(0.05)
-        assert not slow.done()  # and this loop went on meanwhile
+        assert not slow.done()  # and this loop continued meanwhile
         assert await slow == 1
         with pytest.raises(module.RefusedError, match="no LinuxCNC"):
             await after
@@ -959,7 +961,7 @@ def test_commands_are_sent_by_another_process_and_a_lost_one_ends_the_bridge(
         os.waitpid(sender.pid, 0)
 
 
-def test_a_bridge_gives_the_right_to_compensate_only_where_it_was_started_with_it(play: Callable[[Test], None]) -> None:
+def test_a_bridge_only_permits_compensation_if_started_with_it(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         other = Wire(bridge, client="two", control=False, compensate=True)
         assert other.welcome["result"]["compensate"] is False
@@ -969,7 +971,7 @@ def test_a_bridge_gives_the_right_to_compensate_only_where_it_was_started_with_i
     play(test)
 
 
-def test_one_client_compensates_and_may_do_nothing_else(play: Callable[[Test], None]) -> None:
+def test_one_client_may_only_compensate(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         bridge.compensates = True
         first = Wire(bridge, client="two", control=False, compensate=True)

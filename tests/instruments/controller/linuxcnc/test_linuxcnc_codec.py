@@ -42,7 +42,7 @@ def test_a_request_is_a_line_of_json_without_infinities() -> None:
         encode_request(7, "elapse", {"seconds": math.inf})
 
 
-def test_lines_are_answers_and_beats() -> None:
+def test_lines_are_answers_and_heartbeats() -> None:
     assert decode(b'{"id": 7, "ok": true, "result": [1]}\n') == Answer(7, True, [1])
     assert decode(b'{"id": 7, "ok": false, "error": "no"}\n') == Answer(7, False, error="no")
     assert decode(b'{"id": 7, "beat": 3, "time": 1.5}\n') == Beat(7, 1.5)
@@ -51,7 +51,7 @@ def test_lines_are_answers_and_beats() -> None:
 @pytest.mark.parametrize(
     "line", [b"", b"hello", b"[]", b"7", b"{}", b'{"id": 1, "ok": 1, "result": 0}', b'{"id": 1, "ok": true}', b"\xff"]
 )
-def test_what_is_neither_is_refused(line: bytes) -> None:
+def test_other_lines_are_neither_and_refused(line: bytes) -> None:
     with pytest.raises(ProtocolError, match="Expected an answer of the bridge"):
         decode(line)
 
@@ -87,7 +87,7 @@ def test_a_state_of_another_kind_is_refused(name: str, value: object) -> None:
         decode_state({key: each for key, each in STATE.items() if key != name})
 
 
-def test_a_touch_is_known_or_was_none() -> None:
+def test_a_touch_is_known_or_did_not_occur() -> None:
     assert decode_touch({"tripped": False, "position": None, "time": 2.0})["position"] is None
     assert decode_touch({"tripped": True, "position": [0.1, 0.2, 0.3], "time": 2.0})["position"] == [0.1, 0.2, 0.3]
     for wrong in ({"tripped": True, "position": None, "time": 2.0}, {"tripped": True, "position": [0, 0, None]}, None):

@@ -29,7 +29,7 @@ def started() -> LinuxCNCProcess:
     return LinuxCNCProcess({"linuxcnc.ini": ini, "balls.hal": ""}, DISPLAY, wait=90.0)
 
 
-def test_messages_that_a_killed_one_left_are_not_taken_for_its_own() -> None:
+def test_messages_of_a_killed_process_are_not_attributed_to_the_next_one() -> None:
     killed = started()
     for process in linuxcnc_process._parts(killed.folder):
         os.kill(process, signal.SIGKILL)

@@ -1,7 +1,7 @@
 """The driver and the bridge against the real LinuxCNC, without hardware.
 
-A computer has room for one LinuxCNC. It is started once, lingers from test to test, and ends after the last one; that
-is why the kit and the touch probe try this driver here, and not beside all others.
+A computer can only run one LinuxCNC. It is started once, continues between tests, and ends after the last one;
+therefore the kit and the touch probe test this driver here, and not together with the others.
 """
 
 import importlib.util
@@ -51,7 +51,7 @@ def machine() -> Iterator[LinuxCNC]:
 
 
 def above(ball: int, height: float) -> list[float]:
-    """Return a position so far above the centre of a ball, m."""
+    """Return a position at a height above the centre of a ball, m."""
     x, y, z = world("cframe", 3).machine.balls.nominal[ball]
     return [float(x), float(y), float(z) + height]
 
@@ -69,7 +69,7 @@ def run(driver: LinuxCNC, text: str) -> None:
 # ---------------------------------------------------------------------- what it states
 
 
-def test_says_who_it_is_and_how_it_stands(machine: LinuxCNC) -> None:
+def test_states_its_identity_and_state(machine: LinuxCNC) -> None:
     identity = machine.identify()
     assert (identity.manufacturer, identity.serial_number, identity.simulated) == ("LinuxCNC", "seed 3", True)
     assert identity.firmware.startswith("2.")
@@ -79,7 +79,7 @@ def test_says_who_it_is_and_how_it_stands(machine: LinuxCNC) -> None:
     assert math.isnan(state["spindle_load"])
 
 
-def test_moves_to_a_place_and_is_there_when_the_call_returns(machine: LinuxCNC) -> None:
+def test_moves_to_a_position_before_the_call_returns(machine: LinuxCNC) -> None:
     machine.move_to([-0.23, -0.2, 0.12])
     reported = machine.move_to([-0.22, -0.18, 0.12], 0.05)
     state = machine.state()
@@ -89,18 +89,18 @@ def test_moves_to_a_place_and_is_there_when_the_call_returns(machine: LinuxCNC) 
     assert (state["feed"], state["running"], state["mode"]) == (0.0, False, "mdi")
 
 
-def test_the_clock_of_the_world_goes_on_with_motion_and_jumps_by_waiting(machine: LinuxCNC) -> None:
+def test_the_clock_of_the_world_advances_with_motion_and_jumps_by_waiting(machine: LinuxCNC) -> None:
     began = machine.state()["time"]
     reported = machine.move_to(HERE)
     moved = machine.state()["time"] - began
-    assert moved == pytest.approx(reported["duration"], abs=0.2)  # beats come five times a second
+    assert moved == pytest.approx(reported["duration"], abs=0.2)  # there are five heartbeats per second
     machine.elapse(3600.0)
     assert machine.state()["time"] == pytest.approx(began + moved + 3600.0, abs=0.2)
 
 
 def test_turns_the_spindle_which_heats_the_twin(machine: LinuxCNC) -> None:
     machine.spindle(3000.0)
-    while machine.state()["spindle_speed"] < 2900.0:  # an encoder measures how it runs up
+    while machine.state()["spindle_speed"] < 2900.0:  # an encoder measures the acceleration
         time.sleep(0.05)
     machine.elapse(3600.0)
     assert world("cframe", 3).machine.spindle_speed([machine.state()["time"]])[0] == pytest.approx(3000.0)
@@ -122,7 +122,7 @@ def test_turns_the_spindle_which_heats_the_twin(machine: LinuxCNC) -> None:
         ([0.0, 0.0, math.nan], None, "finite"),
     ],
 )
-def test_refuses_what_cannot_be_without_moving(
+def test_refuses_impossible_commands_without_moving(
     machine: LinuxCNC, goal: list[float], feed: float | None, said: str
 ) -> None:
     before = machine.state()["position"]
@@ -135,7 +135,7 @@ def test_refuses_what_cannot_be_without_moving(
 
 
 @pytest.mark.parametrize("feed", [0.01, 0.001, 0.0003])
-def test_a_touch_is_where_the_twin_trips_and_at_most_a_cycle_of_travel_behind(machine: LinuxCNC, feed: float) -> None:
+def test_a_touch_is_at_most_one_cycle_of_travel_after_the_trip_of_the_twin(machine: LinuxCNC, feed: float) -> None:
     machine.move_to(above(0, 0.05))
     machine.move_to(above(0, 0.0157 + 0.05 * feed), FAST)
     start, goal = machine.state()["commanded_position"], above(0, 0.01)
@@ -152,7 +152,7 @@ def test_a_touch_is_where_the_twin_trips_and_at_most_a_cycle_of_travel_behind(ma
     machine.move_to(above(0, 0.05), FAST)
 
 
-def test_a_sideways_touch_and_the_setting_that_puts_it_back() -> None:
+def test_a_sideways_touch_and_the_setting_that_corrects_it() -> None:
     feed, delay = 0.005, 0.5 * CYCLE  # the mean of 0 to 1 cycle
     with LinuxCNC(ADDRESS, LinuxCNCSettings(arm=True, trip_delay=delay)) as machine:
         x, y, z = above(0, 0.0)
@@ -191,7 +191,7 @@ def test_the_balls_move_as_the_machine_warms_up(machine: LinuxCNC) -> None:
     assert abs(places[1] - places[0]) > 5e-6  # the spindle has grown by tens of um
 
 
-def test_without_a_ball_in_the_way_the_machine_stands_at_the_target(machine: LinuxCNC) -> None:
+def test_without_a_ball_in_the_path_the_machine_stops_at_the_target(machine: LinuxCNC) -> None:
     machine.move_to(HERE)
     touch = machine.probe([-0.24, -0.2, 0.11], 0.02)
     assert (touch["tripped"], touch["position"]) == (False, None)
@@ -202,7 +202,7 @@ def test_without_a_ball_in_the_way_the_machine_stands_at_the_target(machine: Lin
 def test_refuses_to_probe_with_the_probe_tripped(machine: LinuxCNC) -> None:
     machine.move_to(above(0, 0.05))
     machine.move_to(above(0, 0.017), FAST)
-    machine.probe(above(0, 0.01), 0.02)  # so fast that it comes to rest far behind the contact
+    machine.probe(above(0, 0.01), 0.02)  # so fast that it stops far behind the contact
     before = machine.state()["position"]
     with pytest.raises(InstrumentError, match="tripped before it moves"):
         machine.probe(above(0, 0.01), 0.001)
@@ -220,7 +220,7 @@ def test_running_into_a_ball_stops_the_machine(machine: LinuxCNC) -> None:
     assert machine.state()["alarms"] == []
 
 
-# ---------------------------------------------------------------------- when things go wrong
+# ---------------------------------------------------------------------- faults
 
 
 def test_an_e_stop_ends_a_move_and_has_to_be_released(machine: LinuxCNC) -> None:
@@ -289,12 +289,12 @@ def test_without_arm_it_reads_and_may_stop_the_machine(machine: LinuxCNC) -> Non
         stopper.join()
         with pytest.raises(InstrumentError, match=r"only reads.*home.*arm = true"):
             reader.home()
-        answer = reader._order  # past the driver's own check: the bridge refuses as well
+        answer = reader._send  # without the check of the driver: the bridge refuses as well
         with pytest.raises(InstrumentError, match="this client only reads"):
             answer("move_to", position=THERE, feed=None)
 
 
-def test_the_limits_of_the_bench_hold_for_each_order(machine: LinuxCNC) -> None:
+def test_the_limits_of_the_bench_apply_to_each_command(machine: LinuxCNC) -> None:
     machine.move_to(HERE)
     machine.bound(MachineLimits({"X": (HERE[0] - 1e-3, HERE[0] + 1e-3)}, feed=0.01, spindle_speed=100.0))
     for order in (
@@ -312,7 +312,7 @@ def test_the_limits_of_the_bench_hold_for_each_order(machine: LinuxCNC) -> None:
 
 
 def test_an_estop_is_answered_while_others_flood(machine: LinuxCNC) -> None:
-    """`benchmarks/linuxcnc_stop.py` measures it; here the quickest of a few, on a computer with other work to do."""
+    """`benchmarks/linuxcnc_stop.py` measures it; here the shortest of a few, on a busy computer."""
     spec = importlib.util.spec_from_file_location("linuxcnc_stop", STOP_BENCHMARK)
     assert spec is not None
     assert spec.loader is not None
@@ -333,10 +333,10 @@ def test_an_estop_is_answered_while_others_flood(machine: LinuxCNC) -> None:
 def test_a_lost_connection_stops_the_move_which_is_not_repeated() -> None:
     with LinuxCNC(ADDRESS, ARMED) as witness, LinuxCNC(f"{ADDRESS}&fault=disconnect&fault_at=2", ARMED) as machine:
         witness.move_to(HERE)
-        machine.state()  # after identity and state the wire breaks at the next answer, that of the stop
+        machine.state()  # after identity and state the connection breaks at the next answer, that of the stop
         ordered = threading.Thread(target=lambda: (wait_until_moving(witness), witness.stop()))
         ordered.start()
-        with pytest.raises(InstrumentError, match="during the order 'move to'"):
+        with pytest.raises(InstrumentError, match="during the command 'move to'"):
             machine.move_to(THERE, 0.05)
         ordered.join()
         place = witness.state()["position"]
@@ -345,7 +345,7 @@ def test_a_lost_connection_stops_the_move_which_is_not_repeated() -> None:
         assert machine.state()["running"] is False
 
 
-def test_who_hangs_up_in_a_move_ends_it() -> None:
+def test_disconnecting_during_a_move_ends_it() -> None:
     with LinuxCNC(ADDRESS, ARMED) as witness:
         witness.move_to(HERE)
         machine = LinuxCNC(ADDRESS, ARMED)
@@ -366,7 +366,7 @@ def test_who_hangs_up_in_a_move_ends_it() -> None:
         witness.move_to(HERE)
 
 
-def test_homes_a_machine_that_was_just_switched_on(machine: LinuxCNC) -> None:
+def test_homes_a_machine_after_switch_on(machine: LinuxCNC) -> None:
     machine.move_to(HERE)
     machine.estop()
     machine.reset()
@@ -404,7 +404,7 @@ def test_a_program_runs_while_its_state_is_followed(machine: LinuxCNC) -> None:
         ("", "text of a program"),
     ],
 )
-def test_a_program_with_an_error_says_so(machine: LinuxCNC, text: str, said: str) -> None:
+def test_a_program_with_an_error_is_reported(machine: LinuxCNC, text: str, said: str) -> None:
     machine.move_to(HERE)
     with pytest.raises(InstrumentError, match=said):
         run(machine, text)
@@ -422,7 +422,7 @@ def test_stop_ends_a_program(machine: LinuxCNC) -> None:
         machine.finish()
 
 
-def test_a_program_probes_the_balls_by_itself(machine: LinuxCNC) -> None:
+def test_a_program_probes_the_balls_automatically(machine: LinuxCNC) -> None:
     machine.move_to(above(0, 0.05))
     machine.probe(above(0, 0.045), 0.02)  # the probe is in the spindle
     x, y, z = (1e3 * each for each in above(0, 0.0157))
@@ -441,7 +441,7 @@ def test_a_program_probes_the_balls_by_itself(machine: LinuxCNC) -> None:
 # ---------------------------------------------------------------------- offsets, units, recordings
 
 
-def test_offsets_of_work_and_tool_and_modes_of_the_operator_change_nothing(machine: LinuxCNC) -> None:
+def test_work_and_tool_offsets_and_operator_modes_have_no_effect(machine: LinuxCNC) -> None:
     machine.move_to(HERE)
     machine.run_program("G21 G90 G94\nG10 L2 P1 X11 Y-7 Z30 R30\nG54\nG92 X5 Y6 Z7\nG43.1 Z13\nG20 G91\nM0\nG4 P60\n")
     time.sleep(0.3)
@@ -505,7 +505,7 @@ def test_another_machine_is_refused_while_one_runs(machine: LinuxCNC) -> None:
     assert machine.state()["enabled"]
 
 
-def test_an_ini_file_in_inches_switched_on_and_homed_by_hand_and_nothing_left_behind() -> None:
+def test_an_ini_file_in_inches_switched_on_and_homed_manually_and_no_process_left() -> None:
     with LinuxCNC("sim://cframe/linuxcnc?seed=3&unit=inch&ready=0&linger=0", ARMED) as machine:
         (control,) = [each for each in linuxcnc._controls.values() if each.process.running]
         folder = control.process.folder

@@ -1,4 +1,4 @@
-"""The bridge's last check of an offset, and what it states, with pins that are a dictionary."""
+"""The bridge's last check of an offset, and its statements, with a dictionary of pins."""
 
 from typing import Any
 
@@ -75,20 +75,20 @@ def pins() -> Pins:
         {"X": 0.0},
     ],
 )
-def test_what_is_no_step_of_an_offset_is_refused_and_is_no_sign_of_life(pins: Pins, offset: Any) -> None:
+def test_an_invalid_step_of_an_offset_is_refused_and_is_not_a_heartbeat(pins: Pins, offset: Any) -> None:
     before = dict(pins.values)
     with pytest.raises(RefusedError):
         Offsets(pins).set(offset, UNIT)
     assert pins.values == before
 
 
-def test_an_offset_is_set_in_the_unit_of_the_ini_file_with_a_sign_of_life(pins: Pins) -> None:
+def test_an_offset_is_set_in_the_unit_of_the_ini_file_with_a_heartbeat(pins: Pins) -> None:
     Offsets(pins).set([1e-6, -2e-6, 0], UNIT)
     assert pins.asked() == pytest.approx([1e-3, -2e-3, 0.0])
     assert pins.values["errormotion-sign.in0"] is True
 
 
-def test_two_signs_of_life_within_one_servo_cycle_would_be_none(pins: Pins) -> None:
+def test_two_heartbeats_within_one_servo_cycle_would_be_lost(pins: Pins) -> None:
     offsets = Offsets(pins)
     offsets.set([0, 0, 0], UNIT)
     offsets.set([1e-6, 0, 0], UNIT)
@@ -104,7 +104,7 @@ def test_two_signs_of_life_within_one_servo_cycle_would_be_none(pins: Pins) -> N
         ({"axis.y.eoffset-request": 0.0105}, "LinuxCNC has an external offset that is 10.5 um off"),
     ],
 )
-def test_a_machine_that_takes_no_offset_says_why(pins: Pins, changed: dict[str, Any], fault: str) -> None:
+def test_a_machine_that_accepts_no_offset_has_a_reason(pins: Pins, changed: dict[str, Any], fault: str) -> None:
     pins.values |= changed
     offsets = Offsets(pins)
     assert fault in offsets.state(UNIT)["fault"]
@@ -122,13 +122,13 @@ def test_a_machine_that_takes_no_offset_says_why(pins: Pins, changed: dict[str, 
         ({"errormotion-limit-x.out": 0.02, "axis.x.eoffset-request": 0.02}, "LinuxCNC limits the offset"),
     ],
 )
-def test_a_held_offset_says_why(pins: Pins, changed: dict[str, Any], busy: str) -> None:
+def test_a_held_offset_has_a_reason(pins: Pins, changed: dict[str, Any], busy: str) -> None:
     pins.values |= changed
     assert busy in Offsets(pins).state(UNIT)["busy"]
 
 
 def test_an_offset_that_moves_while_it_is_read_is_neither_limited_nor_that_of_another_program() -> None:
-    """A computer with other work reads the pins tens of milliseconds apart; the servo thread goes on."""
+    """A busy computer reads the pins tens of milliseconds apart; the servo thread continues."""
 
     class Moving(Pins):
         def get_value(self, name: str) -> Any:
@@ -164,7 +164,7 @@ def test_without_the_realtime_part_nothing_is_set() -> None:
         offsets.set([0, 0, 0], UNIT)
 
 
-def test_what_the_bridge_states_is_read(pins: Pins) -> None:
+def test_the_statements_of_the_bridge_are_read(pins: Pins) -> None:
     pins.values |= {"axis.z.eoffset": -0.003, "errormotion-limit-z.out": -0.003, "axis.z.eoffset-request": -0.003}
     found = codec.decode_offset({**Offsets(pins).state(UNIT), "by": None})
     assert found == codec.Offset("external", (0.0, 0.0, -3e-6), 50e-6, 1e-6, 5.0, "", "", "")

@@ -1,4 +1,4 @@
-"""What is stated where LinuxCNC cannot be started: nothing here starts it."""
+"""Messages if LinuxCNC cannot be started; nothing here starts it."""
 
 import fcntl
 import os
@@ -28,7 +28,7 @@ def test_without_linuxcnc_the_debian_package_is_named(monkeypatch: pytest.Monkey
         LinuxCNC("sim://cframe/linuxcnc?seed=11").open()
 
 
-def test_a_second_one_waits_and_then_says_why(own_lock: Path) -> None:
+def test_a_second_one_waits_and_then_states_the_reason(own_lock: Path) -> None:
     own_lock.touch()
     first = os.open(own_lock, os.O_RDONLY)
     fcntl.flock(first, fcntl.LOCK_EX)
@@ -51,7 +51,7 @@ def test_a_linuxcnc_that_may_run_a_machine_is_not_touched(
     assert theirs.exists()
 
 
-def test_the_ini_file_has_the_travel_in_its_own_unit() -> None:
+def test_the_ini_file_contains_the_travel_in_its_unit() -> None:
     travel = {"X": (-0.254, 0.254), "Y": (0.0, 0.0254), "Z": (0.0, 1.0)}
     in_mm = ini_text("m", travel, 0.0254, 9000.0, arguments="--port 0")
     in_inch = ini_text("m", travel, 0.0254, 9000.0, arguments="--port 0", inch=True)

@@ -1,4 +1,4 @@
-"""The lines of the protocol as its page states them, at both ends: bridge and driver."""
+"""The lines of the protocol on its page, with bridge and driver."""
 
 from typing import Any
 

@@ -1,9 +1,9 @@
-"""The agent: what it has observed of the virtual machine, behind HTTP.
+"""The agent: observations of the virtual machine over HTTP.
 
-Beyond the menu of `faults` it offers ``overrun`` (the buffer is overwritten before a request for observations: the
-agent refuses), ``jump`` (the same, but the agent goes on at its first observation without a word), ``restart`` (a
-new instance, its numbers from 1), ``alarm`` (a fault condition) and ``unavailable`` (the machine is off). ``fault_at``
-counts requests, and intervals of a stream; ``overrun``, ``jump`` and ``restart`` happen once.
+In addition to `faults` it offers ``overrun`` (the buffer is overwritten before a request for observations: the agent
+refuses), ``jump`` (the same, but the agent continues at its first observation without an error), ``restart`` (a new
+instance, with sequence numbers from 1), ``alarm`` (a fault condition) and ``unavailable`` (the machine is off).
+``fault_at`` counts requests, and intervals of a stream; ``overrun``, ``jump`` and ``restart`` happen once.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ BOUNDARY = "6f1d2b52c4a94a0d8d5f0b3a7c1e9f24"
 _VERSIONS = {f"1.{minor}" for minor in range(3, 9)} | {f"2.{minor}" for minor in range(8)}
 _REASONS = {200: "OK", 400: "Bad Request", 404: "Not Found"}
 _POLL_INTERVAL = 0.02
-"""Longest time between two looks at the machine in a stream, s."""
+"""Longest interval between two readings of the machine in a stream, s."""
 _OLD = (2, 0)
 
 
 class SimulatedAgent:
-    """An agent whose device is the machine; the parameters of its address are those of this package.
+    """An agent whose device is the machine; see the package for the parameters of its address.
 
     Attributes
     ----------
@@ -63,15 +63,15 @@ class SimulatedAgent:
         self.fault = parse_fault(address, self.faults)
         seed = int(address.number("seed", 0))
         self._rng = np.random.default_rng([abs(seed), *b"mtconnect"])
-        style = STYLES[_chosen(address, "style", "own", set(STYLES))]
-        version = _chosen(address, "version", style.version, _VERSIONS)
-        self._multipart = _chosen(address, "multipart", style.multipart, {"x-mixed-replace", "mixed"})
+        style = STYLES[_choice(address, "style", "own", set(STYLES))]
+        version = _choice(address, "version", style.version, _VERSIONS)
+        self._multipart = _choice(address, "multipart", style.multipart, {"x-mixed-replace", "mixed"})
         self._offset = work_offset(address, style.offset)
         self._shows_next = bool(address.number("next", 1))
         self._frame = Frame(version, max(1, int(address.number("buffer", BUFFER))), FIRST_INSTANCE)
         self._requests = 0
-        self._befallen = False
-        self._held = WeakKeyDictionary[threading.Thread, bytes]()  # late answers, by the thread of their connection
+        self._fault_applied = False
+        self._delayed = WeakKeyDictionary[threading.Thread, bytes]()  # late answers, by the thread of their connection
         self._lock = threading.Lock()
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
         self.world.attach(self, address.number("pace", 0.0) or None)
@@ -94,14 +94,14 @@ class SimulatedAgent:
         return f"http://{self.url.partition('://')[2]}/"
 
     def close(self) -> None:
-        """End the agent; with the last device of its world the world ends."""
+        """End the agent; the last device of a world also ends the world."""
         self._server.close()
         self.world.detach(self)
 
     def report_delivered(self, samples: int) -> None:
-        """Take no note: an agent follows the world's clock and never drives it."""
+        """Do nothing: an agent follows the world's clock and never drives it."""
 
-    # ------------------------------------------------------------------ what is observed
+    # ------------------------------------------------------------------ observations
 
     def _start(self) -> None:
         """Start an instance: every data item is unavailable before its first value."""
@@ -111,7 +111,7 @@ class SimulatedAgent:
             self._buffer.add(key, now, empty_value(item.category))
 
     def _observe(self) -> None:
-        """Note every data item that has changed."""
+        """Add an observation of every data item that has changed."""
         now = clock_text(self.world.time)
         faulty = self._requests > self.fault.at
         alarm = "the machine is in alarm" if self.fault.kind == "alarm" and faulty else ""
@@ -124,13 +124,13 @@ class SimulatedAgent:
             if latest[key] != value:
                 self._buffer.add(key, now, value)
 
-    def _befall(self, kind: str, number: int) -> None:
-        """Let happen what is due at this request."""
+    def _apply_fault(self, kind: str, number: int) -> None:
+        """Apply an overrun, jump or restart at this request."""
         if self.fault.kind not in ("overrun", "jump", "restart") or kind != "sample":
             return
-        if number < self.fault.at or self._befallen:
+        if number < self.fault.at or self._fault_applied:
             return
-        self._befallen = True
+        self._fault_applied = True
         if self.fault.kind == "restart":
             self._frame = Frame(self._frame.version, self._frame.buffer_size, self._frame.instance + 1)
             self._start()
@@ -148,12 +148,12 @@ class SimulatedAgent:
             self._requests += 1
             if fault.kind == "disconnect" and number >= fault.at:
                 return None
-            if (fault.kind == "silence" and number >= fault.at) or fault.hits("drop", number):
+            if fault.suppresses(number):
                 return iter(())
             status = 200
             try:
                 request = read_request(path, query, self._frame.schema, self._names)
-                self._befall(request.kind, number)
+                self._apply_fault(request.kind, number)
                 self._observe()
                 if request.interval >= 0 and request.kind in ("current", "sample"):
                     self._check_stream(request)
@@ -169,19 +169,19 @@ class SimulatedAgent:
         if fault.kind == "late" and number == fault.at:
             return self._hold(head + body)
         stray = stray_bytes(self._rng) if fault.hits("garbage", number) else b""
-        return fault.pieces(self._held.pop(threading.current_thread(), b"") + stray + head + body)
+        return fault.pieces(self._delayed.pop(threading.current_thread(), b"") + stray + head + body)
 
     def _hold(self, answer: bytes) -> Iterator[bytes]:
-        """Yield an answer late, or keep it until the next one of its connection."""
+        """Yield an answer late, or delay it until the next one of its connection."""
         if math.isinf(self.fault.delay):
-            self._held[threading.current_thread()] = answer
+            self._delayed[threading.current_thread()] = answer
         elif not self._server.ended.wait(self.fault.delay):
             yield answer
 
     def _check_stream(self, request: Request) -> None:
         items = self._items(request)
         if request.kind == "sample":
-            self._selected(request, items)
+            self._select(request, items)
 
     def _stream(self, request: Request) -> Iterator[bytes]:
         """Yield the parts of a stream: new observations, not more often than the interval, or a heartbeat."""
@@ -199,10 +199,10 @@ class SimulatedAgent:
                     yield b""  # closes the connection
                     return
                 silent = fault.kind == "silence" and number >= fault.at
-                self._befall(request.kind, number)
+                self._apply_fault(request.kind, number)
                 self._observe()
                 if self._frame.instance != instance:
-                    yield b""  # a new instance does not know the connections of the one before it
+                    yield b""  # a new instance has no connections of the previous one
                     return
                 refused = False
                 try:
@@ -227,7 +227,7 @@ class SimulatedAgent:
     # ------------------------------------------------------------------ documents
 
     def _document(self, request: Request, begin: int | None = None) -> tuple[bytes, int, bool]:
-        """Return the document of an answer, the sequence number that follows it, and whether it has observations."""
+        """Return the document of an answer, the next sequence number, and whether it has observations."""
         now = clock_text(self.world.time)
         if request.kind == "asset":
             if request.asset:
@@ -239,7 +239,7 @@ class SimulatedAgent:
         items = self._items(request)
         buffer = self._buffer
         if request.kind == "sample":
-            seen, following = self._selected(request, items, begin)
+            seen, following = self._select(request, items, begin)
         else:
             if request.at is not None:
                 check_range("at", request.at, buffer.first - 1, buffer.next)
@@ -265,8 +265,8 @@ class SimulatedAgent:
             raise RefusedError("INVALID_XPATH", text, parameter="path")
         return items
 
-    def _selected(self, request: Request, items: set[str], begin: int | None = None) -> tuple[list[Observation], int]:
-        """Return the observations of a request, checked against what is kept."""
+    def _select(self, request: Request, items: set[str], begin: int | None = None) -> tuple[list[Observation], int]:
+        """Check a request against the stored sequence numbers, and return its observations."""
         buffer, most = self._buffer, self._buffer.size + 1
         start = request.begin if begin is None else begin
         if start is not None:
@@ -283,7 +283,7 @@ class SimulatedAgent:
         return buffer.select(start, count, items, request.end)
 
 
-def _chosen(address: Address, name: str, default: str, known: set[str]) -> str:
+def _choice(address: Address, name: str, default: str, known: set[str]) -> str:
     value = address.params.get(name, default)
     if value not in known:
         raise InstrumentError(f"'{name}={value}' in '{address.url}': expected one of {', '.join(sorted(known))}")

@@ -14,20 +14,20 @@ _SUFFIXES = {"TIME_SERIES": "TimeSeries", "DATA_SET": "DataSet", "TABLE": "Table
 
 @dataclass(frozen=True)
 class DataItem:
-    """A data item and where it is.
+    """A data item and its location.
 
     Attributes
     ----------
     element : str
         Name of its observations in a document.
     attributes : mapping
-        Of the device document.
+        Attributes in the device document.
     source : str
-        Reading that it shows.
+        Name of its reading.
     component, device : Element
-        Which it belongs to.
+        Component and device to which it belongs.
     key : str
-        What an adapter calls it: its source, its name, or its identifier.
+        Its key in an adapter: its source, its name, or its identifier.
     """
 
     element: str
@@ -80,7 +80,7 @@ class Devices:
         return next((each for each in self.root[0] if name in (each.get("name"), each.get("uuid"))), None)
 
     def chosen(self, path: str | None, device: Element | None) -> set[str]:
-        """Return the data items that a path chooses, of all devices or of one.
+        """Return the data items that a path selects, of all devices or of one.
 
         Raises
         ------

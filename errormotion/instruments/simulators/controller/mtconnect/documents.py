@@ -12,20 +12,20 @@ from errormotion.instruments.simulators.controller.mtconnect.observations import
 
 SENDER = "virtual"
 _GROUPS = {"SAMPLE": "Samples", "EVENT": "Events", "CONDITION": "Condition"}
-_NAMED_ERRORS = (2, 6)  # from this schema on an error has an element of its own name
+_NAMED_ERRORS = (2, 6)  # from this schema on, the element of an error has the name of the error
 
 
 class RefusedError(Exception):
-    """A request that the agent answers with an error document.
+    """The agent answers a request with an error document.
 
     Attributes
     ----------
     code : str
-        As ``OUT_OF_RANGE``.
+        Code such as ``OUT_OF_RANGE``.
     status : int
         HTTP status.
     parameter : str
-        Which is wrong; empty = none.
+        Name of the wrong parameter; empty: none.
     """
 
     def __init__(self, code: str, text: str, status: int = 400, parameter: str = "") -> None:
@@ -35,7 +35,7 @@ class RefusedError(Exception):
 
 @dataclass(frozen=True)
 class Frame:
-    """What all documents of an agent have in common.
+    """Common parts of all documents of an agent.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Frame:
         return self.document("Devices", f"<Devices>{text}</Devices>", time, {"assetBufferSize": 1024, "assetCount": 0})
 
     def assets(self, time: str) -> bytes:
-        """Return the answer to a request for assets: there are none."""
+        """Return the answer to a request for assets, without any asset."""
         return self.document("Assets", "<Assets/>", time, {"assetBufferSize": 1024, "assetCount": 0})
 
     def streams(

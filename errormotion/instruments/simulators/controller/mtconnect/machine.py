@@ -1,4 +1,4 @@
-"""What a controller reports of the virtual machine, by the name of the reading."""
+"""Readings of the virtual machine by a controller, by name."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 EPOCH = datetime(2025, 1, 1, tzinfo=UTC)
-"""What the clock of agents and adapters shows at the world's time 0."""
+"""Time of agents and adapters at the world's time 0."""
 UNAVAILABLE = "UNAVAILABLE"
 SERIES_RATE = 100.0
 """Rate of the values of one observation with several values, Hz."""
@@ -26,7 +26,7 @@ class Condition:
     level : str
         ``Normal``, ``Warning``, ``Fault`` or ``Unavailable``.
     code, severity, qualifier, text : str
-        Of the controller; empty = not given.
+        Details from the controller; empty: not given.
     """
 
     level: str
@@ -49,47 +49,47 @@ Value = str | Condition | Series | Mapping[str, str] | Mapping[str, Row]
 
 
 def clock_text(seconds: float) -> str:
-    """Return a time of the world, s, as agents and adapters write it."""
+    """Return a time of the world, s, in the format of agents and adapters."""
     return (EPOCH + timedelta(seconds=seconds)).isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
-def readings(shown: Mapping[str, Any], offset: tuple[float, float, float], alarm: str = "") -> dict[str, Value]:
+def readings(state: Mapping[str, Any], offset: tuple[float, float, float], alarm: str = "") -> dict[str, Value]:
     """Return the readings of a controller.
 
     Parameters
     ----------
-    shown : mapping
-        What the controller of the world displays.
+    state : mapping
+        State that the controller of the world displays.
     offset : tuple of float
         Work offset, m: position in work coordinates = position in machine coordinates - offset.
     alarm : str
-        A further alarm; empty = none.
+        A further alarm; empty: none.
 
     Returns
     -------
     dict
         Values in the units of MTConnect: mm, mm/s, 1/min, %.
     """
-    alarms = [*shown["alarms"], *([alarm] if alarm else [])]
-    mm = {name: [position * _MM for position in shown[f"{name}position"]] for name in ("", "commanded_")}
+    alarms = [*state["alarms"], *([alarm] if alarm else [])]
+    mm = {name: [position * _MM for position in state[f"{name}position"]] for name in ("", "commanded_")}
     work = [actual - shift * _MM for actual, shift in zip(mm[""], offset, strict=True)]
     values: dict[str, Value] = {
         "avail": "AVAILABLE",
-        "estop": "TRIGGERED" if shown["estop"] else "ARMED",
+        "estop": "TRIGGERED" if state["estop"] else "ARMED",
         "system": Condition("Fault", "1104", text="; ".join(alarms)) if alarms else Condition("Normal"),
         "normal": Condition("Normal"),
-        "mode": _MODES[shown["mode"]],
-        "execution": "ACTIVE" if shown["running"] or shown["stepping"] else "READY",
-        "program": shown["program"] or UNAVAILABLE,
-        "feed": f"{shown['feed'] * _MM:.4f}",
-        "rpm": f"{shown['spindle_speed']:.1f}",
-        "rpm.commanded": f"{shown['commanded_spindle_speed']:.1f}",
-        "spindle.load": f"{shown['spindle_load'] * _PERCENT:.2f}",
+        "mode": _MODES[state["mode"]],
+        "execution": "ACTIVE" if state["running"] or state["stepping"] else "READY",
+        "program": state["program"] or UNAVAILABLE,
+        "feed": f"{state['feed'] * _MM:.4f}",
+        "rpm": f"{state['spindle_speed']:.1f}",
+        "rpm.commanded": f"{state['commanded_spindle_speed']:.1f}",
+        "spindle.load": f"{state['spindle_load'] * _PERCENT:.2f}",
         "path.work": _vector(work),
         "path.machine": _vector(mm[""]),
         "offset": _vector([shift * _MM for shift in offset]),
         "offsets": {"G54": {name: f"{shift * _MM:.4f}" for name, shift in zip("XYZ", offset, strict=True)}},
-        "variables": {"v100": f"{shown['spindle_speed']:.1f}", "v101": f"{shown['feed'] * _MM:.4f}"},
+        "variables": {"v100": f"{state['spindle_speed']:.1f}", "v101": f"{state['feed'] * _MM:.4f}"},
     }
     for i, name in enumerate("XYZ"):
         values[f"{name}.machine"] = f"{mm[''][i]:.4f}"
@@ -100,7 +100,7 @@ def readings(shown: Mapping[str, Any], offset: tuple[float, float, float], alarm
 
 
 def reading(values: Mapping[str, Value], source: str) -> Value:
-    """Return the value of one data item: a reading, a constant (``=text``), or nothing known (empty)."""
+    """Return the value of one data item: a reading, a constant (``=text``), or unavailable (empty source)."""
     if source.startswith("="):
         return source[1:]
     return values[source] if source else UNAVAILABLE

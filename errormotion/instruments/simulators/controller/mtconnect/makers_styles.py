@@ -1,4 +1,4 @@
-"""Device documents in the styles of two makers: facts of public documents, in documents of our own."""
+"""Device documents in the styles of two makers, written after public documents."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The memory of an agent: observations with sequence numbers in a ring, and the state at each of them."""
+"""The buffer of an agent: observations with sequence numbers, and the state at each of them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Observation:
 
 @dataclass
 class State:
-    """The latest observation of every data item; of a condition, one for each native code that is active."""
+    """The latest observation of every data item; for a condition, one for each active native code."""
 
     latest: dict[str, dict[str, Observation]] = field(default_factory=dict)
 
@@ -49,7 +49,7 @@ class State:
             self.latest[seen.item] = {"": seen}
 
     def copy(self) -> State:
-        """Return a state that changes alone."""
+        """Return an independent copy."""
         return State({item: dict(active) for item, active in self.latest.items()})
 
     def observations(self, items: Container[str]) -> list[Observation]:
@@ -59,34 +59,34 @@ class State:
 
 
 class Buffer:
-    """The ring of an agent.
+    """The ring buffer of an agent.
 
     Parameters
     ----------
     size : int
-        Number of observations that are kept.
+        Number of stored observations.
     """
 
     def __init__(self, size: int) -> None:
         self.size = size
         self.next = 1
         self.latest = State()
-        self._kept: deque[Observation] = deque()
-        self._before = State()  # at the sequence number before the first that is kept
+        self._stored: deque[Observation] = deque()
+        self._before = State()  # at the sequence number before the first stored one
 
     @property
     def first(self) -> int:
-        """Lowest sequence number that is kept."""
-        return self._kept[0].sequence if self._kept else self.next
+        """Lowest stored sequence number."""
+        return self._stored[0].sequence if self._stored else self.next
 
     def add(self, item: str, time: str, value: Value) -> None:
-        """Add one observation; the oldest is lost where the ring is full."""
+        """Add one observation; the oldest one is lost if the buffer is full."""
         seen = Observation(self.next, item, time, value)
         self.next += 1
-        self._kept.append(seen)
+        self._stored.append(seen)
         self.latest.apply(seen)
-        if len(self._kept) > self.size:
-            self._before.apply(self._kept.popleft())
+        if len(self._stored) > self.size:
+            self._before.apply(self._stored.popleft())
 
     def values(self) -> Mapping[str, Value]:
         """Return the latest value of every data item."""
@@ -96,9 +96,9 @@ class Buffer:
         }
 
     def at(self, sequence: int) -> State:
-        """Return the state at a sequence number that is kept."""
+        """Return the state at a stored sequence number."""
         state = self._before.copy()
-        for seen in self._kept:
+        for seen in self._stored:
             if seen.sequence > sequence:
                 break
             state.apply(seen)
@@ -107,7 +107,7 @@ class Buffer:
     def select(
         self, begin: int, count: int, items: Container[str], end: int | None = None
     ) -> tuple[list[Observation], int]:
-        """Return at most ``count`` observations of some data items from ``begin`` on, and the number that follows.
+        """Return at most ``count`` observations of some data items from ``begin`` on, and the next sequence number.
 
         A negative ``count`` goes backwards from ``begin``.
         """
@@ -123,10 +123,10 @@ class Buffer:
 
     def _walk(self, begin: int, *, forwards: bool) -> Iterator[Observation]:
         if forwards:
-            return (seen for seen in self._kept if seen.sequence >= begin)
-        return (seen for seen in reversed(self._kept) if seen.sequence <= begin)
+            return (seen for seen in self._stored if seen.sequence >= begin)
+        return (seen for seen in reversed(self._stored) if seen.sequence <= begin)
 
 
 def empty_value(category: str) -> Value:
-    """Return what an agent shows of a data item before its first value."""
+    """Return the value that an agent reports for a data item before its first value."""
     return Condition("Unavailable") if category == "CONDITION" else UNAVAILABLE

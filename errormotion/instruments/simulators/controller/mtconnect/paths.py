@@ -1,4 +1,4 @@
-"""The part of XPath with which requests choose data items, as ``//Linear[@name="X"]/DataItems/DataItem[@id='a']``."""
+"""The part of XPath in requests that selects data items: ``//Linear[@name="X"]/DataItems/DataItem[@id='a']``."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Test = Callable[[Element], bool]
 
 
 class PathError(ValueError):
-    """A path that is no XPath of this part."""
+    """A path that is not in this part of XPath."""
 
 
 def select(root: Element, path: str) -> list[Element]:
-    """Return the elements below ``root`` that a path chooses, each once; ``root`` stands for the document.
+    """Return the elements below ``root`` that a path selects, each once; ``root`` stands for the document.
 
     Raises
     ------

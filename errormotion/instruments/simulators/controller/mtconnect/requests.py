@@ -1,7 +1,7 @@
-"""The grammar of requests: which paths an agent knows, which parameters, and in which ranges.
+"""The grammar of requests: paths and parameters of an agent, and their ranges.
 
-Source: part 1 of the standard (fundamentals), and the requests and answers in the tests of mtconnect/cppagent. That an
-agent of a schema before 2.0 answers errors with status 200, and in other words, is an assumption.
+Source: part 1 of the standard (fundamentals), and the requests and answers in the tests of mtconnect/cppagent.
+Assumption: an agent of a schema before 2.0 answers errors with status 200, and with other texts.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ _KINDS: Mapping[str, Kind] = {
 _NUMBERS = {"from": 0, "at": 0, "to": 0, "count": None, "interval": None, "heartbeat": None}
 _LARGEST = (1 << 31) - 1
 HEARTBEAT = 10.0
-"""Interval of documents without observations in a stream, where the request does not state it, s."""
+"""Default interval of documents without observations in a stream, s."""
 COUNT = 100
 
 
 @dataclass(frozen=True)
 class Request:
-    """A request that the agent understands.
+    """A valid request.
 
     Attributes
     ----------
     kind : str
     device : str
-        Empty: all.
+        Name of the device; empty: all.
     path : str or None
-        Which data items.
+        Path that selects data items.
     begin, end, at : int or None
         Sequence numbers.
     count : int or None
-        Not stated: 100, or the size of a smaller buffer.
+        Number of observations; default: 100, or the size of a smaller buffer.
     interval, heartbeat : float
-        Of a stream, s; no stream where ``interval`` is negative.
+        Intervals of a stream, s; no stream if ``interval`` is negative.
     asset : str
-        Which one; empty = all.
+        Id of the asset; empty: all.
     """
 
     kind: Kind
@@ -61,12 +61,12 @@ class Request:
 
 
 def read_request(path: str, query: Mapping[str, str], schema: tuple[int, int], devices: set[str]) -> Request:
-    """Return the meaning of a request.
+    """Return a parsed request.
 
     Raises
     ------
     RefusedError
-        No such path, or a parameter that is no number.
+        The path is unknown, or a parameter is not a number.
     """
     kind, device, asset = _route(path, schema, devices)
     numbers = {name: _number(name, query[name], schema) for name in _NUMBERS if name in query}
@@ -90,7 +90,7 @@ def read_request(path: str, query: Mapping[str, str], schema: tuple[int, int], d
 
 
 def check_range(name: str, value: int, above: int, below: int, *, zero: bool = True) -> None:
-    """Raise RefusedError unless ``above < value < below``, and not 0 where it is not allowed."""
+    """Raise RefusedError unless ``above < value < below``, and not 0 unless ``zero``."""
     text = ""
     if value <= above:
         text = f"'{name}' must be greater than {above}"

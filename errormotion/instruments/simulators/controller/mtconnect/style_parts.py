@@ -1,7 +1,7 @@
 """Parts of device documents.
 
-A data item has the attribute ``src`` here, the name of the reading that it shows (`machine.readings`): ``=text`` for
-a constant, none where the controller never reports anything. It is taken out before the document is sent.
+A data item has the attribute ``src``, the name of its reading (`machine.readings`): ``=text`` for a constant, none if
+the controller never reports a value. The attribute is removed before the document is sent.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ AXES = "XYZ"
 
 
 def data_item(category: str, kind: str, item_id: str, src: str = "", content: str = "", **more: str) -> str:
-    """Return a data item: category, type, identifier, reading, what is inside, further attributes."""
+    """Return a data item: category, type, identifier, reading, content, further attributes."""
     attributes = "".join(f' {name}="{value}"' for name, value in more.items())
     source = f' src="{src}"' if src else ""
     return f'<DataItem category="{category}" id="{item_id}" type="{kind}"{attributes}{source}>{content}</DataItem>'

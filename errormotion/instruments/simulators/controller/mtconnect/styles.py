@@ -22,7 +22,7 @@ class Style:
     offset : tuple of float
         Work offset, mm.
     multipart : str
-        Kind of multipart stream.
+        Type of multipart stream.
     """
 
     document: Callable[[str, str, str], str]
@@ -32,7 +32,7 @@ class Style:
 
 
 def series() -> str:
-    """Return a component whose data items have several values in an observation."""
+    """Return a component whose data items have several values for each observation."""
     positions = (
         data_item(
             *("SAMPLE", "POSITION", f"{name}series", f"{name}.series"),
@@ -55,7 +55,7 @@ def series() -> str:
 
 
 def own(name: str, uuid: str, serial: str) -> str:
-    """Return the plainest document: one device, three axes, a spindle, a controller with a path."""
+    """Return a minimal document: one device, three axes, a spindle, a controller with a path."""
     axes = "".join(
         f'<Linear id="axis{axis}" name="{axis}">'
         + data_items(

@@ -1,7 +1,7 @@
 """The object CncInterface of OPC 40502 1.00, with the types of the published NodeSet ``Opc.Ua.CNC.NodeSet.xml``.
 
-Tables 7 to 15 name the components; units are those of the instances in the NodeSet. What the virtual machine does not
-have (torque, zero offsets, ...) has the status BadNoData.
+Components are those of Tables 7 to 15; units are those of the instances in the NodeSet. Quantities that the virtual
+machine does not have (torque, zero offsets, ...) have the status BadNoData.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ UNITS = "http://www.opcfoundation.org/UA/units/un/cefact"
 VERSION = "1.00"
 CHANNEL, SPINDLE = "Channel1", "S1"
 
-# UNECE codes, and what is displayed
+# UNECE codes, and displayed units
 MM, PERCENT, NEWTON_METRE, WATT = ("MMT", "mm"), ("P1", "%"), ("NU", "N·m"), ("WTT", "W")
 PER_MINUTE, MM_PER_MINUTE, DEGREE = ("RPM", "r/min"), ("H81", "mm/min"), ("DD", "°")
 Unit = tuple[str, str]
@@ -56,11 +56,11 @@ class Item:
     data : str
         ``Double``, ``UInt32``, ``Boolean``, ``String``, ``NodeId``, an enumeration, or ``position`` (a group).
     source : str
-        Name of the reading, or what follows the name of the axis; empty: not known.
+        Name of the reading, or the part of it after the name of the axis; empty: unknown.
     unit : (str, str), optional
         Code and text.
     constant : object, optional
-        A value that does not change, in place of a reading.
+        A value that does not change, instead of a reading.
     rank : int
         -1: one value; 1: a list.
     """
@@ -272,7 +272,7 @@ class Model:
         )
 
     def _reading(self, item: Item) -> Any:
-        """Return the present value of an item; None where it is not known."""
+        """Return the present value of an item; None if it is unknown."""
         machine = self._machine
         match item.source:
             case "":

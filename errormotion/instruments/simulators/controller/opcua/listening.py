@@ -1,4 +1,4 @@
-"""The listening side of the server: connections whose messages pass through a fault."""
+"""The listening side of the server: connections whose messages can have a fault."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from errormotion.instruments.simulators.faults import Fault, stray_bytes
 
 
 class Outgoing:
-    """Passes the messages of the server on, with the fault that is due.
+    """Passes on the messages of the server, with the fault that applies to them.
 
     Parameters
     ----------
     fault : Fault
     rng : numpy.random.Generator
-        Of the stray bytes.
+        Random numbers for the stray bytes.
     restart : callable
-        Has the server go and come back.
+        Restarts the server.
 
     Attributes
     ----------
     messages : int
-        Messages so far, of all connections.
+        Number of messages so far, of all connections.
     """
 
     def __init__(self, fault: Fault, rng: np.random.Generator, restart: Callable[[], None]) -> None:
@@ -39,15 +39,15 @@ class Outgoing:
 
     @property
     def reached(self) -> bool:
-        """Whether the first message with the fault is due or gone."""
+        """Whether the first message with the fault is the next one, or has been sent."""
         return self.messages >= self._fault.at
 
     def send(self, line: asyncio.Transport, data: bytes) -> None:
-        """Send a message, or do to it what the fault says."""
+        """Send a message, or apply the fault to it."""
         number, fault = self.messages, self._fault
         due = self.reached
         self.messages += 1
-        if (fault.kind == "silence" and due) or fault.hits("drop", number):
+        if fault.suppresses(number):
             return
         if fault.kind == "disconnect" and due:
             line.close()
@@ -68,7 +68,7 @@ class Outgoing:
             line.write(piece)
 
     def _release(self) -> None:
-        """Send the message that was held back, if its connection is still open."""
+        """Send the delayed message, if its connection is still open."""
         held, self._held = self._held, None
         if held is not None and not held[0].is_closing():
             held[0].write(held[1])
@@ -128,7 +128,7 @@ class FaultyServer(Server):
         Raises
         ------
         OSError
-            It cannot listen there.
+            The server cannot listen there.
         """
         assert self.socket_address is not None
         await self._setup_server_nodes()
@@ -141,5 +141,5 @@ class FaultyServer(Server):
 
     @property
     def port(self) -> int:
-        """The port at which it listens."""
+        """The port at which the server listens."""
         return self.bserver.port if self.bserver is not None else 0

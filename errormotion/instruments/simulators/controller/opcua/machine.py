@@ -1,4 +1,4 @@
-"""What the server reports of the virtual machine: readings by name, in the units of a control, as values of nodes."""
+"""Readings of the virtual machine for the server: by name, in the units of a control, as values of nodes."""
 
 from __future__ import annotations
 
@@ -13,49 +13,49 @@ from errormotion.instruments.simulators.controller.mtconnect.machine import EPOC
 from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 
 AXES = "XYZ"
-Shown = dict[str, Any]
+State = dict[str, Any]
 _MM, _PERCENT, _PER_MINUTE = 1e3, 1e2, 60.0
 STEADY = 0.5
-"""A spindle within so many 1/min of its set speed has reached it."""
+"""Largest difference from the set speed at which a spindle has reached it, 1/min."""
 
 
 class Machine:
-    """The readings of one instant, renewed at each request.
+    """The readings at one instant, updated at each request.
 
     Parameters
     ----------
     world : VirtualWorld
     unavailable : callable
-        Whether the machine is out of reach: then all values have a bad status.
+        Returns whether the machine is not reachable; all values then have a bad status.
 
     Attributes
     ----------
     time : ua.DateTime
-        Of the instant, on the clock of the world.
+        Time of the instant, on the clock of the world.
     """
 
     def __init__(self, world: VirtualWorld, unavailable: Callable[[], bool]) -> None:
         self._world = world
         self._unavailable = unavailable
-        self._shown: dict[object, tuple[Any, ua.DateTime]] = {}  # of a node: its value, and when it became that
+        self._shown: dict[object, tuple[Any, ua.DateTime]] = {}  # by node: value, and time of its last change
         self.refresh()
 
     def refresh(self) -> None:
         """Read the machine."""
-        shown = self._world.commanded()
-        self.time = ua.DateTime.fromisoformat((EPOCH + timedelta(seconds=shown["time"])).isoformat())
-        self._readings = readings(shown)
+        state = self._world.commanded()
+        self.time = ua.DateTime.fromisoformat((EPOCH + timedelta(seconds=state["time"])).isoformat())
+        self._readings = readings(state)
         self._good = not self._unavailable()
 
     def reading(self, name: str) -> Any:
-        """Return a reading; None where the machine has none of this name or it is not known."""
+        """Return a reading; None if the machine has none with this name, or it is unknown."""
         return self._readings.get(name)
 
     def value(self, node: object, value: Any, kind: ua.VariantType) -> ua.DataValue:
-        """Return the value of a node; None and a machine out of reach become a bad status.
+        """Return the value of a node; None, or a machine that is not reachable, results in a bad status.
 
-        The time of the source is that of the last change of value or status, as far as requests have seen it
-        (OPC 10000-4, 7.11.3).
+        The source timestamp is the time of the last change of value or status that a request has read (OPC 10000-4,
+        7.11.3).
         """
         status = StatusCodes.Good
         if not self._good or value is None:
@@ -76,38 +76,38 @@ class Machine:
         return ua.DataValue(ua.Variant(self.time, ua.VariantType.DateTime), ServerTimestamp=self.time)
 
 
-def readings(shown: Shown) -> dict[str, Any]:
+def readings(state: State) -> dict[str, Any]:
     """Return the readings by name: positions in mm, feed in mm/min, speeds in 1/min, load in %.
 
     Parameters
     ----------
-    shown : dict
-        What the controller of the world displays.
+    state : dict
+        State that the controller of the world displays.
     """
-    moving = bool(shown["running"] or shown["stepping"])
-    speed, wanted = shown["spindle_speed"], shown["commanded_spindle_speed"]
+    moving = bool(state["running"] or state["stepping"])
+    speed, wanted = state["spindle_speed"], state["commanded_spindle_speed"]
     found: dict[str, Any] = {
         "moving": moving,
-        "homed": shown["homed"],
-        "mode": shown["mode"],
-        "program": shown["program"],
-        "feed": shown["feed"] * _MM * _PER_MINUTE,
+        "homed": state["homed"],
+        "mode": state["mode"],
+        "program": state["program"],
+        "feed": state["feed"] * _MM * _PER_MINUTE,
         "speed": abs(speed),
         "set speed": abs(wanted),
-        "load": shown["spindle_load"] * _PERCENT,
+        "load": state["spindle_load"] * _PERCENT,
         "spindle": _spindle(speed, wanted),
         "direction": 0 if abs(speed) < STEADY else 1 if speed > 0 else 2,
     }
     for i, axis in enumerate(AXES):
-        found[f"{axis}.actual"] = shown["position"][i] * _MM
-        found[f"{axis}.set"] = shown["commanded_position"][i] * _MM
-        # the world does not state where a motion ends
+        found[f"{axis}.actual"] = state["position"][i] * _MM
+        found[f"{axis}.set"] = state["commanded_position"][i] * _MM
+        # unknown during a motion
         found[f"{axis}.left"] = None if moving else 0.0
     return found
 
 
 def _spindle(speed: float, wanted: float) -> int:
-    """Return the state of the spindle as of OPC 40502, Table 20."""
+    """Return the state of the spindle by OPC 40502, Table 20."""
     if abs(speed - wanted) <= STEADY:
         return 1 if abs(wanted) > STEADY else 0
     return 2 if abs(speed) < abs(wanted) else 3

@@ -1,4 +1,4 @@
-"""The simulated server: a virtual machine, an address space, and the thread that serves it."""
+"""The simulated server: a virtual machine, an address space, and the serving thread."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from errormotion.instruments.transports.loopback.serving import listening_at, no
 STYLES = ("cnc", "sinumerik")
 UNITS = ("model", "ua")
 REFRESH = 0.05
-"""Time between two looks at the machine for subscriptions, s."""
+"""Interval between two readings of the machine for subscriptions, s."""
 
 
 class SimulatedServer:
-    """An OPC UA server whose machine is the virtual one; the parameters of its address are those of this package.
+    """An OPC UA server of the virtual machine; see the package for the parameters of its address.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class SimulatedServer:
     Raises
     ------
     InstrumentError
-        Unknown style, units or fault, or it cannot listen.
+        Unknown style, units or fault, or the server cannot listen.
     """
 
     faults = ("silence", "split", "garbage", "drop", "disconnect", "late", "unavailable", "restart")
@@ -82,7 +82,7 @@ class SimulatedServer:
         self.url = f"opc.tcp://{reachable_at(self._host, self._port)}/{self._path}"
 
     def close(self) -> None:
-        """End the server; with the last device of its world the world ends. Idempotent."""
+        """End the server; the last device of a world also ends the world. Idempotent."""
         with self._lock:
             closed, self._closed = self._closed, True
         if closed:
@@ -91,7 +91,7 @@ class SimulatedServer:
         self.world.detach(self)
 
     def report_delivered(self, samples: int) -> None:
-        """Take no note: a server follows the world's clock and never drives it."""
+        """Do nothing: a server follows the world's clock and never drives it."""
 
     # ------------------------------------------------------------------ in the thread of the server
 
@@ -99,7 +99,7 @@ class SimulatedServer:
         return self.fault.kind == "unavailable" and self._outgoing.reached
 
     async def _start(self) -> None:
-        """Start a server at the port of the last one, with an address space of its own."""
+        """Start a server with a new address space, at the port of the previous one."""
         server, inner = await prepare_server(self._outgoing, self._host, self._port, self._path)
         release = version("errormotion")
         await server.set_build_info(
@@ -116,7 +116,7 @@ class SimulatedServer:
         self._refreshing = asyncio.create_task(self._refresh(inner))
 
     async def _fill(self, server: FaultyServer, space: Space) -> Any:
-        """Add the nodes of the style; return what reads nodes that are not in the space."""
+        """Add the nodes of the style; return a function that reads nodes that are not in the space."""
         if self._style == "sinumerik":
             await server.register_namespace(sinumerik.NAMESPACE)
             sinumerik.add(space, self._machine)
@@ -134,7 +134,7 @@ class SimulatedServer:
         return None
 
     async def _add_clock(self, server: FaultyServer, space: Space) -> None:
-        """Have the server show the time of the world as its own."""
+        """Set the clock of the server to the time of the world."""
         started = self._machine.time
         ids = (Ids.Server_ServerStatus, Ids.Server_ServerStatus_StartTime, Ids.Server_ServerStatus_CurrentTime)
         whole, start, now = (numeric(each) for each in ids)
@@ -149,21 +149,21 @@ class SimulatedServer:
         space.live(now, self._machine.clock)
 
     async def _refresh(self, inner: SmallServer) -> None:
-        """Report the values of nodes that clients have subscribed to."""
+        """Report the values of nodes to which clients have subscribed."""
         while True:
             await asyncio.sleep(REFRESH)
             if not inner.subscription_service.subscriptions:
                 continue
             self._machine.refresh()
             for node in list(inner.aspace.keys()):
-                held = inner.aspace[node].attributes.get(AttributeIds.Value)
-                if held is None or held.value_callback is None:
+                value = inner.aspace[node].attributes.get(AttributeIds.Value)
+                if value is None or value.value_callback is None:
                     continue
-                for handle, report in list(held.datachange_callbacks.items()):
-                    await report(handle, held.value_callback(node, AttributeIds.Value))
+                for handle, report in list(value.datachange_callbacks.items()):
+                    await report(handle, value.value_callback(node, AttributeIds.Value))
 
     def _restart(self) -> None:
-        """Go and come back: sessions and subscriptions are forgotten."""
+        """Restart: sessions and subscriptions are lost."""
         self._restarting = asyncio.create_task(self._again())
 
     async def _again(self) -> None:

@@ -1,4 +1,4 @@
-"""What the simulated OPC UA servers share: a thread that serves, and a server whose answers may be faulty."""
+"""Common parts of the simulated OPC UA servers: the serving thread, and a server whose answers may be faulty."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ Result = TypeVar("Result")
 
 
 class ServingThread:
-    """A thread with an event loop of its own.
+    """A thread with an event loop.
 
     Parameters
     ----------
     name : str
-        Of the thread.
+        Name of the thread.
     """
 
     def __init__(self, name: str) -> None:
-        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # what a client does wrong is no concern of the user
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # errors of clients do not concern the user
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name=name, daemon=True)
         self._thread.start()
 
     def run(self, work: Coroutine[Any, Any, Result]) -> Result:
-        """Return what the work returns; it runs in the thread."""
+        """Run a coroutine in the thread; return its result."""
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
 
     def end(self, last: Coroutine[Any, Any, None]) -> None:
-        """Do the last work, cancel everything that still runs in the thread, and end it."""
+        """Run a last coroutine, cancel all running tasks, and end the thread."""
         self.run(self._end(last))
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
@@ -54,9 +54,9 @@ class ServingThread:
 
 
 async def prepare_server(outgoing: Outgoing, host: str, port: int, path: str) -> tuple[FaultyServer, SmallServer]:
-    """Return a server that is not started yet, without security, and the part of it that holds the address space."""
+    """Return a server without security, not yet started, and its part with the address space."""
     inner = SmallServer()
-    inner.disabled_clock = True  # its thread would delay the end by a second; the time is read at each request
+    inner.disabled_clock = True  # its thread would delay the end by a second; requests read the time themselves
     inner.allow_remote_admin = False
     server = FaultyServer(inner)
     server.outgoing = outgoing

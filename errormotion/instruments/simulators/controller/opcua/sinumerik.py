@@ -1,9 +1,9 @@
 """Variables of a SINUMERIK, by their paths.
 
 Sources: Siemens, SINUMERIK Access MyMachine / OPC UA, Configuration Manual 12/2017, 5.3.1 with Table 5-1 (form of the
-ids, lists, upper and lower case) and Commissioning Manual 10/2015, 4.2 (what browsing shows: paths without index, which
-stand for the first unit and row; BadAttributeIdInvalid for what the configuration does not have); SINUMERIK 840D sl,
-NC variables (names, units, values of ``opMode`` and ``progStatus``).
+ids, lists, upper and lower case) and Commissioning Manual 10/2015, 4.2 (result of browsing: paths without index, which
+stand for the first unit and row; BadAttributeIdInvalid for variables that the configuration does not have); SINUMERIK
+840D sl, NC variables (names, units, values of ``opMode`` and ``progStatus``).
 
 Assumptions: the types of the values, the ids of the folders, BadNodeIdUnknown for a path that does not exist, and that
 metric positions are displayed.
@@ -27,7 +27,7 @@ INDEX = 2
 """Index of the namespace of the variables."""
 R_PARAMETERS = 100
 LONGEST_ID = 200
-"""Characters of an id."""
+"""Largest number of characters of an id."""
 _ID = re.compile(r"(/\w+/\w+/\w+)(?:\[u(\d{1,4})(?:, ?(\d{1,4})(?:, ?(#?)(\d{1,4}))?)?\])?", re.ASCII)
 _MODES = {"manual": 0, "mdi": 1, "automatic": 2}
 _RUNNING, _ABORTED = 3, 5
@@ -37,7 +37,7 @@ _DOUBLE, _TEXT, _WORD = ua.VariantType.Double, ua.VariantType.String, ua.Variant
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable: its rows, the type of a value, and what reads a row from 0."""
+    """A variable: its rows, the type of a value, and a function that reads a row (from 0)."""
 
     rows: int
     kind: ua.VariantType
@@ -89,7 +89,7 @@ def add(space: Space, machine: Machine) -> None:
         data_type = number(_TYPES[variable.kind])
         title = ua.QualifiedName(name, ua.UInt16(INDEX))
         space.variable(_id(path), title, folders["/".join(above)], data_type, _row(machine, variable, 0))
-        # not shown by browsing; as nodes they can be subscribed to
+        # not found by browsing; as nodes they can be subscribed to
         for row in range(min(variable.rows, len(AXES))):
             node = _id(f"{path}[u1,{row + 1}]")
             space.variable(node, title, None, data_type, _row(machine, variable, row))
@@ -98,7 +98,7 @@ def add(space: Space, machine: Machine) -> None:
 
 
 def value(machine: Machine, node: ua.NodeId) -> ua.DataValue | None:
-    """Return the value of a variable by its id; None where it is no id of a variable."""
+    """Return the value of a variable by its id; None if the id is not that of a variable."""
     identifier = node.Identifier
     if node.NamespaceIndex != INDEX or not isinstance(identifier, str) or len(identifier) > LONGEST_ID:
         return None

@@ -1,7 +1,7 @@
-"""The address space: the standard nodes of a small server, and what adds nodes.
+"""The address space: the standard nodes of a small server, and functions to add nodes.
 
-The package asyncua loads more than 6000 standard nodes, which takes seconds. Here are those that a client of a small
-server needs; OPC 10000-7 leaves the type system to larger profiles.
+The package asyncua loads more than 6000 standard nodes, which takes seconds. This module adds those that a client of a
+small server needs; OPC 10000-7 requires the type system only of larger profiles.
 """
 
 from __future__ import annotations
@@ -101,11 +101,11 @@ def number(identifier: int, namespace: int = UA) -> ua.NodeId:
 
 
 class Space:
-    """What adds nodes to the address space of a server."""
+    """Adds nodes to the address space of a server."""
 
     def __init__(self, server: InternalServer) -> None:
         self._nodes = server.node_mgt_service
-        self._held = server.aspace
+        self._addresses = server.aspace
 
     def add(
         self,
@@ -127,9 +127,9 @@ class Space:
             TypeDefinition=definition or ua.NodeId(),
             NodeAttributes=attributes,
         )
-        item.NodeClass = _class_of(attributes)  # no argument of older versions of the package
+        item.NodeClass = _class_of(attributes)  # not an argument in older versions of the package
         left = list(self._nodes.try_add_nodes([item], check=False))
-        if left or node not in self._held:
+        if left or node not in self._addresses:
             raise InstrumentError(f"the simulated OPC UA server cannot add the node {node.to_string()}")
         return node
 
@@ -171,7 +171,7 @@ class Space:
         reference: int = Ids.HasComponent,
         rank: int = -1,
     ) -> ua.NodeId:
-        """Add a variable with a value that stays, or with what reads it; nobody but the server writes it."""
+        """Add a variable with a constant value, or with a function that reads it; clients cannot write it."""
         attributes = ua.VariableAttributes(DataType=data_type, ValueRank=ua.Int32(rank))
         attributes.AccessLevel = attributes.UserAccessLevel = ua.Byte(1)  # bit 0: it can be read
         attributes.Value = value if isinstance(value, ua.Variant) else ua.Variant()
@@ -183,8 +183,8 @@ class Space:
         return node
 
     def live(self, node: ua.NodeId, read: Reader) -> None:
-        """Have the value of a variable read anew at each request."""
-        self._held.set_attribute_value_callback(node, AttributeIds.Value, lambda _node, _attribute: read())
+        """Read the value of a variable at each request."""
+        self._addresses.set_attribute_value_callback(node, AttributeIds.Value, lambda _node, _attribute: read())
 
 
 _TYPE_FOLDERS = {number(folder) for folder in _FOLDER_OF.values()}
@@ -247,7 +247,7 @@ def _add_server(space: Space) -> None:
 
 
 class Attributes(AttributeService):
-    """Reads attributes; of one request, all values belong to one instant.
+    """Reads attributes; all values of one request belong to the same instant.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ class Attributes(AttributeService):
         self._further = further
 
     def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
-        """Return the attributes that a request names."""
+        """Return the attributes of a request."""
         self._refresh()
         return [self._read(each.NodeId, each.AttributeId) for each in params.NodesToRead]
 

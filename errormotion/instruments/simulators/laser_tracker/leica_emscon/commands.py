@@ -1,7 +1,7 @@
 """Commands that move the beam, level the tracker and measure.
 
-Each method is named after its command and takes its values in SI; it returns a status, the values of the reply, or
-all packets.
+Each method has the name of its command and takes its values in SI; it returns a status, the values of the reply, or all
+packets.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class Commands(StateCommands):
     def _do_Initialize(self) -> bytes:
         self._device.initialised = True
         self._device.tracker.face = 1
-        before = self._said(Event.BUSY, Event.INITIALISATION)
+        before = self._status_changes(Event.BUSY, Event.INITIALISATION)
         level = self._level() if self.system[LEVEL] else b""
-        return before + level + self._ok("Initialize") + self._said(Event.READY)
+        return before + level + self._ok("Initialize") + self._status_changes(Event.READY)
 
     def _do_StartNivelMeasurement(self) -> int | bytes:
         if not self.system[LEVEL]:
@@ -63,7 +63,7 @@ class Commands(StateCommands):
 
     @property
     def _away(self) -> bool:
-        """Whether the beam was sent away from the reflector."""
+        """Whether the beam was pointed away from the reflector."""
         return self._device.tracker.broken and self._device.tracker.pointing != NEST
 
     def _do_GetCurrentPrismPosition(self) -> list[Any] | int:
@@ -115,11 +115,11 @@ class Commands(StateCommands):
 
     def _moved(self, name: str, before: bytes, *, found: bool) -> bytes:
         tracker = self._device.tracker
-        before += self._said(Event.BUSY)
-        if not found or (tracker.broken and not tracker.mends()):
+        before += self._status_changes(Event.BUSY)
+        if not found or (tracker.broken and not tracker.can_lock()):
             tracker.broken = True
             refused = self._device.wire.reply(NUMBERS[name], Status.NO_RESULT)
-            return before + self._said(Event.NOT_READY) + refused
+            return before + self._status_changes(Event.NOT_READY) + refused
         tracker.pointing = NEST
         return before + self._device.locked() + self._ok(name)
 
@@ -152,15 +152,15 @@ class Commands(StateCommands):
         return self._point("ActivateCameraView", self._device.tracker.now())
 
     def _point(self, name: str, direction: Triple) -> bytes:
-        """Send the beam somewhere without a reflector: it is lost."""
+        """Point the beam in a direction without a reflector: it is broken."""
         tracker = self._device.tracker
         tracker.broken, tracker.pointing = True, direction
-        return self._ok(name) + self._said(Event.NOT_READY)
+        return self._ok(name) + self._status_changes(Event.NOT_READY)
 
     def _do_ChangeFace(self) -> bytes:
         tracker = self._device.tracker
         tracker.face = 3 - tracker.face
-        return self._ok("ChangeFace") + self._said(Event.FACE_1 if tracker.face == 1 else Event.FACE_2)
+        return self._ok("ChangeFace") + self._status_changes(Event.FACE_1 if tracker.face == 1 else Event.FACE_2)
 
     # ------------------------------------------------------------------ measuring
 
@@ -177,18 +177,20 @@ class Commands(StateCommands):
         if mode not in known or (mode in PROFILES and self._device.version < (3, 8, 0)):
             return Status.NOT_IMPLEMENTED
         self._mode = mode
-        return self._ok("SetMeasurementMode") + self._said(Event.MODE)
+        return self._ok("SetMeasurementMode") + self._status_changes(Event.MODE)
 
     def _do_StartMeasurement(self) -> bytes | int:
         if not self._device.initialised:
             return Status.NOT_INITIALISED
         if self._mode in (BY_TIME, BY_DISTANCE, GRID):
             self._device.stream.start_soon(self._mode)
-            return self._ok("StartMeasurement") + self._said(Event.BUSY)
+            return self._ok("StartMeasurement") + self._status_changes(Event.BUSY)
         before = self._device.use_beam()
         if self._device.tracker.broken:
             return before + self._device.wire.reply(NUMBERS["StartMeasurement"], Status.NOT_READY)
-        return before + self._said(Event.BUSY) + self._position() + self._ok("StartMeasurement") + self._single()
+        return (
+            before + self._status_changes(Event.BUSY) + self._position() + self._ok("StartMeasurement") + self._single()
+        )
 
     def _do_GoAndMeasure(self, position: Triple) -> bytes | int:
         tracker = self._device.tracker
@@ -196,31 +198,31 @@ class Commands(StateCommands):
             return Status.NOT_IMPLEMENTED
         if not self._device.initialised:
             return Status.NOT_INITIALISED
-        before = self._device.use_beam() + self._said(Event.BUSY)
-        if not tracker.near(position, self._radius) or (tracker.broken and not tracker.mends()):
+        before = self._device.use_beam() + self._status_changes(Event.BUSY)
+        if not tracker.near(position, self._radius) or (tracker.broken and not tracker.can_lock()):
             tracker.broken = True
             refused = self._device.wire.reply(NUMBERS["GoAndMeasure"], Status.NO_RESULT)
-            return before + self._said(Event.NOT_READY) + refused
+            return before + self._status_changes(Event.NOT_READY) + refused
         tracker.broken, tracker.pointing = False, NEST
         return before + self._ok("GoAndMeasure") + self._single()
 
     def _do_StopMeasurement(self) -> bytes:
         self._device.stream.end()
-        return self._ok("StopMeasurement") + self._said(Event.READY)
+        return self._ok("StopMeasurement") + self._status_changes(Event.READY)
 
     def _single(self) -> bytes:
         device, tracker = self._device, self._device.tracker
         change = b""
         if abs(tracker.index() - self._reported_index) > 1e-8:
             self._reported_index = tracker.index()
-            change = self._said(Event.REFRACTION)
-        self._last_point = seen = tracker.now()
+            change = self._status_changes(Event.REFRACTION)
+        self._last_point = position = tracker.now()
         extended = device.always_extended or device.blocks[NUMBERS["SetStatisticMode"]].values[0]
-        spread, errors = device.spread(seen), [0.0, 0.0, 0.0]
+        spread, errors = device.spread(position), [0.0, 0.0, 0.0]
         mode = self._mode if self._mode not in PROFILES else STATIONARY
-        head = [0, mode, device.try_mode, seen]
+        head = [0, mode, device.try_mode, position]
         if extended:
             result = device.wire.result(packets.SINGLE2, [*head, *spread, *errors, *spread, *tracker.air()])
         else:
             result = device.wire.result(packets.SINGLE, [*head, *spread[:2], *errors, *spread[:2], *tracker.air()])
-        return change + result + self._said(Event.READY)
+        return change + result + self._status_changes(Event.READY)

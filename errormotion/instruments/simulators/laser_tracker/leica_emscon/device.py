@@ -1,4 +1,4 @@
-"""The simulated server on the wire: requests, replies, events, and the faults between them."""
+"""The simulated server on its line: requests, replies, events, and faults."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from errormotion.instruments.transports import Address
 BEAM_ERROR = 201
 """Status of the error that reports a broken beam: a number of the tracker processor (assumed)."""
 LARGEST = 1e12
-"""Numbers of a request beyond this, in SI, and those that are none, are wrong parameters (assumed)."""
+"""Larger numbers of a request, in SI, and NaN are wrong parameters (assumed)."""
 VERSIONS = {"3.6": (3, 6, 500), "3.8": (3, 8, 900)}
 
 
@@ -34,14 +34,14 @@ class SimulatedEmScon(SimulatedDevice):
     Further parameters of the address: those of `tracker.Tracker`; ``tracker`` (``AT901`` or ``AT4xx``), ``server``
     (``3.8`` or ``3.6``), ``initialised`` (1), ``result`` (1; with 2 every single measurement is the longer packet).
 
-    Between the answers come status changes, levels and reflector positions, as from the real one.
+    It sends status changes, levels and reflector positions between the answers, as a real one.
 
-    Faults beyond the menu, from ``fault_at`` on, ``fault_for`` times (without end): ``busy`` (answers), ``beam_broken``
-    (points, measurements and motions), ``refuse`` and ``error`` (answers; ``code`` is their status).
+    Faults in addition to the menu, from ``fault_at`` on, ``fault_for`` times (without end): ``busy`` (answers),
+    ``beam_broken`` (points, measurements and motions), ``refuse`` and ``error`` (answers; ``code`` is their status).
     """
 
     faults = ("silence", "split", "garbage", "drop", "disconnect", "late", "busy", "beam_broken", "refuse", "error")
-    drops_answers = False  # `drop` and `disconnect` are about points of a stream
+    drops_answers = False  # `drop` and `disconnect` affect points of a stream
 
     def __init__(self, address: Address) -> None:
         self.points: PointStream | None = None
@@ -63,7 +63,7 @@ class SimulatedEmScon(SimulatedDevice):
             address,
             self._rng,
             absolute=kind == "AT4xx",
-            obstructed=lambda use: self.fault.kind == "beam_broken" and self._hits(use),
+            obstructed=lambda use: bool(self.fault.affects("beam_broken", use)),
         )
         self.initialised = bool(address.number("initialised", 1))
         self.always_extended = address.number("result", 1) == 2
@@ -79,7 +79,7 @@ class SimulatedEmScon(SimulatedDevice):
 
     @property
     def dead_path(self) -> float:
-        """Error of the distances by their start, m."""
+        """Error of the distances from their start value, m."""
         return self.tracker.dead_path
 
     @dead_path.setter
@@ -87,7 +87,7 @@ class SimulatedEmScon(SimulatedDevice):
         self.tracker.dead_path = value
 
     def carry_to(self, position: Sequence[float]) -> None:
-        """Put the tracker near a position in machine coordinates, m, as people do; it counts from a new start."""
+        """Set up the tracker near a position in machine coordinates, m; distances get a new start value."""
         self.tracker.carry_to(position)
 
     def close(self) -> None:
@@ -99,12 +99,12 @@ class SimulatedEmScon(SimulatedDevice):
             self.points.end()
 
     def report_delivered(self, samples: int) -> None:
-        """Let the world's clock follow the reader, unless others drive it."""
+        """Advance the world's clock with the reader, unless another device controls it."""
         if self.points is not None:
             self.points.report_delivered(samples)
 
     def connection_opened(self) -> None:
-        """Forget the incomplete request, and end the measurement, of the connection before."""
+        """Discard an incomplete request, and end the measurement, of the previous connection."""
         super().connection_opened()
         if self.points is not None:
             self.points.request_end()
@@ -127,18 +127,17 @@ class SimulatedEmScon(SimulatedDevice):
                 self.points.start_if_due()
 
     def answer(self, request: bytes) -> bytes:
-        """Return the answer to one request, with what comes unrequested before and behind it."""
+        """Return the answer to one request, with the unrequested packets before and after it."""
         _, kind = HEADER.unpack_from(request)
         if kind != packets.COMMAND or len(request) < HEADER.size + 4:
             return self.error(UNKNOWN, Status.WRONG_PARAMETER)
         number = int.from_bytes(request[HEADER.size : HEADER.size + 4], "little", signed=True)
-        if self._hits(self._answers):
-            if self.fault.kind == "busy":
-                return self.wire.reply(number, Status.BUSY)
-            if self.fault.kind == "refuse":
-                return self.wire.reply(number, self._code)
-            if self.fault.kind == "error":
-                return self.error(number, self._code)
+        if self.fault.affects("busy", self._answers):
+            return self.wire.reply(number, Status.BUSY)
+        if self.fault.affects("refuse", self._answers):
+            return self.wire.reply(number, self._code)
+        if self.fault.affects("error", self._answers):
+            return self.error(number, self._code)
         if number not in COMMANDS or (self.tracker.absolute and number not in AT4XX):
             return self.wire.reply(number, Status.NOT_IMPLEMENTED)
         arguments = request[HEADER.size + 4 :]
@@ -149,9 +148,9 @@ class SimulatedEmScon(SimulatedDevice):
         values = self.wire.unpack(COMMANDS[number].request, arguments)
         if not np.all(np.abs(np.hstack([0.0, *values])) < LARGEST):
             return self.wire.reply(number, Status.WRONG_PARAMETER)
-        return self._done(number, values)
+        return self._execute(number, values)
 
-    def _done(self, number: int, values: list[Any]) -> bytes:
+    def _execute(self, number: int, values: list[Any]) -> bytes:
         name = COMMANDS[number].name
         if name in ABSENT:
             return self.wire.reply(number, ABSENT[name])
@@ -185,14 +184,10 @@ class SimulatedEmScon(SimulatedDevice):
         """Whether a continuous measurement is running."""
         return self.points is not None and self.points.running
 
-    def _hits(self, number: int) -> bool:
-        fault = self.fault
-        return number >= fault.at and (fault.length == 0 or number < fault.at + fault.length)
-
     # ------------------------------------------------------------------ unrequested packets
 
-    def said(self, *events: int) -> bytes:
-        """Return the packets that report changes; none where the client has switched them off."""
+    def status_changes(self, *events: int) -> bytes:
+        """Return the packets that report changes; none if the client has switched them off."""
         if not self._commands.system[UNSOLICITED]:
             return b""
         return b"".join(self.wire.result(packets.CHANGE, [event]) for event in events)
@@ -202,35 +197,35 @@ class SimulatedEmScon(SimulatedDevice):
         return self.wire.result(packets.ERROR, [number, status])
 
     def use_beam(self) -> bytes:
-        """Count one use of the beam; return what the server states where that breaks it."""
+        """Count one use of the beam; return the packets that report that it breaks."""
         if self.tracker.use_beam():
-            return self.error(UNKNOWN, BEAM_ERROR) + self.said(Event.NOT_READY)
+            return self.error(UNKNOWN, BEAM_ERROR) + self.status_changes(Event.NOT_READY)
         return b""
 
     def locked(self) -> bytes:
-        """Take up the reflector; return what the server states then."""
+        """Lock on to the reflector; return the packets that report this."""
         self.tracker.lock()
-        return self.said(Event.DISTANCE_SET, Event.READY)
+        return self.status_changes(Event.DISTANCE_SET, Event.READY)
 
     @property
     def try_mode(self) -> int:
         """Whether the client has switched on the try mode, 0 or 1."""
         return self._commands.system[TRY]
 
-    def spread(self, seen: Triple) -> list[Any]:
+    def spread(self, position: Triple) -> list[Any]:
         """Return the standard deviations of a position in the client's system, their total (m), and no covariances."""
         tracker, system = self.tracker, self.wire.system
         sigmas = (tracker.angle_noise, tracker.angle_noise, tracker.noise)
-        total = math.hypot(*deviations(seen, sigmas, RHR))
-        return [deviations(seen, sigmas, system), self.wire.units.out("L", total), 0.0, 0.0, 0.0]
+        total = math.hypot(*deviations(position, sigmas, RHR))
+        return [deviations(position, sigmas, system), self.wire.units.out("L", total), 0.0, 0.0, 0.0]
 
     def silent(self) -> bool:
-        """Whether the fault ``silence`` holds."""
+        """Whether the fault ``silence`` is active."""
         return self.fault.kind == "silence" and self._silent()
 
     def send(self, packet: bytes) -> bool:
         """Send a packet between the answers; False without a connection."""
-        with self._server.lock:  # an answer may want to go out as well
+        with self._server.lock:  # an answer may be sent at the same time
             return all(map(self._server.send, self.fault.pieces(packet)))
 
     def disconnect(self) -> None:

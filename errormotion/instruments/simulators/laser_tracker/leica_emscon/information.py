@@ -1,4 +1,4 @@
-"""What the server states about itself and the tracker: values of the Get commands, in SI, by the header's order."""
+"""Properties of the server and the tracker: values of the Get commands, in SI, in the order of the header."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MODELS = {
 
 
 def identity(model: Model, version: tuple[int, int, int]) -> dict[str, list[Any]]:
-    """Return the replies that never change, by the names of their commands."""
+    """Return the constant replies by the names of their commands."""
     text = ".".join(map(str, version))
     absolute = model.processor == MODELS["AT4xx"].processor
     compensation = [1, 1, "Factory", "", "Factory"]
@@ -96,10 +96,10 @@ ABSENT: Mapping[str, Status] = {
         Status.NOT_IMPLEMENTED,
     ),
 }
-"""Commands of parts that this tracker does not have, and of computations that the simulator does not make."""
+"""Commands of parts that this tracker does not have, and of calculations that the simulator does not perform."""
 IDLE = frozenset({
     *("ExitApplication", "ReleaseMotors", "SwitchLaser", "Park", "ClearCommandQueue"),
     *("ClearTransformationNominalPointList", "ClearTransformationActualPointList", "AddTransformationNominalPoint"),
     *("AddTransformationActualPoint", "ClearDrivePointList", "AddDrivePoint"),
 })  # fmt: skip
-"""Commands that are accepted and change nothing that a measurement shows."""
+"""Commands that are accepted and do not affect measurements."""

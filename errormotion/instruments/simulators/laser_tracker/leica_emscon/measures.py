@@ -1,4 +1,4 @@
-"""Units and coordinate systems that a client of emScon chooses: from SI and spherical coordinates and back.
+"""Units and coordinate systems of an emScon client: conversion from SI and spherical coordinates, and back.
 
 The numbers are those of the header ``Enum.h`` of the TPI 3.6 (ES_LengthUnit to ES_CoordinateSystemType).
 """
@@ -34,7 +34,7 @@ class Units:
 
     @property
     def wrong(self) -> int:
-        """Position of the first number that is no unit, from 1; 0 where all are."""
+        """Position of the first invalid number, from 1; 0 if all are valid."""
         counts = (len(LENGTHS), len(ANGLES), 2, len(PRESSURES), 1)
         for position, (field, count) in enumerate(zip(fields(self), counts, strict=True), 1):
             if not 0 <= getattr(self, field.name) < count:
@@ -76,7 +76,7 @@ def kinds(system: int) -> str:
 def to_system(spherical: Triple, system: int) -> Triple:
     """Return azimuth, zenith angle (rad) and distance (m) in a coordinate system.
 
-    Left-handed systems have one axis reversed; in clockwise ones the azimuth has the other sign. Cylindrical
+    Left-handed systems have one axis reversed; in clockwise systems the sign of the azimuth is reversed. Cylindrical
     coordinates are the distance from the vertical axis, the azimuth and the height (the order is assumed).
     """
     azimuth, zenith, distance = spherical

@@ -30,7 +30,7 @@ MAX_REQUEST = 256
 """Bytes; the longest request of the header has 128."""
 COMMAND, ERROR, SINGLE, MULTI, NIVEL, REFLECTOR, CHANGE, SINGLE2, MULTI2 = 0, 1, 2, 3, 6, 7, 8, 9, 10
 UNKNOWN = 64
-"""Number of a command in an error that belongs to none."""
+"""Number of the command in an error without a command."""
 
 
 class Layout(NamedTuple):
@@ -188,7 +188,7 @@ AT4XX = frozenset((
     *(79, 80, 81, 83, 84, 85, 86, 90, 91, 92, 93, 95, 98, *range(120, 124), *range(125, 128), *range(129, 136)),
     *(138, 139, 140, 142),
 ))  # fmt: skip
-"""Commands in the header of the AT4xx; the others it does not implement."""
+"""Commands in the header of the AT4xx; it does not implement the others."""
 NUMBERS: Mapping[str, int] = {layout.name: number for number, layout in COMMANDS.items()}
 
 RESULTS: Mapping[int, str] = {
@@ -252,13 +252,13 @@ class Wire:
         return b"".join(parts)
 
     def reply(self, number: int, status: int = 0, values: Sequence[Any] | None = None) -> bytes:
-        """Return the reply to a command; its data are 0 where there are none. It always has the size of the header."""
+        """Return the reply to a command; without data, the data are 0. The size is always that of the header."""
         layout = COMMANDS[number].reply if number in COMMANDS else ""
         data = bytes(size_of(layout)) if values is None else self.pack(layout, values)
         return HEADER.pack(BASIC + len(data), COMMAND) + struct.pack("<ii", number, status) + data
 
     def result(self, kind: int, values: Sequence[Any], points: Sequence[Sequence[Any]] = ()) -> bytes:
-        """Return a packet that is no reply."""
+        """Return a packet other than a reply."""
         data = self.pack(RESULTS[kind], values)
         if points:
             data += b"".join(self.pack(POINTS[kind], point) for point in points)

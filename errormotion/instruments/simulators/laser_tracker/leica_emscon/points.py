@@ -1,4 +1,4 @@
-"""Continuous measurements: points by time, by distance or on a grid, until the number asked for or the stop."""
+"""Continuous measurements: points by time, by distance or on a grid, until the requested number or a stop."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ CLOCK = 1000
 """Time of the tracker's clock when a measurement starts, s."""
 BY_TIME, BY_DISTANCE, GRID = 1, 2, 3
 SAMPLING = 1
-"""Interval at which the position is looked at for points by distance, ms."""
+"""Sampling interval of the position for points by distance, ms."""
 IDLE_WAIT = 0.005
-"""Real time between two looks at a reflector that has not moved far enough, s."""
+"""Real time between two samples of a reflector that has not moved far enough, s."""
 
 
 class PointStream:
-    """The points of one continuous measurement after another, sent by a thread.
+    """The points of continuous measurements, sent by a thread.
 
     Parameters
     ----------
@@ -40,18 +40,18 @@ class PointStream:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._mode = 0
-        self._due = 0  # mode of the measurement that starts behind the answer
+        self._due = 0  # mode of the measurement that starts after the answer
         self._milliseconds = SAMPLING
         self._start_time = 0.0
         self._last: Any = None  # last sent position, for points by distance
         self.running = False
 
     def start_soon(self, mode: int) -> None:
-        """Start as soon as the answer is out."""
+        """Start after the answer."""
         self._due = mode
 
     def start_if_due(self) -> None:
-        """Start where that was asked for."""
+        """Start a requested measurement."""
         mode, self._due = self._due, 0
         if not mode:
             return
@@ -65,7 +65,7 @@ class PointStream:
         self._thread.start()
 
     def request_end(self) -> None:
-        """Let the thread end."""
+        """Request the end of the thread."""
         self._stop.set()
         self.running = False
 
@@ -78,7 +78,7 @@ class PointStream:
         self.running = False
 
     def report_delivered(self, samples: int) -> None:
-        """Let the world's clock follow the reader of points by time, unless others drive it."""
+        """Advance the world's clock with the reader of points by time, unless another device controls it."""
         world = self._device.world
         now = self._start_time + samples * self._milliseconds / 1000.0
         if self._mode == BY_TIME and not world.streaming and now > world.time:
@@ -114,7 +114,7 @@ class PointStream:
             sent += found
             if sent >= wanted:
                 self.running = False
-                device.send(device.said(Event.COUNT_REACHED, Event.READY))
+                device.send(device.status_changes(Event.COUNT_REACHED, Event.READY))
                 return
             if device.fault.kind == "disconnect" and first + POINTS_A_PACKET > device.fault.at:
                 device.disconnect()
@@ -129,7 +129,7 @@ class PointStream:
             self._stop.wait(IDLE_WAIT)
 
     def _packets(self, first: int, most: float) -> Iterator[tuple[bytes, int]]:
-        """Yield what is sent for the next samples, with the number of points in it: points, and news of the beam."""
+        """Yield the packets for the next samples (points, status changes of the beam) and their number of points."""
         device, tracker = self._device, self._device.tracker
         times = self._start_time + (first + np.arange(POINTS_A_PACKET)) * self._milliseconds / 1000.0
         points: list[tuple[int, Triple]] = []
@@ -137,13 +137,13 @@ class PointStream:
         for k, row in enumerate(tracker.seen(times), first):
             if taken >= most:
                 break
-            if tracker.mends():
+            if tracker.can_lock():
                 yield device.locked(), 0
                 row = tracker.seen(times[k - first : k - first + 1])[0]
-            if news := device.use_beam():
+            if changes := device.use_beam():
                 yield from self._multi(points, float(times[0]))
                 points = []
-                yield news, 0
+                yield changes, 0
             if tracker.broken or device.fault.hits("drop", k):
                 continue
             spherical = (float(row[0]), float(row[1]), float(row[2]))
@@ -160,14 +160,14 @@ class PointStream:
         if self._mode == BY_TIME:
             return True
         if self._mode == BY_DISTANCE:
-            there = np.array(to_system(spherical, RHR))
-            far = self._last is None or float(np.linalg.norm(there - self._last)) >= float(parameters[0])
+            position = np.array(to_system(spherical, RHR))
+            far = self._last is None or float(np.linalg.norm(position - self._last)) >= float(parameters[0])
         else:
-            there = np.array(to_system(spherical, self._device.wire.system))
+            position = np.array(to_system(spherical, self._device.wire.system))
             steps = np.array(parameters[0])
-            far = self._last is None or bool(np.any((steps > 0) & (np.abs(there - self._last) >= steps)))
+            far = self._last is None or bool(np.any((steps > 0) & (np.abs(position - self._last) >= steps)))
         if far:
-            self._last = there
+            self._last = position
         return far
 
     def _inside(self, spherical: Triple, region: int) -> bool:
@@ -177,8 +177,8 @@ class PointStream:
             apart = np.subtract(to_system(spherical, RHR), to_system(centre, RHR))
             return float(np.linalg.norm(apart)) <= float(radius)
         corners = [to_system(corner, system) for corner in blocks[NUMBERS["SetBoxRegionParams"]].values]
-        there = to_system(spherical, system)
-        return all(min(a, b) <= x <= max(a, b) for x, a, b in zip(there, *corners, strict=True))
+        position = to_system(spherical, system)
+        return all(min(a, b) <= x <= max(a, b) for x, a, b in zip(position, *corners, strict=True))
 
     def _multi(self, points: list[tuple[int, Triple]], when: float) -> Iterator[tuple[bytes, int]]:
         if not points:

@@ -1,4 +1,4 @@
-"""What the commands and the point stream need of the simulated server."""
+"""The part of the simulated server that the commands and the point stream use."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class Stream(Protocol):
     """A continuous measurement."""
 
     def start_soon(self, mode: int) -> None:
-        """Start as soon as the answer is out."""
+        """Start after the answer."""
 
     def end(self) -> None:
         """End it; idempotent."""
 
 
 class Server(Protocol):
-    """The simulated server: its state, and what it sends unasked."""
+    """The simulated server: its state, and packets without a request."""
 
     name: str
     world: VirtualWorld
@@ -49,20 +49,20 @@ class Server(Protocol):
     def try_mode(self) -> int:
         """Whether the client has switched on the try mode, 0 or 1."""
 
-    def said(self, *events: int) -> bytes:
+    def status_changes(self, *events: int) -> bytes:
         """Return the packets that report changes."""
 
     def use_beam(self) -> bytes:
-        """Count one use of the beam; return what the server states where that breaks it."""
+        """Count one use of the beam; return the packets that report that it breaks."""
 
     def locked(self) -> bytes:
-        """Take up the reflector; return what the server states then."""
+        """Lock on to the reflector; return the packets that report this."""
 
-    def spread(self, seen: Triple) -> list[Any]:
+    def spread(self, position: Triple) -> list[Any]:
         """Return the standard deviations of a position, their total, and covariances."""
 
     def silent(self) -> bool:
-        """Whether the fault ``silence`` holds."""
+        """Whether the fault ``silence`` is active."""
 
     def send(self, packet: bytes) -> bool:
         """Send a packet between the answers; False without a connection."""

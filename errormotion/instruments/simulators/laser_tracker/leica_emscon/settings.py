@@ -32,12 +32,12 @@ def within(position: int, low: float, high: float) -> Check:
 
 
 def among(position: int, most: int) -> Check:
-    """Return a check that a value is a number of an enumeration from 0 to ``most``."""
+    """Return a check that a value is an enumerator from 0 to ``most``."""
     return lambda values: Status.OK if 0 <= values[position] <= most else wrong(position + 1)
 
 
 def together(*checks: Check) -> Check:
-    """Return the first failure of several checks."""
+    """Return a check that returns the first failure of several checks."""
     return lambda values: next((status for check in checks if (status := check(values))), Status.OK)
 
 
@@ -58,7 +58,7 @@ SHORTEST, LONGEST = 500, 100_000  # ms, of a stationary measurement (a)
 def blocks(*, newest: bool) -> dict[int, Block]:
     """Return all blocks with their defaults, by the number of the command that sets them.
 
-    ``newest`` accepts what only headers after 3.6 have.
+    ``newest`` also accepts region types of headers after 3.6.
     """
 
     def region(first: int) -> Check:

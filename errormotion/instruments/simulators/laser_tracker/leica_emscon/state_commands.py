@@ -1,7 +1,7 @@
 """Commands about the state of the server: status, units, coordinates, settings, reflectors, air.
 
-Each method is named after its command and takes its values in SI; it returns a status, the values of the reply, or
-all packets.
+Each method has the name of its command and takes its values in SI; it returns a status, the values of the reply, or all
+packets.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ class StateCommands:
         self._doubles = {number: default for number, (_, default, _) in DOUBLES.items()}
 
     def do(self, name: str, values: Sequence[Any]) -> bytes | int | list[Any]:
-        """Carry out a command; return all packets, a status, or the values of the reply."""
+        """Execute a command; return all packets, a status, or the values of the reply."""
         found: bytes | int | list[Any] = getattr(self, f"_do_{name}")(*values)
         return found
 
     def set_block(self, number: int, values: list[Any]) -> bytes:
-        """Take a block of parameters."""
+        """Set a block of parameters."""
         wire, block = self._device.wire, self._device.blocks[number]
         if status := block.check(values):
             return wire.reply(number, status)
         block.values = values
-        return wire.reply(number) + (self._said(block.event) if block.event is not None else b"")
+        return wire.reply(number) + (self._status_changes(block.event) if block.event is not None else b"")
 
     def _ok(self, name: str, values: Sequence[Any] | None = None) -> bytes:
         return self._device.wire.reply(NUMBERS[name], Status.OK, values)
 
-    def _said(self, *events: int) -> bytes:
-        return self._device.said(*events)
+    def _status_changes(self, *events: int) -> bytes:
+        return self._device.status_changes(*events)
 
     # ------------------------------------------------------------------ state
 
@@ -90,7 +90,7 @@ class StateCommands:
 
     def _do_RestoreStartupConditions(self) -> bytes:
         self._device.wire.units = Units()
-        return self._ok("RestoreStartupConditions") + self._said(Event.UNITS)
+        return self._ok("RestoreStartupConditions") + self._status_changes(Event.UNITS)
 
     # ------------------------------------------------------------------ units, coordinates, settings
 
@@ -103,7 +103,7 @@ class StateCommands:
         if units.wrong:
             return wrong(units.wrong)
         self._device.wire.units = units
-        return self._ok("SetUnits") + self._said(Event.UNITS)
+        return self._ok("SetUnits") + self._status_changes(Event.UNITS)
 
     def _do_GetCoordinateSystemType(self) -> list[Any]:
         return [self._device.wire.system]
@@ -112,7 +112,7 @@ class StateCommands:
         if not 0 <= kind < SYSTEMS:
             return wrong(1)
         self._device.wire.system = kind
-        return self._said(Event.COORDINATES) + self._ok("SetCoordinateSystemType")
+        return self._status_changes(Event.COORDINATES) + self._ok("SetCoordinateSystemType")
 
     def _do_GetSystemSettings(self) -> list[Any]:
         return list(self.system)
@@ -127,10 +127,10 @@ class StateCommands:
         turned = any(blocks[NUMBERS["SetStationOrientationParams"]].values)
         moved = blocks[NUMBERS["SetTransformationParams"]].values != [0.0] * 6 + [1.0]
         if (values[TRANSFORMATION] and moved) or (values[ORIENTATION] and turned):
-            return Status.NOT_IMPLEMENTED  # the simulator turns no coordinates, and does not pretend to
+            return Status.NOT_IMPLEMENTED  # the simulator does not transform coordinates
         self.system = list(values)
         self._device.tracker.meteo = values[METEO]
-        return self._ok("SetSystemSettings") + self._said(Event.SYSTEM_SETTINGS)
+        return self._ok("SetSystemSettings") + self._status_changes(Event.SYSTEM_SETTINGS)
 
     def _do_GetLongSystemParameter(self, number: int) -> list[Any] | int:
         return [number, int(self._parameters[number])] if number in PARAMETERS else wrong(1)
@@ -142,9 +142,9 @@ class StateCommands:
         if not low <= value <= high:
             return out_of_range(2)
         self._parameters[number] = value
-        for parameter, place in ((0, KEEP), (1, METEO), (10, POSITION)):
+        for parameter, index in ((0, KEEP), (1, METEO), (10, POSITION)):
             if number == parameter:
-                self.system[place] = value
+                self.system[index] = value
         self._device.tracker.meteo = self.system[METEO]
         return Status.OK
 
@@ -162,7 +162,7 @@ class StateCommands:
     def _do_SetCompensation(self, number: int) -> int | bytes:
         if number != 1:
             return Status.NO_SUCH_COMPENSATION
-        return self._ok("SetCompensation") + self._said(Event.COMPENSATION)
+        return self._ok("SetCompensation") + self._status_changes(Event.COMPENSATION)
 
     # ------------------------------------------------------------------ reflectors
 
@@ -180,7 +180,7 @@ class StateCommands:
         if not 1 <= number <= len(REFLECTORS):
             return wrong(1)
         self._reflector = number
-        return self._ok("SetReflector") + self._said(Event.REFLECTOR)
+        return self._ok("SetReflector") + self._status_changes(Event.REFLECTOR)
 
     # ------------------------------------------------------------------ air
 
@@ -191,7 +191,7 @@ class StateCommands:
         if not all(low <= value <= high for value, (low, high) in zip(air, LIMITS_OF_AIR, strict=True)):
             return Status.AIR_OUT_OF_RANGE
         self._device.tracker.set_air(*air)
-        return self._ok("SetEnvironmentParams") + self._said(Event.ENVIRONMENT, Event.REFRACTION)
+        return self._ok("SetEnvironmentParams") + self._status_changes(Event.ENVIRONMENT, Event.REFRACTION)
 
     def _do_GetRefractionParams(self) -> list[Any]:
         index = self._device.tracker.index()
@@ -204,7 +204,7 @@ class StateCommands:
                 return out_of_range(position)
         tracker = self._device.tracker
         tracker.set_index(absolute if tracker.absolute else interferometer)
-        return self._ok("SetRefractionParams") + self._said(Event.REFRACTION)
+        return self._ok("SetRefractionParams") + self._status_changes(Event.REFRACTION)
 
     def _position(self) -> bytes:
         tracker = self._device.tracker

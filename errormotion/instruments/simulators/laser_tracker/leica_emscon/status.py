@@ -30,17 +30,17 @@ class Status(IntEnum):
 
 
 def wrong(position: int) -> int:
-    """Return the status for a wrong parameter, counted from 1."""
+    """Return the status for a wrong parameter; positions start at 1."""
     return 3 + position if position <= 7 else 39 + position
 
 
 def out_of_range(position: int) -> int:
-    """Return the status for a parameter out of range that was not taken, counted from 1."""
+    """Return the status for a rejected parameter out of range; positions start at 1."""
     return 10 + 2 * position
 
 
 class Event(IntEnum):
-    """Changes of the system that the server reports unasked."""
+    """Changes of the system that the server reports without a request."""
 
     DISTANCE_SET = 0
     ENVIRONMENT = 2

@@ -1,4 +1,4 @@
-"""The tracker itself: what it sees of its reflector, its dead path, the air it reckons with, and its lock."""
+"""The tracker: readings of its reflector, dead path, air values of the correction, and lock."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 NEST = (0.0, math.pi / 2, 0.3)
 """Direction (rad) and distance (m) of the position at the tracker for a reflector."""
-CARRIED = 5e-3
-"""One sigma of the deviation of a carried tracker from its station, m."""
+STATION_SIGMA = 5e-3
+"""Standard deviation of the position of the tracker at a station, m."""
 NO_METEO, METEO_READ, METEO_REFRACTION = 0, 1, 2
 
 
@@ -26,8 +26,8 @@ class Tracker:
     """A tracker that follows the reflector at the machine's tool.
 
     Parameters of the address: those of `TrackerScene`; ``noise`` (m, of one distance), ``angle_noise`` (rad),
-    ``dead_path`` (m; else drawn: up to 10 mm whenever an interferometer takes up its reflector, up to 0.1 mm once for
-    absolute distances).
+    ``dead_path`` (m; default: random, up to 10 mm whenever an interferometer locks on to its reflector, up to 0.1 mm
+    once for absolute distances).
 
     Parameters
     ----------
@@ -58,42 +58,42 @@ class Tracker:
         self.broken = False
         self.nested = False  # the reflector is in the nest at the tracker
         self.face = 1
-        self.pointing = NEST  # where the beam is without a reflector
+        self.pointing = NEST  # direction of the beam without a reflector
         self.meteo = NO_METEO
         self._set_air = (20.0, 101_325.0, 50.0)
         self._index = refraction_index(*self._set_air)
         self.dead_path = self.new_dead_path()
 
     def new_dead_path(self) -> float:
-        """Return a dead path, m: as the address states, or drawn."""
+        """Return a dead path, m: that of the address, or a random one."""
         drawn = float(self._rng.uniform(-1.0, 1.0)) * (1e-4 if self.absolute else 1e-2)
         return drawn if math.isnan(self._given_dead_path) else self._given_dead_path
 
     def carry_to(self, position: Sequence[float]) -> None:
-        """Put the tracker near a position in machine coordinates, m, as people do; it counts from a new start."""
-        self.scene.station = np.array(position, dtype=float) + CARRIED * self._rng.normal(size=3)
+        """Set up the tracker near a position in machine coordinates, m; distances get a new start value."""
+        self.scene.station = np.array(position, dtype=float) + STATION_SIGMA * self._rng.normal(size=3)
         self.broken = self.nested = False
         self.dead_path = self.new_dead_path()
 
     # ------------------------------------------------------------------ air
 
     def air(self, when: float | None = None) -> tuple[float, float, float]:
-        """Return temperature (degC), pressure (Pa) and humidity (%) that the server reckons with."""
+        """Return temperature (degC), pressure (Pa) and humidity (%) that the server uses."""
         return self._set_air if self.meteo == NO_METEO else self.scene.air(when)
 
     def set_air(self, temperature: float, pressure: float, humidity: float) -> None:
-        """Take values that a client states, and the refraction index that follows from them."""
+        """Set the values of a client, and the refraction index that follows from them."""
         self._set_air = (temperature, pressure, humidity)
         self._index = refraction_index(*self._set_air)
 
     def index(self, when: float | None = None) -> float:
-        """Return the refraction index by which the server divides."""
+        """Return the refraction index with which the server corrects distances."""
         if self.meteo == METEO_REFRACTION:
             self._index = refraction_index(*self.scene.air(when))
         return self._index
 
     def set_index(self, index: float) -> None:
-        """Take a refraction index that a client states."""
+        """Set the refraction index of a client."""
         self._index = index
 
     # ------------------------------------------------------------------ beam
@@ -108,29 +108,29 @@ class Tracker:
         return False
 
     def obstructed(self) -> bool:
-        """Whether the beam cannot be taken up now."""
+        """Whether the beam is blocked now."""
         return self._obstructed(self._uses)
 
-    def mends(self) -> bool:
-        """Whether a broken beam can be taken up again."""
+    def can_lock(self) -> bool:
+        """Whether a broken beam can lock on to the reflector again."""
         return self.broken and not self.obstructed()
 
     def lock(self) -> None:
-        """Take up the reflector; an interferometer then counts from a new distance."""
+        """Lock on to the reflector; an interferometer then starts from a new distance."""
         self.broken = False
         if not self.absolute:
             self.dead_path = self.new_dead_path()
 
     def near(self, spherical: Triple, radius: float) -> bool:
-        """Whether the reflector is within a radius (m) of a position; it is taken out of the nest for that."""
+        """Whether the reflector is within a radius (m) of a position; it is removed from the nest for that."""
         self.nested = False
         wanted = cartesian(*spherical)
-        there = cartesian(*self.scene.seen(np.array([self._world.time]))[0])
-        across = wanted - there * (wanted @ there) / (there @ there)
-        return float(np.linalg.norm(across)) <= radius and float(wanted @ there) > 0
+        actual = cartesian(*self.scene.seen(np.array([self._world.time]))[0])
+        across = wanted - actual * (wanted @ actual) / (actual @ actual)
+        return float(np.linalg.norm(across)) <= radius and float(wanted @ actual) > 0
 
     def seen(self, times: np.ndarray[Any, Any] | None = None) -> np.ndarray[Any, Any]:
-        """Return azimuth, zenith angle and distance as they are read, (n, 3), rad and m."""
+        """Return readings of azimuth, zenith angle and distance, (n, 3), rad and m."""
         times = np.array([self._world.time]) if times is None else times
         true = np.tile(NEST, (len(times), 1)) if self.nested else self.scene.seen(times)
         noise = self._rng.normal(size=true.shape) * (self.angle_noise, self.angle_noise, self.noise)

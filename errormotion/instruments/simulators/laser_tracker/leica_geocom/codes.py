@@ -33,7 +33,7 @@ class Code(IntEnum):
 
 
 class RefusedError(Exception):
-    """The station refuses a call.
+    """A call that the station refuses.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What the calls do: settings, pointing and identity; the measuring ones are in `measuring`.
+"""Calls for settings, pointing and identity; the measuring calls are in `measuring`.
 
 A method has the name of its call. It returns the values of the reply, or raises `RefusedError`.
 """
@@ -46,7 +46,7 @@ MEASURING_PROGRAMS = 12
 
 @dataclass(frozen=True)
 class Model:
-    """What a model states of itself: name, class of accuracy, what it has (bits), class without reflector."""
+    """Properties of a model: name, accuracy class, components (bits), class without reflector."""
 
     name: str
     accuracy: int
@@ -64,15 +64,15 @@ FIRMWARE = (6, 50, 0)
 GEOCOM = (1, 50, 0)
 
 
-def check(right: bool) -> None:
-    """Refuse a parameter that is not right."""
-    if not right:
+def check(valid: bool) -> None:
+    """Raise `RefusedError` if a parameter is invalid."""
+    if not valid:
         raise RefusedError(Code.IVPARAM)
 
 
 @dataclass
 class Settings:
-    """Settings that no measurement needs."""
+    """Settings that do not affect measurements."""
 
     decimals: int = 15
     delay: int = 0
@@ -123,7 +123,7 @@ class Commands(Measuring):
         """Do nothing."""
 
     def COM_Local(self) -> None:
-        """Leave the online mode; the next request enters it again (assumed)."""
+        """End the online mode; the next request starts it again (assumed)."""
 
     def COM_GetDoublePrecision(self) -> int:
         return self.settings.decimals
@@ -211,7 +211,7 @@ class Commands(Measuring):
         return self.settings.prism
 
     def BAP_SetPrismType(self, kind: int) -> None:
-        """Take a kind of prism, and its constant."""
+        """Set a kind of prism, and its constant."""
         check(kind in PRISMS)
         self.settings.prism, self.prism_constant = kind, PRISMS[kind][1]
 
@@ -268,7 +268,7 @@ class Commands(Measuring):
     AUS_GetUserLockState, AUS_SetUserLockState = AUT_GetLockStatus, AUT_SetLockStatus
 
     def _unlock(self) -> None:
-        self.telescope.direction()  # it stays where it followed the reflector to
+        self.telescope.direction()  # keeps the last direction of the reflector
         self.settings.lock = self.telescope.locked = False
 
     def AUT_LockIn(self) -> None:
@@ -292,7 +292,7 @@ class Commands(Measuring):
         return self.settings.timeout
 
     def AUT_SetTimeout(self, horizontal: float, vertical: float) -> None:
-        """Take the times, s, for turning: 7 to 60."""
+        """Set the time limits for turning, s: 7 to 60."""
         check(7.0 <= horizontal <= 60.0 and 7.0 <= vertical <= 60.0)
         self.settings.timeout = horizontal, vertical
 
@@ -345,6 +345,6 @@ class Commands(Measuring):
         self.settings.controller = None
 
     def MOT_SetVelocity(self, horizontal: float, vertical: float) -> None:
-        """Refuse velocities: the simulated station turns to directions only; see the manual for the limit, rad/s."""
+        """Refuse velocities: the simulated station only turns to directions; the limit is that of the manual, rad/s."""
         check(abs(horizontal) <= math.pi and abs(vertical) <= math.pi)
         raise RefusedError(Code.MOT_NOT_OCONST if self.settings.controller != 1 else Code.NOT_IMPL)

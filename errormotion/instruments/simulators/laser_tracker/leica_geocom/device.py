@@ -15,16 +15,16 @@ from errormotion.instruments.transports import Address
 
 
 class SimulatedGeoComStation(SimulatedDevice):
-    """A total station with target recognition that looks at the reflector at the machine's tool.
+    """A total station with target recognition that measures the reflector at the machine's tool.
 
-    Directions count clockwise, as those of the maker: east, north and height are a right-handed system whose north is
-    the x axis of `TrackerScene`, and whose east is its negative y axis.
+    Directions are clockwise, as those of the maker: east, north and height are a right-handed system whose north is the
+    x axis of `TrackerScene`, and whose east is its negative y axis.
 
     Further parameters of the address: those of `telescope.Telescope`; ``model`` (``TS30``, ``TCRP1201``, ``TM30``).
 
-    Faults beyond the menu, from ``fault_at`` on, ``fault_for`` times (without end): ``beam_broken`` (uses of the beam:
-    distances and aiming), ``refuse`` (answers; ``code``, default 4, is their return code) and ``link_error`` (answers;
-    ``code``, default 3080, is the code of the communication).
+    Faults in addition to the menu, from ``fault_at`` on, ``fault_for`` times (without end): ``beam_broken`` (uses of
+    the beam: distances and aiming), ``refuse`` (answers; ``code``, default 4, is their return code) and ``link_error``
+    (answers; ``code``, default 3080, is the code of the communication).
     """
 
     faults = ("silence", "split", "garbage", "drop", "disconnect", "late", "beam_broken", "refuse", "link_error")
@@ -43,7 +43,7 @@ class SimulatedGeoComStation(SimulatedDevice):
             address.number("code", Code.FATAL if self.fault.kind == "refuse" else Code.COM_CANT_DECODE_REQ)
         )
         self.telescope = Telescope(
-            self.world, address, self._rng, lambda use: self.fault.kind == "beam_broken" and self._hits(use)
+            self.world, address, self._rng, lambda use: bool(self.fault.affects("beam_broken", use))
         )
         self.commands = Commands(self.world, self.telescope, model)
 
@@ -58,7 +58,7 @@ class SimulatedGeoComStation(SimulatedDevice):
         return self.telescope.dead_path
 
     def carry_to(self, position: Sequence[float]) -> None:
-        """Put the station near a position in machine coordinates, m, as people do, and aim at the reflector."""
+        """Set up the station near a position in machine coordinates, m, and aim at the reflector."""
         self.telescope.carry_to(position)
 
     def _on_data(self, data: bytes) -> None:
@@ -76,11 +76,10 @@ class SimulatedGeoComStation(SimulatedDevice):
             found = grammar.parse(request)
         except grammar.ProtocolError as error:
             return grammar.refusal(error.code, error.transaction)
-        if self._hits(self._answers):
-            if self.fault.kind == "refuse":
-                return grammar.reply(self._code, found.transaction)
-            if self.fault.kind == "link_error":
-                return grammar.refusal(self._code, found.transaction)
+        if self.fault.affects("refuse", self._answers):
+            return grammar.reply(self._code, found.transaction)
+        if self.fault.affects("link_error", self._answers):
+            return grammar.refusal(self._code, found.transaction)
         settings = self.commands.settings
         if not (settings.powered and not settings.asleep) and found.name != "COM_SwitchOnTPS":
             code = Code.COM_SRVR_IS_SLEEPING if settings.asleep else Code.COM_SRVR_IS_OFF
@@ -91,7 +90,3 @@ class SimulatedGeoComStation(SimulatedDevice):
         except RefusedError as refused:
             return grammar.reply(refused.code, found.transaction)
         return grammar.reply(self.commands.warning, found.transaction, grammar.encode(values, settings.decimals))
-
-    def _hits(self, number: int) -> bool:
-        fault = self.fault
-        return number >= fault.at and (fault.length == 0 or number < fault.at + fault.length)

@@ -1,7 +1,7 @@
 """The ASCII protocol of GeoCOM: requests, types of parameters, and replies.
 
 Request ``%R1Q,<RPC>[,<TrId>]:[<P0>][,<P1>...]<CR><LF>``, reply ``%R1P,<RC_COM>,<TrId>:<RC>[,<P0>...]<CR><LF>``; a line
-feed ahead of a request clears the receive buffer (Reference Manual TPS1200/TS30/TM30 1.50, p. 8, 10 and 11).
+feed before a request clears the receive buffer (Reference Manual TPS1200/TS30/TM30 1.50, p. 8, 10 and 11).
 """
 
 from __future__ import annotations
@@ -116,14 +116,14 @@ CALLS: dict[int, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Request:
-    """A request that was understood.
+    """A valid request.
 
     Attributes
     ----------
     name : str
         Of the call.
     transaction : int
-        0 where the request has none.
+        0 if the request has none.
     values : tuple
         The parameters.
     """
@@ -147,7 +147,7 @@ def parse(line: bytes) -> Request:
     Raises
     ------
     ProtocolError
-        No request of GeoCOM, an unknown call, or parameters in another number or of another type.
+        Not a GeoCOM request, an unknown call, or a wrong number or type of parameters.
     """
     if len(line) > LONGEST:
         raise ProtocolError(Code.COM_OVERRUN)
@@ -170,7 +170,7 @@ def parse(line: bytes) -> Request:
 
 
 def _split(text: str) -> list[str] | None:
-    """Return the words between the commas, or None where one is missing."""
+    """Return the words between the commas, or None if one is missing."""
     words: list[str] = []
     position = 0
     while position < len(text):
@@ -187,7 +187,7 @@ def _split(text: str) -> list[str] | None:
 
 
 def _value(word: str, kind: str) -> Value | None:
-    """Return a parameter; None where it is no such value."""
+    """Return a parameter; None if it is invalid."""
     if kind == "i":
         if not _INTEGER.fullmatch(word):
             return None
@@ -210,9 +210,9 @@ class Byte:
 
 
 def encode(values: Iterable[Value | Byte], decimals: int) -> str:
-    """Return values as a reply has them.
+    """Return values as in a reply.
 
-    Doubles have a stated number of decimals, without zeros at their end (that they are left out is assumed).
+    Doubles have at most the stated number of decimals; trailing zeros are omitted (assumed).
     """
     texts = []
     for value in values:
@@ -234,5 +234,5 @@ def reply(code: int, transaction: int, values: str = "") -> bytes:
 
 
 def refusal(code: int, transaction: int) -> bytes:
-    """Return the reply to a request that was not: the code of the communication (that 0 follows is assumed)."""
+    """Return the reply to a call that was not executed: the communication code, then 0 (assumed)."""
     return f"%R1P,{int(code)},{transaction}:0".encode("ascii") + LINE_END

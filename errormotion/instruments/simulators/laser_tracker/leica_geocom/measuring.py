@@ -1,7 +1,7 @@
 """The calls of theodolite measurement and calculation (TMC): angles, distances, coordinates and their corrections.
 
 Reference Manual TPS1200/TS30/TM30 1.50, section 17. A distance is started by one call and read by another, which waits
-for it no longer than is stated; meanwhile the world's clock runs, unless a stream drives it.
+for it within a time limit; the world's clock advances by the waiting time, unless a stream controls it.
 """
 
 # ruff: noqa: D102 -- a getter or setter without further rules is described by its name, which is the manual's
@@ -26,11 +26,11 @@ DURATIONS = {3: 0.8, 6: 0.3, 7: 0.3, 8: 0.3, 9: 0.15, 13: 7.0}
 """Duration of one distance in some EDM modes, s; in the others 2.4 (technical data of the TPS1200)."""
 DURATION = 2.4
 EXCHANGE = 0.05
-"""Time that passes with a call that does not wait, s."""
+"""Duration of a call without waiting, s."""
 LONGEST_WAIT = 60_000
-"""Time that a call waits at most, ms, whatever is asked (assumed)."""
+"""Longest waiting time of a call, ms, whatever is requested (assumed)."""
 ACCURACY = 2.4e-6
-"""Standard deviation of angles and inclinations that is stated, rad."""
+"""Stated standard deviation of angles and inclinations, rad."""
 WAVELENGTH = 6.58e-7
 EARTH, REFRACTION = 6_378_000.0, 0.13
 
@@ -48,7 +48,7 @@ class Measuring:
     Attributes
     ----------
     warning : int
-        Return code of the last call that was executed: 0, or what its values lack.
+        Return code of the last call that was executed: 0, or a missing part of its values.
     prism_constant : float
         m.
     """
@@ -63,7 +63,7 @@ class Measuring:
         self._refraction: tuple[int, float, float] = (0, EARTH, REFRACTION)
         self._edm = STANDARD
         self._compensator = 1
-        self._ready: float | None = None  # time at which the distance is there, s; None: none was started
+        self._ready: float | None = None  # time at which the distance is complete, s; None: none was started
         self._signal = False
         self._distance: float | None = None
         self._continuous = False
@@ -83,7 +83,7 @@ class Measuring:
             self._ready = self.world.time + duration
 
     def _wait(self, milliseconds: int) -> float | None:
-        """Return the distance, or None where there is none within the time.
+        """Return the distance, or None if it is not complete within the time limit.
 
         Raises
         ------
@@ -94,10 +94,10 @@ class Measuring:
             return self._distance
         if self._ready is None:
             return self._distance
-        patience = min(milliseconds, LONGEST_WAIT) / 1000.0
+        limit = max(min(milliseconds, LONGEST_WAIT) / 1000.0, EXCHANGE)
         missing = max(0.0, self._ready - self.world.time)
-        self._pass(min(missing, max(patience, EXCHANGE)))
-        if missing > max(patience, EXCHANGE) and not self.world.streaming:
+        self._pass(min(missing, limit))
+        if missing > limit and not self.world.streaming:
             return None
         if not self._continuous:
             self._ready = None
@@ -113,7 +113,7 @@ class Measuring:
         return atmospheric_ppm(*self._air[1:])
 
     def _measured(self, wait: int, inclination: int) -> tuple[float, float, float]:
-        """Return directions and distance, 0 where there is none, and set the warning."""
+        """Return directions and distance, 0 if missing, and set the warning."""
         _check(wait >= 0 and 0 <= inclination < INCLINATIONS)
         if self._signal:
             raise RefusedError(Code.TMC_BUSY)
@@ -132,7 +132,7 @@ class Measuring:
         return (*angles, distance or 0.0)
 
     def measure_at_once(self, mode: int) -> tuple[float, float, float]:
-        """Measure directions and, as the mode of the basic application states, a distance."""
+        """Measure directions and, depending on the mode of the basic application, a distance."""
         if mode == 6:
             self.TMC_DoMeasure(STOP, 1)
         elif mode == 5:
@@ -168,7 +168,7 @@ class Measuring:
         return int({1: self._signal, 2: False, 3: distances, 4: distances or self._signal}[kind])
 
     def TMC_GetSignal(self) -> tuple[float | int, ...]:
-        """Return the intensity of the signal, %, in that program only."""
+        """Return the intensity of the signal, %; only in the signal program."""
         if not self._signal:
             raise RefusedError(Code.TMC_SIGNAL_ERROR)
         return 62.0, self._clock()
@@ -221,8 +221,8 @@ class Measuring:
     def TMC_GetCoordinate(self, wait: int, inclination: int) -> tuple[float | int, ...]:
         """Return coordinates and their time, ms, of the distance, and of the continuous angles."""
         measured = self._measured(wait, inclination)
-        place = self._coordinates(*measured) if measured[2] else (0.0, 0.0, 0.0)
-        return (*place, self._clock(), *place, self._clock())
+        coordinates = self._coordinates(*measured) if measured[2] else (0.0, 0.0, 0.0)
+        return (*coordinates, self._clock(), *coordinates, self._clock())
 
     def TMC_GetSimpleCoord(self, wait: int, inclination: int) -> Numbers:
         """Return the coordinates; all 0 without a distance."""
@@ -233,12 +233,12 @@ class Measuring:
         return self._station
 
     def TMC_SetStation(self, east: float, north: float, height: float, instrument: float) -> None:
-        """Take the coordinates of the station; a distance must have been cleared."""
+        """Set the coordinates of the station; there must be no distance."""
         self._cleared()
         self._station = east, north, height, instrument
 
     def TMC_SetOrientation(self, horizontal: float) -> None:
-        """Let the present direction read an angle; a distance must have been cleared."""
+        """Set the reading of the present direction; there must be no distance."""
         self._cleared()
         self.telescope.orientate(horizontal)
 
@@ -272,7 +272,7 @@ class Measuring:
         return self._air
 
     def TMC_SetAtmCorr(self, wavelength: float, pressure: float, dry: float, wet: float) -> None:
-        """Take wavelength, m, pressure, mbar, and dry and wet temperature, degC; the limits are assumed."""
+        """Set wavelength, m, pressure, mbar, and dry and wet temperature, degC; the limits are assumed."""
         _check(wavelength > 0 and 400.0 <= pressure <= 1200.0 and -60.0 <= wet <= 80.0 and -60.0 <= dry <= 80.0)
         self._air = wavelength, pressure, dry, wet
 
@@ -287,11 +287,11 @@ class Measuring:
         return self._refraction
 
     def TMC_SetRefractiveCorr(self, on: int, radius: float, coefficient: float) -> None:
-        """Take the refraction correction; it concerns heights over long distances, so nothing changes here."""
+        """Set the refraction correction; it only affects heights over long distances, and has no effect here."""
         _check(on in (0, 1) and radius > 0)
         self._refraction = on, radius, coefficient
 
 
-def _check(right: bool) -> None:
-    if not right:
+def _check(valid: bool) -> None:
+    if not valid:
         raise RefusedError(Code.IVPARAM)

@@ -1,4 +1,4 @@
-"""The telescope: where it points, what it sees of the reflector at the tool, and its distance meter."""
+"""The telescope: direction, target recognition, and distance meter."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from errormotion.instruments.transports import Address
 if TYPE_CHECKING:
     from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 
-CARRIED = 5e-3
-"""One sigma of the deviation of a carried station from its position, m."""
+STATION_SIGMA = 5e-3
+"""Standard deviation of the position of the station at a set-up, m."""
 BEAM = 1.5e-3
 """Half angle within which the distance meter has a signal from the reflector, rad (assumed)."""
 FIELD = math.radians(1.5) / 2
@@ -57,8 +57,8 @@ class Telescope:
     """A motorized telescope with target recognition.
 
     Parameters of the address: those of `TrackerScene`; ``noise`` (m, of one distance), ``angle_noise`` (rad, of one
-    direction), ``dead_path`` (m, error of every distance; 0), ``prism_constant`` (m, that the reflector needs; 0),
-    ``locked`` (1: at the start it follows the reflector; 0: it points there and stays).
+    direction), ``dead_path`` (m, error of every distance; 0), ``prism_constant`` (m, of the reflector; 0), ``locked``
+    (1: at the start it follows the reflector; 0: it keeps the direction of the reflector at the start).
 
     Attributes
     ----------
@@ -90,16 +90,16 @@ class Telescope:
         self.pointing = self._target()[:2]
 
     def carry_to(self, position: Sequence[float]) -> None:
-        """Put the station near a position in machine coordinates, m, as people do, and aim at the reflector."""
-        self.scene.station = np.array(position, dtype=float) + CARRIED * self._rng.normal(size=3)
+        """Set up the station near a position in machine coordinates, m, and aim at the reflector."""
+        self.scene.station = np.array(position, dtype=float) + STATION_SIGMA * self._rng.normal(size=3)
         self.pointing = self._target()[:2]
 
     def _target(self) -> tuple[float, float, float]:
         azimuth, zenith, distance = self.scene.seen(np.array([self._world.time]))[0]
-        return -float(azimuth), float(zenith), float(distance)  # directions count clockwise
+        return -float(azimuth), float(zenith), float(distance)  # directions are clockwise
 
     def blocked(self) -> bool:
-        """Count one use of the beam; return whether something is in its way, which ends the lock."""
+        """Count one use of the beam; return whether it is blocked, which ends the lock."""
         found = self._obstructed(self._uses)
         self._uses += 1
         if found:
@@ -118,7 +118,7 @@ class Telescope:
         return (horizontal + self.orientation) % (2.0 * math.pi), zenith % (2.0 * math.pi)
 
     def orientate(self, horizontal: float) -> None:
-        """Let the present direction read a stated angle, rad."""
+        """Set the horizontal reading of the present direction, rad."""
         self.orientation = 0.0
         self.orientation = horizontal - self.direction()[0]
 
@@ -139,17 +139,17 @@ class Telescope:
 
     def sees(self, horizontal: float, vertical: float) -> bool:
         """Whether the reflector is within half angles (rad) of the telescope's direction."""
-        there = self._target()
-        across = (there[0] - self.pointing[0] + math.pi) % (2.0 * math.pi) - math.pi
-        return abs(across) * math.sin(there[1]) <= horizontal and abs(there[1] - self.pointing[1]) <= vertical
+        actual = self._target()
+        across = (actual[0] - self.pointing[0] + math.pi) % (2.0 * math.pi) - math.pi
+        return abs(across) * math.sin(actual[1]) <= horizontal and abs(actual[1] - self.pointing[1]) <= vertical
 
     def aim(self, horizontal: float = FIELD, vertical: float = FIELD) -> None:
-        """Point at the reflector that is within half angles, rad.
+        """Point at the reflector if it is within half angles, rad.
 
         Raises
         ------
         RefusedError
-            There is none.
+            There is no reflector.
         """
         if not self.locked and not self.sees(horizontal, vertical):
             raise RefusedError(Code.AUT_NO_TARGET)

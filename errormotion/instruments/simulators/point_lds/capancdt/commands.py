@@ -1,4 +1,4 @@
-"""Commands of a capaNCDT 6200: their grammar, its settings, and its answers as text."""
+"""Commands of a capaNCDT 6200: grammar, settings, and answers as text."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class Refused(Exception):  # noqa: N818 - the controller's answer, not an error 
 
 @dataclass
 class Sensor:
-    """What one channel has connected.
+    """The sensor of one channel.
 
-    ``range`` is its measuring range, um; ``beam`` the beam of the virtual machine that it stands for.
+    ``range`` is its measuring range, um; ``beam`` the corresponding beam of the virtual machine.
     """
 
     beam: str
@@ -54,7 +54,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class MathFunction:
-    """Sum of an offset (21 bits are the measuring range) and of the channels times their factors."""
+    """Sum of an offset (measuring range: 21 bits) and of the products of channels and factors."""
 
     offset: int
     factors: tuple[float, ...]
@@ -80,7 +80,7 @@ class Settings:
 
 
 class Controller(Protocol):
-    """What the commands need of the controller; its sensors are numbered from 1 to 4."""
+    """The part of the controller that the commands use; its sensors are numbered from 1 to 4."""
 
     settings: Settings
     sensors: Mapping[int, Sensor]
@@ -88,14 +88,14 @@ class Controller(Protocol):
     port: int
 
     def measure_once(self) -> None:
-        """Send one frame, where values are not sent all the time."""
+        """Send one frame if values are not sent continuously."""
 
     def latest(self, channel: int) -> int:
         """Return the last value of a channel, 1 to 4."""
 
 
 def answer(controller: Controller, command: str) -> str:
-    """Return what follows the echo of a command, which is given without ``$`` and line end."""
+    """Return the answer that follows the echo of a command; the command is without ``$`` and line end."""
     handler = _HANDLERS.get(command[:3])
     if handler is None:
         return UNKNOWN_COMMAND
@@ -106,7 +106,7 @@ def answer(controller: Controller, command: str) -> str:
 
 
 def statuses(controller: Controller) -> list[int]:
-    """Return the status of each channel: 0 not there, 1 there, 2 with a math function."""
+    """Return the status of each channel: 0 absent, 1 present, 2 with a math function."""
     functions = controller.settings.functions
     return [2 if channel in functions else int(channel in controller.sensors) for channel in range(1, CHANNELS + 1)]
 

@@ -1,4 +1,4 @@
-"""A simulated capaNCDT 6200: two ports, and sensors at the beams of the virtual machine."""
+"""A simulated capaNCDT 6200: two ports, and sensors on the beams of the virtual machine."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ ENDS = b"\r\n"
 GREETING = "DT6220"
 LONGEST_COMMAND = 255
 TIME_LIMIT = 10.0
-"""Time after the last character within which a command has to be ended, s."""
+"""Time limit for the end of a command after its last character, s."""
 ANSWER_DELAY = 0.02
-"""Time for which an answer waits for values that are being sent, s."""
+"""Time limit for which an answer waits for values that are being sent, s."""
 ACCEPT_TIME = 0.5
-"""Time within which a client of the data port is accepted, s."""
+"""Time limit for accepting a client of the data port, s."""
 FIRST_COUNT = 100_000
 """Counter of the first value: the controller has been on for a while."""
 
@@ -47,16 +47,17 @@ FIRST_COUNT = 100_000
 class SimulatedCapaNCDT(DataPortDevice):
     """A controller; the device's name is the beam of its first sensor, X1 X2 Y1 Y2 or Z.
 
-    While a target is set in the world, all its sensors ride on the stage and look at that. A beam that the machine does
-    not have sends no values until then. The line ``data`` (in ``urls``) has the measured values, from the moment on
-    at which a client is connected to it.
+    While a target is set in the world, all its sensors move with the stage and measure the target. Without a target, a
+    beam that the machine does not have sends no values. The line ``data`` (in ``urls``) sends measured values while a
+    client is connected.
 
-    Further parameters of the address: ``beams`` (of channels 1 to 4, joined by commas; empty: no sensor), ``ranges``
-    (measuring ranges in um, joined by commas; default that of the machine's frame, 2000), ``serial``, ``left``
-    (commands of an earlier user without ``$``, joined by semicolons: ``left=TRG1;AVT3;AVN8``), ``time_limit`` (s, 10),
-    ``password`` (empty), ``frames`` (of a block at most, 256), ``greeting`` (line that a client of the commands gets).
+    Further parameters of the address: ``beams`` (of channels 1 to 4, separated by commas; empty: no sensor), ``ranges``
+    (measuring ranges in um, separated by commas; default that of the machine's frame, 2000), ``serial``, ``left``
+    (commands of an earlier user without ``$``, separated by semicolons: ``left=TRG1;AVT3;AVN8``), ``time_limit`` (s,
+    10), ``password`` (empty), ``frames`` (largest number of frames in a block, 256), ``greeting`` (line that is sent to
+    a new client of the commands).
 
-    ``out_of_range`` gives FFFFFF.
+    With the fault ``out_of_range``, FFFFFF is sent.
     """
 
     def __init__(self, address: Address) -> None:
@@ -76,7 +77,9 @@ class SimulatedCapaNCDT(DataPortDevice):
         texts = [each for each in address.params.get("ranges", "").split(",") if each]
         ranges = [float(text) for text in texts] or [self.world.machine.frame.range * 1e6]
         if not channels or len(beams) > CHANNELS or len(ranges) not in (1, len(channels)) or not min(ranges) > 0:
-            raise InstrumentError(f"expected 1 to {CHANNELS} 'beams', and one of 'ranges' (um) for all or for each")
+            raise InstrumentError(
+                f"expected 1 to {CHANNELS} 'beams', and one of the 'ranges' (um) for all or one for each"
+            )
         ranges = ranges * len(channels) if len(ranges) == 1 else ranges
         self.serial = int(address.number("serial", 1000 + abs(self.world.seed)))
         self.sensors: Mapping[int, Sensor] = {
@@ -100,14 +103,14 @@ class SimulatedCapaNCDT(DataPortDevice):
         super().close()
 
     def report_delivered(self, samples: int) -> None:
-        """Take note of how many frames its reader has had."""
+        """Set the number of frames that the reader has processed."""
         for stream in self._streams:
             stream.taken = samples
 
     # ------------------------------------------------------------------ commands
 
     def connection_opened(self) -> None:
-        """Forget an unfinished command, and greet the client."""
+        """Discard an incomplete command of the previous connection, and send the greeting."""
         super().connection_opened()
         self._cancel_timer()
         if self._greeting:
@@ -120,11 +123,11 @@ class SimulatedCapaNCDT(DataPortDevice):
             if character in (b"\r", b"\n"):
                 command, self._buffer = self._buffer, b""
                 if command.startswith(b"$"):
-                    self._obey(command[1:])
+                    self._execute(command[1:])
                 continue
             self._send(character)
             if character == b"$":
-                self._buffer = character  # what came before is ignored
+                self._buffer = character  # preceding characters are ignored
             elif self._buffer:
                 self._buffer = (self._buffer + character)[: LONGEST_COMMAND + 1]
         if self._buffer.startswith(b"$"):
@@ -132,35 +135,32 @@ class SimulatedCapaNCDT(DataPortDevice):
             self._timer.daemon = True
             self._timer.start()
 
-    def _obey(self, command: bytes) -> None:
+    def _execute(self, command: bytes) -> None:
         settings = self.settings
         before, kind = (settings.trigger, settings.sample_time), (settings.averaging, settings.averaging_number)
         ended: tuple[_Channel, ...] = ()
         if command == b"GMD" and settings.trigger:
-            self._data.await_present_client(ACCEPT_TIME)  # one that is connecting gets the value
-        held = self._data.lock.acquire(timeout=ANSWER_DELAY)  # no value is sent meanwhile, unless its reader stalls
+            self._data.await_present_client(ACCEPT_TIME)  # a client that is connecting receives the value
+        held = self._data.lock.acquire(timeout=ANSWER_DELAY)  # no value is sent meanwhile, unless its reader is blocked
         try:
             text = answer(self, command.decode("latin-1"))
             if kind != (settings.averaging, settings.averaging_number):
                 self._averaging = self._new_averaging()
             if before != (settings.trigger, settings.sample_time):
-                ended, self._streams = self._streams, ()  # none of their values follows the answer
+                ended, self._streams = self._streams, ()  # none of their values is sent after the answer
             self._reply(text.encode("latin-1") + LINE_END)
         finally:
             if held:
                 self._data.lock.release()
         for stream in ended:
-            stream.taken = stream.taken or 0  # the clock goes on where the reader is
+            stream.taken = stream.taken or 0  # the clock continues from the position of the reader
             self._end(stream)
         self._start_if_due()
 
     def _reply(self, data: bytes) -> None:
         number, self._answers = self._answers, self._answers + 1
-        if self.fault.kind == "late" and number == self.fault.at:
-            self._late.hold(self._server, data, self.fault.delay)
-            return
-        self._late.release(self._server)
-        self._send(data)
+        if not self._mute:
+            self._late.send(self._server, self.fault, number, data)
 
     def _new_averaging(self) -> Averaging:
         return Averaging(self.settings.averaging, self.settings.averaging_number)
@@ -184,7 +184,7 @@ class SimulatedCapaNCDT(DataPortDevice):
                 self._server.send(piece)
 
     def measure_once(self) -> None:
-        """Send one frame, where values are not sent all the time."""
+        """Send one frame if values are not sent continuously."""
         if self.settings.trigger:
             self._once += 1
 
@@ -195,12 +195,12 @@ class SimulatedCapaNCDT(DataPortDevice):
     # ------------------------------------------------------------------ values
 
     def _data_connected(self) -> None:
-        self._end_streams()  # of the client before
+        self._end_streams()  # of the previous client
         self._once = self._sent = 0
         self._start_if_due()
 
     def _start_if_due(self) -> None:
-        """Start the streams where a client is connected and values are due."""
+        """Start the streams if a client is connected and values are due."""
         due = self._once or not self.settings.trigger
         if due and not self._streams and not self._mute and self._data.connection is not None:
             self._start_streams()
@@ -230,7 +230,7 @@ class SimulatedCapaNCDT(DataPortDevice):
         self.world.end_stream(stream)
 
     def pass_on(self, stream: _Channel, distances: list[Array]) -> None:
-        """Send the frames that the samples of all channels make."""
+        """Send frames of the samples of all channels."""
         columns = [
             raw_values(each, sensor.range * 1e-6) for each, sensor in zip(distances, self.sensors.values(), strict=True)
         ]
@@ -244,7 +244,7 @@ class SimulatedCapaNCDT(DataPortDevice):
             self._deliver(frames)
 
     def _end_with(self, taken: int) -> None:
-        """End the streams of single frames; the clock goes on behind them."""
+        """End the streams of single frames; the clock continues after them."""
         streams, self._streams = self._streams, ()
         for each in streams:
             each.taken, each.ended = taken, True
@@ -252,7 +252,7 @@ class SimulatedCapaNCDT(DataPortDevice):
     def _deliver(self, frames: Array) -> None:
         first = self._sent
         numbers = first + np.arange(len(frames))
-        frames[self._beyond_range(numbers)] = FULL_SCALE
+        frames[self.fault.affects("out_of_range", numbers)] = FULL_SCALE
         frames = frames[self._sent_frames(numbers)]
         values, channels = with_functions(self._averaging(frames), tuple(self.sensors), self.settings)
         if len(values):
@@ -279,7 +279,7 @@ class SimulatedCapaNCDT(DataPortDevice):
 class _Channel(BeamStream):
     """The samples of one channel.
 
-    ``pending`` is shared by those that start together.
+    ``pending`` is shared by all channels.
     """
 
     def __init__(
@@ -291,7 +291,7 @@ class _Channel(BeamStream):
         self._last = last
 
     def push(self, distances: Array) -> None:
-        """Send the next samples, with those of the last channel; may wait for the reader."""
+        """Add the next samples; those of the last channel complete and send the frames. May wait for the reader."""
         self._pending.append(distances)
         if self._last:
             complete = self._pending[:]

@@ -20,17 +20,17 @@ Array = np.ndarray[Any, Any]
 PREAMBLE = 0x4D454153  # MEAS
 HEADER = struct.Struct("<IIIQIHHI")
 FRAMES_PER_BLOCK = 256
-_MATH_SHIFT = 3  # 21 bits of an offset are the 24 bits of a value
+_MATH_SHIFT = 3  # from 21 bits of an offset to 24 bits of a value
 
 
 def raw_values(distances: Array, measuring_range: float) -> Array:
-    """Return distances (m, from the start of the range of so many m) as 24 bits; FFFFFF beyond and without a target."""
+    """Return distances from the start of the range (m) as 24 bits; FFFFFF out of range and without a target."""
     scaled = np.rint(np.nan_to_num(distances, nan=np.inf) / measuring_range * FULL_SCALE)
     return np.clip(scaled, 0, FULL_SCALE).astype(np.int64)
 
 
 class Averaging:
-    """Averages of successive frames, over the limits of the pieces in which they come."""
+    """Averages of successive frames, continued from one call to the next."""
 
     def __init__(self, kind: int, number: int) -> None:
         self._kind = kind
@@ -38,7 +38,7 @@ class Averaging:
         self._past: Array | None = None
 
     def __call__(self, frames: Array) -> Array:
-        """Return the averages that these frames, shape (frame, channel), complete."""
+        """Return the averages that are completed by these frames, shape (frame, channel)."""
         if self._kind not in (1, 2, 3) or not len(frames):
             return frames
         n = self._number
@@ -59,19 +59,19 @@ def _whole(values: Array) -> Array:
     return np.asarray(np.rint(values), dtype=np.int64)
 
 
-def with_functions(frames: Array, there: Sequence[int], settings: Settings) -> tuple[Array, tuple[int, ...]]:
+def with_functions(frames: Array, present: Sequence[int], settings: Settings) -> tuple[Array, tuple[int, ...]]:
     """Return the values of all channels that are sent, shape (frame, channel), and their numbers.
 
-    ``frames`` has those of the channels that are ``there``; a math function takes the position of its channel.
+    ``frames`` contains the channels that are ``present``; a math function replaces its channel.
     """
-    channels = tuple(each for each in range(1, CHANNELS + 1) if each in there or each in settings.functions)
+    channels = tuple(each for each in range(1, CHANNELS + 1) if each in present or each in settings.functions)
     columns = []
     for channel in channels:
         function = settings.functions.get(channel)
         if function is None:
-            columns.append(frames[:, there.index(channel)])
+            columns.append(frames[:, present.index(channel)])
             continue
-        factors = np.array([function.factors[each - 1] for each in there])
+        factors = np.array([function.factors[each - 1] for each in present])
         columns.append(_whole((function.offset << _MATH_SHIFT) + frames @ factors))
     return np.stack(columns, axis=1), channels
 

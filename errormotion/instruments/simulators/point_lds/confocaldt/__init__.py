@@ -1,8 +1,7 @@
-"""A confocalDT IFC2451, IFC2461 or IFC2471 on Ethernet, from the maker's manual: its commands, refusals and blocks.
+"""A simulated confocalDT IFC2451, IFC2461 or IFC2471 on Ethernet, from the maker's manual.
 
-Facts and where they come from (operating instructions confocalDT 24x1 of Micro-Epsilon, pages as at
-manualshive.com/en/manual/micro-epsilon/confocal-dt2471/1785336; "2300" is optoNCDT 2300, a sister with the same
-grammar):
+Facts and their sources (operating instructions confocalDT 24x1 of Micro-Epsilon, pages as at
+manualshive.com/en/manual/micro-epsilon/confocal-dt2471/1785336; "2300" is optoNCDT 2300, which has the same grammar):
 
 * Commands on TCP port 23, parameters after spaces, with spaces inside in quotation marks, ended by LF or CR LF. A
   command without parameters returns the present setting, which can be sent back unchanged; after each command a line
@@ -15,14 +14,14 @@ grammar):
   ``OUTTHICK_ETH``, ``OUTSTATISTIC_ETH``, ``OUTADD_ETH``, ``SWITCHMD2`` (p. 107).
 * Order of the values in a frame (p. 110), exposure time and rate (p. 111), time stamp in us, distances in signed nm,
   intensity (p. 112), error status (p. 113); header and flags (p. 115, 116), little-endian.
-* ``MEASTRANSFER SERVER/TCP 1024`` and the data port 1024: a client of the sister IFC242x.
+* ``MEASTRANSFER SERVER/TCP 1024`` and the data port 1024: a client of the related IFC242x.
 
-Assumptions, because no page at hand shows them: texts of errors, and the numbers of all but E02, E06, E11, E32, E39;
-that lower case is unknown; ``ok`` with ECHO ON (2300 p. 129); the name and values of ``SHUTTERMODE``, ``MEASMODE``,
-``AVERAGE``, ``IPCONFIG`` and ``MEASTRANSFER`` (2300); error values 7FFFFFFB, 7FFFFFFA and 7FFFFFF9 (2300 p. 98); on
-the line bytes per frame precede the number of frames, as capaNCDT controllers send them (``header=frames`` turns them
-round); the preamble is a little-endian number, ``SAEM`` on the line; the default rate of 1 kHz; triggers, light source
-and stored settings are left out.
+Assumptions, because the available pages do not show them: texts of errors, and all numbers except E02, E06, E11, E32,
+E39; that commands in lower case are unknown; ``ok`` with ECHO ON (2300 p. 129); the name and values of ``SHUTTERMODE``,
+``MEASMODE``, ``AVERAGE``, ``IPCONFIG`` and ``MEASTRANSFER`` (2300); error values 7FFFFFFB, 7FFFFFFA and 7FFFFFF9 (2300
+p. 98); on the line, bytes per frame precede the number of frames, as capaNCDT controllers send them (``header=frames``
+reverses this); the preamble is a little-endian number, ``SAEM`` on the line; the default rate of 1 kHz. Triggers, light
+source and stored settings are omitted.
 
 The models IFC2421 and IFC2422 have another grammar (``OUT_ETH 01DIST1``) and another header (``DATA``): not simulated.
 """

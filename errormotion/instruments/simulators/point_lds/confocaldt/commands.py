@@ -70,7 +70,7 @@ ERRORS: Mapping[str, str] = {
     "passwords": "E36 The new passwords are not identical",
     "sensor": "E39 Sensor is not available",
 }
-"""What is answered, by reason; numbers and texts beyond those of the manual are assumptions."""
+"""Answer by reason; numbers and texts that are not in the manual are assumptions."""
 
 _ONE_DECIMAL = re.compile(r"\d{1,3}(\.\d)?")
 

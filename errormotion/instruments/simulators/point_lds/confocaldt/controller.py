@@ -1,4 +1,4 @@
-"""A simulated confocalDT 24x1: a line for commands, one for values, and a sensor at a beam of the virtual machine."""
+"""A simulated confocalDT 24x1: a line for commands, one for values, and a sensor on a beam of the virtual machine."""
 
 from __future__ import annotations
 
@@ -22,15 +22,12 @@ from errormotion.instruments.simulators.point_lds.confocaldt.values import (
     states,
 )
 from errormotion.instruments.simulators.point_lds.data_port import BeamStream, DataPortDevice
-from errormotion.instruments.simulators.point_lds.optoncdt.grammar import Command, RefusalError, split
+from errormotion.instruments.simulators.point_lds.optoncdt.console import LINE_END, LONGEST_PARAMETER, ConsoleDevice
+from errormotion.instruments.simulators.point_lds.optoncdt.grammar import RefusalError
 from errormotion.instruments.transports import Address
 
 Array = np.ndarray[Any, Any]
 
-PROMPT = b"->"
-LONGEST_LINE = 255
-"""Characters of a command line; assumption."""
-LONGEST_PARAMETER = 31
 FIRST_COUNT = 50_000
 """Counter of the first value: the controller has been on for a while."""
 TEMPERATURE = 34.51
@@ -42,22 +39,26 @@ INTENSITY = 512 | 8192 << 16
 RATE_CLOCK = 40_000_000
 """Hz."""
 _NEUTRAL = frozenset({"ECHO", "STDUSER", "IPCONFIG", "DARKCORRTHRES"})
-"""Settings that leave running values as they are."""
+"""Settings that do not affect a running stream."""
 
 
-class SimulatedConfocal(DataPortDevice):
+class SimulatedConfocal(ConsoleDevice, DataPortDevice):
     """A controller with one sensor; the device's name is its beam.
 
-    The line ``data`` (in ``urls``) has the values, from the moment on at which OUTPUT is ETHERNET, MEASTRANSFER is
-    SERVER/TCP and a client is connected to it.
+    It sends values on the line ``data`` (in ``urls``) while OUTPUT is ETHERNET, MEASTRANSFER is SERVER/TCP and a client
+    is connected.
 
     Further parameters of the address: ``model`` (IFC2451, IFC2461 or IFC2471), ``range`` (mm; default that of the
     machine's frame), ``serial``, ``user`` (PROFESSIONAL or USER), ``password`` (000), ``left`` (settings of an earlier
-    user, joined by semicolons: ``left=OUTADD_ETH STATE;ECHO OFF``), ``frames`` (of a block at most), ``header``
-    (``bytes`` or ``frames``: which size comes first).
+    user, separated by semicolons: ``left=OUTADD_ETH STATE;ECHO OFF``), ``frames`` (largest number of frames in a
+    block), ``header`` (``bytes`` or ``frames``: the size that is sent first).
 
-    ``out_of_range`` gives no peak.
+    With the fault ``out_of_range`` there is no peak.
     """
+
+    _commands = COMMANDS
+    _errors = ERRORS
+    longest_parameter = LONGEST_PARAMETER
 
     def __init__(self, address: Address) -> None:
         self._stream: _Values | None = None
@@ -66,7 +67,7 @@ class SimulatedConfocal(DataPortDevice):
         self._phase = 0  # of the reduction
         self._low, self._high = np.inf, -np.inf
         self._reference: float | None = None
-        super().__init__(address, line_end=b"\n", default_name="X1", every=1000)
+        super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
         self._open_data_port(address, self._set_up, self._data_connected)
 
     def _set_up(self, address: Address) -> None:
@@ -78,28 +79,11 @@ class SimulatedConfocal(DataPortDevice):
         if not 0.0 < self.range < 2.0:
             raise InstrumentError("'range': expected more than 0 mm and less than 2000 mm")
         self.serial = int(address.number("serial", 11020000 + abs(self.world.seed)))
-        self._password = address.params.get("password", "000")
-        self._user = "USER" if address.params.get("user") == "USER" else "PROFESSIONAL"
-        self._left = [split(line) for line in address.params.get("left", "").split(";") if line.strip()]
+        self._set_up_console(address)
         self._frames = max(1, int(address.number("frames", FRAMES_PER_BLOCK)))
         self._frames_first = address.params.get("header", "bytes") == "frames"
         self.port = 0
         self._boot()
-
-    def _boot(self) -> None:
-        """Take the settings of delivery, and those that an earlier user has left."""
-        self._settings = {name: tuple(split(each.default)) for name, each in COMMANDS.items() if each.default}
-        self._level = self._user
-        self._settings["STDUSER"] = (self._level,)
-        for name, *words in self._left:
-            command = COMMANDS.get(name)
-            if command is None or command.default is None:
-                raise InstrumentError(f"'left={name}': the controller has no such setting")
-            try:
-                command.check(words)
-            except RefusalError as refused:
-                raise InstrumentError(f"'left={name} {' '.join(words)}': {ERRORS[refused.reason]}") from None
-            self._settings[name] = tuple(words)
 
     def close(self) -> None:
         """End the device."""
@@ -108,21 +92,15 @@ class SimulatedConfocal(DataPortDevice):
         super().close()
 
     def report_delivered(self, samples: int) -> None:
-        """Take note of how many samples of the running stream its reader has had."""
+        """Set the number of samples of the running stream that its reader has processed."""
         stream = self._stream
         if stream is not None:
             stream.taken = samples
 
     # ------------------------------------------------------------------ commands
 
-    def _on_data(self, data: bytes) -> None:
-        super()._on_data(data)
-        if len(self._buffer) > LONGEST_LINE:  # no line end in sight
-            self._buffer = b""
-            self.reply(ERRORS["long"].encode() + b"\r\n" + PROMPT)
-
     def reply(self, data: bytes) -> None:
-        """Send an answer; values that it has switched on start behind it."""
+        """Send an answer; a stream that it switches on starts after it."""
         if not self._mute:
             super().reply(data)
         self._start_if_due()
@@ -130,50 +108,14 @@ class SimulatedConfocal(DataPortDevice):
     def _silent(self) -> bool:
         return self._mute
 
-    def answer(self, request: bytes) -> bytes:
-        """Return the answer to one command, in which ECHO ON repeats it."""
-        echo = self._settings["ECHO"] == ("ON",)
-        line = request.removesuffix(b"\r").decode("latin-1").strip()
-        text = self._text(line) if line else ""
-        if echo and line and line.isascii() and line.isprintable():
-            text = f"{line}\r\n{text}" if text else f"{line} ok"
-        return text.encode("latin-1") + b"\r\n" + PROMPT
-
-    def _text(self, line: str) -> str:
-        if len(line) > LONGEST_LINE:
-            return ERRORS["long"]
-        name, *words = split(line) if line.isascii() and line.isprintable() else [""]
-        command = COMMANDS.get(name)
-        if command is None:
-            return ERRORS["command"]
-        if any(len(word) > LONGEST_PARAMETER for word in words):
-            return ERRORS["long"]
-        try:
-            return self._obey(name, command, words)
-        except RefusalError as refused:
-            return ERRORS[refused.reason]
-
-    def _obey(self, name: str, command: Command, words: Sequence[str]) -> str:
-        if not words and command.default is not None:
-            return " ".join([name, *self._setting(name)])
-        if words or command.forms:
-            command.check(words)
-        if self._level != "PROFESSIONAL" and command.writes:
-            raise RefusalError("access")
-        if command.default is None:
-            return self._act(name, words)
-        self._check(name, words)
-        self._set(name, tuple(words))
-        return ""
-
     def _setting(self, name: str) -> tuple[str, ...]:
         words = self._settings[name]
         if name == "MEASTRANSFER" and words[0] == "SERVER/TCP":
-            return words[0], str(self.port)  # where the simulator really listens
+            return words[0], str(self.port)  # port on which the simulator listens
         return words
 
     def _check(self, name: str, words: Sequence[str]) -> None:
-        """Refuse what the model does not have, or the other settings forbid."""
+        """Raise `RefusalError` if the model or the other settings do not permit this setting."""
         thickness = self._settings["MEASMODE"] == ("THICKNESS",)
         match name:
             case "MEASRATE" if not self.model.allows_rate(words[0]):
@@ -193,11 +135,12 @@ class SimulatedConfocal(DataPortDevice):
             case "MASTERMV" if words[0] == "MASTER" and not abs(float(words[1])) * 1e-3 <= self.range:
                 raise RefusalError("range")
             case "MASTERMV" if words[0] == "MASTER" and self._stream is None:
-                raise RefusalError("timeout")  # no measured value comes within 2 s
+                raise RefusalError("timeout")  # no measured value within 2 s
 
-    def _set(self, name: str, words: tuple[str, ...]) -> None:
+    def _set(self, name: str, words: tuple[str, ...]) -> str:
+        self._check(name, words)
         if name not in _NEUTRAL:
-            self._stop()  # starts again behind the answer
+            self._stop()  # starts again after the answer
         self._settings[name] = words
         if name == "MEASMODE":
             thickness = words == ("THICKNESS",)
@@ -205,6 +148,7 @@ class SimulatedConfocal(DataPortDevice):
             self._settings["OUTTHICK_ETH"] = ("THICK12",) if thickness else ("NONE",)
         if name == "MASTERMV":
             self._reference = None
+        return ""
 
     def _act(self, name: str, words: Sequence[str]) -> str:
         match name:
@@ -216,36 +160,19 @@ class SimulatedConfocal(DataPortDevice):
                 length = f"{self.range * 1e3:.3f} mm"
                 return f"Position: 0\r\nName: ifs-2405x\r\nMeasuring range: {length}\r\nSerial: 12345678"
             case "SENSORTABLE":
-                length = f"{self.range * 1e3:.3f}".replace(".", ",")  # as the manual prints it
+                length = f"{self.range * 1e3:.3f}".replace(".", ",")  # as in the manual
                 return f"Pos, Sensor name, Range, Serial\r\n0, ifs-2405x, {length}mm, 12345678"
             case "PRINT":
                 lines = [" ".join([each, *self._setting(each)]) for each in sorted(self._settings)]
                 return "\r\n".join([*lines, *(self._description() if words else [])])
-            case "HELP":
-                return "\r\n".join(sorted(COMMANDS))
             case "RESET":
                 self._stop()
                 self._boot()
             case "RESETSTATISTIC":
                 self._low, self._high = np.inf, -np.inf
-            case "GETUSERLEVEL":
-                return f"{name} {self._level}"
-            case "LOGOUT":
-                self._level = "USER"
-            case "LOGIN":
-                if words[0] != self._password:
-                    raise RefusalError("access")
-                self._level = "PROFESSIONAL"
-            case "PASSWD":
-                self._change_password(*words)
+            case _:
+                return super()._act(name, words)
         return ""
-
-    def _change_password(self, old: str, new: str, again: str) -> None:
-        if old != self._password:
-            raise RefusalError("access")
-        if new != again:
-            raise RefusalError("passwords")
-        self._password = new
 
     def _description(self) -> list[str]:
         return [
@@ -261,11 +188,11 @@ class SimulatedConfocal(DataPortDevice):
     # ------------------------------------------------------------------ values
 
     def _data_connected(self) -> None:
-        self._stop()  # of the client before
+        self._stop()  # of the previous client
         self._start_if_due()
 
     def _start_if_due(self) -> None:
-        """Start the stream where a client is connected and values are due."""
+        """Start the stream if a client is connected and values are due."""
         due = self._settings["OUTPUT"] == ("ETHERNET",) and self._settings["MEASTRANSFER"][0] == "SERVER/TCP"
         world = self.world
         known = self.name in world.machine.frame.channels or world.stand.target is not None
@@ -299,7 +226,7 @@ class SimulatedConfocal(DataPortDevice):
     def _deliver(self, stream: _Values, distances: Array) -> None:
         first = stream.sent
         numbers = first + np.arange(len(distances))
-        distances[self._beyond_range(numbers)] = np.nan
+        distances[self.fault.affects("out_of_range", numbers)] = np.nan
         frames, names = self._framed(self._averaging(distances))
         lost = np.array([self.fault.hits("drop", int(number)) for number in numbers], dtype=bool)
         kept = self._sent_frames(numbers)
@@ -344,7 +271,7 @@ class SimulatedConfocal(DataPortDevice):
         return frames, names
 
     def _offset(self, distances: Array) -> float:
-        """Return what mastering adds, m; the first valid value after the command is its reference."""
+        """Return the offset from mastering, m; the first valid value after the command is its reference."""
         master = self._settings["MASTERMV"]
         if master[0] == "NONE":
             return 0.0
@@ -355,8 +282,8 @@ class SimulatedConfocal(DataPortDevice):
 
     def _bytes(self, frames: Array, names: tuple[str, ...], lost: Array, first: int) -> bytes:
         """Return values as blocks, with the faults of the content; each gap starts a new block."""
-        every, *where = self._settings["OUTREDUCE"]
-        step = int(every) if not where or where[0] == "ETHERNET" else 1
+        every, *interfaces = self._settings["OUTREDUCE"]
+        step = int(every) if not interfaces or interfaces[0] == "ETHERNET" else 1
         kept = np.flatnonzero((np.arange(len(frames)) + first) % step == 0)
         kept = kept[~lost[kept]]
         linear = self._settings["SWITCHMD2"] == ("0",)

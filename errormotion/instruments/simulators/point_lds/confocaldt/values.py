@@ -1,4 +1,4 @@
-"""Measured values of a confocalDT 24x1: distances to nm and error values, averages, frames and blocks."""
+"""Measured values of a confocalDT 24x1: conversion to nm and error values, averages, frames and blocks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NOT_CALCULABLE = 0x7FFFFFF8
 PREAMBLE = 0x4D454153  # MEAS
 HEADER = struct.Struct("<IIIIIHHI")
 FRAMES_PER_BLOCK = 300
-"""At most, so that a block with a few values fits a packet of Ethernet; assumption."""
+"""Largest number, so that a block with a few values fits an Ethernet packet; assumption."""
 
 RATE_CODES = {70.0: 0, 50.0: 1, 25.0: 2, 10.0: 3, 5.0: 4, 2.5: 5, 1.0: 6, 0.3: 7, 0.2: 8, 0.1: 9}
 """Code of the frame rate in flags 2, by kHz."""
@@ -32,7 +32,7 @@ _NON_LINEAR, _MEASURED = 14, 18
 
 
 def raw_values(distances: Array, measuring_range: float, offset: float = 0.0) -> Array:
-    """Return distances (m, from the start of the range of so many m) in nm, or as error values.
+    """Return distances from the start of the range (m) in nm, or as error values.
 
     ``offset`` (m) is added by mastering.
     """
@@ -45,7 +45,7 @@ def raw_values(distances: Array, measuring_range: float, offset: float = 0.0) ->
 
 
 def states(distances: Array, measuring_range: float) -> Array:
-    """Return error states: bit 2 no peak, 5 before, 6 behind the range."""
+    """Return error states: bit 2 no peak, 5 before, 6 beyond the range."""
     missing = np.isnan(distances).astype(np.int64)
     before = (distances < 0.0).astype(np.int64)
     behind = (distances > measuring_range).astype(np.int64)
@@ -53,7 +53,7 @@ def states(distances: Array, measuring_range: float) -> Array:
 
 
 class Averaging:
-    """Moving, recursive and median averages of distances, over the limits of the pieces in which they come."""
+    """Moving, recursive and median averages of distances, continued from one call to the next."""
 
     def __init__(self, kind: str = "NONE", depth: int = 1) -> None:
         self._kind = kind

@@ -1,7 +1,7 @@
 """Command lines of an optoNCDT: words, and the forms of parameters as the manual writes them.
 
-A form is a row of places. ``A|B`` is one word of these, ``<1..9>`` a whole number, ``<number>`` any number,
-``<text>`` any word, ``[A|B]`` a place that may be missing, ``{A B C}`` any of these words in any order, at least one.
+A form is a sequence of parameters. ``A|B`` is one of these words, ``<1..9>`` a whole number, ``<number>`` any number,
+``<text>`` any word, ``[A|B]`` an optional parameter, ``{A B C}`` one or more of these words in any order.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ LONGEST_LINE = 255
 """Characters of a command line; assumption."""
 
 _WORD = re.compile(r'"([^"]*)"|(\S+)')
-_PLACE = re.compile(r"\{[^}]*\}|\S+")
+_PARAMETER = re.compile(r"\{[^}]*\}|\S+")
 _NUMBER = re.compile(r"[+-]?\d{1,12}(\.\d{1,12})?")
 
 
@@ -27,7 +27,7 @@ class RefusalError(Exception):
 
 
 def split(line: str) -> list[str]:
-    """Return the words of a command line; what stands in quotation marks is one word."""
+    """Return the words of a command line; text in quotation marks is one word."""
     return [quoted or plain for quoted, plain in _WORD.findall(line)]
 
 
@@ -38,9 +38,9 @@ class Command:
     Attributes
     ----------
     forms : sequence of str
-        Parameters that it takes, one form or more; none: it takes no parameters.
+        Forms of its parameters; empty: it takes none.
     default : str or None
-        Setting at delivery; None: it is no setting.
+        Setting as delivered; None: it is not a setting.
     writes : bool
         Whether only the level PROFESSIONAL may set it.
     """
@@ -50,9 +50,9 @@ class Command:
     writes: bool = True
 
     def check(self, words: Sequence[str]) -> None:
-        """Raise ``RefusalError`` where the parameters fit no form.
+        """Raise ``RefusalError`` if the parameters match no form.
 
-        The reason is that of the form which fits furthest: ``count``, ``parameter`` or ``range``.
+        The reason is that of the form which matches the most words: ``count``, ``parameter`` or ``range``.
         """
         misfits = [_misfit(form, words) for form in self.forms] or [(0, "count")]
         found = [misfit for misfit in misfits if misfit is not None]
@@ -64,15 +64,15 @@ _ORDER = ("count", "parameter", "range")
 
 
 def _misfit(form: str, words: Sequence[str]) -> tuple[int, str] | None:
-    """Return after how many words these do not fit a form, and why; None where they do."""
-    places = _PLACE.findall(form)
-    if places and places[0].startswith("{"):
-        return _misfit_of_set(places[0][1:-1].split(), words)
-    for number, (place, word) in enumerate(zip(places, words, strict=False)):
-        if reason := _misfit_of_place(place.strip("[]"), word):
+    """Return the number of words that match a form and the reason of the mismatch; None if all match."""
+    parameters = _PARAMETER.findall(form)
+    if parameters and parameters[0].startswith("{"):
+        return _misfit_of_set(parameters[0][1:-1].split(), words)
+    for number, (parameter, word) in enumerate(zip(parameters, words, strict=False)):
+        if reason := _misfit_of_parameter(parameter.strip("[]"), word):
             return number, reason
-    least = sum(not place.startswith("[") for place in places)
-    return None if least <= len(words) <= len(places) else (min(len(words), len(places)), "count")
+    least = sum(not parameter.startswith("[") for parameter in parameters)
+    return None if least <= len(words) <= len(parameters) else (min(len(words), len(parameters)), "count")
 
 
 def _misfit_of_set(flags: Sequence[str], words: Sequence[str]) -> tuple[int, str] | None:
@@ -82,11 +82,11 @@ def _misfit_of_set(flags: Sequence[str], words: Sequence[str]) -> tuple[int, str
     return None if words else (0, "count")
 
 
-def _misfit_of_place(place: str, word: str) -> str | None:
-    if place == "<text>":
+def _misfit_of_parameter(parameter: str, word: str) -> str | None:
+    if parameter == "<text>":
         return None
     reason = "parameter"
-    for each in place.split("|"):
+    for each in parameter.split("|"):
         if each == word:
             return None
         if each.startswith("<") and _NUMBER.fullmatch(word):
@@ -96,6 +96,6 @@ def _misfit_of_place(place: str, word: str) -> str | None:
             if "." not in word and least <= int(word) <= most:
                 return None
             reason = "range"
-    if reason == "parameter" and place[0].isdigit() and _NUMBER.fullmatch(word):
+    if reason == "parameter" and parameter[0].isdigit() and _NUMBER.fullmatch(word):
         return "range"
     return reason

@@ -1,4 +1,4 @@
-"""What the manuals say of each model: its commands, rates, errors, description and order of values."""
+"""The models according to the manuals: commands, rates, errors, description and order of values."""
 
 from __future__ import annotations
 
@@ -85,22 +85,22 @@ _ILD1420: dict[str, Command] = _COMMON | {
 
 @dataclass(frozen=True)
 class Model:
-    """A model of the maker.
+    """One model of the series.
 
     Attributes
     ----------
     commands : mapping of str to Command
         By name.
     errors : mapping of str to str
-        What is answered, by reason.
+        Answer by reason.
     description : sequence of str
-        Lines of GETINFO, with places for ``range`` (mm) and ``number``.
+        Lines of GETINFO, templates with ``range`` (mm) and ``number``.
     order : sequence of str
-        Values of a block in the order in which they are sent, of those that are selected.
+        All values of a block in the order in which they are sent.
     largest : int
-        Last raw value of a distance, the reserve behind the range included.
+        Last raw value of a distance, including the reserve beyond the range.
     range : float
-        mm, where neither address nor machine gives one.
+        mm; used if neither the address nor the machine states it.
     """
 
     commands: Mapping[str, Command]
@@ -112,7 +112,7 @@ class Model:
     rates: Mapping[str, float] = field(default_factory=dict)
 
     def rate(self, text: str) -> float:
-        """Return the rate of a parameter of MEASRATE, Hz."""
+        """Return the measuring rate for a parameter of MEASRATE, Hz."""
         return self.rates.get(text, float(text) * 1e3)
 
 
@@ -200,4 +200,4 @@ MODELS: dict[str, Model] = {
 }
 
 NEWER_RATES = Command(["0.25|0.5|1|2|4|8"], "2")
-"""MEASRATE of newer sensors of the series 1420."""
+"""MEASRATE of newer sensors of the 1420 series."""

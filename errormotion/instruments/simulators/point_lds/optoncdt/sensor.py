@@ -1,12 +1,12 @@
-"""A simulated optoNCDT: answers commands, streams what the virtual machine's beams see."""
+"""A simulated optoNCDT: answers commands and streams readings of a beam of the virtual machine."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.simulators.device import SimulatedDevice
-from errormotion.instruments.simulators.point_lds.optoncdt.grammar import LONGEST_LINE, Command, RefusalError, split
+from errormotion.instruments.simulators.point_lds.optoncdt.console import LINE_END, ConsoleDevice
+from errormotion.instruments.simulators.point_lds.optoncdt.grammar import RefusalError
 from errormotion.instruments.simulators.point_lds.optoncdt.models import MODELS, NEWER_RATES, Model
 from errormotion.instruments.simulators.point_lds.optoncdt.stream import (
     Counters,
@@ -16,29 +16,25 @@ from errormotion.instruments.simulators.point_lds.optoncdt.stream import (
 )
 from errormotion.instruments.transports import Address
 
-LINE_END = b"\n"
-PROMPT = b"->"
-
 _NO_BEAM = "E300 No such beam in the frame of this machine"
-_OTHER_CLOCK = "E301 Another device drives the clock of this machine"
-"""Errors of the virtual world, not of a sensor."""
+_OTHER_CLOCK = "E301 Another device controls the clock of this machine"
+"""Errors of the virtual world, not of the sensor."""
 
 _FREE = ("ECHO", "HELP", "PRINT", "LOGIN", "LOGOUT", "GETUSERLEVEL")
 _ENDLESS = 16383  # of TRIGGERCOUNT
-_LONGEST_PASSWORD = 31
 _FIRST_COUNT = 4711  # of the measured value counter of a sensor that has been on for a while
 
 
-class SimulatedOptoNCDT(SimulatedDevice):
+class SimulatedOptoNCDT(ConsoleDevice):
     """A sensor of the frame: the device's name is its channel, X1 X2 Y1 Y2 or Z.
 
-    While a target is set it rides on the stage and looks at that, whatever its name.
+    While a target is set, the sensor moves with the stage and measures the target, whatever its name.
 
     Further parameters of the address: ``model`` (ILD2300 or ILD1420), ``range`` (mm), ``newer`` (1: a newer 1420, which
-    also measures at 8 kHz), ``user`` (PROFESSIONAL or USER: who is logged in after power-on), ``password`` (000),
-    ``baudrate`` (of the line: values for which it is too slow are sent as error 262075; without it the line is never
-    too slow) and ``left`` (settings that an earlier user left, as commands joined by semicolons, with ``+`` for a
-    space: ``left=OUTADD_RS422+COUNTER;ECHO+OFF``; with ``OUTPUT+RS422`` the sensor streams from the first byte that it
+    also measures at 8 kHz), ``user`` (PROFESSIONAL or USER: user level after power-on), ``password`` (000),
+    ``baudrate`` (of the line: if it is too slow, values are sent as error 262075; without it, the line is never too
+    slow) and ``left`` (settings of an earlier user, as commands separated by semicolons, with ``+`` for a space:
+    ``left=OUTADD_RS422+COUNTER;ECHO+OFF``; with ``OUTPUT+RS422`` the sensor streams from the first byte that it
     receives).
     """
 
@@ -62,34 +58,20 @@ class SimulatedOptoNCDT(SimulatedDevice):
         if self._model_name not in MODELS:
             raise InstrumentError(f"'model' in '{address.url}': expected {' or '.join(MODELS)}; found another")
         self._model: Model = MODELS[self._model_name]
-        self._commands = dict(self._model.commands)
-        if address.number("newer", 0) and self._model_name == "ILD1420":
-            self._commands["MEASRATE"] = NEWER_RATES
+        newer = address.number("newer", 0) and self._model_name == "ILD1420"
+        self._commands = {**self._model.commands, "MEASRATE": NEWER_RATES} if newer else self._model.commands
         frame = self.world.machine.frame.range * 1e3
         self._range = address.number("range", frame if self._model_name == "ILD2300" else self._model.range) * 1e-3
         self._baudrate = address.number("baudrate", 0.0)
-        self._password = address.params.get("password", "000")
-        self._user = address.params.get("user", "PROFESSIONAL")
+        self._errors = self._model.errors
         self._counters = Counters(measured=_FIRST_COUNT)
-        self._left = [split(line) for line in address.params.get("left", "").split(";") if line.strip()]
+        self._set_up_console(address)
         self._boot()
         if self._baudrate:
             self._settings["BAUDRATE"] = (f"{self._baudrate:.0f}",)
 
     def _boot(self) -> None:
-        """Take the settings of delivery, and those that an earlier user has left."""
-        self._settings = {name: tuple(split(each.default)) for name, each in self._commands.items() if each.default}
-        self._level = "PROFESSIONAL" if self._user != "USER" else "USER"
-        self._settings["STDUSER"] = (self._level,)
-        for words in self._left:
-            command = self._commands.get(words[0])
-            if command is None or command.default is None:
-                raise InstrumentError(f"'left={' '.join(words)}': the {self._model_name} has no such setting")
-            try:
-                command.check(words[1:])
-            except RefusalError as refused:
-                raise InstrumentError(f"'left={' '.join(words)}': {self._model.errors[refused.reason]}") from None
-            self._settings[words[0]] = tuple(words[1:])
+        super()._boot()
         self._resuming = self._settings["OUTPUT"] == ("RS422",)
 
     def close(self) -> None:
@@ -98,7 +80,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
         super().close()
 
     def report_delivered(self, samples: int) -> None:
-        """Take note of how many samples of the running stream its reader has had."""
+        """Set the number of samples of the running stream that its reader has processed."""
         stream = self._stream
         if stream is not None:
             stream.taken = samples
@@ -111,44 +93,6 @@ class SimulatedOptoNCDT(SimulatedDevice):
             if not self._start():
                 self._begin()
         super()._on_data(data)
-        if len(self._buffer) > LONGEST_LINE:  # no line end in sight
-            self._buffer = b""
-            self.reply(self._model.errors["long"].encode() + b"\r\n" + PROMPT)
-
-    def answer(self, request: bytes) -> bytes:
-        """Return the answer to one command, in which ECHO ON repeats it."""
-        echo = self._settings["ECHO"] == ("ON",)
-        line = request.removesuffix(b"\r").decode("latin-1").strip()
-        text = self._text(line) if line else ""
-        if echo and line and (line.isascii() and line.isprintable()):
-            text = f"{line}\r\n{text}" if text else f"{line} ok"
-        return text.encode("latin-1") + b"\r\n" + PROMPT
-
-    def _text(self, line: str) -> str:
-        errors = self._model.errors
-        if len(line) > LONGEST_LINE:
-            return errors["long"]
-        if not (line.isascii() and line.isprintable()):
-            return errors.get("character", errors["command"])
-        name, *words = split(line)
-        command = self._commands.get(name)
-        if command is None:
-            return errors["command"]
-        try:
-            return self._obey(name, command, words)
-        except RefusalError as refused:
-            return errors[refused.reason]
-
-    def _obey(self, name: str, command: Command, words: Sequence[str]) -> str:
-        if not words and command.default is not None:
-            return " ".join([name, *self._settings[name]])
-        if words or command.forms:
-            command.check(words)
-        if self._level != "PROFESSIONAL" and command.writes:
-            raise RefusalError("access")
-        if command.default is not None:
-            return self._set(name, tuple(words))
-        return self._act(name, words)
 
     # ------------------------------------------------------------------ settings
 
@@ -171,7 +115,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
         return ""
 
     def _check_state(self, name: str, words: tuple[str, ...]) -> None:
-        """Refuse what the sensor's other settings forbid."""
+        """Raise `RefusalError` if the other settings do not permit this setting."""
         thickness = self._settings.get("MEASMODE") == ("THICKNESS",)
         if name == "OUTTHICK_RS422" and not thickness:
             raise RefusalError("state")
@@ -181,13 +125,13 @@ class SimulatedOptoNCDT(SimulatedDevice):
             least = -2.0 if self._model_name == "ILD2300" else 0.0
             if not least * self._range <= float(words[1]) * 1e-3 <= 2 * self._range:
                 raise RefusalError("range")
-            if self._settings["LASERPOW"] == ("OFF",):  # no measurement comes within 2 s
+            if self._settings["LASERPOW"] == ("OFF",):  # no measured value within 2 s
                 raise RefusalError("timeout")
 
     def _closed_gate(self) -> int | None:
         return None if self._settings["TRIGGER"][0] == "NONE" else 0
 
-    # ------------------------------------------------------------------ commands that are no settings
+    # ------------------------------------------------------------------ commands other than settings
 
     def _act(self, name: str, words: Sequence[str]) -> str:
         match name:
@@ -199,8 +143,6 @@ class SimulatedOptoNCDT(SimulatedDevice):
                 return " ".join([name, "DIST1"])
             case "PRINT":
                 return "\r\n".join(" ".join([each, *value]) for each, value in sorted(self._settings.items()))
-            case "HELP":
-                return "\r\n".join(sorted(self._commands))
             case "RESET":
                 self._stop()
                 self._boot()
@@ -218,29 +160,8 @@ class SimulatedOptoNCDT(SimulatedDevice):
                 count = int(self._settings["TRIGGERCOUNT"][0])
                 self._counters.gate = None if count == _ENDLESS else count
             case _:
-                return self._act_on_user(name, words)
+                return super()._act(name, words)
         return ""
-
-    def _act_on_user(self, name: str, words: Sequence[str]) -> str:
-        match name:
-            case "GETUSERLEVEL":
-                return f"{name} {self._level}"
-            case "LOGIN":
-                if words[0] != self._password:
-                    raise RefusalError("access")
-                self._level = "PROFESSIONAL"
-            case "LOGOUT":
-                self._level = "USER"
-            case "PASSWD":
-                old, new, again = words
-                if old != self._password:
-                    raise RefusalError("access")
-                if new != again:
-                    raise RefusalError("passwords")
-                if len(new) > _LONGEST_PASSWORD:
-                    raise RefusalError("long")
-                self._password = new
-        return ""  # the rest stores and loads settings, of which there is one set only
 
     def _reset_counters(self, words: Sequence[str]) -> None:
         with self._server.lock:
@@ -320,29 +241,29 @@ class SimulatedOptoNCDT(SimulatedDevice):
         )
 
     def _begin(self) -> None:
-        """Make the stream that was switched on known to the world."""
+        """Add the stream that was switched on to the world."""
         if self._starting and self._stream is not None:
             self.world.start_stream(self._stream)
         self._starting = False
 
     def _restart(self) -> None:
-        """Let the running stream take new settings."""
+        """Restart the running stream with new settings."""
         self._stop()
         self._start()
 
     def _stop(self) -> None:
-        self._silent()  # a sensor that stopped answering sends nothing more on the command to stop
+        self._silent()  # a silent sensor sends nothing after the command to stop
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.ended = True
             self.world.end_stream(stream)
 
     def reply(self, data: bytes) -> None:
-        """Send an answer; a stream that was just switched on starts behind it.
+        """Send an answer; a stream that was just switched on starts after it.
 
-        It is known to the world before the answer is out: the next thing to come may be its master's start.
+        It is added to the world before the answer is sent: its master may start immediately afterwards.
         """
-        with self._server.lock:  # no sample passes before the answer
+        with self._server.lock:  # no sample is sent before the answer
             self._begin()
             super().reply(data)
 

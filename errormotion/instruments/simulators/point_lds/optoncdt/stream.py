@@ -25,14 +25,14 @@ from errormotion.instruments.transports.loopback.serving import Server
 Array = np.ndarray[Any, Any]
 
 _CONSTANTS = {"TEMP": 4 * 30, "SHUTTER": 1000, "INTENSITY": 32000, "DIST2": NOT_CALCULABLE, "THICK12": NOT_CALCULABLE}
-"""Values that the virtual world does not know: 30 degC, an exposure time, an intensity, no second peak."""
+"""Values that the virtual world does not simulate: 30 degC, an exposure time, an intensity, no second peak."""
 
 _NO_PEAK_BIT, _GREEN = 1 << 2, 1 << 16
 
 
 @dataclass
 class Output:
-    """What a stream sends, from the settings of the sensor.
+    """Content of a stream, from the settings of the sensor.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Output:
     largest : int
         Last raw value of a distance.
     every : int
-        One of so many measurements is sent.
+        Every n-th measurement is sent.
     hold : int or None
         Number of measurements for which a missing distance is replaced by the last one; None: no limit.
     average : tuple of (str, int)
@@ -77,11 +77,11 @@ class Output:
 
 @dataclass
 class Counters:
-    """What a sensor counts from stream to stream: measurements, and the values that its trigger lets through.
+    """State that a sensor keeps between streams.
 
-    ``measured`` and ``seconds`` are the counter and the time stamp, ``gate`` is the number of values that the trigger
-    still lets through (None: all), ``reference`` the distance that was mastered, ``low`` and ``high`` are the raw
-    extremes, ``past`` are the distances that an average still needs, ``last`` is the raw value that is held since
+    ``measured`` and ``seconds`` are the counter and the time stamp, ``gate`` is the remaining number of triggered
+    values (None: all are sent), ``reference`` the distance that was mastered, ``low`` and ``high`` are the raw
+    extremes, ``past`` are the preceding distances for the average, ``last`` is the raw value that has been held for
     ``held`` measurements.
     """
 
@@ -102,9 +102,9 @@ class SensorStream:
     Parameters
     ----------
     server : Server
-        The wire.
+        Of the line.
     fault : Fault
-        What goes wrong.
+        Of the line.
     rng : numpy.random.Generator
         For stray bytes.
     channel : str
@@ -114,7 +114,7 @@ class SensorStream:
     sync : str
         NONE, MASTER or SLAVE.
     output : Output
-        What is sent.
+        Of the stream.
     counters : Counters
         Of the sensor.
     """
@@ -146,7 +146,7 @@ class SensorStream:
         self._counters = counters
 
     def push(self, distances: Array) -> None:
-        """Send the next samples with whatever fault is due; may wait for the reader."""
+        """Send the next samples with the fault that is due; may wait for the reader."""
         first, size = self.sent, distances.size
         raws = self._processed(self._raws(distances, first), distances)
         blocks = self._blocks(raws)
@@ -167,12 +167,9 @@ class SensorStream:
     # ------------------------------------------------------------------ distances
 
     def _raws(self, distances: Array, first: int) -> Array:
-        output, fault = self._output, self._fault
+        output = self._output
         raws = raw_distances(self._averaged(distances), output.measuring_range, output.largest)
-        if fault.kind == "out_of_range":
-            numbers = first + np.arange(raws.size)
-            within = (numbers < fault.at + fault.length) | (fault.length == 0)
-            raws[(numbers >= fault.at) & within] = NO_PEAK
+        raws[self._fault.affects("out_of_range", first + np.arange(raws.size))] = NO_PEAK
         if not output.laser:
             raws[:] = LASER_OFF
         if output.overflow:
@@ -202,13 +199,13 @@ class SensorStream:
         return raws if output.hold == 0 else self._held(raws)
 
     def _held(self, raws: Array) -> Array:
-        """Return raw distances with missing ones replaced by the last one, for as long as it is held."""
+        """Return raw distances; missing ones are replaced by the last one while it is held."""
         counters, hold = self._counters, self._output.hold
-        places = np.where(raws < FIRST_ERROR, np.arange(raws.size), -1)
-        places = np.maximum.accumulate(places)
-        before = np.arange(raws.size) + 1 + counters.held  # since the last distance of the block before
-        since = np.where(places < 0, before, np.arange(raws.size) - places)
-        source = np.where(places < 0, counters.last, raws[places])
+        indices = np.where(raws < FIRST_ERROR, np.arange(raws.size), -1)
+        indices = np.maximum.accumulate(indices)
+        before = np.arange(raws.size) + 1 + counters.held  # since the last distance of the previous block
+        since = np.where(indices < 0, before, np.arange(raws.size) - indices)
+        source = np.where(indices < 0, counters.last, raws[indices])
         result = np.where((since > 0) & (source >= 0) & ((hold is None) | (since <= (hold or 0))), source, raws)
         counters.last, counters.held = int(source[-1]), int(since[-1])
         return result
@@ -259,7 +256,7 @@ class SensorStream:
         return np.where(high < 0, NO_PEAK, value)
 
     def _lost(self, first: int, size: int) -> Array:
-        """Return which measurements are not sent: dropped by a fault, reduced, or outside the trigger."""
+        """Return for each measurement whether it is omitted: by a fault or by the reduction."""
         fault = self._fault
         numbers = first + np.arange(size)
         active = numbers >= fault.at
@@ -282,12 +279,12 @@ class SensorStream:
         if fault.kind == "garbage":
             numbers = first + np.arange(lost.size)
             due = int(((numbers >= fault.at) & ((numbers - fault.at) % fault.every == 0)).sum())
-            for place in sorted(self._rng.integers(0, len(data) + 1, due), reverse=True):
-                data = data[:place] + stray_bytes(self._rng) + data[place:]
+            for position in sorted(self._rng.integers(0, len(data) + 1, due), reverse=True):
+                data = data[:position] + stray_bytes(self._rng) + data[position:]
         return data
 
 
 def depth_of(words: tuple[str, ...]) -> tuple[str, int]:
-    """Return method and depth of the parameters of AVERAGE; without a depth that of the method's first choice."""
+    """Return method and depth from the parameters of AVERAGE; the default depth is the method's smallest."""
     method = words[0]
     return method, int(words[1]) if len(words) > 1 else {"MOVING": 2, "MEDIAN": 3}.get(method, 1)

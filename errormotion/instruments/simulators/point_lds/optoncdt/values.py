@@ -15,23 +15,23 @@ BEHIND_RANGE = 262078
 NOT_CALCULABLE = 262080
 LASER_OFF = 262082
 FIRST_ERROR = 262073
-"""Values from here on are no distances."""
+"""Values from this one on are errors, not distances."""
 
 STEPS = 65520 / 1.02
 """Raw values per measuring range."""
 RESERVE = 0.01
-"""Reserve before and behind the range, of the range; also what is added before scaling."""
+"""Reserve on each side of the range as a fraction of the range; added before scaling."""
 MASTERED = 0.51
-"""What is added before scaling once a master value is set."""
+"""Added before scaling once a master value is set."""
 
 BITS = 18
 BYTES_OF_VALUE = 3
 BITS_ON_WIRE = 30
-"""Of one value: three bytes with their start and stop bits."""
+"""Bits of one value: three bytes with their start and stop bits."""
 
 
 def raw_distances(distances: Array, measuring_range: float, largest: int) -> Array:
-    """Return the raw values of distances from the start of the range, m; error values where there is none."""
+    """Return the raw values of distances from the start of the range, m; error values if missing."""
     parts = np.asarray(distances) / measuring_range
     with np.errstate(invalid="ignore"):
         raws = np.rint((parts + RESERVE) * STEPS)
