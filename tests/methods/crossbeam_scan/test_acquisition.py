@@ -220,7 +220,7 @@ def test_a_stream_that_breaks_costs_the_rest_of_its_pass_only(tmp_path):
 def test_silence_in_a_pass_breaks_it_and_silence_before_it_does_not(tmp_path):
     silent = InstrumentTimeoutError("profiler: no data for 1 s")
     raw = record(Machine({2: (0.3, silent)}), tmp_path / "raw.zarr")
-    with pytest.raises(MethodError, match=r"of it is there, .* m: pass 2 broke at 0\.29\d m \(profiler: no"):
+    with pytest.raises(MethodError, match=r"complete, .* m: pass 2 broke at 0\.29\d m \(profiler: no"):
         Scans(raw).scan(2, 0)
     assert [broken.cycle for broken in interruptions(raw)] == [2]
 
@@ -328,7 +328,7 @@ def test_on_a_virtual_machine_that_is_still_there_the_broken_pass_stays_and_the_
     assert machine.orders == ["warm_up_3.nc", "pass.nc"]
     scans = Scans(raw)
     assert [scans.scan(cycle, 0)[0].shape for cycle in range(5)] == [(800, POINTS)] * 5
-    with pytest.raises(MethodError, match="there is no line of it"):
+    with pytest.raises(MethodError, match="the scan has no lines"):
         scans.scan(3, 1)
     assert 1800 < scans.scan(4, 1)[3] < 1820
 
@@ -410,7 +410,7 @@ def test_the_operator_is_reported_which_program_and_what_it_does(tmp_path, day):
     bench = Bench(asks=obey, line_profiler=machine)
     raw = store(record_scans(bench, SETTINGS, None, None), tmp_path / "raw.zarr")
     assert bench.asked[0].startswith(
-        "make pass.nc (measuring pass over 2 artefacts; 19 s) ready, confirm, and start it"
+        "prepare pass.nc (measuring pass over 2 artefacts; 19 s), confirm, and then start it"
     )
     assert bench.asked[2].startswith("When pass.nc has ended: start warm_up_1.nc (warm-up moves, 6.9 min;")
     assert len(bench.asked) == 8
@@ -560,7 +560,7 @@ def test_half_a_file_is_a_scan_with_a_reason(tmp_path):
         write_files(tmp_path, 6, spoil=lambda k, ds: ds.isel(profile=slice(0, 200)) if k == 3 else ds),
         tmp_path / "raw.zarr",
     )
-    with pytest.raises(MethodError, match="50% of it is there"):
+    with pytest.raises(MethodError, match="50% complete"):
         Scans(raw).scan(1, 1)
     assert Scans(raw).scan(2, 1)[2].size in (399, 400)
 

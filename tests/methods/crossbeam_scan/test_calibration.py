@@ -134,7 +134,7 @@ def test_one_height_leaves_the_angle_a_open(scan_pocket, truth):
     ("change", "message"),
     [
         (lambda x, z, s: (x, z[:, :, :-1], s), "found .*3199"),
-        (lambda x, z, s: (x, np.where(z < 0, np.nan, z) * 0, s), "0.2 mm deep is needed"),
+        (lambda x, z, s: (x, np.where(z < 0, np.nan, z) * 0, s), "0.2 mm deep, with ten lines"),
         (lambda x, z, s: (x, z * 1e-3, s), "Check the unit"),
         (lambda x, z, s: (x, z[:, :6], s[:, :6]), "ten lines"),
         (lambda x, z, s: (x, z, s + np.linspace(0, 1e-3, s.shape[1])[:, None]), "one height of the spindle"),
@@ -167,7 +167,7 @@ def test_a_raw_dataset_gives_what_its_arrays_give(gantry, truth, tmp_path):
 def test_scans_of_artefacts_are_no_calibration(gantry):
     profiler = Profiler(80, 0.4e-3, disturbances=Disturbances.white())
     raw = simulation.raw_scans(gantry, [0], [0], seed=1, profiler=profiler, profiles=3, feed=1e-3)
-    with pytest.raises(MethodError, match="needs scans of a pocket"):
+    with pytest.raises(MethodError, match="Expected scans of a pocket"):
         calibration.calibrate_dataset(raw)
 
 

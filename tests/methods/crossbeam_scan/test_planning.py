@@ -154,7 +154,7 @@ def test_a_plan_of_the_pose_says_what_calibration_will_state(machine):
 
 
 def test_one_lift_leaves_the_pose_open():
-    with pytest.raises(MethodError, match=r"expected two lifts of the spindle at least"):
+    with pytest.raises(MethodError, match=r"expected at least two lifts of the spindle"):
         plan(procedure="profiler_pose", pocket_lifts=(0.166,), profiler_pose={"dz": -0.174})
 
 

@@ -9,7 +9,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.poses import displacement
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
-from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import given, given_covariance
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
 from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
 from errormotion.twin import VirtualMachine
 
@@ -114,8 +114,8 @@ def test_the_pose_found_serves_the_scans(raws, found):
 
 def test_settings_give_a_pose_and_its_covariance():
     pose = PoseSettings(a=0.01, b=-0.02, g=0.03, dx=0.001, dy=0.002, dz=-0.17, angle_uncertainty=1e-3)
-    assert calibration.parameters(given(pose)) == pytest.approx([0.01, -0.02, 0.03, 0.001, 0.002, -0.17])
-    assert np.sqrt(np.diag(given_covariance(pose))) == pytest.approx([1e-3] * 3 + [5e-3] * 3)
+    assert calibration.parameters(stated_pose(pose)) == pytest.approx([0.01, -0.02, 0.03, 0.001, 0.002, -0.17])
+    assert np.sqrt(np.diag(stated_covariance(pose))) == pytest.approx([1e-3] * 3 + [5e-3] * 3)
 
 
 def test_one_lift_is_refused_unless_angles_are_known(raws):

@@ -56,14 +56,14 @@ def test_warm_up_moves_may_have_other_ends():
 
 
 def test_warm_up_moves_between_one_place_are_refused():
-    with pytest.raises(MethodError, match="two ends apart"):
+    with pytest.raises(MethodError, match="two different ends"):
         program_texts(SETTINGS.model_copy(update={"warm_up_travel": (0.4, 0.4)}))
 
 
 def test_a_program_that_leaves_the_travel_is_refused_with_its_name_and_both_ends():
     short = SETTINGS.model_copy(update={"travel": (0.3, 0.58)})
     with pytest.raises(
-        MethodError, match=r"pass\.nc would move from Y317\.000 to Y583\.000 .* from 300\.000 to 580\.000"
+        MethodError, match=r"pass\.nc would move from Y317\.000 to Y583\.000, .* from 300\.000 to 580\.000"
     ):
         program_texts(short)
     assert program_texts(SETTINGS.model_copy(update={"travel": (0.317, 0.583)}))

@@ -287,8 +287,8 @@ def test_a_long_campaign_has_a_row_for_each_cycle(page):
 
 def test_the_sentence_on_the_residual_counts_what_a_wrong_pose_would_add(html, whole):
     found = re.search(
-        r"rotation (\w+) by the registration is (\S+) µrad, and a pose that is wrong by 10 times as much would bring "
-        r"the residual from (\S+) nm to (\S+) nm",
+        r"rotation (\w+) of the registration is (\S+) µrad, and an error of the pose of 10 times this value would "
+        r"change the residual from (\S+) nm to (\S+) nm",
         words_of(html),
     )
     assert found[1] == "ECY"
@@ -331,7 +331,7 @@ def test_the_cold_repeat_is_judged_by_its_uncertainty(page, small):
     errors = small.copy(deep=True)
     errors["cold_repeat"][0, 2, 1] = 5 * 2 * errors["cold_repeat_u"][0, 2, 1]
     found = re.search(r'<p class="warning">(Cold repeat: .*?)</p>', page(errors))
-    assert "the largest is EYY at y = −300 mm with 5 times its own" in words_of(found[1])
+    assert "the largest is EYY at y = −300 mm with 5 times its uncertainty" in words_of(found[1])
 
 
 def test_the_pose_is_reported_in_angles_and_shifts(html):

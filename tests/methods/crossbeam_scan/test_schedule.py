@@ -8,7 +8,7 @@ import pytest
 from errormotion.errors import MethodError
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition.programs import measuring_pass
-from errormotion.methods.crossbeam_scan.acquisition.schedule import PAUSE, schedule
+from errormotion.methods.crossbeam_scan.acquisition.schedule import PROGRAM_INTERVAL, schedule
 from errormotion.methods.crossbeam_scan.settings import MINUTE, Settings
 
 TRAVEL = {"X": (0.0, 1.0), "Y": (0.0, 3.0), "Z": (0.0, 1.0)}
@@ -26,8 +26,8 @@ def test_every_pass_begins_at_its_warm_up_time_and_moves_fill_the_time_between(s
     assert [plan.of_cycle(2 + k).start for k in range(9)] == list(settings.warm_up)
     gaps = [second.start - first.end for first, second in pairwise(plan.items)]
     # a rest that is too short for a stroke of a millimetre there and back is not moved
-    assert min(gaps) > PAUSE - 1e-6
-    assert max(gaps) < PAUSE + 0.05
+    assert min(gaps) > PROGRAM_INTERVAL - 1e-6
+    assert max(gaps) < PROGRAM_INTERVAL + 0.05
 
 
 def test_cold_passes_come_before_the_warm_up(settings):
@@ -43,7 +43,7 @@ def test_the_whole_takes_the_last_warm_up_time_and_the_passes_at_both_ends(setti
     plan = schedule(settings)
     one = plan.of_cycle(0).seconds
     way = (1.4 + 0.056 + 2 * 0.005) / settings.measuring_feed  # back to where the pass begins
-    assert plan.seconds == pytest.approx(180 * MINUTE + 3 * one + way + 2 * PAUSE)
+    assert plan.seconds == pytest.approx(180 * MINUTE + 3 * one + way + 2 * PROGRAM_INTERVAL)
 
 
 def test_predicted_durations_are_those_of_a_control_that_moves_with_constant_feed(settings):
@@ -59,12 +59,12 @@ def test_predicted_durations_are_those_of_a_control_that_moves_with_constant_fee
 
 def test_warm_up_times_without_time_for_a_pass_between_them_are_refused(settings):
     close = settings.model_copy(update={"warm_up": (7 * MINUTE, 8 * MINUTE)})
-    with pytest.raises(MethodError, match=r"at 8 min the axis is not free before 8\.\d min"):
+    with pytest.raises(MethodError, match=r"the pass at 8 min can start at 8\.\d min"):
         schedule(close)
 
 
 def test_a_campaign_without_artefacts_says_what_is_missing():
-    with pytest.raises(MethodError, match="give 'positions'"):
+    with pytest.raises(MethodError, match="set 'positions'"):
         schedule(Settings())
 
 

@@ -256,7 +256,7 @@ def test_wrong_inputs_are_refused():
         smooth(x, y, v, x, order=4)
     with pytest.raises(MethodError, match="finite"):
         smooth(np.where(x > 1, np.nan, x), y, v, x)
-    with pytest.raises(MethodError, match="lie above 0"):
+    with pytest.raises(MethodError, match="positions above 0"):
         smooth(x - x[0], y, v, x, exact_zero=True)
     with pytest.raises(MethodError, match=r"\(\.\.\., n, 6\)"):
         smooth_twists(x, y, v, x)

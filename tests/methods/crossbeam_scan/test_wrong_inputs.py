@@ -91,7 +91,7 @@ def bumpy(x, y):
 
 def test_a_scan_that_is_all_nan(raw, errors):
     spoil(raw, np.nan)
-    assert_lost_alone(identify(raw), errors, "all of it is NaN")
+    assert_lost_alone(identify(raw), errors, "all values are NaN")
 
 
 def test_a_scan_of_another_artefact(gantry, raw, errors):
@@ -129,7 +129,9 @@ def test_half_a_scan_is_worth_less_and_says_so(gantry, raw, errors):
 
 def test_lines_that_do_not_rise(raw, errors):
     raw["y"][CYCLE, ARTEFACT, 50] = raw["y"][CYCLE, ARTEFACT, 40].values
-    assert_lost_alone(identify(raw), errors, "expected y to rise from line to line; 1 of 400 lines lie behind")
+    assert_lost_alone(
+        identify(raw), errors, "expected y to increase from line to line; 1 of 400 lines are at or before"
+    )
 
 
 def test_a_scan_backwards_is_the_same_scan(raw, errors):
@@ -299,7 +301,7 @@ def test_a_pass_that_broke_says_where_and_why(record, record_errors):
     found = identify(broken)
     assert (
         found["reason"].values[1, 2]
-        == "there is no line of it: pass 2 broke at 0.100 m (no data for 1 s; is the cable in?)"
+        == "the scan has no lines: pass 2 broke at 0.100 m (no data for 1 s; is the cable in?)"
     )
     np.testing.assert_array_equal(found.em.twist().values[:, :2], record_errors.em.twist().values[:, :2])
     np.testing.assert_array_equal(found.em.twist().values[2, 2], record_errors.em.twist().values[2, 2])
