@@ -93,11 +93,9 @@ RAW_SCHEMAS = (
         "beam detection as recorded",
         "scan",
         (
-            Row(
-                "record", ("sample",), "m", *READING, "reading along the beam that is scanned; NaN = none", missing=True
-            ),
+            Row("record", ("sample",), "m", *READING, "reading along the scanned beam; NaN = none", missing=True),
             Row("scan", ("sample",), "", 0, 1000, "number of the scan: channel times profiles plus profile"),
-            Row("attempt", ("sample",), "", 0, 1000, "number of the attempt; the last one counts", required=False),
+            Row("attempt", ("sample",), "", 0, 1000, "number of the attempt; the last one is used", required=False),
             *_STEPPED_SPHERE,
         ),
         sizes={**DIRECTION, "channel": 5},

@@ -139,12 +139,12 @@ def test_missing_touches_are_flagged_and_nan(machine):
     ("arguments", "why"),
     [
         ({"balls": 9}, "1 to 8 balls"),
-        ({"touches": 4}, "5 times or more"),
-        ({"times": [0.0, 60.0]}, "Cycles of 120 s"),
-        ({"cycle": -1.0}, "Cycles of -1 s"),
+        ({"touches": 4}, "expected 5 or more"),
+        ({"times": [0.0, 60.0]}, "at least 120 s apart"),
+        ({"cycle": -1.0}, "at least -1 s apart"),
         ({"missing": 1.5}, "from 0 to 1"),
-        ({"moved": (4, 0.0, (0, 0, 0))}, "one of 0 to 3"),
-        ({"variant": "balls"}, "'touches' and 'centres'"),
+        ({"moved": (4, 0.0, (0, 0, 0))}, "from 0 to 3"),
+        ({"variant": "balls"}, "'touches' or 'centres'"),
     ],
 )
 def test_what_cannot_be_probed_is_refused_in_words(cframe, arguments, why):

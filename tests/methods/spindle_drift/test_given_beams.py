@@ -56,5 +56,5 @@ def test_what_is_no_beam_of_the_frame_is_refused(detected):
         given_beams({"beams": detected, "X1": one.assign(beam_origin=one["beam_origin"] * np.nan)})
     with pytest.raises(MethodError, match="several frames"):
         given_beams({"beams": detected, "X1": one.assign_attrs(frame="table")})
-    with pytest.raises(MethodError, match="holds the beams X1, Z; expected X2 as well"):
+    with pytest.raises(MethodError, match="contains the beams X1, Z; expected X2 as well"):
         given_beams({"beams": detected.sel(beam=["X1", "Z"])})

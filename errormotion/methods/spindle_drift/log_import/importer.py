@@ -1,4 +1,4 @@
-"""Logs of a drift: columns of text become a raw dataset."""
+"""Conversion of logs of a drift, columns of text, to a raw dataset."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     Raises
     ------
     DatasetError
-        The map or the log is wrong; all mistakes are reported together, each with its line.
+        The map or the log is invalid; all mistakes are reported together, each with its line.
     """
     settings = load_model(map_file, ImportMap, error=DatasetError)
     mistakes = Mistakes(log)
