@@ -49,7 +49,7 @@ def test_values_that_are_no_points_are_refused(fit):
     broken[[3, 7]] = np.nan
     with pytest.raises(FitError, match=r"2 of 20 points are not finite \(rows 3, 7\)"):
         fit(broken)
-    with pytest.raises(FitError, match=r"one point a row; found \(20,\)"):
+    with pytest.raises(FitError, match=r"one row for each point; found \(20,\)"):
         fit(np.zeros(20))
     with pytest.raises(FitError, match=r"found \(3, 20\)"):
         fit(np.zeros((3, 20)))
@@ -79,7 +79,7 @@ def test_three_lines_hold_a_cylinder():
         ({"sigma": 0.0}, "positive sigma"),
         ({"sigma": float("nan")}, "positive sigma"),
         ({"weights": [1.0, 1.0]}, "12 positive weights"),
-        ({"weights": [0.0] + [1.0] * 11}, "leave out points of weight 0"),
+        ({"weights": [0.0] + [1.0] * 11}, "remove points of weight 0"),
     ],
 )
 def test_options_are_checked(options, message):

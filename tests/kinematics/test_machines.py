@@ -214,7 +214,7 @@ def test_a_wrong_chain_is_refused(chain, message):
         (lambda: Machine(CFRAME).volumetric_error(np.zeros(3), np.zeros(6)), r"errors of shape \(..., 21\)"),
         (lambda: Machine(CFRAME).errors_at(np.zeros(3), {"C": np.zeros}), "has no C"),
         (lambda: Machine(CFRAME).errors_at(np.zeros(3), {}, {"EC0Z": 0.0}), "has no EC0Z"),
-        (lambda: ErrorMotion(np.array([0.0, 0.0]), np.zeros((2, 6))), "strictly increase"),
+        (lambda: ErrorMotion(np.array([0.0, 0.0]), np.zeros((2, 6))), "strictly increasing"),
         (lambda: ErrorMotion(np.array([0.0, 1.0]), np.zeros((3, 6))), r"twists of shape \(n, 6\)"),
         (lambda: ErrorMotion(np.array([0.0, 7.0]), np.zeros((2, 6)), period=6.28), "one period"),
         (lambda: Axis("Q", True), "found 'Q'"),

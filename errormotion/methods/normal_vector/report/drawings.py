@@ -56,8 +56,8 @@ def balls(seen: Probing, key: str) -> Block:
     caption = (
         f"Balls on the table in the cold cycle (grey), and their apparent displacements, magnified {integer(factor)} "
         "times: light in the first quarter of the record, dark in the last, with a black point at the last known "
-        f"cycle. The largest is {fixed(1e6 * float(size[k, i]), 1)} µm, of {seen.balls[i]}. The displacement of the tool side "
-        "is opposite."
+        f"cycle. The largest is {fixed(1e6 * float(size[k, i]), 1)} µm, of {seen.balls[i]}. The displacement of the "
+        "tool side is opposite."
         + (
             f" Red, dashed: {listed(moved_names)}, which moved on the table and was not used afterwards."
             if moved_names
