@@ -41,7 +41,7 @@ def test_the_pass_goes_from_a_margin_before_the_first_scan_to_a_margin_behind_th
     np.testing.assert_allclose(np.abs(np.diff(path.places[:, 1])) / np.diff(path.times), [0.025, 0, 0.025], atol=1e-9)
 
 
-def test_warm_up_moves_take_exactly_the_time_that_there_is():
+def test_warm_up_moves_take_exactly_the_available_time():
     for seconds in (10.0, 100.0, 1234.5):
         program = warm_up_piece(SETTINGS, 1, seconds, start=0.317)
         # half a micrometre of rounding in each of some hundred moves at 60 mm/s
@@ -55,7 +55,7 @@ def test_warm_up_moves_may_have_other_ends():
     assert (y.min(), y.max()) == (pytest.approx(-0.1), pytest.approx(0.9))
 
 
-def test_warm_up_moves_between_one_place_are_refused():
+def test_warm_up_moves_with_equal_ends_are_refused():
     with pytest.raises(MethodError, match="two different ends"):
         program_texts(SETTINGS.model_copy(update={"warm_up_travel": (0.4, 0.4)}))
 
@@ -86,7 +86,7 @@ def test_a_pass_goes_to_the_height_of_the_scans_where_that_is_given():
     assert " Z" not in program_texts(SETTINGS)["pass.nc"]
 
 
-def test_no_place_is_written_as_minus_zero():
+def test_no_position_is_written_as_minus_zero():
     text = measuring_pass(Settings(positions=(0.033 - 1e-8, 0.2), warm_up=())).text()
     assert "Y0.000" in text
     assert "Y-0.000" not in text

@@ -20,7 +20,7 @@ def settings():
     return Settings(positions=tuple(0.35 + 0.2 * k for k in range(8)))
 
 
-def test_every_pass_begins_at_its_warm_up_time_and_moves_fill_the_time_between(settings):
+def test_every_pass_starts_at_its_warm_up_time_with_moves_between(settings):
     plan = schedule(settings)
     assert plan.cold == 2
     assert [plan.of_cycle(2 + k).start for k in range(9)] == list(settings.warm_up)
@@ -39,7 +39,7 @@ def test_cold_passes_come_before_the_warm_up(settings):
     assert plan.before(2).start == 0
 
 
-def test_the_whole_takes_the_last_warm_up_time_and_the_passes_at_both_ends(settings):
+def test_duration_is_the_last_warm_up_time_and_the_passes_at_both_ends(settings):
     plan = schedule(settings)
     one = plan.of_cycle(0).seconds
     way = (1.4 + 0.056 + 2 * 0.005) / settings.measuring_feed  # back to where the pass begins
@@ -63,7 +63,7 @@ def test_warm_up_times_without_time_for_a_pass_between_them_are_refused(settings
         schedule(close)
 
 
-def test_a_campaign_without_artefacts_says_what_is_missing():
+def test_campaign_without_artefacts_states_what_is_missing():
     with pytest.raises(MethodError, match="set 'positions'"):
         schedule(Settings())
 
@@ -73,6 +73,6 @@ def test_a_campaign_may_be_cold_passes_only(settings):
     assert [item.program for item in plan.items] == ["pass.nc", "pass.nc"]
 
 
-def test_the_schedule_goes_into_the_dataset_as_json(settings):
+def test_schedule_is_stored_in_the_dataset_as_json(settings):
     items = json.loads(schedule(settings).to_json())
     assert items[3] == {"program": "pass.nc", "start": 420.0, "seconds": pytest.approx(60.64, abs=0.01), "cycle": 2}
