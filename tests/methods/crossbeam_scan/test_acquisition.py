@@ -36,9 +36,9 @@ SETTINGS = Settings(
 
 
 class Machine:
-    """A control and a profiler on one clock; the first point of a line is the position of the axis, the second the time.
+    """A control and a profiler on one clock; the points of a line are the position of the axis and the time.
 
-    ``breaks`` maps the number of a pass (repeats counted) to a place and what the profiler raises there.
+    ``breaks`` maps the number of a pass (repeats counted) to a position and the error that the profiler raises there.
     """
 
     def __init__(self, breaks=None, scale=1e-6, real=False):
