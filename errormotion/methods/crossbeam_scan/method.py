@@ -42,12 +42,7 @@ class CrossbeamScan:
     redrawing = lazy("errormotion.methods.crossbeam_scan.redrawing:redrawing")
 
     def acquire(
-        self,
-        bench: Bench,
-        settings: ScanSettings,
-        *,
-        inputs: Mapping[str, xr.Dataset],
-        done: xr.Dataset | None = None,
+        self, bench: Bench, settings: ScanSettings, *, inputs: Mapping[str, xr.Dataset], done: xr.Dataset | None = None
     ) -> Iterator[xr.Dataset]:
         """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition`` and ``pocket``."""
         from errormotion.methods.crossbeam_scan.acquisition import pocket

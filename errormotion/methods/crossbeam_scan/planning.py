@@ -21,10 +21,7 @@ from errormotion.methods.crossbeam_scan.identification import strain
 from errormotion.methods.crossbeam_scan.identification.carriage import Rig
 from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint, carriage_errors, pose_twists
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
-from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import (
-    stated_covariance,
-    stated_pose,
-)
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
 from errormotion.methods.crossbeam_scan.settings import PoseSettings
 
 if TYPE_CHECKING:

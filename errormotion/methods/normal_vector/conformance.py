@@ -12,10 +12,7 @@ from errormotion.plugins import MethodSubject
 FUNCTIONAL_POINT = (0.0, 0.0, 0.15)
 """m."""
 WARM_UP = Settings(
-    tool_axes="Z",
-    functional_point=FUNCTIONAL_POINT,
-    duration=3600.0,
-    schedule=(Event(at=0.0, spindle_speed=12000.0),),
+    tool_axes="Z", functional_point=FUNCTIONAL_POINT, duration=3600.0, schedule=(Event(at=0.0, spindle_speed=12000.0),)
 )
 
 

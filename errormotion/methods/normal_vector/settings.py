@@ -48,9 +48,7 @@ class Settings(PluginSettings):
     )
     tip_radius: Length | None = Field(default=None, gt=0, description="radius of the tip; default: that of the probe")
     touch_noise: Length | None = Field(
-        default=None,
-        gt=0,
-        description="standard deviation of one touch along its normal; default: that of the probe",
+        default=None, gt=0, description="standard deviation of one touch along its normal; default: that of the probe"
     )
 
     # Motion of the machine

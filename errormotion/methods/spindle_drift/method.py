@@ -44,12 +44,7 @@ class SpindleDrift:
     redrawing = lazy("errormotion.methods.spindle_drift.redrawing:redrawing")
 
     def acquire(
-        self,
-        bench: Bench,
-        settings: DriftSettings,
-        *,
-        inputs: Mapping[str, xr.Dataset],
-        done: xr.Dataset | None = None,
+        self, bench: Bench, settings: DriftSettings, *, inputs: Mapping[str, xr.Dataset], done: xr.Dataset | None = None
     ) -> Iterator[xr.Dataset]:
         """Measure; yield raw datasets to be joined along ``append_dim``.
 

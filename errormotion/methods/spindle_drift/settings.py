@@ -93,9 +93,7 @@ class Settings(PluginSettings):
     )
     frame_temperature: str = Field(default="frame", description="name of the temperature sensor on the measuring frame")
     frame_smoothing: Time = Field(
-        default=180.0,
-        ge=0,
-        description="length of the moving fit that smooths the temperature of the frame",
+        default=180.0, ge=0, description="length of the moving fit that smooths the temperature of the frame"
     )
     frame_expansion_uncertainty: float = Field(
         default=0.1, ge=0, description="relative standard uncertainty of the expansion of the frame"

@@ -65,11 +65,7 @@ class Balls:
             raise BenchError(f"expected 1 to {len(self)} balls; found {count}")
         part = slice(count)
         return replace(
-            self,
-            nominal=self.nominal[part],
-            centre=self.centre[part],
-            radius=self.radius[part],
-            form=self.form[part],
+            self, nominal=self.nominal[part], centre=self.centre[part], radius=self.radius[part], form=self.form[part]
         )
 
     def moved(self, ball: int, shift: ArrayLike) -> Balls:

@@ -125,9 +125,7 @@ def measuring_pass(settings: Settings) -> Program:
     count = len(settings.positions)
     height = () if settings.scan_z is None else (Move(settings.scan_z, settings.warm_up_feed, "Z"),)
     return Program(
-        PASS,
-        f"measuring pass over {count} artefact{'s' if count > 1 else ''}",
-        (*height, *_pass(low, high, settings)),
+        PASS, f"measuring pass over {count} artefact{'s' if count > 1 else ''}", (*height, *_pass(low, high, settings))
     )
 
 

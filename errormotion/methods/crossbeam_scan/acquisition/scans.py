@@ -25,17 +25,9 @@ from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.crossbeam_scan.acquisition.listening import BrokenPassError, Lines, listen
 from errormotion.methods.crossbeam_scan.acquisition.moving import Mover, mover
 from errormotion.methods.crossbeam_scan.acquisition.programs import Program, pass_ends, warm_up_piece
-from errormotion.methods.crossbeam_scan.acquisition.schedule import (
-    PROGRAM_INTERVAL,
-    Schedule,
-    program_texts,
-    schedule,
-)
+from errormotion.methods.crossbeam_scan.acquisition.schedule import PROGRAM_INTERVAL, Schedule, program_texts, schedule
 from errormotion.methods.crossbeam_scan.identification.cutting import interruption
-from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import (
-    stated_covariance,
-    stated_pose,
-)
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
 from errormotion.methods.crossbeam_scan.schema import SCHEMA
 
 if TYPE_CHECKING:

@@ -41,10 +41,7 @@ class ArtefactCheck:
 
     def extras(self) -> dict[str, Any]:
         """Return the extra variables of the error dataset."""
-        return {
-            "moved": ("position", np.isfinite(self.since)),
-            "moved_since": ("position", self.since, {"units": "s"}),
-        }
+        return {"moved": ("position", np.isfinite(self.since)), "moved_since": ("position", self.since, {"units": "s"})}
 
 
 def check_artefacts(

@@ -35,11 +35,7 @@ def lost(seen: Campaign) -> str:
     """Return the number of missing registrations by reason; empty where none is missing."""
     holes, absent = ~seen.known[seen.warm], seen.absent[seen.warm]
     silent = holes & ~absent & (seen.reason[seen.warm] == NO_REASON)
-    kinds = (
-        (absent, "without a scan"),
-        (holes & ~absent & ~silent, "refused"),
-        (silent, "without a stated reason"),
-    )
+    kinds = ((absent, "without a scan"), (holes & ~absent & ~silent, "refused"), (silent, "without a stated reason"))
     return ", ".join(f"{integer(kind.sum())} {words}" for kind, words in kinds if kind.any())
 
 

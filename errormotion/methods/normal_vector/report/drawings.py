@@ -186,20 +186,12 @@ def normals(seen: Probing, key: str) -> Block:
     """Return the published construction minus the fit of all touches, and its relative uncertainty, over time."""
     shown = [i for i in range(6) if np.isfinite(seen.normals[:, i]).any() and np.isfinite(seen.loss[:, i]).any()]
     if not shown:
-        return Text(
-            "The result contains no published normals; the reason is stated under data quality.",
-            "note",
-        )
+        return Text("The result contains no published normals; the reason is stated under data quality.", "note")
     panels = []
     if not seen.by_normals:
         for title, first, (unit, size) in (("displacements", 0, UM), ("rotations", 3, SECOND_OF_ARC)):
             lines = [
-                timeline.Line(
-                    FREEDOMS[i],
-                    (seen.normals[:, i] - seen.values[:, i]) / size,
-                    None,
-                    canvas.COLOURS[i % 3],
-                )
+                timeline.Line(FREEDOMS[i], (seen.normals[:, i] - seen.values[:, i]) / size, None, canvas.COLOURS[i % 3])
                 for i in shown
                 if first <= i < first + 3
             ]

@@ -31,12 +31,7 @@ _DRIFT = RAW_SCHEMAS[0]
 _ORIGIN = float(Settings.model_fields["nominal_origin_uncertainty"].default)
 _DIRECTION = float(Settings.model_fields["nominal_direction_uncertainty"].default)
 _ROWS = {row.name: row for row in _DRIFT.rows}
-_VARIABLE = {
-    "time": "time",
-    "channels": "distance",
-    "temperatures": "temperature",
-    "spindle_speed": "spindle_speed",
-}
+_VARIABLE = {"time": "time", "channels": "distance", "temperatures": "temperature", "spindle_speed": "spindle_speed"}
 
 
 def read_log(log: Path, map_file: Path) -> xr.Dataset:

@@ -110,12 +110,7 @@ class ProfilerPose:
 
 
 def calibrate(
-    x: ArrayLike,
-    height: ArrayLike,
-    stage: ArrayLike,
-    pocket: Pocket,
-    *,
-    angle_prior: float | None = None,
+    x: ArrayLike, height: ArrayLike, stage: ArrayLike, pocket: Pocket, *, angle_prior: float | None = None
 ) -> ProfilerPose:
     """Return the pose of the profiler from scans of a pocket.
 
