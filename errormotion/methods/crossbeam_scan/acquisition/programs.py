@@ -19,7 +19,7 @@ DWELL = 2.0
 """Dwell before the measuring move, s: the axis comes to rest and the profiler becomes ready."""
 MM, MINUTE = 1000.0, 60.0
 _SHORTEST = 1e-3
-"""Moves below this, m, are left out."""
+"""Shortest move that is written, m."""
 
 PASS = "pass.nc"
 
