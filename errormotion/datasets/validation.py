@@ -13,7 +13,7 @@ from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.raw import raw_violations, variant_of
 from errormotion.datasets.results.checks import error_violations
 from errormotion.datasets.schemas import SCHEMA, RawSchema, known_schemas
-from errormotion.errors import DatasetError, ErrormotionError
+from errormotion.errors import DatasetError, ErrormotionError, MethodError
 
 
 def violations(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> list[str]:
@@ -72,3 +72,21 @@ def validate(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> None:
     found = violations(ds, tables)
     if found:
         raise DatasetError(f"The dataset breaks its schema ({ds.attrs.get('schema', 'none given')}):", found)
+
+
+def checked_raw(raw: xr.Dataset, method: plugins.Method) -> xr.Dataset:
+    """Return a raw dataset that follows the raw schema of a method; without an attribute ``schema`` it gets this one.
+
+    Raises
+    ------
+    DatasetError
+        It breaks its schema; see `validate`.
+    MethodError
+        It has the schema of another method.
+    """
+    schema = method.needs.raw_schema
+    checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=schema)
+    validate(checked)
+    if checked.attrs["schema"] != schema:
+        raise MethodError(f"{method.info.id} reads raw data of schema {schema}; found {checked.attrs['schema']}.")
+    return checked

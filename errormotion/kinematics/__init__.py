@@ -1,7 +1,7 @@
 """Rigid bodies and machines: arrays in, arrays out.
 
 ===============  ===================================================================================
-module           what it holds
+module           content
 ===============  ===================================================================================
 ``twists``       small errors as twists; functional points, frames, covariance
 ``poses``        twists and exact poses (scipy's ``RigidTransform``)

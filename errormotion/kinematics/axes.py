@@ -52,7 +52,7 @@ class ErrorMotion:
                 f"found {positions.shape} and {twists.shape}"
             )
         if positions.size == 0 or not np.all(np.diff(positions) > 0):
-            raise ValueError("expected at least one position, and positions that strictly increase; sort the table")
+            raise ValueError("expected one or more strictly increasing positions; sort the table")
         if self.period is not None and not np.ptp(positions) < self.period:
             raise ValueError(
                 f"expected positions within one period of {self.period:g}; found a range of {np.ptp(positions):g}"
@@ -113,10 +113,10 @@ class Axis:
 
     @property
     def error_follows_motion(self) -> bool:
-        """Whether the error acts in the tool-side body's frame, behind the motion, or in the workpiece-side body's.
+        """Whether the error is stated in the frame of the tool-side body, else in that of the workpiece-side body.
 
-        The reference of a linear axis moves with the body; a rotary axis's error motions are stated in the body that
-        does not rotate (ISO 230-7).
+        The reference of a linear axis moves with the moving body; the error motions of a rotary axis are stated in the
+        body that does not rotate (ISO 230-7).
         """
         return self.carries_tool != self.rotary
 

@@ -2,12 +2,12 @@
 
 A beam starts at its zero point, where the reading is 0; its direction is the unit vector u to the target. A surface
 with unit normal N (towards the sensor, N.u < 0) is inclined to it by alpha, the angle between -u and N. The azimuth of
-that tilt about the beam, counted from the plane of triangulation (emitted and received beam), is the rotation beta.
+this tilt about the beam, measured from the plane of triangulation (emitted and received beam), is the rotation beta.
 Both together form the tilt vector
 
     q = tan(alpha) (cos beta, sin beta) = (N.e1, N.e2) / (-N.u),    e1 = t x u / |t x u|,   e2 = u x e1,
 
-t the normal of the plane of triangulation. q has no pole where the beam is perpendicular to the surface. The
+with t the normal of the plane of triangulation. q has no pole where the beam is perpendicular to the surface. The
 published deflection of a sensor is not a third freedom: u, t and N determine alpha and beta in any orientation.
 """
 
@@ -32,14 +32,14 @@ __all__ = [
 ]
 
 
-_ALONG = np.cos(np.radians(1e-4))
-"""Cosine above which a direction is taken to be along an axis."""
-_IN_LINE = 1e-6
-"""Sine of the angle below which a triangulation normal lies along the beam."""
+_PARALLEL_COSINE = np.cos(np.radians(1e-4))
+"""Cosine of the angle above which a direction is parallel to an axis."""
+_PARALLEL_SINE = 1e-6
+"""Sine of the angle below which a triangulation normal is parallel to the beam."""
 
 
 def across(direction: Array) -> Array:
-    """Return two unit vectors (2, 3) that span the plane across a direction (3,)."""
+    """Return two unit vectors (2, 3) that span the plane perpendicular to a direction (3,)."""
     first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(direction, first)])
@@ -47,8 +47,8 @@ def across(direction: Array) -> Array:
 
 def turned(direction: Array, angles: Array) -> Array:
     """Return the unit vector (3,) at two small angles (2,), rad, to ``direction`` along the vectors of ``across``."""
-    there = direction + angles @ across(direction)
-    return np.asarray(there / np.linalg.norm(there))
+    vector = direction + angles @ across(direction)
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def rotation_between(nominal: ArrayLike, actual: ArrayLike) -> Array:
@@ -71,11 +71,11 @@ def beam_errors(
     direction: ArrayLike,
     covariance: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Return the errors of beams against their nominal ones, and the covariance of these errors.
+    """Return the errors of beams relative to their nominal ones, and the covariance of these errors.
 
-    EX EY EZ is the shift of the zero point, EA EB EC the smallest rotation from the nominal direction to the
-    actual one, about that beam's zero point. The rotation of a beam about itself is unknown: NaN where the nominal
-    beam is along an axis; elsewhere the smallest rotation is stated.
+    EX EY EZ is the shift of the zero point, EA EB EC the smallest rotation from the nominal direction to the actual
+    one, about the zero point of the beam. The rotation of a beam about itself is unknown: NaN where the nominal beam is
+    parallel to an axis; elsewhere the smallest rotation is stated.
 
     Parameters
     ----------
@@ -102,14 +102,14 @@ def beam_errors(
     errors = np.concatenate([p - p0, rotation_between(u0, u)], axis=-1)
     chart = error_jacobian(u0, u)
     moved = chart @ np.nan_to_num(np.asarray(covariance, float)) @ np.swapaxes(chart, -1, -2)
-    along = np.abs(u0) >= _ALONG
+    along = np.abs(u0) >= _PARALLEL_COSINE
     errors[:, 3:][along] = np.nan
     unseen = np.isnan(errors)
     return errors, np.where(unseen[:, :, None] | unseen[:, None, :], np.nan, moved)
 
 
 def error_jacobian(nominal_direction: ArrayLike, direction: ArrayLike) -> Array:
-    """Return the derivative (beam, 6, 6) of the errors of beams by their (origin, direction); see `beam_errors`."""
+    """Return the derivative (beam, 6, 6) of `beam_errors` with respect to (origin, direction)."""
     u0, u = np.asarray(nominal_direction, float), np.asarray(direction, float)
     chart = np.zeros((len(u), 6, 6))
     chart[:, :3, :3] = np.eye(3)
@@ -118,7 +118,7 @@ def error_jacobian(nominal_direction: ArrayLike, direction: ArrayLike) -> Array:
 
 
 def _turning_by_direction(u0: Array, u: Array) -> Array:
-    """Return the derivative (..., 3, 3) of `rotation_between` by the actual direction."""
+    """Return the derivative (..., 3, 3) of `rotation_between` with respect to the actual direction."""
     sine = np.cross(u0, u)
     size, cosine = np.linalg.norm(sine, axis=-1), np.sum(u0 * u, axis=-1)
     angle = np.arctan2(size, cosine)
@@ -140,7 +140,7 @@ def tilt(beam: ArrayLike, triangulation_normal: ArrayLike, normal: ArrayLike) ->
     beam : array_like (3,)
         Unit vector from the sensor to the target.
     triangulation_normal : array_like (3,)
-        Unit normal of the plane that holds emitted and received beam; its component along the beam has no effect.
+        Unit normal of the plane of emitted and received beam; its component along the beam has no effect.
     normal : array_like (..., 3)
         Unit normals of the surfaces, towards the sensor.
 
@@ -157,10 +157,10 @@ def tilt(beam: ArrayLike, triangulation_normal: ArrayLike, normal: ArrayLike) ->
     u, t, N = (np.asarray(part, float) for part in (beam, triangulation_normal, normal))
     first = np.cross(t, u)
     size = np.linalg.norm(first)
-    if not size > _IN_LINE:
+    if not size > _PARALLEL_SINE:
         raise MethodError(
-            "The triangulation normal lies along the beam; expected the normal of the plane that holds the emitted and "
-            "the received beam, which is perpendicular to the beam."
+            "The triangulation normal lies along the beam; expected the normal of the plane of the emitted and the "
+            "received beam, which is perpendicular to the beam."
         )
     e1 = first / size
     e2 = np.cross(u, e1)

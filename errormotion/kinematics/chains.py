@@ -13,7 +13,7 @@ def parse_chain(chain: str) -> dict[str, bool]:
     Parameters
     ----------
     chain : str
-        From ``workpiece`` over ``bed`` to ``tool``, joined by ``-``; ``spindle`` may stand before ``tool``.
+        From ``workpiece`` over ``bed`` to ``tool``, joined by ``-``; ``spindle`` may precede ``tool``.
 
     Raises
     ------

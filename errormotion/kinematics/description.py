@@ -27,7 +27,7 @@ _ROUNDING = 1e-9
 
 
 class DescriptionError(ValueError):
-    """A description that contradicts itself; ``mistakes`` maps each key to what is wrong with it."""
+    """An inconsistent description; ``mistakes`` maps each wrong key to a text on its error."""
 
     def __init__(self, mistakes: Mapping[str, str]) -> None:
         self.mistakes = dict(mistakes)
@@ -36,7 +36,7 @@ class DescriptionError(ValueError):
 
 @dataclass(frozen=True)
 class MachineDescription:
-    """One machine tool as its user describes it.
+    """Description of one machine tool by its user.
 
     Attributes
     ----------
@@ -45,18 +45,18 @@ class MachineDescription:
     chain : str
         Bodies and axes from workpiece to tool, see `errormotion.kinematics.chains.parse_chain`.
     travel : mapping of str to (float, float)
-        Axis to its lowest and highest position, m or rad. A fixed axis needs none.
+        Lowest and highest position of each axis, m or rad; not needed for a fixed axis.
     spindle_axis : str
         ``X``, ``Y`` or ``Z``: the direction of the spindle's axis of rotation.
     positions : mapping of str to (3,) sequence of float
-        Rotary axis to a point on its line, m, in machine coordinates with all axes at zero.
+        A point on the line of each rotary axis, m, in machine coordinates with all axes at zero.
     fixed : mapping of str to float
-        Rotary axis that stands still to its angle, rad.
+        Angle of each rotary axis that does not move, rad.
 
     Raises
     ------
     DescriptionError
-        The description contradicts itself; all mistakes at once, by key.
+        The description is inconsistent; all mistakes are reported together, by key.
     """
 
     name: str
@@ -97,12 +97,12 @@ class MachineDescription:
         return Machine(self.chain, self.positions)
 
     def commands(self, moving: ArrayLike) -> Array:
-        """Return the commands (..., axis) of all axes for those (..., moving axis) of the moving ones, m and rad.
+        """Return the commands (..., axis) of all axes for commands (..., moving axis) of the moving axes, m and rad.
 
         Raises
         ------
         ValueError
-            Another number of coordinates than of moving axes.
+            The number of coordinates is not that of the moving axes.
         """
         q = np.asarray(moving, dtype=float)
         if q.ndim == 0 or q.shape[-1] != len(self.moving_axes):
@@ -155,10 +155,7 @@ class MachineDescription:
         for axis, (low, high) in self.travel.items():
             unit = "rad" if axis in ROTARY_AXES else "m"
             if axis not in sides:
-                yield (
-                    f"travel.{axis}",
-                    f"the chain '{self.chain}' has no axis {axis}; remove one or add the other",
-                )
+                yield f"travel.{axis}", f"the chain '{self.chain}' has no axis {axis}; remove one or add the other"
             elif not -math.inf < low < high < math.inf:
                 yield (
                     f"travel.{axis}",
@@ -171,11 +168,11 @@ class MachineDescription:
         if not math.isfinite(angle) or not low - _ROUNDING <= angle <= high + _ROUNDING:
             span = f" within the travel, {low:g} rad to {high:g} rad" if axis in self.travel else ""
             yield f"rotary.{axis}.fixed", f"expected an angle{span}; found {angle:g} rad"
-        before, behind = order[: order.index(axis)], order[order.index(axis) + 1 :]
-        turned = all(any(each in LINEAR_AXES for each in part) for part in (before, behind))
-        if angle != 0 and turned:
+        before, after = order[: order.index(axis)], order[order.index(axis) + 1 :]
+        between = all(any(each in LINEAR_AXES for each in part) for part in (before, after))
+        if angle != 0 and between:
             yield (
                 f"rotary.{axis}.fixed",
-                f"expected 0 rad, because linear axes stand on both sides of {axis} in '{self.chain}' and would not "
-                f"move along X, Y and Z at another angle; found {angle:g} rad",
+                f"expected 0 rad, because there are linear axes on both sides of {axis} in '{self.chain}', which would "
+                f"not move along X, Y and Z at another angle; found {angle:g} rad",
             )

@@ -1,8 +1,8 @@
 """The six freedoms, and the names of the errors of an axis in ISO 230-1.
 
-A name is E, the direction, the axis that moves: ``EYX`` is the straightness of X in Y, ``ECX`` its rotation about Z.
-A zero in it marks an error of position or orientation of the axis, not of its motion: ``EC0Y`` is the squareness of Y
-to X.
+A name consists of E, the direction and the moving axis: ``EYX`` is the straightness of X in Y, ``ECX`` its rotation
+about Z. A zero denotes an error of position or orientation of the axis, not of its motion: ``EC0Y`` is the squareness
+of Y to X.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _NO_AXIS = ("tool", "beam")
 
 
 def iso_names(component: str, *, spindle_axis: str = "C") -> dict[str, str]:
-    """Return the name of each freedom's error.
+    """Return the names of the errors of a component.
 
     Parameters
     ----------
@@ -31,8 +31,8 @@ def iso_names(component: str, *, spindle_axis: str = "C") -> dict[str, str]:
     Returns
     -------
     dict
-        Freedom to name, such as ``{"EX": "EXX", "EY": "EYX", ...}``. The volume's and a beam's errors have the
-        freedom's own name.
+        Freedom to name, such as ``{"EX": "EXX", "EY": "EYX", ...}``. The errors of the volume and of a beam have the
+        name of the freedom.
 
     Raises
     ------
@@ -63,8 +63,8 @@ def direction_of(axis: str) -> int:
 def location_names(axis: str, others: tuple[str, ...] = LINEAR_AXES) -> dict[str, str]:
     """Return the errors of position and orientation of an axis on a machine that also has the axes ``others``.
 
-    X is the datum's first axis and Y the second, so a three-axis machine has three: ``EC0Y``, ``EA0Z``, ``EB0Z``. A
-    rotary axis has four: two offsets and two tilts of its line.
+    X is the primary axis of the datum and Y the secondary one, so that a three-axis machine has three such errors:
+    ``EC0Y``, ``EA0Z``, ``EB0Z``. A rotary axis has four: two offsets and two tilts of its line.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """A machine as a chain of axes from workpiece to tool, and the effect of its axes' errors at the tool.
 
-A description such as ``workpiece-X-Y-bed-Z-spindle-tool`` names the bodies and axes on the way from the workpiece over
-the bed to the tool. Volumetric errors are twists of the tool relative to the workpiece, actual minus commanded, at the
-functional point, in the workpiece's frame (at all axes zero this is the machine's frame).
+A description such as ``workpiece-X-Y-bed-Z-spindle-tool`` lists the bodies and axes from the workpiece over the bed to
+the tool. Volumetric errors are twists of the tool relative to the workpiece, actual minus commanded, at the functional
+point, in the frame of the workpiece (which is the frame of the machine with all axes at zero).
 """
 
 from __future__ import annotations
@@ -28,25 +28,24 @@ ORIGIN = (0.0, 0.0, 0.0)
 
 
 class Machine:
-    """A serial machine, forward model of its geometric errors and the model's Jacobian.
+    """A serial machine: forward model of its geometric errors, and the Jacobian of the model.
 
     Parameters
     ----------
     chain : str
-        From ``workpiece`` over ``bed`` to ``tool``, joined by ``-``; ``spindle`` may stand before ``tool``.
-        Axes before ``bed`` carry the workpiece, those behind it the tool.
+        From ``workpiece`` over ``bed`` to ``tool``, joined by ``-``; ``spindle`` may precede ``tool``. Axes before
+        ``bed`` carry the workpiece, axes after it carry the tool.
     references : mapping of str to array_like (3,), optional
-        Axis to the point at which its error motion is stated (see `errormotion.kinematics.axes.Axis`);
-        a point of its line for a rotary axis. Default: the origin.
+        For each axis the point at which its error motion is stated (see `errormotion.kinematics.axes.Axis`), for a
+        rotary axis a point of its line. Default: the origin.
 
     Attributes
     ----------
     axis_names : tuple of str
-        Order of the commanded coordinates: X Y Z U V W A B C, as far as there are.
+        Order of the commanded coordinates: X Y Z U V W A B C, as far as the machine has them.
     error_names : tuple of str
-        Order of the error parameters: six error motions of every axis, then the errors of position and orientation
-        (squareness among them). A machine with X, Y
-        and Z has 21: EXX ... ECZ, EC0Y, EA0Z, EB0Z.
+        Order of the error parameters: six error motions of every axis, then the errors of position and orientation,
+        such as squareness. A machine with X, Y and Z has 21: EXX ... ECZ, EC0Y, EA0Z, EB0Z.
 
     Raises
     ------
@@ -103,10 +102,10 @@ class Machine:
         commanded : array_like, (..., axis)
             In the order of `axis_names`; m and rad.
         motions : mapping of str to callable
-            Axis to a function from its commanded position (...) to its error twist (..., 6), such as
-            `errormotion.kinematics.axes.ErrorMotion`. An axis that is not named has unknown errors: NaN.
+            For each axis a function of its commanded position (...) that returns its error twist (..., 6), such as
+            `errormotion.kinematics.axes.ErrorMotion`. The errors of other axes are unknown: NaN.
         locations : mapping of str to float, optional
-            Name of an error of position (``EC0Y``) to its value, rad or m. NaN where not named.
+            Values of errors of position by name (``EC0Y``), rad or m; the others are NaN.
 
         Returns
         -------
@@ -142,13 +141,13 @@ class Machine:
         tool : array_like, (3,)
             The functional point: where the tool is, in machine coordinates with all axes at zero, m.
         exact : bool
-            Multiply the poses out. Default: first order, ``jacobian @ errors``; what it leaves out is of the size of
-            two errors multiplied.
+            Multiply the poses. Default: first order, ``jacobian @ errors``; the neglected terms are products of two
+            errors.
 
         Returns
         -------
         ndarray, (..., 6)
-            NaN where an unknown error matters; the exact model needs all of them.
+            NaN where an unknown error has an effect; the exact model needs all of them.
         """
         q, e = self._commands(commanded), np.asarray(errors, dtype=float)
         if e.ndim == 0 or e.shape[-1] != len(self.error_names):
@@ -181,16 +180,16 @@ class Machine:
         flat = q.reshape(-1, q.shape[-1])
         at = self.nominal_pose(flat).apply(np.asarray(tool, dtype=float))
         J = np.zeros((len(flat), 6, len(self.error_names)))
-        before = RigidTransform.identity(len(flat))
+        start = RigidTransform.identity(len(flat))
         for joint in self.joints:
-            behind = before * joint.motion(self._of(joint, flat))
-            in_front, after = (_to_tool(pose, joint.reference, at) for pose in (before, behind))
+            end = start * joint.motion(self._of(joint, flat))
+            before, after = (_to_tool(pose, joint.reference, at) for pose in (start, end))
             i = 6 * self.axis_names.index(joint.name)
-            J[:, :, i : i + 6] = after if joint.error_follows_motion else in_front
-            # The line is displaced in front of the motion and put back behind it.
+            J[:, :, i : i + 6] = after if joint.error_follows_motion else before
+            # The line is displaced before the motion and displaced back after it.
             for column, dof in self._locations(joint):
-                J[:, :, column] = (in_front - after)[:, :, dof]
-            before = behind
+                J[:, :, column] = (before - after)[:, :, dof]
+            start = end
         return J.reshape(*q.shape[:-1], 6, -1)
 
     def _exact(self, q: Array, e: Array, tool: Array) -> Array:

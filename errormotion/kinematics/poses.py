@@ -1,4 +1,4 @@
-"""Exact poses on scipy's ``RigidTransform``, and the way between them and twists.
+"""Exact poses (scipy's ``RigidTransform``), and their conversion to and from twists.
 
 ``T_ab`` maps coordinates in b to coordinates in a; ``T_ab * T_bc`` is ``T_ac``. Twists are ordered as everywhere in
 this package: translation first, then rotation.
@@ -17,7 +17,7 @@ __all__ = ["adjoint_of", "displaced", "displacement", "exp", "log"]
 
 
 def exp(twist: ArrayLike) -> RigidTransform:
-    """Return the pose that a constant motion of this twist reaches after unit time.
+    """Return the pose after a constant motion with this twist for unit time.
 
     Parameters
     ----------
@@ -35,9 +35,10 @@ def log(pose: RigidTransform) -> Array:
 
 
 def displaced(twist: ArrayLike, point: ArrayLike = (0.0, 0.0, 0.0)) -> RigidTransform:
-    """Return the pose of a body that is turned about a point by the rotation vector R and shifted by E, exactly.
+    """Return the pose of a body that is rotated about a point by the rotation vector R and shifted by E, exactly.
 
-    A finite error is defined so: the functional point is displaced by (EX, EY, EZ), independent of the rotation.
+    This is the definition of a finite error: the functional point is displaced by (EX, EY, EZ), independently of the
+    rotation.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ def displaced(twist: ArrayLike, point: ArrayLike = (0.0, 0.0, 0.0)) -> RigidTran
 
 
 def displacement(pose: RigidTransform, point: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Return the twist, (..., 6), at a point of the body: how far the point went, and the rotation vector.
+    """Return the twist, (..., 6), at a point of the body: the displacement of the point, and the rotation vector.
 
     The inverse of `displaced`.
     """
@@ -65,7 +66,7 @@ def adjoint_of(pose: RigidTransform) -> Array:
     Parameters
     ----------
     pose : RigidTransform
-        Takes coordinates of the old frame to coordinates of the new one.
+        Converts coordinates of the old frame to coordinates of the new one.
 
     Returns
     -------

@@ -1,8 +1,8 @@
-"""Small errors of a rigid body as twists, and what becomes of them at another point or in another frame.
+"""Small errors of a rigid body as twists, and their transformation to other points and frames.
 
-A twist ``(EX, EY, EZ, EA, EB, EC)`` holds the displacement (m) of one point of the body, the functional point, and the
-body's small rotation (rad) about X, Y, Z. An unknown freedom is NaN. It affects only what depends on it: where
-a coefficient is exactly zero, the unknown freedom does not matter.
+A twist ``(EX, EY, EZ, EA, EB, EC)`` consists of the displacement (m) of one point of the body, the functional point,
+and the small rotation (rad) of the body about X, Y, Z. An unknown freedom is NaN. It affects only results that depend
+on it: where its coefficient is exactly zero, it has no effect.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def cross_matrix(v: ArrayLike) -> Array:
     Raises
     ------
     ValueError
-        The last axis of ``v`` has not length 3.
+        The last axis of ``v`` does not have length 3.
     """
     v = _with_last("vector", v, 3)
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
@@ -49,15 +49,15 @@ def cross_matrix(v: ArrayLike) -> Array:
 
 
 def adjoint(rotation: ArrayLike | Rotation | None = None, shift: ArrayLike | None = None) -> Array:
-    """Return the 6x6 matrix that takes a twist to another functional point and into another frame.
+    """Return the 6x6 matrix that transforms a twist to another functional point and into another frame.
 
-    The twist is moved first, ``E' = E + R x shift`` with ``shift`` in the old frame; then both its parts are rotated
-    into the new frame, ``v_new = rotation @ v_old``.
+    First the functional point is moved, ``E' = E + R x shift`` with ``shift`` in the old frame; then both parts are
+    rotated into the new frame, ``v_new = rotation @ v_old``.
 
     Parameters
     ----------
     rotation : array_like, (..., 3, 3), or Rotation, optional
-        Turns coordinates of the old frame into coordinates of the new one; default: same frame.
+        Converts coordinates of the old frame to coordinates of the new one; default: same frame.
         Entries below 1e-15 are taken as rounded zeros.
     shift : array_like, (..., 3), optional
         From the old functional point to the new one, m, in the old frame; default: same point.
@@ -69,7 +69,7 @@ def adjoint(rotation: ArrayLike | Rotation | None = None, shift: ArrayLike | Non
     Raises
     ------
     ValueError
-        Wrong shape, or ``rotation`` is no proper rotation.
+        Wrong shape, or ``rotation`` is not a proper rotation.
     """
     Q = _rotation_matrix(rotation)
     S = cross_matrix(np.zeros(3) if shift is None else shift)
@@ -82,7 +82,7 @@ def adjoint(rotation: ArrayLike | Rotation | None = None, shift: ArrayLike | Non
 
 
 def transform(twist: ArrayLike, A: ArrayLike) -> Array:
-    """Return ``A @ twist``; a NaN freedom spoils only what depends on it.
+    """Return ``A @ twist``; an unknown freedom (NaN) affects only results that depend on it.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def transform(twist: ArrayLike, A: ArrayLike) -> Array:
 
 
 def known_product(A: Array, x: Array) -> Array:
-    """Return ``A @ x`` over the last axes, in which a NaN in ``x`` counts only where its coefficient is not zero.
+    """Return ``A @ x`` over the last axes; a NaN in ``x`` has no effect where its coefficient is zero.
 
     Parameters
     ----------
@@ -113,12 +113,12 @@ def known_product(A: Array, x: Array) -> Array:
     if not unknown.any():
         return _product(A, x)
     known = _product(A, np.where(unknown, 0.0, x))
-    spoilt = _product((A != 0).astype(float), unknown.astype(float)) > 0
-    return np.where(spoilt, np.nan, known)
+    affected = _product((A != 0).astype(float), unknown.astype(float)) > 0
+    return np.where(affected, np.nan, known)
 
 
 def transform_covariance(covariance: ArrayLike, A: ArrayLike) -> Array:
-    """Return ``A @ covariance @ A.T``; NaN rows and columns spoil only what depends on them.
+    """Return ``A @ covariance @ A.T``; NaN rows and columns affect only results that depend on them.
 
     Parameters
     ----------
@@ -139,8 +139,8 @@ def transform_covariance(covariance: ArrayLike, A: ArrayLike) -> Array:
     moved = 0.5 * (moved + np.swapaxes(moved, -1, -2))
     if not unknown.any():
         return moved
-    spoilt = ((A != 0).astype(float) @ unknown.astype(float) @ (At != 0).astype(float)) > 0
-    return np.where(spoilt, np.nan, moved)
+    affected = ((A != 0).astype(float) @ unknown.astype(float) @ (At != 0).astype(float)) > 0
+    return np.where(affected, np.nan, moved)
 
 
 def move(twist: ArrayLike, shift: ArrayLike) -> Array:
@@ -166,8 +166,8 @@ def to_frame(twist: ArrayLike, pose: RigidTransform) -> Array:
     ----------
     twist : array_like, (..., 6)
     pose : RigidTransform
-        Takes coordinates of the old frame to coordinates of the new one. Only its rotation acts on the twist. The
-        functional point stays where it is and has the coordinates ``pose.apply(functional_point)`` in the new frame.
+        Converts coordinates of the old frame to coordinates of the new one. Only its rotation affects the twist. The
+        functional point is the same point, with the coordinates ``pose.apply(functional_point)`` in the new frame.
 
     Returns
     -------

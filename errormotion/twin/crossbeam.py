@@ -1,8 +1,8 @@
-"""The crossbeam of the gantry as it warms up, and scans of artefacts by the line profiler in its spindle.
+"""The crossbeam of the gantry during the warm-up, and scans of artefacts by the line profiler in its spindle.
 
 The carriage O20 moves along the crossbeam, Y. The tool frame O30 is offset from it by the ``lever`` (x_y, 0, z_y), the
 profiler frame O40 has the ``pose`` H in O30. With the carriage at y and its error E (a displacement of its origin
-and a rotation), a point (x, 0, z) of a profile is in the machine at
+and a rotation), a point (x, 0, z) of a profile has the machine coordinates
 
     (0, y, 0) + E (lever + H (x, 0, z)).
 """
@@ -18,21 +18,21 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 from errormotion.kinematics.poses import displaced
 
-#: time constants of screw, beam and columns, s
+#: Time constants of screw, beam and columns, s.
 LAGS = (900.0, 2700.0, 7200.0)
-#: steady errors: per lag a polynomial in u = y / half of the travel, lowest power first; um and urad
+#: Steady errors: for each lag a polynomial in u = y / half of the travel, lowest power first; um and urad.
 _STEADY = {
     "EX": ((0.0,), (0.5, 3.0, -4.0, 1.0), (1.5, 0.5)),
     "EY": ((16.0, 18.0, 1.0), (6.0, 8.0, 0.0, 1.5), (2.0, 1.0)),
     "EZ": ((0.0,), (7.0, 3.0, -12.0, 0.8), (-9.0, 1.0)),
     "EB": ((1.0,), (5.0, 4.0, 1.5), (4.0, 1.0)),
 }
-#: from the carriage to the tool frame, m (Zhao et al., section 4.3)
+#: From the carriage to the tool frame, m (Zhao et al., section 4.3).
 LEVER = (-0.9, 0.0, -2.051)
-#: nominal height of the profiler in the tool frame, m
+#: Nominal height of the profiler in the tool frame, m.
 LIFT = -0.174
-#: deviation of an artefact from its nominal position, m, and orientation, rad (one sigma)
-PLACE, TURN = 0.2e-3, 3e-3
+#: Deviation of an artefact from its nominal position, m, and orientation, rad (one sigma).
+ARTEFACT_SHIFT, ARTEFACT_ROTATION = 0.2e-3, 3e-3
 
 _ARTEFACT = 3
 
@@ -65,7 +65,7 @@ class Crossbeam:
     own: Array = field(default_factory=lambda: np.zeros(6))
 
     def twist(self, t: ArrayLike, y: ArrayLike) -> Array:
-        """Return the thermal error of the carriage at its origin, (..., 6), m and rad, at times t, s, and y, m.
+        """Return the thermal error of the carriage at its origin, (..., 6), m and rad, at times t (s) and y (m).
 
         Times and positions broadcast. Before time 0 the machine is cold.
         """
@@ -82,14 +82,14 @@ class Crossbeam:
 
     def carriage(self, t: float, y: Array, middle: float, motion: str) -> Array:
         """Return the poses (n, 4, 4) of the carriage in the machine at commanded positions y (n,), m."""
-        going = np.tile(np.eye(4), (y.size, 1, 1))
-        going[:, 1, 3] = y
+        nominal = np.tile(np.eye(4), (y.size, 1, 1))
+        nominal[:, 1, 3] = y
         if motion == "axis":
-            return going @ displaced(self.twist(t, y)).as_matrix()
-        going[:, 1, 3] -= middle
-        there = np.eye(4)
-        there[1, 3] = middle
-        return there @ displaced(self.twist(t, middle)).as_matrix() @ going
+            return nominal @ displaced(self.twist(t, y)).as_matrix()
+        nominal[:, 1, 3] -= middle
+        at_middle = np.eye(4)
+        at_middle[1, 3] = middle
+        return at_middle @ displaced(self.twist(t, middle)).as_matrix() @ nominal
 
     def carriage_at(self, t: Array, positions: Array) -> Array:
         """Return the poses of the carriage at times t (n,) since the start of the warm-up, s, and positions (n, 3), m.
@@ -97,17 +97,17 @@ class Crossbeam:
         Returns
         -------
         ndarray, (n, 4, 4)
-            In the machine, m. Z moves the spindle in the carriage and not the carriage.
+            In the machine, m. Z moves the spindle in the carriage, not the carriage.
         """
-        going = np.tile(np.eye(4), (len(positions), 1, 1))
-        going[:, :2, 3] = positions[:, :2]
-        return np.asarray(going @ displaced(self.twist(t, positions[:, 1])).as_matrix())
+        nominal = np.tile(np.eye(4), (len(positions), 1, 1))
+        nominal[:, :2, 3] = positions[:, :2]
+        return np.asarray(nominal @ displaced(self.twist(t, positions[:, 1])).as_matrix())
 
     def artefact_pose(self, seed: int, position: float) -> Array:
-        """Return the pose of the artefact of a position, (4, 4) in the machine, m: under the profiler, misaligned."""
+        """Return the pose of the artefact at a position, (4, 4) in the machine, m: below the profiler, misaligned."""
         bits = int(np.float64(position).view(np.int64))
         rng = np.random.default_rng([abs(seed), int(seed < 0), _ARTEFACT, bits & 0x7FFFFFFFFFFFFFFF, int(bits < 0)])
-        off = rng.normal(0, [PLACE] * 3 + [TURN] * 3)
+        off = rng.normal(0, [ARTEFACT_SHIFT] * 3 + [ARTEFACT_ROTATION] * 3)
         off[:3] += [0.0, position, 0.0] + self.lever + self.pose[:3, 3]
         return np.asarray(displaced(off).as_matrix())
 
@@ -138,7 +138,7 @@ class Crossbeam:
     def lines(self, carriage: Array, artefact: Array, *, lift: ArrayLike = 0.0) -> Array:
         """Return the poses (n, 4, 4) of the profiler relative to an artefact, from those of the carriage.
 
-        The spindle is lifted along Z, m, once or for each line.
+        ``lift`` is the position of the spindle along Z, m, one for all lines or one for each.
         """
         to_profiler = np.tile(self.pose, (len(carriage), 1, 1))
         to_profiler[:, :3, 3] += self.lever
@@ -147,7 +147,7 @@ class Crossbeam:
 
 
 def seeded_crossbeam(rng: np.random.Generator, travel: tuple[float, float]) -> Crossbeam:
-    """Return the crossbeam of one machine: the tables within 15 percent, and a profiler with a seeded misalignment."""
+    """Return the crossbeam of one machine: the tables varied by up to 15 percent, and a misaligned profiler."""
     steady = np.zeros((len(LAGS), len(_STEADY), 4))
     for k, terms in enumerate(_STEADY.values()):
         for lag, coefficients in enumerate(terms):

@@ -1,4 +1,4 @@
-"""Geometric errors of the axes of any chain: smooth, seeded, zero at the axis's zero."""
+"""Geometric errors of the axes of any chain: smooth, seeded, and zero at the zero of the axis."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from errormotion.kinematics.machines import Machine
 WAVES = 4
 """Number of waves over the travel of a linear axis, or over a turn of a rotary one."""
 STRAIGHTNESS = 3e-6
-"""Displacement by the first wave on 1 m of travel (it grows with the root of the travel), and on a turn, m, 1 sigma."""
+"""Displacement of the first wave on 1 m of travel (proportional to its root), or on a turn, m, 1 sigma."""
 ANGLE = 8e-6
-"""Rotation by the first wave, likewise, rad, 1 sigma."""
+"""Rotation of the first wave, in the same way, rad, 1 sigma."""
 SCALE = 6e-6
-"""Linear growth of the positioning error, m/m, 1 sigma."""
+"""Linear part of the positioning error, m/m, 1 sigma."""
 SQUARENESS = 15e-6
 """Squareness of a linear axis and tilt of the line of a rotary axis, rad, 1 sigma."""
 LINE_OFFSET = 10e-6
@@ -68,9 +68,9 @@ class GeometricErrors:
     machine : Machine
         Its kinematic model.
     motions : mapping
-        Axis to its error motions, stated at the machine's origin, or on the line of a rotary axis.
+        Error motions by axis, stated at the machine's origin, or on the line of a rotary axis.
     locations : mapping
-        Name of an error of position (squareness among them) to its value, rad or m.
+        Values of the errors of position (such as squareness) by name, rad or m.
     """
 
     description: MachineDescription
@@ -81,14 +81,14 @@ class GeometricErrors:
     def twist(self, points: ArrayLike) -> Array:
         """Return the error twists of the tool relative to the workpiece.
 
-        They are stated in the frame of the workpiece that coincides with the machine's where the moving axes are at
-        zero and the fixed ones at their angle, for the point of the tool that is then at the origin.
+        They are stated in the frame of the workpiece that coincides with the machine's frame when the moving axes are
+        at zero and the fixed ones at their angle, for the point of the tool that is then at the origin.
 
         Parameters
         ----------
         points : array_like, (..., moving axis)
-            Commands of the moving axes in the order of `MachineDescription.moving_axes`, m and rad. Of a machine that
-            also has rotary axes, X Y Z are enough: the others are at zero.
+            Commands of the moving axes in the order of `MachineDescription.moving_axes`, m and rad. For a machine with
+            rotary axes, X Y Z are sufficient: the others are then at zero.
 
         Returns
         -------
@@ -121,23 +121,23 @@ class GeometricErrors:
         return reduce(mul, table, still), reduce(mul, head, still)
 
     def displacement(self, points: ArrayLike) -> Array:
-        """Return EX, EY, EZ of `twist`, (..., 3), m; fifty times as fast where all axes are linear."""
+        """Return EX, EY, EZ of `twist`, (..., 3), m; fifty times faster for the axes X, Y and Z."""
         if self.machine.axis_names != ("X", "Y", "Z"):
             return self.twist(points)[..., :3]
         q = np.asarray(points, dtype=float)
         total, before = np.zeros(q.shape), np.zeros(q.shape)
         for joint in self.machine.joints:
-            way = q[..., self.machine.axis_names.index(joint.name), None] * joint.direction
-            error = self.motions[joint.name](np.sum(way, axis=-1))
-            at = before + way if joint.error_follows_motion else before
+            motion = q[..., self.machine.axis_names.index(joint.name), None] * joint.direction
+            error = self.motions[joint.name](np.sum(motion, axis=-1))
+            at = before + motion if joint.error_follows_motion else before
             total += error[..., :3] + np.cross(error[..., 3:], q - at)
-            total += np.cross(self._places[joint.name], way)
-            before = before + way
+            total += np.cross(self._orientations[joint.name], motion)
+            before = before + motion
         return total
 
     @cached_property
-    def _places(self) -> Mapping[str, Array]:
-        """Rotational errors of orientation of each axis, (3,), rad."""
+    def _orientations(self) -> Mapping[str, Array]:
+        """Errors of orientation of each axis, (3,), rad."""
         axes = self.machine.axis_names
         named = {axis: location_names(axis, axes) for axis in axes}
         return {
@@ -147,7 +147,7 @@ class GeometricErrors:
 
 
 def seeded_errors(rng: np.random.Generator, description: MachineDescription) -> GeometricErrors:
-    """Return the errors of a good machine: some micrometres and seconds of arc."""
+    """Return the errors of a good machine: a few micrometres and seconds of arc."""
     machine = description.machine()
     motions = {}
     for axis in machine.axis_names:

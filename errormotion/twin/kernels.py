@@ -1,7 +1,7 @@
 """The compiled inner loops: counter-based noise, and the samples of the sensors.
 
-Every random number is a pure function of (key, index), so a sample has the same noise in any block of a
-stream. The loops are independent of the machine: they take nodes, tables and coefficients.
+Every random number is a pure function of (key, index), so that a sample has the same noise in any block of a stream.
+The loops do not depend on the machine: their arguments are nodes, tables and coefficients.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def horner(coefficients: tuple[float, ...], x: float) -> float:
 
 @compiled
 def normal_quantile(p: float) -> float:
-    """Return the standard normal quantile of p, 1e-12 < p < 1 - 1e-12 to 1e-15 of its value, beyond to 1e-6."""
+    """Return the standard normal quantile of p, to a relative 1e-15 for 1e-12 < p < 1 - 1e-12, else to 1e-6."""
     q = p - 0.5
     if abs(q) <= 0.425:
         r = 0.180625 - q * q
@@ -127,9 +127,9 @@ def rotating_bar(
     slow : ndarray, (channel, node)
         Distance at each node, m; linear between.
     turns : ndarray, (node, 3)
-        Angle of the spindle behind node k: turns[k] @ (1, dt, dt^2), in turns.
+        Angle of the spindle after node k: turns[k] @ (1, dt, dt^2), in turns.
     table : ndarray, (channel, angle + 1)
-        The part that repeats in every turn, m, over one turn; the last column repeats the first.
+        The pattern that repeats in every turn, m, over one turn; the last column repeats the first.
     noise : ndarray, (channel,)
         White noise of one sample, m.
     keys : ndarray of uint64, (channel,)

@@ -18,19 +18,19 @@ class MachineKind:
     Attributes
     ----------
     travel : mapping
-        Axis to (lowest, highest) position, m.
+        (Lowest, highest) position of each axis, m.
     chain : str
         Order of the bodies from workpiece to tool.
     capacity, links, to_air, heat_share
         The thermal network: J/K, W/K, W/K, share of the spindle's heat.
     heat_linear, heat_square : float
-        Heat of the spindle at n /min: heat_linear n + heat_square n^2, W.
+        Heat of the spindle at a speed of n (1/min): heat_linear n + heat_square n^2, W.
     growth : mapping
-        Error of the spindle to (body to um/K or urad/K), at the end of the bar.
+        For each error of the spindle at the end of the bar, the growth with each body, um/K or urad/K.
     behind : tuple of str
-        Bodies behind the last axis. They displace and tilt the spindle; the others also rotate the frame of the axes.
+        Bodies after the last axis. They displace and tilt the spindle; the others also rotate the frame of the axes.
     compensation : mapping
-        Axis to (steady correction at top speed in m, time constant of the control's model in s).
+        For each axis the steady correction at top speed, m, and the time constant of the control's model, s.
     top_speed : float
         1/min.
     rapid : float
@@ -54,7 +54,7 @@ class MachineKind:
 
     @property
     def description(self) -> MachineDescription:
-        """The machine as a bench file describes it."""
+        """Description of the machine as in a bench file."""
         return MachineDescription(self.name, self.chain, self.travel)
 
 
@@ -190,8 +190,8 @@ KINDS: Mapping[str, MachineKind] = {"cframe": CFRAME, "gantry": GANTRY}
 def machine_kind(machine: str | MachineDescription) -> tuple[str, MachineKind]:
     """Return the name of a kind and its tables.
 
-    A described machine has its own chain and travel. It warms up like the gantry where X, Y and Z all carry the tool,
-    otherwise like the C-frame.
+    A machine with a description has the chain and travel of the description. It has the thermal properties of the
+    gantry if X, Y and Z carry the tool, else those of the C-frame.
 
     Raises
     ------

@@ -26,9 +26,9 @@ from errormotion.twin.sensors.probing import ProbeMeasurements
 from errormotion.twin.sensors.sensing import Sensing
 from errormotion.twin.sensors.stage_sensor import StageSensor
 
-#: time to full spindle speed, s
+#: Time to full spindle speed, s.
 SPIN_UP_TIME = 0.75
-#: time since switching on after which sensors are warm, s
+#: Time since switching on after which sensors are warm, s.
 WARM_AFTER = 4 * 3600.0
 
 _PARTS = ("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor", "probing")
@@ -38,18 +38,18 @@ _PART = {name: number for number, name in enumerate(_PARTS)}
 class VirtualMachine(StageSensor, ProbeMeasurements):
     """A machine tool whose true errors are known.
 
-    The seed selects an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
-    schedule give the same numbers, independent of the order of the calls.
+    The seed selects an individual: thermal amplitudes, beams, bar, geometric errors, noise. The results depend on the
+    seed and the schedule only, not on the order of the calls.
 
     Parameters
     ----------
     machine : str or MachineDescription
-        "cframe" (610 x 510 x 460 mm), "gantry" (4 x 1.8 x 1 m), or the description of any other machine: it has the
-        heat of the gantry where X, Y and Z all carry the tool, else that of the C-frame.
+        "cframe" (610 x 510 x 460 mm), "gantry" (4 x 1.8 x 1 m), or the description of any other machine; see
+        `machine_kind` for its thermal properties.
     seed : int
-        Which individual.
+        Number of the individual.
     warm : bool
-        Whether the sensors were switched on long before time 0; otherwise they are switched on then.
+        Whether the sensors were switched on long before time 0, else at time 0.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
     description : MachineDescription
         Chain, travel, spindle axis and rotary axes.
     travel : mapping
-        Moving axis to (lowest, highest) position, m or rad.
+        (Lowest, highest) position of each moving axis, m or rad.
     rapid : float
         Feed of rapid moves, m/s.
     chain : str
@@ -72,7 +72,7 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
     sphere_radius : float
         m.
     state : ThermalState
-        Temperatures and thermal errors under the present schedule.
+        Temperatures and thermal errors under the current schedule.
     geometry : GeometricErrors
         The geometric errors of all axes.
     crossbeam : Crossbeam
@@ -123,19 +123,19 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         Raises
         ------
         BenchError
-            Events out of order, a speed that the spindle does not have, an unknown axis.
+            Events out of order, a speed outside the range of the spindle, an unknown axis.
         """
         self._follow(schedule, None)
 
     def compensate(self, times: ArrayLike, offsets: ArrayLike) -> None:
-        """Add offsets to the commanded positions: the errors are those that remain, of a tool in the spindle.
+        """Add offsets to the commanded positions; the errors of a tool in the spindle are then the remaining errors.
 
         Parameters
         ----------
         times : (n,)
             s, increasing.
         offsets : (n, 3)
-            X, Y and Z, m; linear between, constant before and after. They replace earlier ones.
+            X, Y and Z, m; linear between, constant before and after. They replace earlier offsets.
 
         Raises
         ------
@@ -154,14 +154,14 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         self._sensing = self._sense()
 
     def command(self, event: Event) -> None:
-        """Add a command to the schedule; the state before its time stays unchanged.
+        """Add a command to the schedule; the state before its time does not change.
 
-        Later commands of the schedule stay, and those of the same time are executed before it.
+        Later commands of the schedule are kept, and those at the same time are executed before it.
 
         Raises
         ------
         BenchError
-            As `start`; the schedule stays unchanged.
+            As for `start`; the schedule is not changed.
         """
         events = sorted([*self._events, event], key=lambda each: each.time)
         self._follow(events, self.state.offset)
@@ -173,9 +173,9 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         self.command(Event(time, spindle_speed=0.0))
 
     def forget(self, events: Sequence[Event], time: float) -> None:
-        """Remove these events from the schedule, as far as they are at or after a time, s."""
-        left = [each for each in self._events if each.time < time or each not in events]
-        self._follow(left, self.state.offset)
+        """Remove those of these events from the schedule that are at or after a time, s."""
+        kept = [each for each in self._events if each.time < time or each not in events]
+        self._follow(kept, self.state.offset)
 
     @property
     def _events(self) -> tuple[Event, ...]:
@@ -227,7 +227,7 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         t : (n,)
             Times, s, increasing.
         functional_point : (3,), optional
-            m; ``spindle_functional_point`` where not given.
+            m; by default ``spindle_functional_point``.
         """
         t = _times(t)
         point = self.spindle_functional_point if functional_point is None else np.asarray(functional_point, dtype=float)
@@ -243,8 +243,7 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
     def truth_axis(self, axis: str, positions: ArrayLike) -> xr.Dataset:
         """Return the geometric errors of an axis as an error dataset over ``position``, m or rad.
 
-        They are stated at the machine's origin; those of a rotary axis at the point of its line that the description
-        gives.
+        They are stated at the machine's origin; those of a rotary axis at the point of its line in the description.
         """
         if axis not in self.geometry.motions:
             raise BenchError(f"expected one of the axes {', '.join(self.geometry.motions)}; found {axis!r}")
@@ -262,12 +261,12 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         points : (n, moving axis)
             See `GeometricErrors.twist`, m and rad.
         """
-        places = np.atleast_2d(np.asarray(points, dtype=float))
+        commands = np.atleast_2d(np.asarray(points, dtype=float))
         coords = {
             axis.lower(): ("target", column, {"units": "rad" if axis in ROTARY_AXES else "m"})
-            for axis, column in zip(self.description.moving_axes, places.T, strict=False)
+            for axis, column in zip(self.description.moving_axes, commands.T, strict=False)
         }
-        twist = self.geometry.twist(places)
+        twist = self.geometry.twist(commands)
         return truth.dataset(twist, "target", coords, "tool", np.zeros(3), "commanded point", self._origin())
 
     def _origin(self) -> truth.Origin:
@@ -302,13 +301,13 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         Parameters
         ----------
         first, n : int
-            Counter of the first sample, and how many; sample i is taken at i / rate seconds.
+            Counter of the first sample, and number of samples; sample i is taken at i / rate seconds.
         rate : float
             Samples per second.
         channels : sequence of str, optional
-            Which sensors; all where not given.
+            The sensors; by default all.
         tool : {"bar", "sphere"}
-            Mounted in the spindle.
+            The piece in the spindle.
         motion : StepProgram, optional
             Motion of the sphere; required for the sphere.
 

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 
-#: least feed, m/s, and length, m, of a move along Y that warms up the crossbeam
-WARM_UP_FEED, WARM_UP_WAY = 2.0 / 60, 0.2
+#: Lowest feed, m/s, and shortest distance, m, of a move along Y that warms up the crossbeam.
+WARM_UP_FEED, WARM_UP_DISTANCE = 2.0 / 60, 0.2
 _ROUNDING = 1e-6  # counts
 
 
@@ -21,7 +21,7 @@ class Path:
     Attributes
     ----------
     times : ndarray, (n,)
-        Increasing, s. Before the first and after the last of them the machine stands still.
+        Increasing, s. Before the first and after the last time, the machine does not move.
     places : ndarray, (n, 3)
         Commanded, m. Two equal positions in succession are a dwell.
     rapid : ndarray of bool, (n - 1,)
@@ -34,7 +34,7 @@ class Path:
 
     @classmethod
     def resting(cls, place: ArrayLike) -> Path:
-        """Return the path of a machine that stands still."""
+        """Return the path of a machine that does not move."""
         return cls(np.zeros(1), np.array(place, dtype=float).reshape(1, 3), np.zeros(0, dtype=bool))
 
     @property
@@ -49,7 +49,7 @@ class Path:
 
     @property
     def duration(self) -> float:
-        """From ``begin`` to ``end``, s."""
+        """Time from ``begin`` to ``end``, s."""
         return self.end - self.begin
 
     def beginning(self, time: float) -> Path:
@@ -75,17 +75,17 @@ class Path:
         piece = int(np.searchsorted(self.times, time, side="right")) - 1
         if not 0 <= piece < len(self.times) - 1:
             return 0.0
-        way = np.linalg.norm(self.places[piece + 1] - self.places[piece])
-        return float(way / (self.times[piece + 1] - self.times[piece]))
+        distance = np.linalg.norm(self.places[piece + 1] - self.places[piece])
+        return float(distance / (self.times[piece + 1] - self.times[piece]))
 
     def warm_up(self) -> float | None:
         """Return the start of the first move that warms up the crossbeam, s; None without one.
 
-        It is a move along Y at `WARM_UP_FEED` or faster over more than `WARM_UP_WAY` that is not rapid: a measuring
-        pass with a rapid return is not a warm-up.
+        It is a move along Y at `WARM_UP_FEED` or faster over more than `WARM_UP_DISTANCE` that is not rapid: a
+        measuring pass with a rapid return is not a warm-up.
         """
-        way, seconds = np.abs(np.diff(self.places[:, 1])), np.diff(self.times)
-        warming = (way > WARM_UP_WAY) & (way >= WARM_UP_FEED * seconds * (1 - 1e-9)) & ~self.rapid
+        distance, seconds = np.abs(np.diff(self.places[:, 1])), np.diff(self.times)
+        warming = (distance > WARM_UP_DISTANCE) & (distance >= WARM_UP_FEED * seconds * (1 - 1e-9)) & ~self.rapid
         return float(self.times[np.argmax(warming)]) if warming.any() else None
 
     def pieces_forwards(self, after: float) -> list[int]:
@@ -108,7 +108,7 @@ class Path:
         start : int
             Count at Y = 0.
         step : int
-            Counts from trigger to trigger.
+            Counts between triggers.
 
         Returns
         -------

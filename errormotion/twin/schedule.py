@@ -27,7 +27,7 @@ class Event:
     spindle_speed : float, optional
         New spindle speed, 1/min; None: unchanged.
     compensation : mapping of str to bool, optional
-        Thermal compensation of the axes X, Y, Z on or off; axes that are not named are unchanged.
+        Thermal compensation of the axes X, Y, Z on or off; other axes are unchanged.
     """
 
     time: float
@@ -39,8 +39,9 @@ class Event:
 class StepProgram:
     """A sphere in the spindle, moved along a line with a rest at each position.
 
-    At ``begin`` the sphere leaves ``home`` and reaches ``start`` after ``approach`` seconds; it rests ``dwell`` seconds
-    at each of ``count`` positions, moves ``travel`` seconds between two, and returns home in ``approach`` seconds.
+    At the time ``begin`` the sphere leaves ``home`` and reaches ``start`` after ``approach`` seconds. It rests for
+    ``dwell`` seconds at each of ``count`` positions, moves for ``travel`` seconds between two, and returns home in
+    ``approach`` seconds.
 
     Attributes
     ----------
@@ -57,7 +58,7 @@ class StepProgram:
     begin : float
         Time of the machine at the start of the program, s.
     home : (3,) array_like, optional
-        Position of the sphere before and after; the middle of the line where not given.
+        Position of the sphere before and after; by default the middle of the line.
     """
 
     start: Any
@@ -98,7 +99,7 @@ class StepProgram:
 
     @property
     def end(self) -> float:
-        """Time at which the sphere is back home, s."""
+        """Time at which the sphere has returned home, s."""
         return self.begin + 2 * self.approach + self.count * self.dwell + (self.count - 1) * self.travel
 
     @property
@@ -109,7 +110,7 @@ class StepProgram:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Events in order, and the speed, the angle of the spindle and the compensation that follow from them.
+    """Events in order, and the resulting speed and angle of the spindle and compensation.
 
     Attributes
     ----------
@@ -123,7 +124,7 @@ class Schedule:
     events: tuple[Event, ...]
     spin_up: float
     top_speed: float
-    #: times and values (1/min) of commanded speeds; the first is (0, 0) or an event at 0
+    #: times, s, and values (1/min) of commanded speeds; the first is (0, 0) or an event at 0
     speed_times: Array = field(init=False, repr=False)
     speeds: Array = field(init=False, repr=False)
     #: times of the spindle's phases, and (turns, turns/s, turns/s^2 / 2) at their start
@@ -155,7 +156,7 @@ class Schedule:
         """Compute the phases: constant acceleration up to each commanded speed, then constant speed."""
         times, phases = [0.0], [(0.0, 0.0, 0.0)]
         for time, speed in zip(self.speed_times, self.speeds / 60, strict=True):
-            while times[-1] > time:  # a change while the spindle still accelerates
+            while times[-1] > time:  # a change of speed during an acceleration
                 del times[-1], phases[-1]
             turns, rate = self._after(times[-1], phases[-1], time)
             if times[-1] == time:

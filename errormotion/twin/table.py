@@ -1,4 +1,4 @@
-"""Pieces on the table of the gantry, and their scans by the line profiler as the carriage passes."""
+"""Pieces on the table of the gantry, and their scans by the line profiler during a pass of the carriage."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from errormotion.twin.artefacts.pieces import Artefact, circular_pocket, swept
 from errormotion.twin.crossbeam import Crossbeam
 from errormotion.twin.sensors.profiler import Profiler
 
-#: default distance of two artefacts, m
+#: Default distance of two artefacts, m.
 SPACING = 0.2
-#: margin of a scan beyond the artefact, m: an artefact is off its position by 0.2 mm (one
-#: sigma), and the profiler, tilted by some mrad, measures 20 mm up and down
-BESIDE = 3e-3
-#: lines per block; their noise does not depend on the start of a stream
+#: Margin of a scan beyond the artefact, m: an artefact deviates from its position by 0.2 mm (one sigma), and the
+#: profiler, tilted by some mrad, measures 20 mm up and down.
+SCAN_MARGIN = 3e-3
+#: Lines per block; their noise does not depend on the start of a stream.
 CHUNK = 64
 
 
@@ -43,8 +43,8 @@ class Target:
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Lowest and highest position of the axis at which the profiler may see it, m."""
-        half = self.artefact.half_size[1] + BESIDE
+        """Lowest and highest position of the axis at which the profiler may measure it, m."""
+        half = self.artefact.half_size[1] + SCAN_MARGIN
         return self.position - half, self.position + half
 
 
@@ -75,10 +75,10 @@ class Table:
         object.__setattr__(self, "targets", tuple(ordered))
 
     def runs(self, y: Array) -> Iterator[tuple[slice, Target | None]]:
-        """Yield which of increasing positions (n,) of the axis lie over which piece, None over none, in order."""
+        """Yield slices of increasing positions (n,) of the axis in order, each with its piece, None without one."""
         first = 0
         for target in self.targets:
-            start, end = (int(place) for place in np.searchsorted(y, target.reach))
+            start, end = (int(index) for index in np.searchsorted(y, target.reach))
             if first < start:
                 yield slice(first, start), None
             if start < end:
@@ -88,7 +88,7 @@ class Table:
             yield slice(first, y.size), None
 
     def scan(self, target: Target, profiler: Profiler, t: Array, positions: Array, key: tuple[int, ...]) -> Array:
-        """Return the lines that the profiler takes of a piece, each with the error at its own time.
+        """Return the lines that the profiler measures on a piece, each with the error at its time.
 
         Parameters
         ----------
@@ -97,30 +97,30 @@ class Table:
         profiler : Profiler
             The sensor.
         t : ndarray, (n,)
-            Time since the start of the warm-up, s, of each line; cold before 0.
+            Time of each line since the start of the warm-up, s; cold before 0.
         positions : ndarray, (n, 3)
             Commanded X, Y and Z, m.
         key : tuple of int
-            Of the noise.
+            Key of the noise.
 
         Returns
         -------
         ndarray, (n, point)
             Heights, m; NaN = none.
         """
-        alone = len(t) == 1
-        if alone:  # a direction along the feed takes two lines
+        single = len(t) == 1
+        if single:  # two lines are needed for the direction of the feed
             t, positions = np.repeat(t, 2), positions + np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])
         lines = self.crossbeam.lines(self.crossbeam.carriage_at(t, positions), target.pose, lift=positions[:, 2])
         heights = profiler.scan(target.artefact, lines, key=key)
-        return heights[:1] if alone else heights
+        return heights[:1] if single else heights
 
 
 def set_table(crossbeam: Crossbeam, seed: int, positions: Sequence[float], pocket: float | None = None) -> Table:
-    """Return a table with a swept free form at each position of the axis, m, and perhaps a circular pocket.
+    """Return a table with a swept free form at each position of the axis, m, and optionally a circular pocket.
 
-    The free forms are misaligned under the profiler by `Crossbeam.artefact_pose`; the pocket was cut by
-    the cold machine itself at the position ``pocket`` and Z = 0.
+    The free forms are misaligned below the profiler by `Crossbeam.artefact_pose`; the pocket was cut by the cold
+    machine itself at the position ``pocket`` and Z = 0.
 
     Raises
     ------
@@ -130,12 +130,12 @@ def set_table(crossbeam: Crossbeam, seed: int, positions: Sequence[float], pocke
     shape = swept()
     targets = [Target(shape, crossbeam.artefact_pose(seed, position), position) for position in positions]
     if pocket is not None:
-        over = pocket - float(crossbeam.pose[1, 3])  # here the profiler, not the tool, is over its middle
+        over = pocket - float(crossbeam.pose[1, 3])  # position at which the profiler is over the middle of the pocket
         targets.append(Target(circular_pocket(), crossbeam.pocket_pose(pocket), over))
     return Table(crossbeam, targets)
 
 
 def default_positions(travel: tuple[float, float]) -> list[float]:
-    """Return the positions of artefacts in a travel, one every 200 mm and as far from both ends, m."""
+    """Return the positions of artefacts in a travel, 200 mm apart and 200 mm from both ends, m."""
     n = int(round((travel[1] - travel[0]) / SPACING, 6))
     return [round(travel[0] + SPACING * k, 9) for k in range(1, n)]

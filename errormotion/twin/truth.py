@@ -1,4 +1,4 @@
-"""True errors as error datasets: values that are known exactly, with covariance 0."""
+"""True errors as error datasets with covariance 0."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from errormotion.twin.schedule import Event
 
 @dataclass(frozen=True)
 class Origin:
-    """The virtual machine behind a truth, and its schedule; ``description`` where it is not one of the two kinds."""
+    """The virtual machine of a truth, and its schedule; ``description`` if it is not one of the two kinds."""
 
     name: str
     kind: str

@@ -44,7 +44,7 @@ def test_across_completes_a_direction_to_a_right_handed_frame(vector):
 
 
 @given(st.floats(0.01, 1.5), st.floats(0, 6.28))
-def test_tilt_gives_back_inclination_and_rotation(alpha, beta):
+def test_tilt_vector_is_inverted_to_inclination_and_rotation(alpha, beta):
     q = tilt(U, T, surface(alpha, beta))
     np.testing.assert_allclose(q, tilt_vector(alpha, beta), atol=1e-12 / np.cos(alpha) ** 2)
     found = inclination_rotation(q)
@@ -52,14 +52,14 @@ def test_tilt_gives_back_inclination_and_rotation(alpha, beta):
     assert np.cos(found[1] - beta) == pytest.approx(1, abs=1e-9)
 
 
-def test_tilt_takes_many_surfaces_and_knows_the_back_of_one():
+def test_tilt_of_many_surfaces_is_nan_on_their_back():
     normals = np.stack([surface(0.3, 0.1), surface(0.3, 2.0), -surface(0.3, 0.1)])
     q = tilt(U, T, normals)
     np.testing.assert_allclose(q[:2], tilt_vector(0.3, [0.1, 2.0]), atol=1e-12)
     assert np.isnan(q[2]).all()
 
 
-def test_tilt_is_the_same_whatever_way_the_sensor_was_turned():
+def test_tilt_does_not_depend_on_the_orientation_of_the_sensor():
     # Deflection is no third freedom: beam, triangulation plane and surface turned as one leave q as it is.
     normal, R = surface(0.4, 1.1), Rotation.from_rotvec([0.4, -1.2, 0.3])
     np.testing.assert_allclose(tilt(R.apply(U), R.apply(T), R.apply(normal)), tilt(U, T, normal), atol=1e-12)
@@ -80,7 +80,7 @@ def test_triangulation_normal_along_the_beam_is_refused():
 
 
 @given(vectors)
-def test_rotation_between_is_the_smallest_that_does_it(vector):
+def test_rotation_between_is_the_smallest_rotation(vector):
     u0 = np.array([0, 0.6, 0.8])
     u = Rotation.from_rotvec(vector).apply(u0)
     R = Rotation.from_rotvec(rotation_between(u0, u))
@@ -109,7 +109,7 @@ def test_covariance_of_errors_follows_the_derivative(angle):
     np.testing.assert_allclose(covariance[0, 3:, 3:], factor.T @ factor, atol=1e-6 * spread[0] ** 2)
 
 
-def test_unknown_origin_stays_unknown_and_an_axis_hides_the_turn_about_itself():
+def test_unknown_origin_and_rotation_about_the_beam_are_nan():
     origin, nominal = np.array([[np.nan] * 3, [0.1, 0, 0]]), np.array([[0, 0, -1.0], [0, 0, -1.0]])
     C = np.broadcast_to(np.eye(6) * 1e-12, (2, 6, 6))
     errors, covariance = beam_errors(np.zeros((2, 3)), nominal, origin, nominal, C)

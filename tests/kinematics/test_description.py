@@ -48,7 +48,7 @@ def test_commands_of_moving_axes_are_completed_by_the_fixed_angles():
         five_axes().commands(np.zeros((2, 4)))
 
 
-def test_a_table_that_stands_still_below_all_linear_axes_leaves_their_directions():
+def test_fixed_table_below_all_linear_axes_keeps_their_directions():
     # The fixed angle turns the frame of the workpiece; the way of the tool between two positions is the same.
     full, linear = five_axes().machine(), Machine(five_axes().moving_chain)
     q = np.array([[0.1, 0.2, 0.3], [0.4, -0.1, 0.2]])
@@ -85,7 +85,7 @@ def test_a_table_that_stands_still_below_all_linear_axes_leaves_their_directions
         ({"fixed": {"A": 0.0, "C": np.inf}}, "rotary.C.fixed", "expected an angle; found inf rad"),
     ],
 )
-def test_a_description_that_contradicts_itself_is_refused_by_its_key(changes, key, text):
+def test_inconsistent_description_is_refused_with_the_key(changes, key, text):
     with pytest.raises(DescriptionError) as caught:
         five_axes(**changes)
     assert list(caught.value.mistakes) == [key]

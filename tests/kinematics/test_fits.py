@@ -86,7 +86,7 @@ def test_far_from_the_origin_only_the_rounding_of_the_points_is_left(shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_scipys_optimiser_finds_the_same_minimum(shape):
+def test_scipy_finds_the_same_minimum(shape):
     points = 1000 * points_on(shape, noise=1e-4)  # mm, so that scipy's tolerances bite
     fitted = fit_cylinder(points, 25.0) if "known" in shape else FITS[shape](points)
 
@@ -195,7 +195,7 @@ def test_parameters_have_their_names():
     assert set(cylinder.standard_uncertainty) == set(cylinder.parameter_names)
 
 
-def test_the_shapes_come_back():
+def test_true_shapes_are_recovered():
     axis = TURN[2] * np.sign(TURN[2][np.argmax(np.abs(TURN[2]))])
     np.testing.assert_allclose(fit_line(points_on("line3")).direction, axis, atol=1e-12)
     np.testing.assert_allclose(fit_plane(points_on("plane")).normal, axis, atol=1e-12)
@@ -216,7 +216,7 @@ def test_weights_are_repeated_points():
     np.testing.assert_allclose(weighted.parameters, twice.parameters, atol=1e-12)
 
 
-def test_direction_chooses_among_the_cylinders_through_four_points():
+def test_direction_selects_one_of_the_cylinders_through_four_points():
     # Two levels, sideways sensors in x on one and y on both: the ISO 230-3 frame around a bar of 10 mm.
     r = 0.005
     points = [(r, 0, 0.01), (0, r, 0.01), (r, 0, 0.05), (0, r, 0.05)]

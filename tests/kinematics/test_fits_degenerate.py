@@ -44,12 +44,12 @@ def test_points_that_leave_a_freedom_undetermined_are_refused(fit, points, messa
 
 
 @pytest.mark.parametrize("fit", [fit_line, fit_plane, fit_circle, fit_sphere, fit_cylinder, fit_cone])
-def test_values_that_are_no_points_are_refused(fit):
+def test_invalid_points_are_refused(fit):
     broken = RNG.normal(size=(20, 3))
     broken[[3, 7]] = np.nan
     with pytest.raises(FitError, match=r"2 of 20 points are not finite \(rows 3, 7\)"):
         fit(broken)
-    with pytest.raises(FitError, match=r"one point a row; found \(20,\)"):
+    with pytest.raises(FitError, match=r"one row for each point; found \(20,\)"):
         fit(np.zeros(20))
     with pytest.raises(FitError, match=r"found \(3, 20\)"):
         fit(np.zeros((3, 20)))
@@ -67,7 +67,7 @@ def test_noise_that_hides_the_radius_is_refused():
         fit_circle(np.column_stack([x, y]))
 
 
-def test_three_lines_hold_a_cylinder():
+def test_three_lines_determine_a_cylinder():
     lines = [np.column_stack([np.full(5, np.cos(a)), np.full(5, np.sin(a)), np.linspace(0, 3, 5)]) for a in (0, 2, 4)]
     cylinder = fit_cylinder(np.concatenate(lines))
     assert cylinder.radius == pytest.approx(1.0, abs=1e-12)
@@ -79,7 +79,7 @@ def test_three_lines_hold_a_cylinder():
         ({"sigma": 0.0}, "positive sigma"),
         ({"sigma": float("nan")}, "positive sigma"),
         ({"weights": [1.0, 1.0]}, "12 positive weights"),
-        ({"weights": [0.0] + [1.0] * 11}, "leave out points of weight 0"),
+        ({"weights": [0.0] + [1.0] * 11}, "remove points of weight 0"),
     ],
 )
 def test_options_are_checked(options, message):

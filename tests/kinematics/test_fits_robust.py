@@ -66,13 +66,13 @@ def noisy(shape, n, rng, noise=1e-6):
     return p @ TURN
 
 
-def test_touch_probe_meets_the_check_bar():
+def test_fit_to_touches_of_the_check_bar():
     circle = fit_circle(TOUCH_PROBE)
     np.testing.assert_allclose([*circle.centre, circle.radius], [5.6026, -17.7493, 25.0018], atol=5e-5)
     assert circle.rms == pytest.approx(0.19e-3, abs=0.005e-3)
 
 
-def test_laser_held_at_zero_meets_the_check_bar():
+def test_fit_to_laser_points_at_zero_on_the_check_bar():
     circle = fit_circle(LASER_AT_ZERO)
     np.testing.assert_allclose([*circle.centre, circle.radius], [176.4197, -108.8329, 25.0009], atol=6e-5)
     assert circle.rms == pytest.approx(3.4e-3, abs=0.05e-3)
@@ -90,7 +90,7 @@ def test_laser_scans_of_the_check_bar(table, column, radius, rms):
     assert circle.rms == pytest.approx(rms, abs=0.06e-3)
 
 
-def test_misprint_in_the_published_table_is_named():
+def test_misprint_in_the_published_table_is_detected():
     points = np.array(LASER_0_DEG)[:, [1, 2]]
     circle = fit_circle(points, robust=True)
     assert circle.left_out == (8,)
@@ -101,7 +101,7 @@ def test_misprint_in_the_published_table_is_named():
 
 
 @pytest.mark.parametrize("shape", list(FITS))
-def test_wrong_points_are_named_and_do_not_matter(shape):
+def test_outliers_are_listed_and_have_no_effect(shape):
     """30 % of the points off by 0.1 mm to millimetres, noise 1 um."""
     rng = np.random.default_rng(4)
     points = noisy(shape, 40, rng)
@@ -120,7 +120,7 @@ def test_wrong_points_are_named_and_do_not_matter(shape):
 
 
 @pytest.mark.parametrize(("shape", "fits"), [("circle", 150), ("plane", 100), ("line", 100), ("cylinder", 12)])
-def test_clean_points_are_seldom_accused(shape, fits):
+def test_clean_points_are_rarely_excluded(shape, fits):
     rng = np.random.default_rng(20)
     accused = sum(bool(FITS[shape](noisy(shape, 16, rng), robust=True).left_out) for _ in range(fits))
     # One fit in a hundred; the binomial's 1e-3 point at 150 fits of probability 0.01 is 6.
@@ -128,12 +128,12 @@ def test_clean_points_are_seldom_accused(shape, fits):
 
 
 @pytest.mark.parametrize("shape", list(FITS))
-def test_exact_points_are_not_accused_for_their_rounding(shape):
+def test_exact_points_are_not_excluded_for_their_rounding(shape):
     exact = noisy(shape, 20, np.random.default_rng(1), noise=0.0) + 10.0
     assert FITS[shape](exact, robust=True).left_out == ()
 
 
-def test_same_points_same_answer():
+def test_same_points_give_the_same_result():
     points = noisy("circle", 20, np.random.default_rng(2))
     points[3] += 1e-3
     first, second = fit_circle(points, robust=True), fit_circle(points, robust=True)
@@ -141,7 +141,7 @@ def test_same_points_same_answer():
     np.testing.assert_array_equal(first.parameters, second.parameters)
 
 
-def test_known_noise_excuses_what_it_explains():
+def test_deviations_within_known_noise_are_accepted():
     points = noisy("circle", 20, np.random.default_rng(2))
     points[3] *= 1 + 8e-6 / 0.025
     assert fit_circle(points, robust=True).left_out == (3,)
@@ -153,6 +153,6 @@ def test_robust_fit_needs_points_to_spare():
         fit_circle([(1, 0), (0, 1), (-1, 0), (0, -1), (0.7, 0.7)], robust=True)
 
 
-def test_points_of_nothing_are_refused():
+def test_coincident_points_are_refused():
     with pytest.raises(FitError, match="half of the"):
         fit_line(np.repeat([[1.0, 2.0], [3.0, 4.0]], [8, 2], axis=0), robust=True)

@@ -43,7 +43,7 @@ def test_order_of_commands_does_not_depend_on_the_chain():
     assert Machine("workpiece-C-A-Y-bed-X-Z-tool").axis_names == ("X", "Y", "Z", "A", "C")
 
 
-def test_rotary_axes_bring_six_motions_and_four_places_each():
+def test_rotary_axes_add_six_motions_and_four_location_errors_each():
     assert len(Machine("workpiece-C-A-Y-bed-X-Z-tool").error_names) == 21 + 2 * 10
 
 
@@ -73,7 +73,7 @@ def test_first_order_differs_from_exact_by_products_of_errors(chain):
 
 
 @pytest.mark.parametrize("chain", CHAINS)
-def test_without_errors_there_is_none(chain):
+def test_no_error_without_axis_errors(chain):
     machine = machine_of(chain)
     none = np.zeros(len(machine.error_names))
     q = commands(machine)
@@ -93,7 +93,7 @@ def test_rotary_table_turns_the_tool_around_the_workpiece():
     np.testing.assert_allclose(pose.apply([0.3, 0.0, 0.0]), [[0.1, 0.2, 0.0]], atol=1e-16)
 
 
-def test_error_motions_do_at_the_tool_what_their_names_say():
+def test_error_motions_have_the_effect_of_their_names():
     machine = Machine(CFRAME)
     error = dict.fromkeys(machine.error_names, 0.0) | {"EXX": 1e-6}
     twist = machine.volumetric_error([0.1, 0.2, 0.3], list(error.values()))
@@ -106,7 +106,7 @@ def test_error_motions_do_at_the_tool_what_their_names_say():
     np.testing.assert_allclose(twist, [10e-6 * -0.3, 0, 0, 0, 10e-6, 0], atol=1e-18)
 
 
-def test_reference_rides_on_the_moving_body():
+def test_reference_moves_with_the_moving_body():
     # Yaw of X acts on the tool's distance from the reference: on the table it stays, on the tool's slide it moves.
     yaw = dict.fromkeys(Machine(CFRAME).error_names, 0.0) | {"ECX": 1e-6}
     on_table = Machine(CFRAME).volumetric_error([0.5, 0.0, 0.0], list(yaw.values()))
@@ -116,7 +116,7 @@ def test_reference_rides_on_the_moving_body():
 
 
 @pytest.mark.parametrize("chain", CHAINS[:3])
-def test_squareness_leans_the_axis_and_turns_nothing(chain):
+def test_squareness_tilts_the_axis_without_a_rotation(chain):
     machine = machine_of(chain)
     place = [0.3, 0.2, 0.1]
     for name, expected in {
@@ -183,7 +183,7 @@ def test_error_motion_is_linear_between_and_unknown_outside():
     assert motion(np.zeros((2, 4))).shape == (2, 4, 6)
 
 
-def test_error_motion_of_a_turning_axis_goes_on():
+def test_error_motion_of_a_rotary_axis_is_periodic():
     angle = np.linspace(0, 2 * np.pi, 36, endpoint=False)
     motion = ErrorMotion(angle, np.sin(angle)[:, None] * np.ones(6), period=2 * np.pi)
     np.testing.assert_allclose(motion(angle + 8 * np.pi), motion(angle), atol=1e-14)
@@ -214,7 +214,7 @@ def test_a_wrong_chain_is_refused(chain, message):
         (lambda: Machine(CFRAME).volumetric_error(np.zeros(3), np.zeros(6)), r"errors of shape \(..., 21\)"),
         (lambda: Machine(CFRAME).errors_at(np.zeros(3), {"C": np.zeros}), "has no C"),
         (lambda: Machine(CFRAME).errors_at(np.zeros(3), {}, {"EC0Z": 0.0}), "has no EC0Z"),
-        (lambda: ErrorMotion(np.array([0.0, 0.0]), np.zeros((2, 6))), "strictly increase"),
+        (lambda: ErrorMotion(np.array([0.0, 0.0]), np.zeros((2, 6))), "strictly increasing"),
         (lambda: ErrorMotion(np.array([0.0, 1.0]), np.zeros((3, 6))), r"twists of shape \(n, 6\)"),
         (lambda: ErrorMotion(np.array([0.0, 7.0]), np.zeros((2, 6)), period=6.28), "one period"),
         (lambda: Axis("Q", True), "found 'Q'"),

@@ -24,7 +24,7 @@ def test_cross_matrix_is_the_cross_product(v, w):
     np.testing.assert_allclose(twists.cross_matrix(v) @ w, np.cross(v, w), atol=1e-14)
 
 
-def test_cross_matrix_takes_stacks():
+def test_cross_matrix_accepts_stacks():
     v = np.arange(24.0).reshape(2, 4, 3)
     assert twists.cross_matrix(v).shape == (2, 4, 3, 3)
     np.testing.assert_array_equal(twists.cross_matrix(v)[1, 2], twists.cross_matrix(v[1, 2]))
@@ -75,7 +75,7 @@ def test_covariance_is_that_of_the_moved_draws():
     np.testing.assert_allclose(np.cov(moved.T), twists.transform_covariance(np.cov(draws.T), A), rtol=1e-10)
 
 
-def test_stacked_matrices_act_place_by_place():
+def test_stacked_matrices_act_element_by_element():
     rng = np.random.default_rng(1)
     twist, shift = rng.normal(size=(4, 6)), rng.normal(size=(4, 3))
     moved = twists.move(twist, shift)
@@ -87,7 +87,7 @@ def test_stacked_matrices_act_place_by_place():
         np.testing.assert_allclose(spread[i], A @ A.T, rtol=1e-13)
 
 
-def test_unknown_freedom_spoils_only_what_depends_on_it():
+def test_unknown_freedom_affects_only_dependent_freedoms():
     no_roll_about_z = np.array([1e-6, 2e-6, 3e-6, 4e-6, 5e-6, np.nan])
     along_z = twists.move(no_roll_about_z, [0, 0, 0.1])
     np.testing.assert_allclose(along_z, [1.5e-6, 1.6e-6, 3e-6, 4e-6, 5e-6, np.nan])
@@ -95,14 +95,14 @@ def test_unknown_freedom_spoils_only_what_depends_on_it():
     np.testing.assert_array_equal(np.isnan(aside), [False, True, False, False, False, True])
 
 
-def test_unknown_freedom_stays_its_own_after_a_quarter_turn():
+def test_unknown_freedom_is_one_freedom_after_a_quarter_turn():
     # cos 90 deg rounds to 6e-17; that is no dependence.
     pose = RigidTransform.from_rotation(Rotation.from_euler("x", 90, degrees=True))
     turned = twists.to_frame([1e-6, 2e-6, 3e-6, 4e-6, 5e-6, np.nan], pose)
     np.testing.assert_allclose(turned, [1e-6, -3e-6, 2e-6, 4e-6, np.nan, 5e-6])
 
 
-def test_unknown_covariance_spoils_only_what_depends_on_it():
+def test_unknown_covariance_affects_only_dependent_elements():
     covariance = np.eye(6)
     covariance[5, :] = covariance[:, 5] = np.nan
     along_z = twists.transform_covariance(covariance, twists.adjoint(shift=[0, 0, 0.1]))

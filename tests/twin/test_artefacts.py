@@ -61,14 +61,14 @@ def test_free_form_is_the_function_it_was_made_from():
     assert artefacts.freeform(wave).height(x, y) == pytest.approx(wave(x, y), abs=1.2e-11)
 
 
-def test_swept_surface_turns_no_reading_away():
+def test_swept_surface_is_not_too_steep_for_readings():
     artefact = SHAPES["free form"]
     x, y = np.meshgrid(np.linspace(-0.022, 0.022, 400), np.linspace(-0.03, 0.03, 400), indexing="ij")
     slopes = np.gradient(artefact.height(x, y), x[:, 0], y[0])
     assert np.hypot(*slopes).max() < 1.0
 
 
-def test_beside_the_artefact_there_is_nothing():
+def test_no_readings_beside_the_artefact():
     assert np.isnan(SHAPES["plane"].height([0.0221, 0.0], [0.0, -0.0301])).all()
     profiler = Profiler(3200, disturbances=Disturbances.none())
     heights = profiler.scan(artefacts.plane((10e-3, 30e-3)), lines(twist=[0] * 6))
@@ -90,7 +90,7 @@ def test_tilted_ray_reaches_the_floor_of_the_pocket_farther_on():
     assert points[floor, 2] == pytest.approx(-5e-3, abs=1e-12)
 
 
-def test_unphysical_artefacts_are_refused_in_words():
+def test_unphysical_artefacts_are_refused():
     with pytest.raises(BenchError, match="radius of an artefact as a positive length"):
         artefacts.circular_pocket(-1)
     with pytest.raises(BenchError, match="not finite"), np.errstate(invalid="ignore"):
@@ -106,7 +106,7 @@ def errors_of(**wrong):
     return heights, profiler
 
 
-def test_same_key_same_numbers_and_another_key_others():
+def test_key_determines_the_numbers():
     profiler, poses = Profiler(400, 100 * UM, disturbances=Disturbances(blobs=2)), lines()
     one, same, other = (profiler.scan(SHAPES["free form"], poses, key=key) for key in ((3,), (3,), (4,)))
     assert np.array_equal(one, same, equal_nan=True)
@@ -145,7 +145,7 @@ def test_speckle_is_correlated_over_its_points_and_not_between_lines():
     assert abs(np.mean(heights[1:] * heights[:-1])) < 0.03 * heights.var()
 
 
-def test_too_steep_places_give_no_reading():
+def test_too_steep_points_have_no_reading():
     wrong = Disturbances(**(vars(Disturbances.none()) | {"steepest": 0.5}))
     profiler, radius = Profiler(3200, disturbances=wrong), 25e-3
     heights = profiler.scan(artefacts.sphere(radius), lines(3, 1e-9, [0] * 6))[1]
@@ -154,7 +154,7 @@ def test_too_steep_places_give_no_reading():
     assert reach == pytest.approx(radius * np.sin(np.arctan(0.5)), abs=profiler.pitch)
 
 
-def test_stray_light_keeps_to_the_edges():
+def test_stray_light_is_limited_to_the_edges():
     wrong = Disturbances(**(vars(Disturbances.none()) | {"edge_lift": 30 * UM, "edge_reach": 150 * UM}))
     profiler = Profiler(disturbances=wrong)
     heights = profiler.scan(artefacts.plane((15e-3, 30e-3)), lines(20, 0.5e-3, [0] * 6))
@@ -164,7 +164,7 @@ def test_stray_light_keeps_to_the_edges():
     assert heights[:, last].mean() == pytest.approx(30 * UM, rel=0.3)
 
 
-def test_outliers_and_losses_come_as_often_as_stated():
+def test_outliers_and_losses_are_as_frequent_as_stated():
     heights, _ = errors_of(outliers=0.01, outlier_spread=0.5e-3, missing=0.02)
     n = heights.size
     assert np.isnan(heights).mean() == pytest.approx(0.02, abs=5 * np.sqrt(0.02 / n))

@@ -12,7 +12,7 @@ POSITIONS = -0.7 + 0.2 * np.arange(8)
 
 @pytest.fixture
 def gantry():
-    """A gantry whose Y axis has been going to and fro since time 0."""
+    """A gantry whose Y axis moves back and forth from time 0."""
     return VirtualMachine("gantry", seed=3)
 
 
@@ -24,14 +24,14 @@ def test_carriage_follows_its_guide(gantry):
     assert here[:, 5] == pytest.approx(-slope[:, 0], abs=1e-11)
 
 
-def test_carriage_may_turn_by_itself(gantry):
+def test_carriage_may_rotate_relative_to_the_guide(gantry):
     own = np.array([0, 0, 0, 5e-6, 0, 0])
     turned = replace(gantry.crossbeam, own=own)
     more = turned.twist(1e6, POSITIONS) - gantry.crossbeam.twist(1e6, POSITIONS)
     assert more == pytest.approx(np.tile(own, (8, 1)), abs=1e-15)
 
 
-def test_seed_makes_the_crossbeam(gantry):
+def test_seed_determines_the_crossbeam(gantry):
     t, y = 3600.0, POSITIONS
     assert np.array_equal(VirtualMachine("gantry", seed=3).crossbeam.twist(t, y), gantry.crossbeam.twist(t, y))
     assert not np.array_equal(VirtualMachine("gantry", seed=4).crossbeam.twist(t, y), gantry.crossbeam.twist(t, y))

@@ -57,7 +57,7 @@ def test_volumetric_truth_is_a_valid_error_dataset(either):
     assert truth.EX.dims == ("target",)
 
 
-def test_along_the_last_axis_before_the_tool_the_volume_shows_that_axis_alone(either):
+def test_volume_along_the_last_axis_shows_this_axis_only(either):
     # The Z axis carries the tool: with X and Y at zero, the tool sees the errors of Z at the machine's origin.
     z = np.array([0.1, 0.3])
     points = np.column_stack([np.zeros(2), np.zeros(2), z])
@@ -70,12 +70,12 @@ def test_along_the_last_axis_before_the_tool_the_volume_shows_that_axis_alone(ei
     assert np.abs(volume.EY.values - axis.EY.values) == pytest.approx(np.abs(squareness["EA0Z"] * z), abs=1e-12)
 
 
-def test_an_unknown_axis_names_the_known_ones(machine):
+def test_unknown_axis_is_refused_with_the_known_ones(machine):
     with pytest.raises(BenchError, match="X, Y, Z"):
         machine.truth_axis("A", [0.0])
 
 
-def test_the_quick_way_to_the_displacement_is_the_model_itself(either):
+def test_fast_displacement_agrees_with_the_model(either):
     low, high = np.array([either.travel[axis] for axis in "XYZ"]).T
     places = low + np.random.default_rng(0).uniform(size=(40, 3)) * (high - low)
     # sums of some 10 um in another order: 1e-16 of that, some times
@@ -122,7 +122,7 @@ def test_a_described_machine_has_the_errors_of_its_kinematic_model(chain, fixed,
     np.testing.assert_allclose(geometry.twist(points), model.volumetric_error(q, errors, exact=True), rtol=0, atol=3e-8)
 
 
-def test_a_fixed_table_turns_the_frame_of_the_workpiece_and_not_the_errors_of_the_linear_axes():
+def test_fixed_table_rotates_the_frame_of_the_workpiece_but_not_the_errors_of_the_linear_axes():
     def linear_only(machine):
         geometry = machine.geometry
         still = {axis: geometry.motions[axis] for axis in "XYZ"} | {
@@ -155,7 +155,7 @@ def test_errors_of_a_rotary_axis_repeat_after_a_turn():
     assert 0.3e-6 < np.abs(motion(angle)).max() < 200e-6
 
 
-def test_truth_of_a_described_machine_is_valid_and_says_where_it_was():
+def test_truth_of_a_described_machine_is_valid_and_contains_the_description():
     machine = VirtualMachine(described(fixed={"A": 0.0}, C=(-3.0, 3.0)), seed=7)
     volume = machine.volumetric_truth([[0.1, 0.2, 0.3, 0.5]])
     validate(volume)
@@ -184,7 +184,7 @@ def test_a_described_machine_warms_up_and_measures_like_its_kind(chain, kind):
 
 
 @pytest.mark.parametrize("kind", ["cframe", "gantry"])
-def test_the_two_kinds_are_what_their_own_description_makes(kind):
+def test_the_two_kinds_equal_machines_of_their_descriptions(kind):
     machine = VirtualMachine(kind, seed=7)
     same = VirtualMachine(machine.description, seed=7)
     np.testing.assert_array_equal(same.geometry.twist(POINTS), machine.geometry.twist(POINTS))

@@ -1,4 +1,4 @@
-"""Where beams meet surfaces."""
+"""Intersections of beams with surfaces."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_point_on_the_plane_lies_in_it(shift, lean, aim):
     assert (np.array([0, 0, -1e-3]) + d * u - shift) @ n == pytest.approx(0, abs=1e-17)
 
 
-def test_a_miss_is_nan():
+def test_missed_surface_is_nan():
     beam = np.array([6e-3, 6e-3, 0.0]), np.array([-1.0, 0, 0])
     assert np.isnan(intersections.to_sphere(*beam, np.zeros(3), 5e-3))
     assert np.isnan(intersections.to_cylinder(*beam, np.zeros(3), np.array([0, 0, 1.0]), 5e-3))

@@ -60,7 +60,7 @@ def test_same_seed_and_schedule_give_the_same_machine(warming):
     assert np.array_equal(other.frame.true_direction, warming.frame.true_direction)
 
 
-def test_starting_again_forgets_the_schedule_before(warming):
+def test_restart_removes_the_previous_schedule(warming):
     hot = warming.distances(20000, 100, 20000.0)
     warming.start()
     assert not np.array_equal(warming.distances(20000, 100, 20000.0), hot)
@@ -76,7 +76,7 @@ def test_other_seeds_are_other_machines(machine):
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_every_machine_can_be_measured(seed):
+def test_deviations_and_readings_of_every_machine_are_plausible(seed):
     machine = VirtualMachine("cframe", seed)
     beams = machine.frame.nominal_direction
     off = machine.frame.true_origin - machine.frame.nominal_origin
@@ -119,7 +119,7 @@ def test_truth_moves_to_another_functional_point_as_a_rigid_body(warming):
     assert there.EA.item() == here[3]
 
 
-def test_axis_of_rotation_is_where_the_twist_puts_it(warming):
+def test_axis_of_rotation_follows_the_twist(warming):
     twist = warming.spindle_twist([6000.0])[0]
     (point,), (axis,) = warming.spindle_axis([6000.0])
     assert point == pytest.approx(warming.spindle_functional_point + twist[:3], abs=1e-18)
@@ -132,7 +132,7 @@ def test_twist_is_continuous_where_nothing_is_switched(warming):
     assert np.max(np.abs(np.diff(warming.spindle_twist(t)[:, :3], axis=0))) < 0.1e-6
 
 
-def test_an_unknown_machine_names_the_known_ones():
+def test_unknown_machine_is_refused_with_the_known_ones():
     with pytest.raises(BenchError, match="cframe or gantry, or a description; found"):
         VirtualMachine("lathe")
 
@@ -156,6 +156,6 @@ def test_an_offset_of_the_commands_displaces_the_tool() -> None:
     ("times", "offsets"),
     [([0.0], [[0.0, 0.0]]), ([1.0, 1.0], np.zeros((2, 3))), ([0.0], [[np.nan] * 3]), ([], np.zeros((0, 3)))],
 )
-def test_offsets_that_are_none_are_refused(times: list[float], offsets: list[list[float]]) -> None:
+def test_invalid_offsets_are_refused(times: list[float], offsets: list[list[float]]) -> None:
     with pytest.raises(BenchError, match="offsets"):
         VirtualMachine("cframe").compensate(times, offsets)

@@ -1,4 +1,4 @@
-"""The noise is normal, white, different in every channel, and a function of the sample counter alone."""
+"""The noise is normal, white, different in every channel, and a function of the sample counter only."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_distribution_is_normal_in_centre_and_tails(numbers):
 
 
 @pytest.mark.parametrize("lag", [1, 2, 3, 64, 80, 1024, 20000])
-def test_samples_do_not_know_one_another(numbers, lag):
+def test_samples_are_uncorrelated(numbers, lag):
     assert abs(np.mean(numbers[lag:] * numbers[:-lag])) < 5 / np.sqrt(N)
 
 
@@ -57,7 +57,7 @@ def test_every_split_gives_the_same_numbers(numbers):
     assert np.array_equal(np.concatenate(parts), numbers[:5000])
 
 
-def test_numbers_go_on_far_behind_any_record():
+def test_numbers_continue_far_beyond_any_record():
     late = kernels.normals(kernels.stream_key(1, 0), 2**40, 10_000)
     assert abs(late.mean()) < 5 / 100
     assert abs(late.std() - 1) < 5 / np.sqrt(20_000)

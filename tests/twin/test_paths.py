@@ -1,4 +1,4 @@
-"""Paths of the axes: places at times, triggers of the encoder, and what warms the machine up."""
+"""Paths of the axes: positions over time, triggers of the encoder, and warm-up moves."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def path(*moves: tuple[float, float, bool]) -> Path:
     return Path(np.array(times), np.array(places), np.array(rapid, dtype=bool))
 
 
-def test_places_are_linear_in_time_and_rest_before_and_after() -> None:
+def test_positions_are_linear_in_time_and_constant_before_and_after() -> None:
     way = path((60, 3600, False), (0, 0, False), (-30, 3600, False)).beginning(10.0)
     assert (way.begin, way.end, way.duration) == pytest.approx((10.0, 12.5, 2.5))
     y = way.place([0.0, 10.0, 10.5, 11.5, 12.25, 99.0])[:, 1]
@@ -36,7 +36,7 @@ def test_the_encoder_triggers_at_every_multiple_in_the_positive_direction_once()
     assert times[1] == pytest.approx(2.0 + np.arange(1, 12) / 10)
 
 
-def test_multiples_are_those_of_the_count_and_not_of_the_place() -> None:
+def test_triggers_are_multiples_of_the_count_not_of_the_position() -> None:
     counts, times = path((1.0, 60, False)).crossings(0, 1e-6, 30, 70)
     assert (counts % 70 == 0).all()
     assert times == pytest.approx((counts - 30) * 1e-3)

@@ -1,4 +1,4 @@
-"""The twin's point sensor: triangulation, range, warm-up, and what it looks at."""
+"""The point sensor of the virtual machine: triangulation, range, warm-up, and its targets."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def slope(sensor: PointSensor, alpha: float, beta: float) -> float:
 # ---------------------------------------------------------------------- the beam
 
 
-def test_a_seed_is_an_individual() -> None:
+def test_seed_selects_an_individual() -> None:
     one, again, other = (VirtualMachine("cframe", seed=seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.point_sensor.true_direction, again.point_sensor.true_direction)
     assert np.abs(one.point_sensor.true_direction - other.point_sensor.true_direction).max() > 1e-5
@@ -104,7 +104,7 @@ def test_readings_on_the_bar_lie_on_a_cylinder(sensor: PointSensor, machine: Vir
     np.testing.assert_allclose(normals, across / bar.radius, atol=1e-12)
 
 
-def test_the_gauge_stands_as_it_is_set_but_for_arcseconds_and_a_micrometre(machine: VirtualMachine) -> None:
+def test_gauge_deviates_from_its_setting_by_arcseconds_and_a_micrometre(machine: VirtualMachine) -> None:
     gauge = machine.sine_gauge
     nominal = gauge.nominal_normal(20 * DEG, 30 * DEG)
     assert np.degrees(np.arccos(nominal[2])) == pytest.approx(20.0)
@@ -120,7 +120,7 @@ def test_the_gauge_stands_as_it_is_set_but_for_arcseconds_and_a_micrometre(machi
         gauge.plane(61 * DEG, 0.0)
 
 
-def test_a_beam_that_misses_reads_nothing(sensor: PointSensor) -> None:
+def test_missed_target_has_no_reading(sensor: PointSensor) -> None:
     u = sensor.true_direction
     start = -sensor.true_origin[None]  # the stage that has the zero point at the machine's origin
     across = np.array([u[2], 0.0, -u[0]]) / np.hypot(u[0], u[2])
@@ -137,7 +137,7 @@ def test_a_beam_that_misses_reads_nothing(sensor: PointSensor) -> None:
         assert np.isfinite(sensor.still(target, start)).all()
 
 
-def test_out_of_range_there_is_no_reading_and_which_side_can_be_told(sensor: PointSensor) -> None:
+def test_no_reading_out_of_range_and_its_side_can_be_requested(sensor: PointSensor) -> None:
     face = Plane(-sensor.true_direction, np.zeros(3))
     depths = 1e-3 * np.array([-10.1, -9.9, 0.0, 9.9, 10.1])
     stage = -sensor.true_origin - depths[:, None] * sensor.true_direction
@@ -147,7 +147,7 @@ def test_out_of_range_there_is_no_reading_and_which_side_can_be_told(sensor: Poi
     assert reported[-1] == np.inf
 
 
-def test_a_sensor_that_counts_from_the_start_of_its_range_sees_the_same_surface(
+def test_sensor_with_readings_from_the_start_of_its_range_measures_the_same_surface(
     sensor: PointSensor, machine: VirtualMachine
 ) -> None:
     face = machine.sine_gauge.face(20 * DEG, 0.0)
@@ -196,14 +196,14 @@ def test_the_error_grows_faster_than_the_tilt(sensor: PointSensor) -> None:
     assert abs(k[0]) <= 1e-4  # at right angles only the sensor's own scale
 
 
-def test_tilts_to_either_side_of_the_triangulation_plane_are_alike(sensor: PointSensor) -> None:
+def test_tilts_to_either_side_of_the_triangulation_plane_have_the_same_effect(sensor: PointSensor) -> None:
     for alpha, beta in ((20.0, 30.0), (40.0, 90.0), (35.0, 140.0)):
         assert slope(sensor, alpha, beta) == pytest.approx(slope(sensor, alpha, -beta), abs=1e-12)
         assert slope(sensor, -alpha, beta) == pytest.approx(slope(sensor, alpha, beta + 180.0), abs=1e-12)
 
 
-def test_no_cubic_is_the_error_surface_but_a_polynomial_comes_near(sensor: PointSensor) -> None:
-    """So a calibration has an honest model error: some of the noise at the ends of the range, little of the error."""
+def test_error_surface_is_no_cubic_but_near_a_polynomial(sensor: PointSensor) -> None:
+    """A calibration therefore has a model error: part of the noise at the ends of the range, little of the error."""
     alpha, beta = np.meshgrid(np.linspace(-45, 45, 31) * DEG, np.linspace(0, 180, 37) * DEG)
     q = tilt_vector(alpha, beta).reshape(-1, 2)
     k = sensor.slope(q)
@@ -217,8 +217,8 @@ def test_no_cubic_is_the_error_surface_but_a_polynomial_comes_near(sensor: Point
     assert left(6) < 0.5e-6
 
 
-def test_a_receiver_in_the_shade_of_the_surface_sees_nothing(sensor: PointSensor) -> None:
-    """It lies 28 deg off the beam: a surface that leans away from it by more than 62 deg hides the spot."""
+def test_no_reading_with_the_receiver_in_the_shade_of_the_surface(sensor: PointSensor) -> None:
+    """It is at 28 deg to the beam: a surface inclined away from it by more than 62 deg hides the spot."""
     assert np.isfinite(slope(sensor, 60.0, 0.0))
     assert np.isnan(slope(sensor, 63.0, 0.0))
     assert np.isfinite(slope(sensor, 63.0, 180.0))
@@ -240,7 +240,7 @@ def test_speckle_has_its_variance_and_loses_its_correlation_over_its_length() ->
     assert abs(np.mean(fields)) < 0.05
 
 
-def test_speckle_is_a_texture_and_depends_on_nothing_but_the_place() -> None:
+def test_speckle_depends_on_the_position_only() -> None:
     places = np.outer(np.arange(300) * 7e-6, [1.0, 0.3, 0.0])
     whole = speckle(5, places, 50e-6)
     blocks = np.concatenate([speckle(5, part, 50e-6) for part in np.split(places, [1, 50, 222])])
@@ -248,7 +248,7 @@ def test_speckle_is_a_texture_and_depends_on_nothing_but_the_place() -> None:
     assert np.abs(speckle(6, places, 50e-6) - whole).max() > 0.1
 
 
-def test_readings_hold_noise_and_speckle_of_their_sizes(machine: VirtualMachine) -> None:
+def test_readings_contain_noise_and_speckle_as_stated(machine: VirtualMachine) -> None:
     sensor, face = machine.point_sensor, machine.sine_gauge.face(20 * DEG, 90 * DEG)
     n = 4000
     places = machine.home() + np.outer(np.linspace(-8e-3, 8e-3, n), [1.0, 0.0, 0.0])  # 80 lengths either way
@@ -285,8 +285,8 @@ def test_a_cold_sensor_warms_up() -> None:
     assert 9.9e-6 < sensor.warm_up < 11.1e-6
 
 
-def test_a_plane_fitted_through_compensated_readings_is_the_face(machine: VirtualMachine) -> None:
-    """All in one: who knows beam and slope finds the face as it stands."""
+def test_plane_fitted_to_compensated_readings_is_the_face(machine: VirtualMachine) -> None:
+    """With a known beam and slope, the readings determine the face."""
     sensor, face = machine.point_sensor, machine.sine_gauge.face(20 * DEG, 0.0)
     places = simulation.strokes(machine, 20 * DEG, 0.0)
     reading = machine.point_readings(np.zeros(len(places)), places, face)

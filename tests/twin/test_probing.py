@@ -40,8 +40,8 @@ def test_axes_that_carry_the_tool_follow_from_the_chain(cframe, gantry):
     assert (cframe.tool_axes, gantry.tool_axes) == ("Z", "XYZ")
 
 
-def test_on_a_gantry_the_balls_seem_to_move_as_a_rigid_body(gantry):
-    """M = I: displacement of any ball from the twist at the functional point, lever and all."""
+def test_balls_on_a_gantry_appear_to_move_as_a_rigid_body(gantry):
+    """M = I: the displacement of any ball follows from the twist at the functional point and the lever."""
     truth = gantry.truth_probing(HOURS)
     twist = np.asarray(truth.em.twist())
     lever = gantry.balls.centre - gantry.probing_functional_point
@@ -50,7 +50,7 @@ def test_on_a_gantry_the_balls_seem_to_move_as_a_rigid_body(gantry):
     np.testing.assert_allclose(rigid, error - error[0], atol=1e-15)
 
 
-def test_on_a_c_frame_only_the_lever_along_z_counts(cframe):
+def test_only_the_lever_along_z_has_an_effect_on_a_c_frame(cframe):
     there = np.array([[0.2, -0.1, 0.1], [-0.2, 0.15, 0.1], [0.2, -0.1, 0.3]])
     cold = cframe.probe_error(there, np.zeros(3))
     low, beside, high = cframe.probe_error(there, np.full(3, HOURS[-1])) - cold
@@ -84,13 +84,13 @@ def test_truth_is_a_valid_error_dataset_of_the_tool(machine):
     assert not truth.em.twist().values[0].any()
 
 
-def test_geometric_errors_stay_and_cancel_between_cycles(machine):
+def test_geometric_errors_are_constant_and_cancel_between_cycles(machine):
     p = machine.balls.centre
     np.testing.assert_allclose(machine.probe_error(p, np.zeros(4)), machine.geometry.twist(p)[:, :3], atol=1e-18)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 11])
-def test_a_warm_up_of_the_gantry_is_worth_measuring(seed):
+def test_warm_up_of_the_gantry_has_a_measurable_size(seed):
     """Three hours at full speed: some 10 um, and several seconds of arc about every axis."""
     gantry = VirtualMachine("gantry", seed)
     gantry.start([Event(0, spindle_speed=gantry.top_speed)])
@@ -113,14 +113,14 @@ def test_the_probe_trips_where_the_gap_closes(machine):
         assert machine.probe_gap(start, 5000.0)[0] == pytest.approx(way, abs=0.3e-3)  # aimed 0.1 mm beside the centre
 
 
-def test_the_first_ball_on_the_way_stops_the_probe(machine):
+def test_probe_trips_on_the_first_ball_of_the_path(machine):
     first, last = machine.balls.nominal[[0, 3]]
     way = (last - first) / np.linalg.norm(last - first)
     place, _ = machine.contact(first - 0.03 * way, last, 0.0)
     assert np.linalg.norm(place - first) < 0.016
 
 
-def test_nothing_in_the_way_is_no_contact(machine):
+def test_no_contact_on_a_free_path(machine):
     ball = machine.balls.nominal[0]
     place, way = machine.contact(ball + np.array([0.03, 0, 0.03]), ball + np.array([-0.03, 0, 0.03]), 0.0)
     assert place is None
@@ -159,7 +159,7 @@ def test_pretravel_has_three_lobes_around_the_stylus(machine):
     assert machine.probe.pretravel([0, 0, 1])[0] == machine.probe.mean
 
 
-def test_balls_are_good_balls(machine):
+def test_balls_have_the_stated_deviations(machine):
     balls = machine.balls_on_table(8)
     assert np.abs(balls.radius - balls.nominal_radius).max() <= RADIUS_ERROR
     rng = np.random.default_rng(0)
@@ -173,7 +173,7 @@ def test_balls_are_good_balls(machine):
 
 @pytest.mark.parametrize("kind", ["cframe", "gantry"])
 @pytest.mark.parametrize("seed", range(5))
-def test_every_touch_is_within_the_travel_and_balls_stand_apart(kind, seed):
+def test_every_touch_is_within_the_travel_and_balls_are_apart(kind, seed):
     machine = VirtualMachine(kind, seed)
     balls = machine.balls_on_table(8)
     low, high = np.array([machine.travel[axis] for axis in "XYZ"]).T
@@ -189,7 +189,7 @@ def test_every_touch_is_within_the_travel_and_balls_stand_apart(kind, seed):
 # ---------------------------------------------------------------------- determinism and noise
 
 
-def test_the_same_touch_scatters_the_same_whatever_came_before(machine):
+def test_scatter_of_a_touch_does_not_depend_on_previous_touches(machine):
     other = warmed(machine.kind)
     other.contact(other.balls.nominal[1] + [0.03, 0, 0], other.balls.nominal[1], 5.0)
     b = machine.balls.nominal
@@ -208,7 +208,7 @@ def test_triggers_scatter_along_the_normal_as_stated(cframe):
     assert abs(np.mean(scatter)) < 4 * NOISE / 20
 
 
-def test_a_slow_approach_meets_the_ball_at_the_time_of_the_contact(gantry):
+def test_slow_approach_has_the_error_at_the_time_of_contact(gantry):
     ball = gantry.balls.nominal[3]
     place, way = gantry.contact(ball + np.array([0.03, 0, 0]), ball, 1000.0, 1e-5, noise=False)  # 25 min on its way
     # some 10 um at first, and each of two more rounds leaves what the ball moves by the feed of it: 1e-8 / 1e-5
@@ -216,7 +216,7 @@ def test_a_slow_approach_meets_the_ball_at_the_time_of_the_contact(gantry):
     assert abs(gantry.probe_gap(place, 1000.0)[0]) > 5e-6
 
 
-def test_sensors_read_the_temperature_with_a_noise_of_their_own(machine):
+def test_sensors_have_independent_temperature_noise(machine):
     t = np.arange(0, 3600.0, 10)
     off = machine.sensor_temperatures(t, seed=4) - machine.temperatures(t)
     assert np.std(off) == pytest.approx(0.02, rel=0.05)
@@ -260,7 +260,7 @@ def test_an_impossible_command_changes_nothing():
     assert machine.spindle_speed(20.0)[0] == pytest.approx(8000, rel=1e-12)
 
 
-def test_a_stopped_spindle_forgets_what_was_scheduled_for_it():
+def test_stop_of_the_spindle_removes_its_scheduled_speeds():
     machine = VirtualMachine("cframe", 3)
     machine.start([Event(0, spindle_speed=8000), Event(200, spindle_speed=15000, compensation={"Z": False})])
     machine.stop_spindle(100.0)

@@ -1,4 +1,4 @@
-"""What the sensors read: exact geometry under the true motion, plus noise, runout, texture, warm-up and expansion."""
+"""Readings of the sensors: exact geometry under the true motion, plus noise, runout, texture, warm-up and expansion."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -25,7 +25,7 @@ def noiseless(machine, **changes):
 
 
 def exact(sensing, t):
-    """Every sample on its own: the bar turned as a rigid body, the beam met exactly."""
+    """Each sample separately: the bar rotated as a rigid body, exact intersection with the beam."""
     bar, frame = sensing.bar, sensing.frame
     point, axis = sensing.axis(t)
     angle = 2 * np.pi * sensing.state.schedule.turning(t)[:, 0]
@@ -71,7 +71,7 @@ def test_block_size_does_not_change_a_single_bit(first, cuts, rate):
     assert np.array_equal(np.concatenate(parts, axis=1), whole)
 
 
-def test_a_channel_alone_reads_the_same_as_among_the_others(warming):
+def test_reading_of_a_channel_does_not_depend_on_the_others(warming):
     together = warming.distances(5000, 300, RATE)
     assert np.array_equal(warming.distances(5000, 300, RATE, ["Y2", "Z"]), together[[3, 4]])
 
@@ -173,7 +173,7 @@ def rests(program, rate):
     ]
 
 
-def test_sphere_at_rest_is_met_by_the_true_beam(machine):
+def test_readings_of_a_resting_sphere_follow_the_true_beam(machine):
     program = scan(machine)
     out = machine.distances(0, int(program.end * 1000), 1000.0, ["X1"], "sphere", program)[0]
     means = np.array([out[i].mean() for i in rests(program, 1000.0)])
@@ -221,7 +221,7 @@ def test_sphere_readings_do_not_depend_on_block_size(machine):
     assert np.array_equal(np.concatenate(parts, axis=1), whole, equal_nan=True)
 
 
-def test_a_beam_that_misses_the_sphere_reads_nothing(machine):
+def test_missed_sphere_has_no_reading(machine):
     program = scan(machine, count=3)
     assert np.isnan(machine.distances(0, 3000, 1000.0, ["X2"], "sphere", program)).all()
 
@@ -236,6 +236,6 @@ def test_a_beam_that_misses_the_sphere_reads_nothing(machine):
         ((0, 10, RATE, None, "probe"), "'bar'"),
     ],
 )
-def test_impossible_requests_are_refused_in_words(machine, arguments, message):
+def test_invalid_requests_are_refused(machine, arguments, message):
     with pytest.raises(BenchError, match=message):
         machine.distances(*arguments)

@@ -1,4 +1,4 @@
-"""What is commanded, and what follows for the spindle's angle and the compensation."""
+"""Commands, and the resulting angle of the spindle and compensation."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_spindle_settles_at_the_last_speed_even_when_changes_come_fast():
     assert s.speed([10.0]) == pytest.approx([6000])
 
 
-def test_compensation_goes_and_comes_within_its_slew():
+def test_compensation_switches_within_its_slew_time():
     s = schedule(Event(10, compensation={"Z": False}), Event(20, compensation={"Z": True, "X": False}))
     share = s.compensation(np.array([9.9, 10 + SLEW / 2, 15, 20 + SLEW, 30]))
     assert share[:, 2] == pytest.approx([1, 0.5, 0, 1, 1])
@@ -66,12 +66,12 @@ def test_compensation_goes_and_comes_within_its_slew():
         ([Event(0, compensation={"A": False})], "X, Y and Z"),
     ],
 )
-def test_impossible_schedules_are_refused_in_words(machine, events, message):
+def test_invalid_schedules_are_refused(machine, events, message):
     with pytest.raises(BenchError, match=message):
         machine.start(events)
 
 
-def test_step_program_visits_every_place_in_its_time():
+def test_step_program_reaches_every_position_in_time():
     p = StepProgram((1e-3, 0, 0), (0, 2, 0), 20e-6, 101, dwell=1.0, travel=0.1, begin=5.0, approach=0.5)
     assert p.places.shape == (103, 3)
     assert p.places[1] == pytest.approx([1e-3, 0, 0])
@@ -93,7 +93,7 @@ def test_step_program_visits_every_place_in_its_time():
         ({"home": (0, 0, float("nan"))}, "'home'"),
     ],
 )
-def test_impossible_steps_are_refused_in_words(change, message):
+def test_invalid_steps_are_refused(change, message):
     good = {"start": (0, 0, 0), "direction": (0, 1, 0), "step": 20e-6, "count": 3}
     with pytest.raises(BenchError, match=message):
         StepProgram(**(good | change))

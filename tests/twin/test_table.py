@@ -1,4 +1,4 @@
-"""What stands on the gantry's table: where, and what the profiler sees of it."""
+"""Pieces on the table of the gantry: positions, and scans by the profiler."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def test_a_scan_at_rest_in_time_is_that_of_the_raw_dataset(gantry: VirtualMachin
         assert heights == pytest.approx(raw.height.values[cycle, 0], abs=1e-9, nan_ok=True)  # float32 of 4 mm: 0.25 nm
 
 
-def test_each_line_is_under_the_error_of_its_own_moment(gantry: VirtualMachine) -> None:
+def test_each_line_has_the_error_at_its_time(gantry: VirtualMachine) -> None:
     table = set_table(gantry.crossbeam, 3, [0.1])
     y, t = np.linspace(0.08, 0.12, 5), np.array([0.0, 600.0, 1200.0, 1800.0, 2400.0])
     together = table.scan(table.targets[0], PERFECT, t, along(y), (0,))
@@ -72,7 +72,7 @@ def test_the_pocket_is_where_the_cold_machine_cut_it(gantry: VirtualMachine) -> 
         assert np.isfinite(seen).mean() > 0.5
 
 
-def test_noise_goes_by_the_key(gantry: VirtualMachine) -> None:
+def test_noise_depends_on_the_key(gantry: VirtualMachine) -> None:
     table = set_table(gantry.crossbeam, 3, [0.1])
     noisy = Profiler(80, 0.4e-3, disturbances=Disturbances.white(0.5e-6))
     y = np.linspace(0.09, 0.11, 50)

@@ -62,18 +62,18 @@ def test_a_machine_at_rest_in_still_air_has_the_airs_temperature():
     assert network().air_response(np.array([0.0, 5000.0]), still) == pytest.approx(21.0, abs=1e-12)
 
 
-def test_bodies_follow_the_air_late_and_less():
+def test_bodies_follow_the_air_delayed_and_attenuated():
     day = Ambient(20.0, np.array([1.0]), np.array([2 * np.pi / 86400]), np.zeros(1))
     t = np.linspace(0, 86400, 500)
     swings = np.ptp(network().air_response(t, day), axis=0)
     assert np.all(swings < np.ptp(day(t)))
 
 
-def test_nothing_is_warm_before_the_heat_is_on():
+def test_no_temperature_rise_before_the_heat():
     assert not network().heating(np.array([0.0, 99.0]), np.array([100.0]), np.array([300.0])).any()
 
 
-def test_answer_does_not_depend_on_who_else_asks():
+def test_result_does_not_depend_on_other_requested_times():
     net = network()
     t = np.linspace(0, 5000, 137)
     together = net.heating(t, TIMES, POWER) + net.air_response(t, AIR)

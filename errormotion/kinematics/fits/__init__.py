@@ -5,15 +5,15 @@
 >>> print(f"{circle.radius:.8f} {circle.sum_of_squares:.8f}")
 4.71422603 1.22759908
 
-All fits share their keywords: ``robust`` leaves out points that do not belong and names them in ``left_out``; ``sigma``
-is the standard uncertainty of a point across the shape, estimated from the residuals where it is not given; ``weights``
-are relative, one over the variance of each point. Points that do not determine the shape raise
-`errormotion.errors.FitError`, which names what is undetermined.
+All fits have these keywords: ``robust`` excludes outliers and lists them in ``left_out``; ``sigma`` is the standard
+uncertainty of a point perpendicular to the shape, estimated from the residuals by default; ``weights`` are relative,
+one over the variance of each point. Points that do not determine the shape raise `errormotion.errors.FitError`, which
+states the undetermined parameters.
 """
 
 from __future__ import annotations
 
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,9 +53,9 @@ def fit_line(
     points : array_like, (n, 2) or (n, 3)
         At least 2, in any one unit of length.
     robust : bool
-        Leave out points that do not belong (up to about 30 %) and name them in ``left_out``.
+        Exclude outliers (up to about 30 % of the points) and list them in ``left_out``.
     sigma : float, optional
-        Standard uncertainty of a point across the line; default: estimated from the residuals.
+        Standard uncertainty of a point perpendicular to the line; default: estimated from the residuals.
     weights : array_like, (n,), optional
         Relative weights, one over the variance.
 
@@ -67,7 +67,7 @@ def fit_line(
     Raises
     ------
     FitError
-        Too few points, points that do not determine the line, or input that is no such array.
+        Too few points, points that do not determine the line, or an invalid array.
     """
     p = _points(points, (2, 3))
     return LineFit(**_fit(Line(p.shape[1]), p, robust, sigma, weights))
@@ -91,7 +91,7 @@ def fit_circle(
 ) -> CircleFit:
     """Fit a circle to (n, 2) or (n, 3) points, n >= 3; keywords, errors as in `fit_line`.
 
-    In 3D the distance counts both in the circle's plane and across it.
+    In 3D the distance has components in the plane of the circle and perpendicular to it.
 
     Returns
     -------
@@ -138,9 +138,9 @@ def fit_cylinder(
     radius : float, optional
         The known radius, in the unit of the points.
     robust : bool
-        Leave out points that do not belong.
+        Exclude outliers.
     direction : array_like, (3,), optional
-        About where the axis points, within 20 degrees. Few points lie on several cylinders: this chooses.
+        Approximate direction of the axis, within 20 degrees. It selects one of several cylinders through few points.
     sigma, weights
         As in `fit_line`.
 
@@ -173,16 +173,6 @@ def fit_cone(
     return ConeFit(**_fit(Cone(_direction(direction)), _points(points, (3,)), robust, sigma, weights))
 
 
-class _Common(TypedDict):
-    parameters: Array
-    parameter_names: tuple[str, ...]
-    covariance: Array
-    residuals: Array
-    left_out: tuple[int, ...]
-    sigma: float
-    dof: int
-
-
 def _fit(shape: Shape, points: Array, robust: bool, sigma: float | None, weights: ArrayLike | None) -> dict[str, Any]:
     """Return the fields of the result: the common ones, and the shape's parameters by name."""
     if sigma is not None and not (np.isfinite(sigma) and sigma > 0):
@@ -190,7 +180,7 @@ def _fit(shape: Shape, points: Array, robust: bool, sigma: float | None, weights
     w = _weights(weights, len(points))
     left_out = outliers(shape, points, w, sigma) if robust else ()
     fitted = estimate(shape, points, w, sigma, left_out)
-    common: _Common = {
+    values: dict[str, Any] = {
         "parameters": fitted.theta,
         "parameter_names": tuple(name for group in shape.groups for name in group.names),
         "covariance": fitted.covariance,
@@ -199,13 +189,12 @@ def _fit(shape: Shape, points: Array, robust: bool, sigma: float | None, weights
         "sigma": fitted.sigma,
         "dof": fitted.dof,
     }
-    values: dict[str, Any] = {}
     start = 0
     for group in shape.groups:
         part = fitted.theta[start : start + group.size]
         values[group.name] = part if group.size > 1 else float(part[0])
         start += group.size
-    return values | dict(common)
+    return values
 
 
 def _points(points: ArrayLike, dimensions: tuple[int, ...]) -> Array:
@@ -215,11 +204,11 @@ def _points(points: ArrayLike, dimensions: tuple[int, ...]) -> Array:
         raise FitError(f"expected points as an array of numbers; {error}") from error
     if p.ndim != 2 or p.shape[1] not in dimensions:
         shapes = " or ".join(f"(n, {d})" for d in dimensions)
-        raise FitError(f"expected points of shape {shapes}, one point a row; found {p.shape}")
+        raise FitError(f"expected points of shape {shapes}, one row for each point; found {p.shape}")
     bad = np.flatnonzero(~np.isfinite(p).all(axis=1))
     if bad.size:
         named = ", ".join(str(i) for i in bad[:5]) + (", ..." if bad.size > 5 else "")
-        raise FitError(f"{bad.size} of {len(p)} points are not finite (rows {named}); leave them out first")
+        raise FitError(f"{bad.size} of {len(p)} points are not finite (rows {named}); remove them first")
     return p
 
 
@@ -228,7 +217,7 @@ def _weights(weights: ArrayLike | None, n: int) -> Array:
         return np.ones(n)
     w = np.asarray(weights, dtype=float)
     if w.shape != (n,) or not (np.isfinite(w).all() and (w > 0).all()):
-        raise FitError(f"expected {n} positive weights, one a point; leave out points of weight 0")
+        raise FitError(f"expected {n} positive weights, one for each point; remove points of weight 0")
     return w
 
 

@@ -1,8 +1,9 @@
-"""Cylinder and cone, whose axis direction has to be searched for before the solver can start.
+"""Cylinder and cone: the solver starts from an approximate direction of the axis, which a search provides.
 
-Along each of many directions the points are projected onto the plane across it. There a cylinder is a circle,
-``|p - c|^2 = r^2``, and a cone a circle that grows, ``|p - c|^2 = (r + t h)^2``: both are linear in some functions of
-their parameters. Few points determine a candidate; the candidate that the other points like best is the start.
+For each of many directions, the points are projected onto the plane perpendicular to it. There a cylinder is a circle,
+``|p - c|^2 = r^2``, and a cone is a circle whose radius increases with the height h, ``|p - c|^2 = (r + t h)^2``: both
+are linear in functions of their parameters. Few points determine a candidate; the solver starts from the candidates
+nearest to all points.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from errormotion.kinematics.fits._shapes import Group, Shape, about_axis, comple
 
 __all__ = ["Cone", "Cylinder"]
 
-DIRECTIONS = 150  # over the half sphere: no axis is farther than 8 degrees from one of them
+DIRECTIONS = 150  # over the half sphere: every axis is within 8 degrees of one of them
 SEARCHED_POINTS = 150
 
 
 class _Axial(Shape):
-    """Common to both: the point of the axis nearest to the origin, its direction, the radius there."""
+    """Base of both: point of the axis nearest to the origin, direction of the axis, radius at the point."""
 
     spans = 3
-    elements: int  # points that determine a candidate along a known direction
-    near: Array | None = None
+    elements: int  # number of points that determine a candidate for a known direction
+    near: Array | None = None  # approximate direction of the axis
     robust_tries = 24
 
     def starts(self, q: Array) -> list[Array]:
@@ -42,9 +43,9 @@ class _Axial(Shape):
         u = self._directions(q)
         B = np.stack([complement(direction) for direction in u])
         xy, h = np.einsum("ni,kij->knj", q, B), u @ q.T
-        # Through few points each: their number is such that one of them misses 30 % outliers with certainty 1e-5.
+        # Candidates through few points: if 30 % are outliers, all candidates contain one with a probability of 1e-5.
         few = rng.permuted(np.tile(np.arange(len(q)), (30 if self.elements < 4 else 70, 1)), axis=1)[:, : self.elements]
-        with np.errstate(all="ignore"):  # points in line give no circle; such candidates are dropped below
+        with np.errstate(all="ignore"):  # no circle through points on a line; such candidates are removed below
             through_few = self._candidates(xy[:, few], h[:, few])
             through_all = self._candidates(xy[:, None], h[:, None])
             c, r, t = (np.concatenate(parts, axis=1) for parts in zip(through_few, through_all, strict=True))
@@ -62,7 +63,7 @@ class _Axial(Shape):
         ]
 
     def _directions(self, q: Array) -> Array:
-        """Return the principal directions of the points, and directions spread over the half sphere."""
+        """Return the principal directions of the points, and directions distributed over the half sphere."""
         z = (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
         turn = np.pi * (1 + np.sqrt(5)) * np.arange(DIRECTIONS)
         spread = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
@@ -85,8 +86,8 @@ class Cylinder(_Axial):
 
     def __init__(self, radius: float | None = None, near: Array | None = None) -> None:
         self.radius, self.near = radius, near
-        self.groups = (Group("point", "place", 3), Group("direction", "direction", 3))
-        # A known radius is held even by two lines along the cylinder, a free one only by more than a plane.
+        self.groups = (Group("point", "position", 3), Group("direction", "direction", 3))
+        # Points on two parallel lines determine a cylinder of known radius; one of free radius needs points in space.
         self.minimum, self.elements, self.spans = 4, 2, 2
         if radius is None:
             self.groups = (*self.groups, Group("radius", "length"))
@@ -134,7 +135,7 @@ class Cone(_Axial):
 
     name, minimum, elements = "cone", 6, 5
     groups = (
-        Group("point", "place", 3),
+        Group("point", "position", 3),
         Group("direction", "direction", 3),
         Group("radius", "length"),
         Group("half_angle", "angle"),
@@ -161,7 +162,7 @@ class Cone(_Axial):
     def tangent(self, theta: Array) -> Array:
         T = np.zeros((8, 6))
         T[:7, :5] = _axis_tangent(theta)
-        # The point slides along the axis to stay nearest to the origin, and the radius with it.
+        # The point moves along the axis to remain nearest to the origin; the radius changes accordingly.
         T[6, 2:4] = -(theta[:3] @ T[3:6, 2:4]) * np.tan(theta[7])
         T[7, 5] = 1.0
         return T
@@ -185,7 +186,7 @@ class Cone(_Axial):
 
 
 def _axis_tangent(theta: Array) -> Array:
-    """Return the free steps of (point, direction, radius): two shifts across, two tilts, the radius."""
+    """Return the free steps of (point, direction, radius): two lateral shifts, two tilts, the radius."""
     c, u = theta[:3], theta[3:6]
     B = complement(u)
     T = np.zeros((7, 5))

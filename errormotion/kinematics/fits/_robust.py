@@ -1,13 +1,13 @@
-"""Outliers, found without trust in any single point.
+"""Detection of outliers.
 
-1. Shapes through few points are tried; the one that half of the points are nearest to wins (least median of squares,
-   Rousseeuw 1984), improved by fitting to the nearest half (concentration steps of least trimmed squares).
-2. Points within four robust standard deviations of it make a first clean set.
-3. The set is refitted and every point judged by a fit that does not contain it, until the set no longer changes. A
-   point is left out where Student's t says that among n clean Gaussian points the worst is so far off once in two
-   hundred fits.
-4. Few points may look wrong only because the others agree too well by chance. Unless all left-out points together gain
-   more than such luck, the judging starts again from the set of all points.
+1. Of many shapes through few points, the one nearest to half of the points is selected (least median of squares,
+   Rousseeuw 1984) and fitted to the nearest half (concentration steps of least trimmed squares).
+2. The points within four robust standard deviations of it are the first clean set.
+3. The shape is fitted to the clean set, and every point is tested against a fit without it, until the set no longer
+   changes. A point is excluded if, by Student's t, the worst of n clean Gaussian points would be so far off in fewer
+   than one of two hundred fits.
+4. If few points agree well by chance, others appear as outliers. Unless the excluded points together are significant
+   as well, step 3 is repeated from the set of all points.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ __all__ = ["FALSE_ALARMS", "outliers"]
 
 Flags = NDArray[np.bool_]
 
-FALSE_ALARMS = 0.01  # fits of clean Gaussian data in which any point is named; steps 3 and 4 share it
+FALSE_ALARMS = 0.01  # share of fits of clean Gaussian data with any excluded point; one half each for steps 3 and 4
 SEED = 230
 
 
 def outliers(shape: Shape, points: Array, weights: Array, sigma: float | None) -> tuple[int, ...]:
-    """Return the indices of the points that are not on the shape.
+    """Return the indices of the outliers.
 
     Raises
     ------
     FitError
-        Too few points, or no shape that half of the points agree on.
+        Too few points, or no shape through at least half of the points.
     """
     spare = 3
     if len(points) < shape.minimum + spare:
@@ -50,49 +50,49 @@ def outliers(shape: Shape, points: Array, weights: Array, sigma: float | None) -
         raise FitError(f"half of the points are one point; a {shape.name} needs distinct points")
     frame = Frame(centre, scale)
     local, q, root = shape.scaled(scale), frame.inside(points), np.sqrt(weights)
-    # Nothing below the rounding of the coordinates is a deviation; nor, where the noise is known, what it explains.
+    # Deviations below the rounding of the coordinates, or below the stated noise, are not significant.
     floor = 50 * EPS * (1 + np.abs(points).max() / scale) * root.max()
     floor = floor if sigma is None else max(floor, sigma / scale)
 
     theta, spread = _least_trimmed(local, q, root)
-    clean = _grown(local, theta, q, root, _misses(local, theta, q, root) <= 4 * max(spread, floor), floor)
-    if not _stand_out(local, theta, q, root, clean, floor):
-        clean = _grown(local, theta, q, root, np.ones(len(q), dtype=bool), floor)
+    clean = _clean_set(local, theta, q, root, _misses(local, theta, q, root) <= 4 * max(spread, floor), floor)
+    if not _significant(local, theta, q, root, clean, floor):
+        clean = _clean_set(local, theta, q, root, np.ones(len(q), dtype=bool), floor)
     return tuple(int(i) for i in np.flatnonzero(~clean))
 
 
-def _grown(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, floor: float) -> Flags:
-    """Refit and judge until the clean set no longer changes."""
+def _clean_set(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, floor: float) -> Flags:
+    """Fit the shape and test the points until the clean set no longer changes."""
     seen: set[bytes] = set()
     while clean.tobytes() not in seen:
         seen.add(clean.tobytes())
-        _majority(shape, clean)
+        _check_majority(shape, clean)
         theta = levenberg(shape, theta, q[clean], root[clean]).theta
-        clean = _belongs(shape, theta, q, root, clean, floor)
-    _majority(shape, clean)
+        clean = _accepted(shape, theta, q, root, clean, floor)
+    _check_majority(shape, clean)
     return clean
 
 
-def _stand_out(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, floor: float) -> bool:
-    """Whether leaving these points out gains more than the luckiest choice of clean ones would.
+def _significant(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, floor: float) -> bool:
+    """Return whether excluding these points improves the fit more than excluding as many clean points could.
 
-    An F test of what the sum of squares loses; among n points there are n! / k! (n - k)! choices of k.
+    F test of the decrease of the sum of squares, for n! / k! (n - k)! choices of k among n points.
     """
     from scipy.special import betainc, gammaln
 
-    n, left = len(q), int((~clean).sum())
-    if not left:
+    n, excluded = len(q), int((~clean).sum())
+    if not excluded:
         return True
     costs = [levenberg(shape, theta, q[part], root[part]).cost for part in (clean, np.ones(n, dtype=bool))]
-    freedoms = left * shape.components
+    freedoms = excluded * shape.components
     dof = int(clean.sum()) * shape.components - shape.tangent(theta).shape[1]
     gain = (costs[1] - costs[0]) / max(costs[0] / dof, floor**2)
-    choices = gammaln(n + 1) - gammaln(left + 1) - gammaln(n - left + 1)
+    choices = gammaln(n + 1) - gammaln(excluded + 1) - gammaln(n - excluded + 1)
     return bool(betainc(dof / 2, freedoms / 2, dof / (dof + max(gain, 0.0))) <= FALSE_ALARMS / 2 * np.exp(-choices))
 
 
 def _least_trimmed(shape: Shape, q: Array, root: Array) -> tuple[Array, float]:
-    """Return the shape that the nearest half of the points agree on best, and their robust standard deviation."""
+    """Return the shape nearest to half of the points, and the robust standard deviation of the points."""
     n, rng = len(q), np.random.default_rng(SEED)
     half = min(n - 1, (n + shape.minimum + 1) // 2)
 
@@ -101,7 +101,7 @@ def _least_trimmed(shape: Shape, q: Array, root: Array) -> tuple[Array, float]:
 
     starts = sorted(shape.robust_starts(q, rng), key=rank)[: shape.robust_tries]
     if not starts:
-        raise FitError(f"no small set of the points determines a {shape.name}; plot them")
+        raise FitError(f"no small set of the points determines a {shape.name}; plot the points")
     trimmed = [_concentrate(shape, theta, q, root, half) for theta in starts]
     best = min(trimmed, key=rank)
     quantile = _normal_length(half / n, shape.components)
@@ -116,12 +116,12 @@ def _concentrate(shape: Shape, theta: Array, q: Array, root: Array, half: int) -
         if before is not None and np.array_equal(nearest, before):
             break
         before = nearest
-        theta = levenberg(shape, theta, q[nearest], root[nearest], limit=20, last_digits=False).theta
+        theta = levenberg(shape, theta, q[nearest], root[nearest], limit=20, refine=False).theta
     return theta
 
 
-def _belongs(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, floor: float) -> Flags:
-    """Judge every point by the fit to the clean set without it."""
+def _accepted(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, floor: float) -> Flags:
+    """Return which points are consistent with the fit to the clean set without them."""
     J, f = design(shape, theta, q, root)
     m, p = shape.components, J.shape[1]
     inside = np.repeat(clean, m)
@@ -129,7 +129,7 @@ def _belongs(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, fl
     if dof < 2 * m:
         return clean
     R = np.linalg.qr(J[inside])[1]
-    # Leverage: the share of the fit's own uncertainty in the point's distance, mean over its components.
+    # Leverage: contribution of the uncertainty of the fit to the distance of a point, mean over its components.
     leverage = np.sum(np.linalg.lstsq(R.T, J.T, rcond=None)[0] ** 2, axis=0).reshape(-1, m).mean(axis=1)
     square = np.sum(f.reshape(-1, m) ** 2, axis=1)
     total = float(f[inside] @ f[inside])
@@ -142,18 +142,18 @@ def _belongs(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, fl
 
 
 def _limit(m: int, dof: int, n: int) -> float:
-    """Return the F quantile with (m, dof) freedoms that the worst of n clean points seldom exceeds."""
+    """Return the F quantile with (m, dof) degrees of freedom that the worst of n clean points rarely exceeds."""
     tail = FALSE_ALARMS / 2 / n
     if m == 2:
         return float(dof / 2 * (tail ** (-2 / dof) - 1))
-    from scipy.special import stdtrit  # loaded here: half a second that only robust fits need
+    from scipy.special import stdtrit  # slow to import, needed for robust fits only
 
     quantile = float(stdtrit(dof, 1 - tail / 2))
     return quantile * quantile
 
 
 def _normal_length(share: float, m: int) -> float:
-    """Return the length below which this share of standard normal vectors of m = 1 or 2 components stay."""
+    """Return the quantile of the length of standard normal vectors with m = 1 or 2 components."""
     return NormalDist().inv_cdf((1 + share) / 2) if m == 1 else float(np.sqrt(-2 * np.log(1 - share)))
 
 
@@ -162,8 +162,6 @@ def _misses(shape: Shape, theta: Array, q: Array, root: Array) -> Array:
     return length
 
 
-def _majority(shape: Shape, clean: Flags) -> None:
+def _check_majority(shape: Shape, clean: Flags) -> None:
     if clean.sum() < max(shape.minimum + 1, (len(clean) + 1) // 2):
-        raise FitError(
-            f"no {shape.name} that at least half of the {len(clean)} points agree on; they have another shape"
-        )
+        raise FitError(f"no {shape.name} fits at least half of the {len(clean)} points; the points have another shape")

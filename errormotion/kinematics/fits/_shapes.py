@@ -1,8 +1,8 @@
-"""What a shape is to the solver, and the shapes whose start is one algebraic fit: line, plane, circle, sphere.
+"""Shapes as the solver uses them, and those with an algebraic fit as a start: line, plane, circle, sphere.
 
-A shape is written in centred and scaled coordinates: the origin is the points' centroid and their root mean square
-distance from it is 1. Its parameter vector holds directions as three numbers; the solver moves in the fewer free ones,
-which `tangent` spans. Cylinder and cone are in `errormotion.kinematics.fits._axial`.
+Coordinates are centred and scaled: the origin is the centroid of the points, and their root mean square distance from
+it is 1. The parameter vector contains each direction as three numbers; the solver varies the smaller number of free
+steps spanned by ``tangent``. Cylinder and cone are in `errormotion.kinematics.fits._axial`.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 
 from errormotion.arrays import Array
 
-Kind = Literal["place", "direction", "length", "angle"]
+Kind = Literal["position", "direction", "length", "angle"]
 
 __all__ = ["Array", "Circle", "Circle3D", "Group", "Line", "Plane", "Shape", "Sphere", "complement", "norms"]
 
 
 @dataclass(frozen=True)
 class Group:
-    """Parameters that belong together: a place and a direction have several, a length and an angle one."""
+    """Parameters that belong together: a position and a direction have several, a length and an angle one."""
 
     name: str
     kind: Kind
@@ -44,13 +44,13 @@ class Shape(ABC):
     groups : tuple of Group
         The parameter vector theta.
     minimum : int
-        Fewest points that determine the shape.
+        Smallest number of points that determine the shape.
     components : int
-        Parts of the vector from a point to the shape; its length is the orthogonal distance.
+        Number of components of the vector from a point to the shape; its length is the orthogonal distance.
     spans : int
-        Dimensions that the points must spread over: 1 a line, 2 a plane, 3 space.
+        Number of dimensions that the points must span: 1 a line, 2 a plane, 3 space.
     robust_tries : int
-        Candidates that a robust fit follows to their minimum.
+        Number of candidates from which a robust fit iterates to a minimum.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Shape(ABC):
 
     @abstractmethod
     def starts(self, q: Array) -> list[Array]:
-        """Return parameter vectors to start from, best first; none if the points allow none."""
+        """Return parameter vectors to start from, best first; none if the points determine none."""
 
     @abstractmethod
     def residuals(self, theta: Array, q: Array) -> Array:
@@ -70,26 +70,26 @@ class Shape(ABC):
 
     @abstractmethod
     def gradient(self, theta: Array, q: Array) -> Array:
-        """Return the residuals' derivative by theta, (n, components, k)."""
+        """Return the derivative of the residuals with respect to theta, (n, components, k)."""
 
     @abstractmethod
     def tangent(self, theta: Array) -> Array:
-        """Return the free steps as columns, (k, p): theta may go to ``settle(theta + tangent @ step)``."""
+        """Return the free steps as columns, (k, p), of ``settle(theta + tangent @ step)``."""
 
     @abstractmethod
     def settle(self, theta: Array) -> Array:
-        """Return the same shape with unit directions, a fixed sign, and its point nearest to the origin."""
+        """Return normalised parameters of the shape: unit directions of fixed sign, the point nearest to the origin."""
 
     def preference(self, theta: Array) -> float:  # noqa: ARG002 - only shapes with a hint have one
-        """Return what is least for the shape to choose where several leave no residual."""
+        """Return a number that is smallest for the preferred one of several shapes without residuals."""
         return 0.0
 
     def scaled(self, scale: float) -> Self:  # noqa: ARG002 - only shapes with a known length depend on it
-        """Return the shape to fit when lengths are divided by ``scale``."""
+        """Return the shape with lengths divided by ``scale``."""
         return self
 
     def robust_starts(self, q: Array, rng: np.random.Generator) -> Iterator[Array]:
-        """Yield candidates through few points each, some of which miss the outliers."""
+        """Yield candidates through few points each, some of them without outliers."""
         for _ in range(50 * self.minimum):
             yield from self.starts(q[rng.choice(len(q), self.minimum, replace=False)])
 
@@ -101,14 +101,14 @@ class Line(Shape):
 
     def __init__(self, dimensions: int) -> None:
         self.dimensions = dimensions
-        self.groups = (Group("point", "place", dimensions), Group("direction", "direction", dimensions))
+        self.groups = (Group("point", "position", dimensions), Group("direction", "direction", dimensions))
         self.components = dimensions - 1
 
     def starts(self, q: Array) -> list[Array]:
         middle = q.mean(axis=0)
         _, s, axes = np.linalg.svd(q - middle, full_matrices=False)
         if s[0] - s[1] <= 1e-9 * s[0]:
-            return []  # no direction is better than the others
+            return []  # the direction is not determined
         return [self.settle(np.concatenate([middle, axes[0]]))]
 
     def residuals(self, theta: Array, q: Array) -> Array:
@@ -136,7 +136,7 @@ class Plane(Shape):
     """A plane: point nearest to the origin, normal."""
 
     name, minimum, spans = "plane", 3, 2
-    groups = (Group("point", "place", 3), Group("normal", "direction", 3))
+    groups = (Group("point", "position", 3), Group("normal", "direction", 3))
 
     def starts(self, q: Array) -> list[Array]:
         middle = q.mean(axis=0)
@@ -170,7 +170,7 @@ class Sphere(Shape):
     name, minimum, spans, dimensions = "sphere", 4, 3, 3
 
     def __init__(self) -> None:
-        self.groups = (Group("centre", "place", self.dimensions), Group("radius", "length"))
+        self.groups = (Group("centre", "position", self.dimensions), Group("radius", "length"))
 
     def starts(self, q: Array) -> list[Array]:
         """Return Taubin's algebraic fit (IEEE Trans. PAMI 13 (1991) 1115), by singular values."""
@@ -209,10 +209,10 @@ class Circle(Sphere):
 
 
 class Circle3D(Shape):
-    """A circle in 3D: centre, normal, radius. The distance has a part in the circle's plane and one across it."""
+    """A circle in 3D: centre, normal, radius. The distance has components in its plane and perpendicular to it."""
 
     name, minimum, spans, components = "circle", 3, 2, 2
-    groups = (Group("centre", "place", 3), Group("normal", "direction", 3), Group("radius", "length"))
+    groups = (Group("centre", "position", 3), Group("normal", "direction", 3), Group("radius", "length"))
 
     def starts(self, q: Array) -> list[Array]:
         found = []
@@ -245,7 +245,7 @@ class Circle3D(Shape):
 
 
 def norms(d: Array) -> tuple[Array, Array]:
-    """Return lengths, (n,), and unit vectors, (n, dimensions); the unit vector of nothing is 0."""
+    """Return lengths, (n,), and unit vectors, (n, dimensions), of vectors; that of a zero vector is 0."""
     length = np.sqrt(np.einsum("ni,ni->n", d, d))
     return length, d / np.where(length > 0, length, 1.0)[:, None]
 
@@ -258,7 +258,7 @@ def about_axis(theta: Array, q: Array) -> tuple[Array, Array, Array]:
 
 
 def complement(u: Array) -> Array:
-    """Return orthonormal vectors across the unit vector ``u`` as columns, (d, d - 1), by a Householder reflection."""
+    """Return the orthonormal complement of a unit vector as columns, (d, d - 1), by a Householder reflection."""
     v = u.copy()
     v[0] += np.copysign(1.0, u[0])
     return (np.eye(len(u)) - np.outer(v, v) * (2 / (v @ v)))[:, 1:]

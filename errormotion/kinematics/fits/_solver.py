@@ -1,7 +1,7 @@
-"""Least squares of orthogonal distances to any shape, with covariance and refusal of what the points do not determine.
+"""Least squares of orthogonal distances to any shape, with covariance, and errors if the points do not determine it.
 
-The points are centred and scaled, so that all numbers are near 1 wherever the machine's origin is. Levenberg-Marquardt
-(by QR) iterates from the shape's algebraic start to the minimum, Gauss-Newton to its last digits.
+The points are centred and scaled, so that all numbers are near 1 for any origin of the machine. Levenberg-Marquardt (by
+QR) iterates from the start of the shape to the minimum, and Gauss-Newton refines it to the rounding.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from errormotion.kinematics.fits._shapes import Shape, norms
 __all__ = ["Estimate", "Frame", "Solution", "design", "estimate", "levenberg"]
 
 EPS = float(np.finfo(float).eps)
-SEARCHED_POINTS = 1000  # the best of several starts is chosen on a part of the points
-# Of a shape of size 1 a step of 1e-7 changes the sum of squares by 1e-14 of itself: from there on the steps, not the
-# sum, show whether the solver converges.
-LAST_DIGITS = 1e-7
-# Sum of squares of a fit that leaves nothing: among several such fits the shape prefers one.
+SEARCHED_POINTS = 1000  # number of points by which the best of several starts is selected
+# Step below which the minimum is refined. On a shape of size 1, such a step changes the sum of squares by a relative
+# 1e-14: convergence is then shown by the steps, no longer by the sum.
+REFINED_STEP = 1e-7
+# Sum of squares below which a fit is exact: `Shape.preference` selects one of several exact fits.
 EXACT = 1e-20
-# Ratio of the least to the greatest singular value below which a freedom is numerically undetermined. An arc of one
+# Ratio of the smallest to the largest singular value below which a freedom is numerically undetermined. An arc of one
 # part in 1e5 of its radius has 1e-10.
 UNDETERMINED = 1e-11
-# A radius known to worse than half of itself, a direction to half a radian: no linear covariance holds there.
+# Largest relative uncertainty of a radius, and largest uncertainty of a direction, rad, for a linear covariance.
 TOO_UNCERTAIN = 0.5
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the solver stopped."""
+    """Result of the solver."""
 
     theta: Array
     cost: float
@@ -51,18 +51,18 @@ class Frame:
         return (points - self.centre) / self.scale
 
     def outside(self, shape: Shape, theta: Array) -> tuple[Array, Array]:
-        """Return parameters in the points' own unit, and the scale of each."""
+        """Return parameters in the unit of the points, and the scale of each."""
         shift: list[float] = []
         scale: list[float] = []
         for group in shape.groups:
-            shift.extend(self.centre if group.kind == "place" else np.zeros(group.size))
-            scale.extend(np.full(group.size, self.scale if group.kind in ("place", "length") else 1.0))
+            shift.extend(self.centre if group.kind == "position" else np.zeros(group.size))
+            scale.extend(np.full(group.size, self.scale if group.kind in ("position", "length") else 1.0))
         return np.array(shift) + np.array(scale) * theta, np.array(scale)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A fitted shape in the points' own unit; ``residuals`` of all points, the left-out ones included."""
+    """A fitted shape in the unit of the points; ``residuals`` of all points, including the excluded ones."""
 
     shape: Shape
     theta: Array
@@ -76,12 +76,12 @@ class Estimate:
 def estimate(
     shape: Shape, points: Array, weights: Array, sigma: float | None, left_out: tuple[int, ...] = ()
 ) -> Estimate:
-    """Fit a shape to all points but the left-out ones.
+    """Fit a shape to all points except the excluded ones.
 
     Raises
     ------
     FitError
-        The points do not determine the shape; the message names what is undetermined.
+        The points do not determine the shape; the message states the undetermined parameters.
     """
     used = np.ones(len(points), dtype=bool)
     used[list(left_out)] = False
@@ -97,7 +97,7 @@ def estimate(
         raise _undetermined(shape, points[used], local.tangent(theta) @ Vt[-1])
     if not solution.converged:
         raise FitError(
-            f"the fit of the {shape.name} did not converge: the points do not look like a {shape.name}. "
+            f"the fit of the {shape.name} did not converge: the points may have another shape. "
             f"Plot them, or use a robust fit"
         )
     dof = int(used.sum()) * shape.components - J.shape[1]
@@ -114,14 +114,14 @@ def estimate(
 
 
 def design(shape: Shape, theta: Array, q: Array, root_weights: Array) -> tuple[Array, Array]:
-    """Return the weighted Jacobian by the free steps, (n components, p), and the weighted residuals."""
+    """Return the weighted Jacobian of the free steps, (n components, p), and the weighted residuals."""
     J = (shape.gradient(theta, q) @ shape.tangent(theta)) * root_weights[:, None, None]
     f = shape.residuals(theta, q) * root_weights[:, None]
     return J.reshape(f.size, -1), f.ravel()
 
 
 def levenberg(
-    shape: Shape, theta: Array, q: Array, root_weights: Array, *, limit: int = 200, last_digits: bool = True
+    shape: Shape, theta: Array, q: Array, root_weights: Array, *, limit: int = 200, refine: bool = True
 ) -> Solution:
     """Iterate from ``theta`` to the nearest minimum of the weighted sum of squared distances."""
     damping, cost = 1e-3, np.inf
@@ -129,8 +129,8 @@ def levenberg(
         J, f = design(shape, theta, q, root_weights)
         R, g = _triangle(J, f)
         cost = float(f @ f)
-        if np.linalg.norm(_solve(R, g)) < LAST_DIGITS:
-            return _last_digits(shape, theta, q, root_weights) if last_digits else Solution(theta, cost, converged=True)
+        if np.linalg.norm(_solve(R, g)) < REFINED_STEP:
+            return _refined(shape, theta, q, root_weights) if refine else Solution(theta, cost, converged=True)
         marquardt = np.maximum(np.linalg.norm(R, axis=0), 1e-6)
         while damping < 1e10:
             step = _solve(np.vstack([R, np.sqrt(damping) * np.diag(marquardt)]), np.append(g, 0 * marquardt))
@@ -140,14 +140,14 @@ def levenberg(
                 theta, damping = trial, 0.1 * damping
                 break
             damping = max(10 * damping, 1e-6)
-        else:  # no step improves: a minimum as far as rounding shows it, if the gradient agrees
+        else:  # no step decreases the sum: a minimum within rounding, if the gradient is small as well
             flat = np.linalg.norm(R.T @ g) <= 1e-6 * np.linalg.norm(R) * np.sqrt(cost)
             return Solution(theta, cost, bool(flat or cost < (100 * EPS) ** 2 * len(q)))
     return Solution(theta, cost, converged=False)
 
 
-def _last_digits(shape: Shape, theta: Array, q: Array, root_weights: Array) -> Solution:
-    """Gauss-Newton as long as its steps shrink."""
+def _refined(shape: Shape, theta: Array, q: Array, root_weights: Array) -> Solution:
+    """Iterate by Gauss-Newton as long as the steps decrease."""
     before = np.inf
     for _ in range(100):
         J, f = design(shape, theta, q, root_weights)
@@ -162,12 +162,10 @@ def _last_digits(shape: Shape, theta: Array, q: Array, root_weights: Array) -> S
 def _best(shape: Shape, q: Array, root_weights: Array) -> Solution:
     starts = shape.starts(q)
     if not starts:
-        raise FitError(
-            f"the points do not determine one {shape.name}: they fit several equally well. Add points elsewhere"
-        )
+        raise FitError(f"the points do not determine one {shape.name}: several fit equally well. Add points elsewhere")
     if len(starts) > 1:
         part = np.unique(np.linspace(0, len(q) - 1, min(len(q), SEARCHED_POINTS)).astype(int))
-        tried = [levenberg(shape, theta, q[part], root_weights[part], limit=60, last_digits=False) for theta in starts]
+        tried = [levenberg(shape, theta, q[part], root_weights[part], limit=60, refine=False) for theta in starts]
         starts = [min(tried, key=lambda end: (max(end.cost, EXACT), shape.preference(end.theta))).theta]
     return levenberg(shape, starts[0], q, root_weights)
 
@@ -209,15 +207,15 @@ def _refuse_flat(shape: Shape, points: Array, frame: Frame) -> None:
 
 
 def _undetermined(shape: Shape, points: Array, direction: Array) -> FitError:
-    """Return the error that names the parameters which may change without moving the shape off the points."""
+    """Return the error that states the parameters which can change without a change of the residuals."""
     names, start = [], 0
     for group in shape.groups:
         if np.linalg.norm(direction[start : start + group.size]) > 0.1 * np.linalg.norm(direction):
             names.append(group.name)
         start += group.size
     return FitError(
-        f"the points leave the {shape.name} undetermined: {' and '.join(names) or 'everything'} may change together "
-        f"without leaving the points. Add points elsewhere on it{_repeated(shape, points)}"
+        f"the points leave the {shape.name} undetermined: {' and '.join(names) or 'all parameters'} can change "
+        f"together without a change of the residuals. Add points elsewhere on it{_repeated(shape, points)}"
     )
 
 
@@ -232,10 +230,10 @@ def _refuse_uncertain(shape: Shape, theta: Array, half: Array) -> None:
         part = slice(start, start + group.size)
         uncertainty = np.linalg.norm(half[part], axis=None if group.size > 1 else 1).item()
         size = abs(theta[part][0]) if group.kind == "length" else 1.0
-        if group.kind != "place" and uncertainty > TOO_UNCERTAIN * size:
+        if group.kind != "position" and uncertainty > TOO_UNCERTAIN * size:
             raise FitError(
                 f"the noise hides the {group.name} of the {shape.name}: its standard uncertainty is "
-                f"{uncertainty / size:.2g} {'of itself' if group.kind == 'length' else 'rad'}. "
-                f"The points span too little of the {shape.name}; spread them, or fit a simpler shape"
+                f"{uncertainty / size:.2g} {'times its value' if group.kind == 'length' else 'rad'}. "
+                f"The points cover too little of the {shape.name}; distribute them, or fit a simpler shape"
             )
         start += group.size

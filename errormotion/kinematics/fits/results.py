@@ -1,4 +1,4 @@
-"""What a fit returns: the shape's parameters by name, their covariance, and the residuals of the points."""
+"""Results of fits: the parameters of the shape by name, their covariance, and the residuals of the points."""
 
 from __future__ import annotations
 
@@ -13,27 +13,28 @@ __all__ = ["CircleFit", "ConeFit", "CylinderFit", "Fit", "LineFit", "PlaneFit", 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fit:
-    """Common to all fits; lengths are in the unit of the points, angles in rad.
+    """Base of all results; lengths are in the unit of the points, angles in rad.
 
     Attributes
     ----------
     parameters : ndarray, (k,)
         All parameters, in the order of `parameter_names`.
     parameter_names : tuple of str
-        Such as ``("centre_x", "centre_y", "radius")``. A direction counts as three although it has two freedoms.
+        Such as ``("centre_x", "centre_y", "radius")``. A direction has three parameters and two freedoms.
     covariance : ndarray, (k, k)
-        Of `parameters`: ``sigma^2 (J^T W J)^-1`` spread over them. Without a freedom of its own a direction's length,
-        and a point along its own line, has no variance: the rank is the number of freedoms. NaN where `sigma` is.
+        Of `parameters`: ``sigma^2 (J^T W J)^-1`` of the free steps, transformed to the parameters. The length of a
+        direction and the position of a point along its line are fixed and have no variance: the rank is the number of
+        freedoms. NaN if `sigma` is NaN.
     residuals : ndarray, (n,)
-        Orthogonal distance of every point, left-out ones included. Positive outside of a round shape or on the normal's
-        side of a plane; never negative for a line or circle in 3D, whose distance has no sign.
+        Orthogonal distances of all points, including the excluded ones. Positive outside of a round shape and on the
+        side of a plane's normal; never negative for a line or circle in 3D, whose distance has no sign.
     left_out : tuple of int
-        Indices of the points that a robust fit left out.
+        Indices of the points that a robust fit excluded.
     sigma : float
-        Standard uncertainty of a point across the shape (weight 1), given or estimated; NaN where no freedom is left
-        to estimate it.
+        Standard uncertainty of a point perpendicular to the shape (weight 1), stated or estimated; NaN if there is no
+        degree of freedom to estimate it.
     dof : int
-        Degrees of freedom: components of residuals less freedoms of the shape.
+        Degrees of freedom: components of residuals minus freedoms of the shape.
     """
 
     parameters: Array
@@ -98,7 +99,7 @@ class SphereFit(Fit):
 class CylinderFit(Fit):
     """A cylinder: the axis's point nearest to the points' centroid, (3,), unit direction, (3,), radius.
 
-    A known radius is repeated here and is none of the `parameters`.
+    A known radius is stated here, but is not among the `parameters`.
     """
 
     point: Array
@@ -110,7 +111,7 @@ class CylinderFit(Fit):
 class ConeFit(Fit):
     """A cone: the axis's point nearest to the points' centroid, (3,), unit direction towards the opening, (3,).
 
-    ``radius`` is that of the cone at ``point``, ``half_angle`` the one between axis and surface, rad.
+    ``radius`` is the radius of the cone at ``point``, ``half_angle`` the angle between axis and surface, rad.
     """
 
     point: Array
@@ -120,6 +121,6 @@ class ConeFit(Fit):
 
     @property
     def apex(self) -> Array:
-        """The tip, (3,); infinitely far for a cylinder."""
+        """The apex, (3,); infinitely far away for a cylinder."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(self.point - self.direction * (self.radius / np.tan(self.half_angle)))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from errormotion.errors import DatasetError, MethodError
+from errormotion.errors import DatasetError
 from errormotion.methods.beam_direction.schema import SCHEMA
 from errormotion.methods.beam_direction.settings import Settings as BeamSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -36,6 +36,7 @@ class BeamDirection:
     texts = lazy("errormotion.methods.beam_direction.report:texts")
     figures = lazy("errormotion.methods.beam_direction.figures:figures")
     calibrations = lazy("errormotion.methods.beam_direction.identification.inclination.figures:CALIBRATIONS")
+    motions = lazy("errormotion.methods.beam_direction.motions:steps")
     simulate = lazy("errormotion.methods.beam_direction.simulation:simulate")
     conformance = lazy("errormotion.methods.beam_direction.conformance:subjects")
     redrawing = lazy("errormotion.methods.beam_direction.redrawing:redrawing")
@@ -52,12 +53,6 @@ class BeamDirection:
         from errormotion.methods.beam_direction import acquisition
 
         return acquisition.measure_planes(bench, settings, inputs, done)
-
-    def motions(self, settings: BeamSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
-        """Return every step of the machine, for the check of its limits and for a dry run."""
-        from errormotion.methods.beam_direction.motions import steps
-
-        return steps(settings, instruments)
 
     def check(self, settings: BeamSettings) -> dict[str, str]:
         """Return by setting why the calibration of the settings cannot be used; empty if it can."""
@@ -97,14 +92,11 @@ class BeamDirection:
         MethodError
             The data do not determine the result.
         """
-        from errormotion.datasets import validate
+        from errormotion.datasets.validation import checked_raw
         from errormotion.methods.beam_direction.identification.planes import identify_beam
 
         settings = settings or BeamSettings()
-        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
-        validate(checked)
-        if checked.attrs["schema"] != SCHEMA:
-            raise MethodError(f"beam_direction reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        checked = checked_raw(raw, self)
         if "distance" not in checked:
             from errormotion.methods.beam_direction.identification.check_bar.result import identify_bar
             from errormotion.methods.beam_direction.identification.planes import sensor_of

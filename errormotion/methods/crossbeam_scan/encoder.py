@@ -11,7 +11,7 @@ OVERFLOW = 2.0**32
 """Counts after which an encoder starts again from zero."""
 
 
-def folded(counts: ArrayLike, middle: float) -> Array:
-    """Return encoder counts less whole overflows, so that they are nearest to the middle of the axis."""
+def unwrapped(counts: ArrayLike, middle: float) -> Array:
+    """Return encoder counts corrected by whole overflows to be nearest to the count in the middle of the axis."""
     counts = np.asarray(counts, dtype=float)
     return np.asarray(counts - OVERFLOW * np.rint((counts - middle) / OVERFLOW))

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import xarray as xr
-
-from errormotion.datasets import validate
-from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.schema import SCHEMA
 from errormotion.methods.crossbeam_scan.settings import Settings as ScanSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from errormotion.kinematics.description import MachineDescription
+    import xarray as xr
 
-SCHEMA = "errormotion.raw.crossbeam_scan/1"
+    from errormotion.kinematics.description import MachineDescription
 
 
 class CrossbeamScan:
@@ -45,12 +42,7 @@ class CrossbeamScan:
     redrawing = lazy("errormotion.methods.crossbeam_scan.redrawing:redrawing")
 
     def acquire(
-        self,
-        bench: Bench,
-        settings: ScanSettings,
-        *,
-        inputs: Mapping[str, xr.Dataset],
-        done: xr.Dataset | None = None,
+        self, bench: Bench, settings: ScanSettings, *, inputs: Mapping[str, xr.Dataset], done: xr.Dataset | None = None
     ) -> Iterator[xr.Dataset]:
         """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition`` and ``pocket``."""
         from errormotion.methods.crossbeam_scan.acquisition import pocket
@@ -131,21 +123,20 @@ class CrossbeamScan:
         Parameters
         ----------
         raw : Dataset
-            Schema ``errormotion.raw.crossbeam_scan/1``, any variant; not changed, and possibly larger than memory.
+            Schema ``errormotion.raw.crossbeam_scan/1``, any variant; not modified; it may be larger than memory.
         settings : Settings, optional
 
         Raises
         ------
         DatasetError
-            The raw dataset does not follow its schema; all violations are listed.
+            The raw dataset violates its schema; all violations are reported together.
         MethodError
-            The data do not determine the answer.
+            The data do not determine the result.
         """
+        from errormotion.datasets.validation import checked_raw
+
         settings = settings or ScanSettings()
-        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
-        validate(checked)
-        if checked.attrs["schema"] != SCHEMA:
-            raise MethodError(f"crossbeam_scan reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        checked = checked_raw(raw, self)
         if "pocket_radius" in checked:
             from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import identify_pose
 

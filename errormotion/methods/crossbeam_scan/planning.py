@@ -1,9 +1,9 @@
 """Expected covariance of the errors of a campaign.
 
-The artefacts are waves along x and y. From their slopes comes the information of one registration, line by line: a line
-that jitters along z and y with the variances t (of both scans) has two unknowns of its own, with B its columns for
-them, and its information about the twist is A - B (1/t + C)^-1 B^T, all in units of the noise. The chain
-follows, as for real registrations.
+The artefacts are waves along x and y. Their slopes determine the information of one registration, line by line. A line
+that jitters along z and y with the variances t (of both scans) has two additional unknowns, with the columns B and the
+information C; its information about the twist is A - B (1/t + C)^-1 B^T, in units of the noise. The chain to the
+carriage is that of real registrations.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from errormotion.methods.crossbeam_scan.identification import strain
 from errormotion.methods.crossbeam_scan.identification.carriage import Rig
 from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint, carriage_errors, pose_twists
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
-from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import given, given_covariance
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
 from errormotion.methods.crossbeam_scan.settings import PoseSettings
 
 if TYPE_CHECKING:
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from errormotion.plugins import MethodInfo
 
 
-EXPECTED = np.array([20e-6, 20e-6, 20e-6, 10e-6, 10e-6, 10e-6])
+EXPECTED_ERRORS = np.array([20e-6, 20e-6, 20e-6, 10e-6, 10e-6, 10e-6])
 """Errors (m, rad) that a plan assumes for the influence of pose and lever."""
-_CELLS = 100
-PLATE = 2e-3
-"""Distance of the used part of the plate from the pocket, m: a mean of a hundred points of each line."""
-_OPEN = 1e12
+PLATE_DISTANCE = 2e-3
+"""Distance of the used part of the plate from the pocket, m; each line has the mean of a hundred points there."""
+_CELLS = 100  # of a profile
+_SINGULAR = 1e12  # condition number
 
 
 def plan(info: MethodInfo, settings: Settings) -> xr.Dataset:
@@ -54,7 +54,8 @@ def _plan_scans(info: MethodInfo, settings: Settings) -> xr.Dataset:
         raise MethodError("A plan needs the positions of the artefacts: set positions, such as ['350 mm', '550 mm']")
     positions = np.array(settings.positions)
     pose = settings.profiler_pose or PoseSettings()
-    rig = Rig(given(pose), np.array(settings.lever), given_covariance(pose), np.array(settings.lever_uncertainty))
+    lever, lever_uncertainty = np.array(settings.lever), np.array(settings.lever_uncertainty)
+    rig = Rig(stated_pose(pose), lever, stated_covariance(pose), lever_uncertainty)
     W, A = strain.from_maps(rig.pose)[:6], carriage_adjoint(rig.pose, rig.lever)
     noise = np.tile(W @ registration_covariance(settings) @ W.T, (positions.size, 1, 1))
     if settings.strain == "guided":
@@ -62,13 +63,13 @@ def _plan_scans(info: MethodInfo, settings: Settings) -> xr.Dataset:
         noise = strain.guided(twist, noise, positions, A, settings.guide_uncertainty).covariance
     own = transform_covariance(noise, A)
     shared = carriage_errors(
-        EXPECTED, np.zeros((6, 6)), rig.pose, rig.lever,
+        EXPECTED_ERRORS, np.zeros((6, 6)), rig.pose, rig.lever,
         pose_covariance=rig.pose_covariance, lever_uncertainty=rig.lever_uncertainty,
     )  # fmt: skip
     time = np.array([0.0, *settings.warm_up])
     shape = (time.size, positions.size)
     covariance = np.broadcast_to(own, (*shape, 6, 6)).copy()
-    # The influence is stated at the carriage's origin for errors of the size expected, for these are not known yet.
+    # The influence at the carriage's origin is stated for the expected size of the errors, which are not known yet.
     influence = np.broadcast_to(shared.influence[:, None, None], (len(shared.sources), *shape, 6)).copy()
     covariance += np.einsum("stki,stkj->tkij", influence, influence)
     covariance[0], influence[:, 0] = 0.0, 0.0
@@ -92,14 +93,14 @@ def _plan_scans(info: MethodInfo, settings: Settings) -> xr.Dataset:
 
 
 def registration_covariance(settings: Settings) -> Array:
-    """Return the covariance (9, 9) of (T_Q, R_Q, drift) of one registration to expect; zeros for a rigid picture."""
+    """Return the expected covariance (9, 9) of (T_Q, R_Q, drift) of one registration; a rigid scan has no drift."""
     layout = settings.layout
     x = (np.arange(_CELLS) + 0.5) / _CELLS * layout.width - layout.width / 2
     lines = max(2, round(settings.scan_length / settings.line_pitch))
     y = np.linspace(-settings.scan_length / 2, settings.scan_length / 2, min(lines, 4 * _CELLS))
     kx, ky = (2 * np.pi / wave for wave in layout.wavelength)
     Y, X = np.meshgrid(y, x, indexing="ij")
-    # The phases leave the surface without symmetry.
+    # With these phases, the surface has no symmetry.
     z = layout.relief * (np.sin(kx * X + 0.4) + np.cos(ky * Y - 0.7))
     zx, zy = layout.relief * kx * np.cos(kx * X + 0.4), -layout.relief * ky * np.sin(ky * Y - 0.7)
     n = np.stack([-zx, -zy, np.ones_like(z)], axis=-1)
@@ -127,7 +128,7 @@ def _plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
     MethodError
         The scans do not determine a parameter of the pose.
     """
-    nominal = given(settings.profiler_pose or PoseSettings())
+    nominal = stated_pose(settings.profiler_pose or PoseSettings())
     centre = np.array([*calibration.parameters(nominal), settings.pocket_radius])
     J = np.transpose(
         [
@@ -140,10 +141,10 @@ def _plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
     if settings.angle_prior is not None:
         information[range(3), range(3)] += 1 / settings.angle_prior**2
     scale = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-    if np.linalg.cond(information * np.outer(scale, scale)) > _OPEN:
+    if np.linalg.cond(information * np.outer(scale, scale)) > _SINGULAR:
         raise MethodError(
-            "These scans of the pocket do not determine the pose of the profiler: expected two lifts of the spindle at "
-            f"least (pocket_lifts), or an angle_prior; found {len(settings.pocket_lifts)}."
+            "These scans of the pocket do not determine the pose of the profiler: expected at least two lifts of the "
+            f"spindle (pocket_lifts), or an angle_prior; found {len(settings.pocket_lifts)}."
         )
     covariance = (np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))[:6, :6]
     at_profiler = pose_twists(nominal, -nominal.translation)
@@ -166,26 +167,27 @@ def _plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
 def _pocket(settings: Settings, parameters: Array) -> Array:
     """Return the observations of the fit of a pocket with (a, b, g, dx, dy, dz, r), in units of its noise."""
     layout, radius = settings.layout, settings.pocket_radius
-    nominal = given(settings.profiler_pose or PoseSettings())
+    nominal = stated_pose(settings.profiler_pose or PoseSettings())
     pose = calibration.pose(*parameters[:6])
     lines = np.arange(-0.9 * radius, 0.9 * radius, settings.line_pitch)
     half = np.sqrt(radius**2 - lines**2)
     out = []
     for lift in settings.pocket_lifts:
-        # On the rim and on the plate as a profiler at its nominal pose would see them.
-        for x, sigma, seen in ((half, layout.edge, "rim"), (half + PLATE, settings.height_noise / 10, "plate")):
+        # Points on the rim and on the plate, as measured by a profiler at its nominal pose.
+        plate = half + PLATE_DISTANCE
+        for x, sigma, part in ((half, layout.edge, "rim"), (plate, settings.height_noise / 10, "plate")):
             sides = []
             for side in (-1, 1):
-                there = np.stack([side * x, lines, np.zeros_like(x)], axis=-1)
+                point = np.stack([side * x, lines, np.zeros_like(x)], axis=-1)
                 stage = np.stack([np.zeros_like(x), np.zeros_like(x), np.full_like(x, lift)], axis=-1)
-                p = nominal.inv().apply(there - stage)
+                p = nominal.inv().apply(point - stage)
                 along = p[:, 1] / (nominal.rotation.inv().apply([0.0, 1.0, 0.0])[1])
                 stage[:, 1] += along
-                p = nominal.inv().apply(there - stage)
+                p = nominal.inv().apply(point - stage)
                 P = pose.apply(p) + stage
-                sides.append(np.hypot(P[:, 0], P[:, 1]) - parameters[6] if seen == "rim" else P[:, 2])
+                sides.append(np.hypot(P[:, 0], P[:, 1]) - parameters[6] if part == "rim" else P[:, 2])
             left, right = sides
-            # A line that jitters in height takes both sides of the plate along.
-            both = np.hypot(sigma / np.sqrt(2), layout.jitter_z if seen == "plate" else 0.0)
+            # The jitter of a line in height is common to both sides of the plate.
+            both = np.hypot(sigma / np.sqrt(2), layout.jitter_z if part == "plate" else 0.0)
             out += [(left + right) / 2 / both, (left - right) / np.sqrt(2) / sigma]
     return np.concatenate(out)

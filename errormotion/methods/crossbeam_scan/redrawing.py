@@ -1,6 +1,6 @@
-"""Sources of scans, drawn anew for the Monte Carlo method: noise of points and lines, pose, lever, scales, guide.
+"""Redrawing of the sources of scans for the Monte Carlo method: noise of points and lines, pose, lever, scales, guide.
 
-Scans of the pocket state no noise. Their lines are drawn with replacement, which has the scatter that they have.
+Scans of the pocket state no noise. Their lines are drawn with replacement, which reproduces their scatter.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ HEIGHT = ("cycle", "artefact", "profile", "point")
 
 
 def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
-    """Return the scans with their sources."""
+    """Return the scans with their sources of uncertainty."""
     if "pocket_radius" in raw:
         return _pocket(raw, settings)
     reduced = _scans(raw)
@@ -47,7 +47,7 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     found = register_all(Scans(reduced), cold, float(raw["height_noise"]), settings)
     sources = {"heights": _heights(reduced, found, cold)}
     if settings.strain == "guided":
-        # A scan that was excluded would act on its neighbours, as far as the guide couples them.
+        # Otherwise an excluded scan would affect its neighbours through the guide.
         reduced = reduced.assign(height=reduced["height"].where(~xr.DataArray(moved, dims=HEIGHT[:2])))
         sources["guide"] = _guide(found.without(moved), reduced, rig, settings.guide_uncertainty, rows)
     if rig.pose_covariance is not None:
@@ -62,7 +62,7 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
 
 
 def _scans(raw: xr.Dataset) -> xr.Dataset:
-    """Return the scans of a campaign in memory, cut out of a record where it is one."""
+    """Return the scans of a campaign in memory, cut out of the record where the raw data are one."""
     scans = Scans(raw)
     cut: dict[tuple[int, int], tuple[NDArray[np.float32], Array, float]] = {}
     for cycle, artefact in np.ndindex(scans.cycles, scans.artefacts):
@@ -75,34 +75,29 @@ def _scans(raw: xr.Dataset) -> xr.Dataset:
     shape = (scans.cycles, scans.artefacts, lines)
     height = np.full((*shape, raw.sizes["point"]), np.nan, dtype=np.float32)
     y, time = np.full(shape, np.nan), np.full(shape[:2], np.nan)
-    for place, (surface, along, moment) in cut.items():
+    for index, (surface, along, moment) in cut.items():
         rows = slice(len(along))
-        height[(*place, rows)], y[(*place, rows)], time[place] = surface, along, moment
+        height[(*index, rows)], y[(*index, rows)], time[index] = surface, along, moment
     known = np.isfinite(time).any(axis=1)
-    when = np.arange(scans.cycles, dtype=float)
-    when[known] = [float(np.nanmean(row)) for row in time[known]]
+    of_cycle = np.arange(scans.cycles, dtype=float)
+    of_cycle[known] = [float(np.nanmean(row)) for row in time[known]]
     kept = (
-        "x",
-        "position",
-        "profiler_pose",
-        "lever",
-        "lever_uncertainty",
-        "pose_covariance",
-        "height_noise",
-        "warm_up",
-    )
+        "x", "position", "profiler_pose", "lever", "lever_uncertainty", "pose_covariance", "height_noise", "warm_up",
+    )  # fmt: skip
     reduced = raw[[name for name in kept if name in raw.variables]].load()
     return reduced.assign(
-        height=(HEIGHT, height, {"units": "m"}), y=(HEIGHT[:3], y, {"units": "m"}), time=("cycle", when, {"units": "s"})
+        height=(HEIGHT, height, {"units": "m"}),
+        y=(HEIGHT[:3], y, {"units": "m"}),
+        time=("cycle", of_cycle, {"units": "s"}),
     )
 
 
 def _heights(raw: xr.Dataset, found: Registrations, cold: list[int]) -> Redraw:
     """Return the noise of the points, and the jitter of the lines along z and along the feed.
 
-    The noise of the points is raised to the variance of their blocks: what neighbouring points have in common is drawn
-    as if they were independent, with the same effect on a block. The jitter that a registration finds is that of both
-    scans; half of its variance is the cold scan's.
+    The noise of the points is increased to the variance of their blocks: noise that neighbouring points share is drawn
+    as independent noise with the same effect on a block. The jitter found by a registration is that of both scans; half
+    of its variance belongs to the cold scan.
     """
     quality = found.quality
     warm = [c for c in range(raw.sizes["cycle"]) if c not in cold]
@@ -133,9 +128,9 @@ def _pitch(y: Array) -> float:
 
 
 def _guide(found: Registrations, raw: xr.Dataset, rig: Rig, uncertainty: float, rows: list[int]) -> Redraw:
-    """Return how far pitch and yaw of the carriage are off the slopes of its guide, which no reading contains.
+    """Return the deviation of pitch and yaw of the carriage from the slopes of its guide, which no reading contains.
 
-    The least squares are those of registrations and of assumptions "EA - dEZ/dY is 0". Their effect is linear.
+    The least squares include the assumptions that EA - dEZ/dY and EC + dEX/dY are 0. Their effect is linear.
     """
     assumed = carriage(found, raw["position"].values, rig, guide=uncertainty).assumed[:, rows]
 
@@ -172,21 +167,21 @@ def _lever(rig: Rig) -> Redraw:
 
 
 def _strain(relative: float, *, together: bool) -> Redraw:
-    """Return scales of x and z that each scan has on its own, or the expansion of x, y and z ``together``.
+    """Return independent scales of x and z of each scan, or the expansion of x, y and z ``together``.
 
-    A surface that is wider by e has the height z - e x dz/dx at x.
+    A surface expanded by e has the height z - e x dz/dx at x.
     """
 
     def draw(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
         height = raw["height"].transpose(*HEIGHT).values.copy()
         x, y = raw["x"].values, raw["y"].transpose(*HEIGHT[:3]).values
-        for place in np.ndindex(height.shape[:2]):
-            scan, along = height[place], np.nan_to_num(y[place])
+        for index in np.ndindex(height.shape[:2]):
+            scan, along = height[index], np.nan_to_num(y[index])
             e = relative * (np.full(3, generator.normal()) if together else generator.normal(size=3) * (1, 0, 1))
             across = np.nan_to_num(np.gradient(scan, axis=1) / np.median(np.diff(x)))
             change = e[2] * np.nan_to_num(scan) - e[0] * x * across
             if e[1]:
-                change -= e[1] * along[:, None] * np.nan_to_num(np.gradient(scan, axis=0) / _pitch(y[place]))
+                change -= e[1] * along[:, None] * np.nan_to_num(np.gradient(scan, axis=0) / _pitch(y[index]))
             scan += change.astype(np.float32)
         return raw.assign(height=(HEIGHT, height, raw["height"].attrs)), settings
 
@@ -194,7 +189,7 @@ def _strain(relative: float, *, together: bool) -> Redraw:
 
 
 def _pocket(raw: xr.Dataset, settings: Settings) -> Redrawing:
-    """Return scans of the pocket: their lines with replacement, and radius and centre as they are known."""
+    """Return the scans of a pocket with their sources: lines drawn with replacement, radius and centre."""
     radius = float(raw["pocket_radius_uncertainty"]) if "pocket_radius_uncertainty" in raw else RADIUS_UNCERTAINTY
     sources = {"lines": Redraw(_lines, own=True), "radius of the pocket": _shift("pocket_radius", radius)}
     if "pocket_centre_uncertainty" in raw:
@@ -204,7 +199,7 @@ def _pocket(raw: xr.Dataset, settings: Settings) -> Redrawing:
 
 
 def _lines(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
-    """Return every scan with as many of its own lines, drawn with replacement."""
+    """Return every scan with the same number of its lines, drawn with replacement."""
     scans = []
     for number in range(raw.sizes["scan"]):
         drawn = np.sort(generator.integers(0, raw.sizes["profile"], raw.sizes["profile"]))

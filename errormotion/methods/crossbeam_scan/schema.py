@@ -2,6 +2,7 @@
 
 from errormotion.datasets.schemas import DIRECTION, NO_LIMIT, NOISE, POSITION, RADIUS, XYZ, RawSchema, Row
 
+SCHEMA = "errormotion.raw.crossbeam_scan/1"
 _PROFILER = (
     Row("x", ("point",), "m", -1.0, 1.0, "along the profile, profiler frame"),
     Row("position", ("artefact",), "m", *POSITION, "position of the axis at each artefact"),
@@ -32,7 +33,7 @@ _PROFILER_SIZES = {"row": 4, "column": 4, "p": 6, "p_": 6}
 
 RAW_SCHEMAS = (
     RawSchema(
-        "errormotion.raw.crossbeam_scan/1",
+        SCHEMA,
         "scans",
         "y",
         (
@@ -60,7 +61,7 @@ RAW_SCHEMAS = (
         labels=XYZ,
     ),
     RawSchema(
-        "errormotion.raw.crossbeam_scan/1",
+        SCHEMA,
         "scans as recorded",
         "record",
         (
@@ -83,7 +84,7 @@ RAW_SCHEMAS = (
                 missing=True,
             ),
             Row("cycle_of_line", ("line",), "", 0, 100000, "number of the measuring pass; pass 0 is the cold one"),
-            Row("line_time", ("line",), "s", -NO_LIMIT, NO_LIMIT, "since the warm-up began"),
+            Row("line_time", ("line",), "s", -NO_LIMIT, NO_LIMIT, "since the start of the warm-up"),
             Row(
                 "line_clock",
                 ("line",),
@@ -93,7 +94,7 @@ RAW_SCHEMAS = (
                 "since the attribute `start`: for a campaign that is resumed",
                 required=False,
             ),
-            Row("encoder_pitch", (), "m", -1e-2, 1e-2, "way of the axis per count"),
+            Row("encoder_pitch", (), "m", -1e-2, 1e-2, "travel of the axis per count"),
             Row("encoder_zero", (), "m", *POSITION, "position of the axis where the count is 0"),
             Row("scan_length", (), "m", 0.0, 1.0, "length of a scan along the feed"),
             *_PROFILER,
@@ -102,7 +103,7 @@ RAW_SCHEMAS = (
         labels=XYZ,
     ),
     RawSchema(
-        "errormotion.raw.crossbeam_scan/1",
+        SCHEMA,
         "profiler pose",
         "scan",
         (
@@ -121,10 +122,10 @@ RAW_SCHEMAS = (
                 ("scan", "profile", "direction"),
                 "m",
                 *POSITION,
-                "tool frame, off its place over the pocket",
+                "displacement of the tool frame from its position over the pocket",
                 missing=True,
             ),
-            Row("pocket_centre", ("direction",), "m", *POSITION, "centre of the rim in the tool frame at that place"),
+            Row("pocket_centre", ("direction",), "m", *POSITION, "centre of the rim in the tool frame there"),
             Row("pocket_radius", (), "m", *RADIUS, "radius of the pocket"),
             Row(
                 "pocket_centre_uncertainty",

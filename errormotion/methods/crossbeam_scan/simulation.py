@@ -18,8 +18,8 @@ from errormotion.datasets import build_errors, provenance
 from errormotion.errors import BenchError
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.poses import displacement
-from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import given
-from errormotion.methods.crossbeam_scan.method import SCHEMA
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_pose
+from errormotion.methods.crossbeam_scan.schema import SCHEMA
 from errormotion.methods.crossbeam_scan.settings import PoseSettings
 from errormotion.twin import VirtualMachine, truth
 from errormotion.twin.artefacts.pieces import Artefact, circular_pocket, swept
@@ -35,10 +35,10 @@ _LEVER = 2
 
 
 def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return the raw dataset of a campaign or of a pocket by these settings, and the true errors.
+    """Return the raw dataset of a campaign or of a pocket with these settings, and the true errors.
 
-    The size of a scan follows from ``scan_length``, ``line_pitch`` and ``layout``. There is one cold pass. The lever is
-    stated with an error drawn from ``lever_uncertainty``.
+    The size of a scan follows from ``scan_length``, ``line_pitch`` and ``layout``. There is one cold pass. The stated
+    lever has an error drawn from ``lever_uncertainty``.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         raw = raw_pocket(
             machine, seed=seed, lifts=settings.pocket_lifts, profiler=profiler, profiles=profiles, feed=feed
         )
-        return raw, truth_pose(machine, given(settings.profiler_pose or PoseSettings()))
+        return raw, truth_pose(machine, stated_pose(settings.profiler_pose or PoseSettings()))
     times, positions = (0.0, *settings.warm_up), settings.positions or POSITIONS
     profiles = round(settings.scan_length / feed)
     raw = raw_scans(machine, times, positions, seed=seed, profiler=profiler, profiles=profiles, feed=feed)
@@ -64,9 +64,9 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
 
 
 def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:  # noqa: ARG001 - the interface
-    """Return the true errors at the times of the scans of an error dataset; the axis warms up from its time 0 on."""
+    """Return the true errors at the times of the scans of an error dataset; the warm-up starts at its time 0."""
     found = truth_axis(machine, errors["time"].values, errors["y"].values)
-    twist = machine.crossbeam.twist(errors["scan_time"].values, errors["y"].values)  # one artefact after the other
+    twist = machine.crossbeam.twist(errors["scan_time"].values, errors["y"].values)  # at the time of each scan
     return found.assign({name: (("time", "position"), twist[..., k], found[name].attrs) for k, name in enumerate(DOF)})
 
 
@@ -143,20 +143,20 @@ def raw_scans(
     positions : (artefact,)
         Of the Y axis over the middle of each artefact, m.
     seed : int
-        Of noise and sampling phase alone; machine and artefacts stay as they are.
+        Seed of noise and sampling phase only; machine and artefacts do not depend on it.
     artefact : Artefact, optional
-        At every position, slightly misaligned; the swept free form where not given.
+        The artefact at every position, slightly misaligned; by default the swept free form.
     profiler : Profiler, optional
-        LJ-X8000A with all its disturbances where not given.
+        By default an LJ-X8000A with all its disturbances.
     profiles : int
-        Lines of a scan.
+        Number of lines of a scan.
     feed : float
         Distance of two lines, m.
     motion : {"axis", "rigid"}
-        "axis": the carriage has at each line the error that the axis has there, as in the truth. "rigid": over the
-        whole scan it has the error at the middle, which a registration can find exactly.
+        "axis": the carriage has at each line the error of the axis there, as in the truth. "rigid": over the whole scan
+        it has the error at the middle, which a registration can determine exactly.
     pose : (4, 4), optional
-        Profiler pose that the dataset states; the true one where not given.
+        Profiler pose that the dataset states; by default the true one.
 
     Raises
     ------
@@ -221,13 +221,13 @@ def raw_pocket(
     machine : VirtualMachine
         Of kind "gantry".
     seed : int
-        Of the noise alone.
+        Seed of the noise only.
     lifts : (scan,)
         Height of the spindle above its position when the pocket was cut, m.
     profiler : Profiler, optional
-        LJ-X8000A with all its disturbances where not given.
+        By default an LJ-X8000A with all its disturbances.
     profiles : int
-        Lines of a scan.
+        Number of lines of a scan.
     feed : float
         Distance of two lines, m.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from errormotion.errors import MethodError
 from errormotion.methods.linear_positioning.schema import SCHEMA
 from errormotion.methods.linear_positioning.settings import Settings as PositioningSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
@@ -138,15 +137,12 @@ class LinearPositioning:
         MethodError
             The data do not determine the result.
         """
-        from errormotion.datasets import validate
+        from errormotion.datasets.validation import checked_raw
         from errormotion.methods.linear_positioning.diagonals.identification import identify_diagonals
         from errormotion.methods.linear_positioning.identification.identify import identify
         from errormotion.methods.linear_positioning.identification.moving import identify_moving
 
-        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
-        if checked.attrs["schema"] != SCHEMA:
-            raise MethodError(f"linear_positioning reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
-        validate(checked)
+        checked = checked_raw(raw, self)
         settings = settings or PositioningSettings()
         if "cycle" in checked.dims:
             return identify_moving(checked, settings, self.info)

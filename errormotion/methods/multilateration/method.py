@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import xarray as xr
-
-from errormotion.datasets import validate
-from errormotion.errors import MethodError
 from errormotion.methods.multilateration.schema import SCHEMA
 from errormotion.methods.multilateration.settings import Settings as MultilaterationSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+
+    import xarray as xr
 
     from errormotion.kinematics.description import MachineDescription
 
@@ -113,14 +111,12 @@ class Multilateration:
         MethodError
             The data do not determine the result, or contradict one another.
         """
+        from errormotion.datasets.validation import checked_raw
         from errormotion.methods.multilateration.acquisition.measure import latest
         from errormotion.methods.multilateration.identification.identify import identify_targets
 
         settings = settings or MultilaterationSettings()
-        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
-        validate(checked)
-        if checked.attrs["schema"] != SCHEMA:
-            raise MethodError(f"multilateration reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        checked = checked_raw(raw, self)
         return identify_targets(latest(checked), settings, self.info.id, self.info.version)
 
     def plan(self, settings: MultilaterationSettings | None = None) -> xr.Dataset:

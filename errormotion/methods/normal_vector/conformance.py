@@ -1,4 +1,4 @@
-"""What the conformance kit examines of the method."""
+"""Simulated warm-up with which the conformance kit examines the method."""
 
 from __future__ import annotations
 
@@ -12,17 +12,14 @@ from errormotion.plugins import MethodSubject
 FUNCTIONAL_POINT = (0.0, 0.0, 0.15)
 """m."""
 WARM_UP = Settings(
-    tool_axes="Z",
-    functional_point=FUNCTIONAL_POINT,
-    duration=3600.0,
-    schedule=(Event(at=0.0, spindle_speed=12000.0),),
+    tool_axes="Z", functional_point=FUNCTIONAL_POINT, duration=3600.0, schedule=(Event(at=0.0, spindle_speed=12000.0),)
 )
 
 
 def subjects() -> tuple[MethodSubject, ...]:
-    """Return the method on a C-frame whose table moves in X and Y, so that the frame is rotated about Z alone.
+    """Return the method on a C-frame whose table moves in X and Y, so that the frame is rotated about Z only.
 
-    A gantry shows all six errors, but at 4 m single precision is as coarse as its touches.
+    On a gantry all six errors are determined, but at 4 m the resolution of single precision is that of its touches.
     """
     centres = ((-0.24, -0.2, 0.06), (0.24, -0.19, 0.23), (0.23, 0.2, 0.09))
     subject = MethodSubject(

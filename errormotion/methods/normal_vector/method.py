@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from errormotion.errors import MethodError
+from errormotion.methods.normal_vector.schema import SCHEMA
 from errormotion.methods.normal_vector.settings import Settings as BallSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from errormotion.kinematics.description import MachineDescription
-
-SCHEMA = "errormotion.raw.normal_vector/1"
 
 
 class NormalVector:
@@ -41,6 +39,7 @@ class NormalVector:
     chapters = lazy("errormotion.methods.normal_vector.report:chapters")
     texts = lazy("errormotion.methods.normal_vector.report:texts")
     figures = lazy("errormotion.datasets.results.merit:last_values")
+    motions = lazy("errormotion.methods.normal_vector.acquisition.cycle:campaign_steps")
     simulate = lazy("errormotion.methods.normal_vector.simulation:simulate")
     truth = lazy("errormotion.methods.normal_vector.simulation:truth_of")
     conformance = lazy("errormotion.methods.normal_vector.conformance:subjects")
@@ -68,12 +67,6 @@ class NormalVector:
 
         tip = getattr((instruments or {}).get("touch_probe"), "tip_radius", None)
         return programs(settings if settings.tip_radius or not tip else settings.model_copy(update={"tip_radius": tip}))
-
-    def motions(self, settings: BallSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
-        """Return every step of the machine, for the check of its limits and for a dry run."""
-        from errormotion.methods.normal_vector.acquisition.cycle import campaign_steps
-
-        return campaign_steps(settings, instruments)
 
     def check(self, settings: BallSettings) -> dict[str, str]:
         """Return the settings with which no campaign is possible: too few balls, or no cycle after the cold one."""
@@ -127,18 +120,15 @@ class NormalVector:
         Raises
         ------
         DatasetError
-            The raw dataset violates its schema; all violations in one message.
+            The raw dataset violates its schema; all violations are reported together.
         MethodError
             The data do not determine the errors, or contradict the stated balls.
         """
-        from errormotion.datasets import validate
+        from errormotion.datasets.validation import checked_raw
         from errormotion.methods.normal_vector.identification.identify import identify_motion
 
         settings = settings or BallSettings()
-        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
-        validate(checked)
-        if checked.attrs["schema"] != SCHEMA:
-            raise MethodError(f"normal_vector reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        checked = checked_raw(raw, self)
         return identify_motion(checked, settings, self.info.id, self.info.version)
 
     def planning_settings(self, settings: BallSettings, instruments: Mapping[str, Any]) -> BallSettings:

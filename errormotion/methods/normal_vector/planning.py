@@ -13,6 +13,7 @@ from errormotion.datasets.units import format_quantity
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.normal_vector.acquisition import touching
+from errormotion.methods.normal_vector.acquisition.cycle import TIP_RADIUS
 from errormotion.methods.normal_vector.identification import normals as published
 from errormotion.methods.normal_vector.identification.freedoms import Motion, check_layout
 from errormotion.methods.normal_vector.identification.rigid import Observations, fit
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from errormotion.methods.normal_vector.settings import Settings
     from errormotion.plugins import Method
 
-TIP_RADIUS, NOISE = 3e-3, 0.25e-6
-"""Radius of the tip and noise of a touch where the settings have none, m."""
+NOISE = 0.25e-6
+"""Noise of a touch where the settings have none, m."""
 
 
 def plan(method: Method, settings: Settings) -> xr.Dataset:
@@ -97,11 +98,7 @@ def _loss(
 ) -> Array:
     if motion.tool_axes != "XYZ" or len(anchor) < 4:
         return np.full(6, np.nan)
-    names = touching.names(settings)
-    chosen = settings.normals_balls or tuple(names[:4])
-    if missing := [name for name in chosen if name not in names]:
-        raise MethodError(f"normals_balls: expected names of {', '.join(names)}; found {', '.join(missing)}")
-    four = [names.index(name) for name in chosen]
+    four = published.chosen(touching.names(settings), settings.normals_balls)
     measured = centres(seen, anchor, reach)
     if not published.planes_apart(measured.centre[0, four]):
         return np.full(6, np.inf)

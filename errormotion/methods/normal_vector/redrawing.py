@@ -1,4 +1,4 @@
-"""Sources of touches of balls, drawn anew for the Monte Carlo method: their noise is the only one."""
+"""Redrawing of touches of balls for the Monte Carlo method; their noise is the only source."""
 
 from __future__ import annotations
 
@@ -16,15 +16,12 @@ if TYPE_CHECKING:
     from errormotion.arrays import Array
     from errormotion.methods.normal_vector.settings import Settings
 
-USED = 0
-"""Flag of what took part in the result."""
-
 
 def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
-    """Return the touches or centres that took part in the result, and their noise."""
+    """Return the touches or centres that the result is based on, and their noise."""
     touched = "touch" in raw.variables
     name, dims = ("touch", ("time", "ball", "touch")) if touched else ("centre", ("time", "ball", "direction"))
-    used = errors["left_out"].transpose(*dims).values == USED
+    used = errors["left_out"].transpose(*dims).values == 0
     used = used[..., None] if touched else used.all(axis=-1, keepdims=True)
     order = (*dims, "direction") if touched else dims
     values = np.asarray(raw.variables[name].transpose(*order).values, dtype=float)
@@ -53,10 +50,10 @@ def _noise(
     values: Array,
     errors: xr.Dataset,
 ) -> Redraw:
-    """Return the noise of the touches along their normals, or of the centres by their covariance.
+    """Return the noise of the touches along their normals, or of the centres from their covariance.
 
-    A noise that was found from ``freedom`` residuals is itself drawn, so that the numbers have Student's distribution:
-    JCGM 101, 6.4.9.
+    A noise that was estimated from residuals with ``freedom`` degrees of freedom is drawn as well, so that the values
+    have a t-distribution: JCGM 101, 6.4.9.
     """
     if name == "touch":
         outward = values - errors["centre"].transpose("time", "ball", "direction").values[:, :, None]

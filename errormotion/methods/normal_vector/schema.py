@@ -2,13 +2,32 @@
 
 from errormotion.datasets.schemas import DIRECTION, NO_LIMIT, NOISE, POSITION, RADIUS, UNIT_VECTOR, XYZ, RawSchema, Row
 
+SCHEMA = "errormotion.raw.normal_vector/1"
+
+TOUCH_FLAGS = ("", "no trip", "tripped at the start", "repeat differs", "not made")
+"""Meanings of ``touch_flag``; 0 is a good touch."""
+
+
+def flag_text(flag: float) -> str:
+    """Return the meaning of a flag of a touch."""
+    return TOUCH_FLAGS[int(flag)] if 0 <= flag < len(TOUCH_FLAGS) else f"flag {flag:g}"
+
+
+_TIME = Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "time of the probing, increasing")
+_NOMINAL = Row("ball_nominal", ("ball", "direction"), "m", *POSITION, "nominal centre of each ball", required=False)
+_STATE = (
+    Row("temperature", ("time", "sensor"), "degC", -40.0, 200.0, "at each probing; NaN = unknown", required=False),
+    Row("spindle_speed", ("time",), "1/min", 0.0, 1e6, "at the start of each probing", required=False),
+    Row("feed", ("time",), "m/s", 0.0, 10.0, "mean feed since the previous probing", required=False),
+)
+
 RAW_SCHEMAS = (
     RawSchema(
-        "errormotion.raw.normal_vector/1",
+        SCHEMA,
         "centres",
         "centre",
         (
-            Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "time of the probing, increasing"),
+            _TIME,
             Row(
                 "centre",
                 ("time", "ball", "direction"),
@@ -26,28 +45,18 @@ RAW_SCHEMAS = (
                 "covariance of each centre",
                 required=False,
             ),
-            Row("ball_nominal", ("ball", "direction"), "m", *POSITION, "nominal centre of each ball", required=False),
-            Row(
-                "temperature",
-                ("time", "sensor"),
-                "degC",
-                -40.0,
-                200.0,
-                "at each probing; NaN = unknown",
-                required=False,
-            ),
-            Row("spindle_speed", ("time",), "1/min", 0.0, 1e6, "at the start of each probing", required=False),
-            Row("feed", ("time",), "m/s", 0.0, 10.0, "mean feed since the previous probing", required=False),
+            _NOMINAL,
+            *_STATE,
         ),
         sizes={**DIRECTION, "direction_": 3},
         labels=XYZ,
     ),
     RawSchema(
-        "errormotion.raw.normal_vector/1",
+        SCHEMA,
         "touches",
         "touch",
         (
-            Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "time of the probing, increasing"),
+            _TIME,
             Row(
                 "touch",
                 ("time", "ball", "touch", "direction"),
@@ -84,19 +93,9 @@ RAW_SCHEMAS = (
                 required=False,
             ),
             Row("ball_radius", ("ball",), "m", *RADIUS, "radius of each ball; NaN = unknown", required=False),
-            Row("ball_nominal", ("ball", "direction"), "m", *POSITION, "nominal centre of each ball", required=False),
+            _NOMINAL,
             Row("touch_noise", (), "m", *NOISE, "standard deviation of one contact along its normal", required=False),
-            Row(
-                "temperature",
-                ("time", "sensor"),
-                "degC",
-                -40.0,
-                200.0,
-                "at each probing; NaN = unknown",
-                required=False,
-            ),
-            Row("spindle_speed", ("time",), "1/min", 0.0, 1e6, "at the start of each probing", required=False),
-            Row("feed", ("time",), "m/s", 0.0, 10.0, "mean feed since the previous probing", required=False),
+            *_STATE,
         ),
         sizes=DIRECTION,
         labels=XYZ,

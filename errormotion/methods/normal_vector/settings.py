@@ -22,7 +22,7 @@ class Ball(PluginSettings):
 
     centre: tuple[Length, Length, Length] = Field(description="approximate position of its centre, machine coordinates")
     radius: Length = Field(default=12.5e-3, gt=0, description="radius of the ball")
-    name: str = Field(default="", description="name of the ball; default its number, starting at 1")
+    name: str = Field(default="", description="name of the ball; default: its number, starting at 1")
 
 
 class Event(PluginSettings):
@@ -43,14 +43,12 @@ class Settings(PluginSettings):
     )
     order: Literal["there and back", "forward"] = Field(
         default="there and back",
-        description="one half of the touches from the first ball to the last, the other half in reverse order, so that "
-        "every ball has the same mean time; or ball after ball",
+        description="there and back: one half of the touches from the first ball to the last, the other half in "
+        "reverse order, so that every ball has the same mean time; forward: ball after ball",
     )
-    tip_radius: Length | None = Field(default=None, gt=0, description="radius of the tip; default that of the probe")
+    tip_radius: Length | None = Field(default=None, gt=0, description="radius of the tip; default: that of the probe")
     touch_noise: Length | None = Field(
-        default=None,
-        gt=0,
-        description="standard deviation of one touch along its normal; default that of the probe",
+        default=None, gt=0, description="standard deviation of one touch along its normal; default: that of the probe"
     )
 
     # Motion of the machine
@@ -63,7 +61,8 @@ class Settings(PluginSettings):
     clearance: Length = Field(
         default=15e-3,
         gt=0,
-        description="height of the tip above the starts of the touches while it passes; that of the probe has priority",
+        description="height of the tip above the starts of the touches on its way to another ball; that of the probe "
+        "has priority",
     )
     probing_feed: Velocity = Field(
         default=0.3 / MINUTE, gt=0, description="feed of the touches; that of the probe has priority"
@@ -100,7 +99,7 @@ class Settings(PluginSettings):
     )
     functional_point: tuple[Length, Length, Length] | None = Field(
         default=None,
-        description="functional point of the errors; default the mean of the balls' centres, rounded to 0.1 mm",
+        description="functional point of the errors; default: the mean of the balls' centres, rounded to 0.1 mm",
     )
     procedure: Literal["rigid", "normals"] = Field(
         default="rigid",
@@ -108,7 +107,7 @@ class Settings(PluginSettings):
         "two planes through four balls",
     )
     normals_balls: tuple[str, str, str, str] | None = Field(
-        default=None, description="balls P1 P2 P3 P4 of the two planes; default the first four"
+        default=None, description="balls P1 P2 P3 P4 of the two planes; default: the first four"
     )
     reference: Literal["cold", "first"] = Field(
         default="cold", description="cold: the cold cycle at time 0; first: the first existing cycle, at any time"
@@ -131,7 +130,7 @@ class Settings(PluginSettings):
     def _fits(self) -> Settings:
         names = [ball.name or str(i + 1) for i, ball in enumerate(self.balls)]
         if len(set(names)) < len(names):
-            raise ValueError(f"balls: expected names that differ; found {', '.join(names)}")
+            raise ValueError(f"balls: expected different names; found {', '.join(names)}")
         times = [event.at for event in self.schedule]
         if any(second <= first for first, second in pairwise(times)):
             raise ValueError(f"schedule: expected increasing times; found {times} s")

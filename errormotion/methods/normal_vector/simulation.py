@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import BenchError, MethodError
+from errormotion.methods.normal_vector.schema import SCHEMA
 from errormotion.twin import Event, VirtualMachine
 from errormotion.twin.artefacts.balls import Balls, Probe
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
 Moved = tuple[int, float, ArrayLike]
 
-SCHEMA = "errormotion.raw.normal_vector/1"
 BALLS = 4
 """Number of balls where none is given."""
 TOUCH_TIME = 6.0
@@ -69,7 +69,7 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     count = int(settings.duration / settings.interval + 1e-9) + 1
     data = raw(machine, settings.interval * np.arange(count), seed=seed, balls=balls, touches=touches)
     point = settings.functional_point
-    if point is None:  # as the identification takes it: the mean of the centres as probed in the cold cycle
+    if point is None:  # as in the identification: the mean of the centres probed in the cold cycle
         centre = machine.balls_on_table(balls).centre
         point = np.round((centre - machine.probe_error(centre, np.zeros(balls))).mean(axis=0), 4)
     steps = int((settings.interval * (count - 1) + cycle) / TRUTH_STEP) + 4
@@ -81,7 +81,7 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
 
 
 def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:
-    """Return the true errors at the times of an error dataset, whose time 0 was at ``clock`` (s) of the machine."""
+    """Return the true errors at the times of an error dataset with its time 0 at ``clock`` (s) of the machine."""
     truth = machine.truth_probing(errors["time"].values + clock, errors.attrs["functional_point"])
     return truth.assign_coords(time=("time", errors["time"].values, {"units": "s"}))
 
@@ -99,7 +99,7 @@ def raw(
     missing: float = 0.0,
     noise: float | None = None,
 ) -> xr.Dataset:
-    """Return a raw dataset of balls that a virtual machine probes in cycles under its present schedule.
+    """Return a raw dataset of balls that a virtual machine probes in cycles during its current schedule.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def raw(
     times : (n,)
         Start of each cycle, s, increasing; the first cycle is the cold one and the reference.
     seed : int
-        Of the noise alone; machine and balls do not depend on it.
+        Seed of the noise only; machine and balls do not depend on it.
     balls : int
         1 to 8.
     touches : int
@@ -153,7 +153,7 @@ def raw(
         variables |= _centres(cycles, table, contacts, sigma, rng)
         coords["direction_"] = list("xyz")
     else:
-        raise BenchError(f"The variants are 'touches' and 'centres'; found {variant!r}.")
+        raise BenchError(f"variant: expected 'touches' or 'centres'; found {variant!r}.")
     address = f"twin://{machine.kind}?seed={machine.seed}"
     attrs: Mapping[str, Any] = {
         "schema": SCHEMA,
@@ -168,7 +168,7 @@ def raw(
 def touch_normals(count: int) -> Array:
     """Return the outward unit normals at which a ball is touched, (count, 3)."""
     if count < len(_AROUND_AND_TOP):
-        raise BenchError(f"A ball is touched {len(_AROUND_AND_TOP)} times or more; found {count}.")
+        raise BenchError(f"touches: expected {len(_AROUND_AND_TOP)} or more for each ball; found {count}.")
     more = count - len(_AROUND_AND_TOP)
     azimuth = np.pi / 4 + 2 * np.pi * np.arange(more) / max(more, 1)
     slanting = np.stack([np.cos(azimuth), np.sin(azimuth), np.ones(more)], axis=1) / np.sqrt(2)
@@ -210,12 +210,13 @@ class Cycles:
         duration = TOUCH_TIME * balls * touches if cycle is None else float(cycle)
         if not duration >= 0 or not np.all(np.isfinite(starts)) or np.any(np.diff(starts) < max(duration, 1e-9)):
             raise BenchError(
-                f"Cycles of {duration:g} s start at increasing times, one after the other; found times {starts} s."
+                f"times: expected increasing starts at least {duration:g} s apart, the duration of a cycle; found "
+                f"{starts} s."
             )
         if not 0 <= missing <= 1:
-            raise BenchError(f"The fraction of missing touches is from 0 to 1; found {missing:g}.")
+            raise BenchError(f"missing: expected a fraction from 0 to 1; found {missing:g}.")
         if moved is not None and not 0 <= moved[0] < balls:
-            raise BenchError(f"The ball that moves is one of 0 to {balls - 1}; found {moved[0]}.")
+            raise BenchError(f"moved: expected a ball from 0 to {balls - 1}; found {moved[0]}.")
         return cls(starts, touch_normals(touches), int(balls), duration, moved, float(missing))
 
     @property

@@ -17,14 +17,14 @@ _RANGES = {
     "range_running": "to the end of running",
     "range_total": "over the whole record",
 }
-"""Measures of `iso_value`, in the order of preference."""
+"""Measures of ``iso_value``, in the order of preference."""
 
 
 def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
     """Return the figures of a drift or of a beam detection; none for a plan.
 
-    The ISO 230-3 range of each quantity is that of the first 60 min. For a shorter record it is the range to the end
-    of running, or over the whole record.
+    The ISO 230-3 range of each quantity is that of the first 60 min; for a shorter record, the range to the end of
+    running, else that over the whole record.
     """
     if is_planned(errors):
         return []

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.schema import SCHEMA
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -38,22 +37,18 @@ class SpindleDrift:
     texts = lazy("errormotion.methods.spindle_drift.report:texts")
     log_readers = lazy("errormotion.methods.spindle_drift.log_import.importer:LOG_READERS")
     figures = lazy("errormotion.methods.spindle_drift.figures:figures")
+    motions = lazy("errormotion.methods.spindle_drift.acquisition.motions:steps")
     simulate = lazy("errormotion.methods.spindle_drift.simulation:simulate")
     truth = lazy("errormotion.methods.spindle_drift.simulation:truth_of")
     conformance = lazy("errormotion.methods.spindle_drift.conformance:subjects")
     redrawing = lazy("errormotion.methods.spindle_drift.redrawing:redrawing")
 
     def acquire(
-        self,
-        bench: Bench,
-        settings: DriftSettings,
-        *,
-        inputs: Mapping[str, xr.Dataset],
-        done: xr.Dataset | None = None,
+        self, bench: Bench, settings: DriftSettings, *, inputs: Mapping[str, xr.Dataset], done: xr.Dataset | None = None
     ) -> Iterator[xr.Dataset]:
         """Measure; yield raw datasets to be joined along ``append_dim``.
 
-        For a drift, ``inputs`` may hold the ``beams`` of a detection, or single beams under their channels' names.
+        For a drift, ``inputs`` may contain the ``beams`` of a detection, or single beams by the names of the channels.
         """
         from errormotion.methods.spindle_drift.acquisition import beams as scanning
         from errormotion.methods.spindle_drift.acquisition import drift as acquisition
@@ -63,18 +58,12 @@ class SpindleDrift:
             return scanning.detect_beams(bench, settings, done)
         return acquisition.record_drift(bench, settings, given_beams(inputs), done)
 
-    def motions(self, settings: DriftSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
-        """Return every step of the machine, for the check of its limits and for a dry run."""
-        from errormotion.methods.spindle_drift.acquisition.motions import steps
-
-        return steps(settings, instruments)
-
     def check_machine(self, settings: DriftSettings, machine: MachineDescription) -> dict[str, str]:  # noqa: ARG002
-        """Return what contradicts the machine: a spindle along another axis than Z of the measuring frame."""
+        """Return what contradicts the machine: a spindle axis other than Z, the axis of the measuring frame."""
         if machine.spindle_axis == "Z":
             return {}
         return {
-            "": "expected a spindle axis Z, the direction of the channel Z of the measuring frame; the machine's is "
+            "": "expected a spindle axis Z, the direction of the channel Z of the measuring frame; found "
             f"{machine.spindle_axis}"
         }
 
@@ -114,13 +103,10 @@ class SpindleDrift:
         MethodError
             The data do not determine the result.
         """
-        from errormotion.datasets import validate
+        from errormotion.datasets.validation import checked_raw
 
         settings = settings or DriftSettings()
-        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
-        validate(checked)
-        if checked.attrs["schema"] != SCHEMA:
-            raise MethodError(f"spindle_drift reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        checked = checked_raw(raw, self)
         if "sphere_radius" in raw:
             from errormotion.methods.spindle_drift.identification.detection import identify_beams
 

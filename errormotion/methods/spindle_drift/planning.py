@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.settings import Settings
 
 _PLANNED = "planned, not measured"
-_DRIFT = np.array([5e-6, 5e-6, 20e-6, 1e-4, 1e-4])
+_TYPICAL_DRIFT = np.array([5e-6, 5e-6, 20e-6, 1e-4, 1e-4])  # EX, EY, EZ, m; EA, EB, rad
 
 
 def plan(settings: Settings, method: str, version: str) -> xr.Dataset:
@@ -63,13 +63,13 @@ def _plan_beams(settings: Settings, method: str, version: str) -> xr.Dataset:
 def _plan_drift(settings: Settings, method: str, version: str) -> xr.Dataset:
     """Plan a drift: the reference state and one later instant.
 
-    A bar of the stated radius is in a frame as drawn in ISO 230-3, its readings at mid-range; the beams are those of a
+    A bar of the stated radius is in a frame as drawn in ISO 230-3, with readings at mid-range; the beams are those of a
     detection with the stated steps. The later instant has a typical drift (5 um in X and Y, 20 um in Z, 0.1 mrad),
-    because the effect of the uncertainty of the beams grows with the drift.
+    because the effect of the uncertainty of the beams increases with the drift.
     """
     p = settings.layout
     origin, direction, covariance = _frame(settings)
-    ex, ey, ez, ea, eb = _DRIFT
+    ex, ey, ez, ea, eb = _TYPICAL_DRIFT
     zs = np.array(p.levels)
     still = np.full(5, p.standoff)
     # Distances to first order: a displacement of the bar towards the sensor reduces the reading.

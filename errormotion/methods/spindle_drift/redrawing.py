@@ -1,4 +1,4 @@
-"""Sources of a drift record or of a detection of beams, drawn anew for the Monte Carlo method."""
+"""Redrawing of the sources of a drift record or of a beam detection for the Monte Carlo method."""
 
 from __future__ import annotations
 
@@ -11,12 +11,7 @@ from errormotion.datasets.files.hashing import DatasetHasher
 from errormotion.methods.spindle_drift.identification.detection import segmented
 from errormotion.methods.spindle_drift.identification.drift import UNSEEN, beams_of
 from errormotion.methods.spindle_drift.identification.frame_expansion import FrameWarming, frame_warming
-from errormotion.methods.spindle_drift.identification.record import (
-    average_record,
-    noise,
-    run_out_at_rest,
-    sensors,
-)
+from errormotion.methods.spindle_drift.identification.record import average_record, noise, run_out_at_rest, sensors
 from errormotion.methods.spindle_drift.identification.uncertainty import REFERENCE
 from errormotion.methods.spindle_drift.schema import CHANNELS
 from errormotion.plugins import Redraw, Redrawing
@@ -28,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
-    """Return the means of a drift record, or the steps of a detection, with their sources."""
+    """Return the means of a drift record, or the steps of a detection, with their sources of uncertainty."""
     return _detection(raw, settings, errors) if "sphere_radius" in raw else _drift(raw, settings, errors)
 
 
@@ -90,7 +85,7 @@ def _means(raw: xr.Dataset, record: Record, mean: Array) -> xr.Dataset:
 
 
 def _shifted(raw: xr.Dataset, name: str, change: Array) -> xr.Dataset:
-    """Return raw data with a variable changed; the change has its order of dimensions."""
+    """Return raw data with a change added to a variable, whose order of dimensions it has."""
     return raw.assign({name: raw[name].copy(data=raw[name].values + change)})
 
 
@@ -102,7 +97,7 @@ def _readings(sigma: Array) -> Redraw:
 
 
 def _beams(covariance: Array, which: str, group: str) -> Redraw:
-    """Return origins and directions by their covariance (5, 6, 6), one draw for the record."""
+    """Return origins and directions drawn from their covariance (5, 6, 6), one draw for the record."""
     size = np.sqrt(np.einsum("cii->ci", covariance))
     unit = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(covariance / (unit[:, :, None] * unit[:, None, :]))
@@ -128,7 +123,7 @@ def _bar_radius(uncertainty: float) -> Redraw:
 
 
 def _changes(changes: Array) -> Redraw:
-    """Return changes of the readings (source, 5, instant), each one draw."""
+    """Return changes of the readings (source, 5, instant), with one draw for each source."""
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         return _shifted(raw, "distance", np.tensordot(generator.normal(size=len(changes)), changes, axes=1)), settings
@@ -146,7 +141,7 @@ def _frame_expansion(relative: float) -> Redraw:
 
 
 def _frame_temperature(warming: FrameWarming, index: int) -> Redraw:
-    """Return the temperature of the frame: the noise of each mean, smoothed as the temperature was."""
+    """Return the temperature of the frame: the noise of each mean, smoothed like the temperature."""
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         temperature = raw["temperature"].transpose("time", "sensor")
@@ -158,7 +153,7 @@ def _frame_temperature(warming: FrameWarming, index: int) -> Redraw:
 
 
 def _unseen_rotation(errors: xr.Dataset) -> Redraw:
-    """Return the rotation about the spindle axis: no reading contains it, it moves a functional point off the axis."""
+    """Return the rotation about the spindle axis: it displaces a functional point off the axis, but no reading."""
     rows = errors["influence"].sel(source=errors["source_group"].values == UNSEEN).transpose("source", "time", "dof")
     effect = np.nan_to_num(rows.values)
 

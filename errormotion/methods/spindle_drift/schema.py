@@ -20,23 +20,11 @@ CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 """Channels of the five-sensor frame."""
 
 _STEPPED_SPHERE = (
-    Row(
-        "sphere_centre",
-        ("channel", "profile", "step", "direction"),
-        "m",
-        *POSITION,
-        "commanded centre of the sphere",
-    ),
+    Row("sphere_centre", ("channel", "profile", "step", "direction"), "m", *POSITION, "commanded centre of the sphere"),
     Row("sphere_radius", (), "m", *RADIUS, "radius of the calibrated sphere"),
     Row("scan_direction", ("channel", "profile", "direction"), "1", *UNIT_VECTOR, "direction of the steps"),
     Row("nominal_origin", ("channel", "direction"), "m", *POSITION, "origin of the beam, from the drawing"),
-    Row(
-        "nominal_direction",
-        ("channel", "direction"),
-        "1",
-        *UNIT_VECTOR,
-        "direction of the beam, from the drawing",
-    ),
+    Row("nominal_direction", ("channel", "direction"), "1", *UNIT_VECTOR, "direction of the beam, from the drawing"),
 )
 
 RAW_SCHEMAS = (
@@ -93,11 +81,9 @@ RAW_SCHEMAS = (
         "beam detection as recorded",
         "scan",
         (
-            Row(
-                "record", ("sample",), "m", *READING, "reading along the beam that is scanned; NaN = none", missing=True
-            ),
+            Row("record", ("sample",), "m", *READING, "reading along the scanned beam; NaN = none", missing=True),
             Row("scan", ("sample",), "", 0, 1000, "number of the scan: channel times profiles plus profile"),
-            Row("attempt", ("sample",), "", 0, 1000, "number of the attempt; the last one counts", required=False),
+            Row("attempt", ("sample",), "", 0, 1000, "number of the attempt; the last one is used", required=False),
             *_STEPPED_SPHERE,
         ),
         sizes={**DIRECTION, "channel": 5},
@@ -118,14 +104,7 @@ RAW_SCHEMAS = (
                 missing=True,
             ),
             *_STEPPED_SPHERE,
-            Row(
-                "distance_noise",
-                (),
-                "m",
-                *NOISE,
-                "standard deviation of one value of `distance`",
-                required=False,
-            ),
+            Row("distance_noise", (), "m", *NOISE, "standard deviation of one value of `distance`", required=False),
         ),
         sizes={**DIRECTION, "channel": 5},
         labels={**XYZ, "channel": CHANNELS},

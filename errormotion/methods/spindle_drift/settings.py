@@ -45,7 +45,7 @@ class Settings(PluginSettings):
     """Settings of ``spindle_drift``."""
 
     procedure: Literal["drift", "beam_detection"] = Field(
-        default="drift", description="what to acquire; identification takes the procedure from the data"
+        default="drift", description="what to acquire; the identification is selected by the data"
     )
 
     # Drift: acquisition
@@ -62,20 +62,20 @@ class Settings(PluginSettings):
     reference_time: Time | None = Field(
         default=None,
         ge=0,
-        description="start of the reference state, since the start of the record; default the first mean, or the first "
-        "mean after spin_up where the record starts together with the spindle",
+        description="start of the reference state, since the start of the record; default: the first mean, or the "
+        "first mean after spin_up where the record starts together with the spindle",
     )
     spin_up: Time = Field(default=1.0, ge=0, description="time in which the spindle reaches another speed")
     reference_average: Time | None = Field(
-        default=None, gt=0, description="length of the reference state; default one mean"
+        default=None, gt=0, description="length of the reference state; default: one mean"
     )
     functional_point: tuple[Length, Length, Length] | None = Field(
         default=None,
-        description="functional point of the errors; default the end of the bar on its axis, rounded to 0.1 mm",
+        description="functional point of the errors; default: the end of the bar on its axis, rounded to 0.1 mm",
     )
     beams: Literal["raw", "nominal"] = Field(
         default="raw",
-        description="beams of the raw dataset (raw), or nominal beams, which shows the effect of the detection",
+        description="beams of the raw dataset (raw), or nominal beams (nominal), to see the effect of the detection",
     )
     nominal_origin_uncertainty: Length = Field(
         default=1e-4, ge=0, description="standard uncertainty of a nominal origin"
@@ -93,9 +93,7 @@ class Settings(PluginSettings):
     )
     frame_temperature: str = Field(default="frame", description="name of the temperature sensor on the measuring frame")
     frame_smoothing: Time = Field(
-        default=180.0,
-        ge=0,
-        description="length of the moving fit that smooths the temperature of the frame",
+        default=180.0, ge=0, description="length of the moving fit that smooths the temperature of the frame"
     )
     frame_expansion_uncertainty: float = Field(
         default=0.1, ge=0, description="relative standard uncertainty of the expansion of the frame"
@@ -106,22 +104,22 @@ class Settings(PluginSettings):
         description="standard deviation of the rotation about the spindle axis, which is not measured",
     )
     running_end: Time | None = Field(
-        default=None, gt=0, description="end of running; default the time at which the spindle stops"
+        default=None, gt=0, description="end of running; default: the time at which the spindle stops"
     )
     iso_average: Time = Field(default=30.0, gt=0, description="averaging time for ranges and end values")
     iso_temperature: str | None = Field(
         default=None,
-        description="temperature sensor for the change per kelvin; default the sensor with the largest change",
+        description="temperature sensor for the change per kelvin; default: the sensor with the largest change",
     )
 
     # Beam detection
     sphere_radius: Length = Field(default=5e-3, gt=0, description="radius of the sphere in the spindle")
     depths: tuple[Length, ...] = Field(
-        default=(0.2e-3, 1.0e-3, 1.8e-3), min_length=1, description="readings at which to scan"
+        default=(0.2e-3, 1.0e-3, 1.8e-3), min_length=1, description="readings at which the sphere is scanned"
     )
     scan_length: Length = Field(default=2e-3, gt=0, description="length of one scan")
     steps: int = Field(default=101, ge=5, description="number of rests of one scan, both ends included")
-    dwell: Time = Field(default=1.0, gt=0, description="rest at each step")
+    dwell: Time = Field(default=1.0, gt=0, description="duration of the rest at each step")
     step_average: Time = Field(default=0.3, gt=0, description="averaging time of a rest, from its middle on")
 
     # Planning

@@ -1,4 +1,4 @@
-"""Raw data of the method, simulated on the virtual machine without instruments: cheap enough for Monte Carlo."""
+"""Raw data of the method, simulated on the virtual machine without instruments: fast enough for Monte Carlo."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Beams = tuple[Array, Array, Array | None]
 DEPTHS = (0.2e-3, 1.0e-3, 1.8e-3)
 """Readings at which a beam detection scans, m."""
 STEPS = 20e-6 * np.arange(-50, 51)
-"""Steps of a scan across the beam, m."""
+"""Positions of the steps of a scan across the beam, m."""
 SAMPLES_PER_REST = 6000
 INSTANTS = 24
-"""Instants of a simulated drift."""
+"""Number of instants of a simulated drift."""
 SPEED = 15000.0
 """Spindle speed of a simulated drift without a schedule, 1/min."""
 BEAM_SIGMA = np.array([0.5e-6] * 3 + [0.4e-3] * 3)
-"""Standard uncertainty of the beams in a simulated drift, as a beam detection attains it: m, rad."""
+"""Standard uncertainty of the beams in a simulated drift, typical of a beam detection: m, rad."""
 
 _M = {"units": "m"}
 _1 = {"units": "1"}
@@ -39,7 +39,7 @@ _XYZ = np.eye(3)
 
 
 def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return raw data of the procedure that the settings name, and the true errors.
+    """Return raw data of the procedure stated in the settings, and the true errors.
 
     A drift has 24 instants, evenly spaced over ``duration``, and the spindle speeds of ``schedule`` (15000 1/min from
     the start where it is empty). The seed selects the machine and the noise.
@@ -48,7 +48,7 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
 
 
 def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:
-    """Return the true errors of the spindle at the times of a drift, whose time 0 was at ``clock`` (s)."""
+    """Return the true errors of the spindle at the times of a drift with its time 0 at ``clock`` (s)."""
     truth = machine.truth_spindle(errors["time"].values + clock, errors.attrs["functional_point"])
     return truth.assign_coords(time=("time", errors["time"].values, {"units": "s"}))
 
@@ -73,7 +73,7 @@ def _machine(seed: int, speeds: tuple[tuple[float, float | None], ...]) -> Virtu
 
 
 def calibrated_beams(machine: VirtualMachine, seed: int) -> Beams:
-    """Return the beams of a machine as a calibration states them: origin, direction (5, 3), covariance (5, 6, 6)."""
+    """Return the beams of a machine with errors of calibration: origin, direction (5, 3), covariance (5, 6, 6)."""
     rng = np.random.default_rng([seed, 1])
     origin = machine.frame.true_origin + BEAM_SIGMA[:3] * rng.normal(size=(5, 3))
     direction = machine.frame.true_direction.copy()
@@ -130,11 +130,11 @@ def raw_drift(
     beams : {"true", "nominal"} or (origin, direction, covariance)
         The beams that the dataset states: (channel, 3) m, (channel, 3), (channel, 6, 6) or None.
     averaged : int
-        Samples in each mean: ``distance_noise`` is that of one sample divided by the root of this; so is the noise.
+        Number of samples in each mean: the noise and ``distance_noise`` are those of one sample divided by its root.
     expansion : bool
-        Whether the readings include the expansion of the frame; without it they are as if compensated perfectly.
+        Whether the readings include the expansion of the frame; without it they are perfectly compensated.
     warm_up : bool
-        Whether the readings include the warm-up of the sensors; zero in a warm machine.
+        Whether the readings include the warm-up of the sensors, which is zero in a warm machine.
     radius_error : bool
         Whether the dataset states the certified radius of the bar instead of the true one.
 
@@ -153,7 +153,7 @@ def raw_drift(
         "nominal": (frame.nominal_origin, frame.nominal_direction, None),
     }
     if isinstance(beams, str) and beams not in known:
-        raise BenchError(f"The beams are 'true', 'nominal' or (origin, direction, covariance); found {beams!r}.")
+        raise BenchError(f"beams: expected 'true', 'nominal' or (origin, direction, covariance); found {beams!r}.")
     origin, direction, covariance = known[beams] if isinstance(beams, str) else beams
     variables: dict[str, Any] = {
         "distance": (("channel", "time"), readings, _M),
@@ -180,15 +180,15 @@ def raw_drift(
 def raw_beam_detection(machine: VirtualMachine, *, seed: int) -> xr.Dataset:
     """Return a raw dataset of a beam detection in the cold state, one mean reading per rest of the sphere.
 
-    The seed is that of positions and speckle; the machine does not change.
+    The seed determines positions and speckle, not the machine.
     """
     frame, radius = machine.frame, machine.sphere_radius
     rng = np.random.default_rng(seed)
     centres, scans = _scan_plan(frame, radius)
-    there = centres + rng.normal(0, REPEATABILITY, centres.shape)
+    actual = centres + rng.normal(0, REPEATABILITY, centres.shape)
     beams = (frame.true_origin[:, None, None, :], frame.true_direction[:, None, None, :])
     noise = np.hypot(SPECKLE, frame.noise / np.sqrt(SAMPLES_PER_REST))[:, None, None]
-    readings = intersections.to_sphere(*beams, there, radius) + noise * rng.normal(size=centres.shape[:-1])
+    readings = intersections.to_sphere(*beams, actual, radius) + noise * rng.normal(size=centres.shape[:-1])
     readings[~((readings >= 0) & (readings <= frame.range))] = np.nan
     variables = {
         "distance": (("channel", "profile", "step"), readings, _M),
@@ -206,14 +206,14 @@ def raw_beam_detection(machine: VirtualMachine, *, seed: int) -> xr.Dataset:
 def _scan_plan(frame: FrameGeometry, sphere_radius: float) -> tuple[Array, Array]:
     """Return commanded centres (channel, profile, step, 3), m, and scan directions (channel, profile, 3).
 
-    Six profiles a channel: at three depths of the range, in both machine directions across the beam.
+    Each channel has six profiles: at three depths of the range, in both machine directions across the beam.
     """
     centres, directions = [], []
     for origin, beam in zip(frame.nominal_origin, frame.nominal_direction, strict=True):
         across = [axis for axis in _XYZ if abs(axis @ beam) < 0.5]
         scans = np.array([axis for _ in DEPTHS for axis in across])
-        ahead = np.repeat(DEPTHS, len(across)) + sphere_radius
-        middle = origin + ahead[:, None] * beam
+        distance = np.repeat(DEPTHS, len(across)) + sphere_radius
+        middle = origin + distance[:, None] * beam
         centres.append(middle[:, None, :] + STEPS[:, None] * scans[:, None, :])
         directions.append(scans)
     return np.array(centres), np.array(directions)

@@ -11,19 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
 
-#: of a ball, m: nominal radius; largest deviation of the true one; roundness from peak to valley
+#: Nominal radius of a ball, largest deviation of the true one, and roundness from peak to valley, m.
 RADIUS, RADIUS_ERROR, FORM = 12.5e-3, 3e-6, 0.5e-6
-#: deviation of a ball's position from its nominal one, m (one sigma, each coordinate; at most three times that)
-PLACING = 0.1e-3
-#: positions of the balls as a share of the travel: X and Y from the middle, Z from the lowest position
-PLACES = (
+#: Deviation of a ball's position from its nominal one, m (one sigma, each coordinate; at most three sigma).
+POSITION_DEVIATION = 0.1e-3
+#: Positions of the balls as a share of the travel: X and Y from the middle, Z from the lowest position.
+POSITIONS = (
     *((-0.8, -0.8, 0.12), (0.8, -0.75, 0.50), (0.75, 0.8, 0.20), (-0.8, 0.75, 0.62)),
     *((0.0, 0.0, 0.35), (0.1, -0.8, 0.15), (-0.1, 0.8, 0.45), (0.4, 0.1, 0.55)),
 )
 
-#: of the probe, m: nominal radius of its tip; largest deviation of the true one; scatter of a trigger
+#: Nominal radius of the probe's tip, largest deviation of the true one, and scatter of a trigger, m.
 TIP_RADIUS, TIP_ERROR, NOISE = 3e-3, 1e-6, 0.25e-6
-#: pre-travel, m: its mean, and the amplitude of its three lobes
+#: Mean of the pre-travel, and amplitude of its three lobes, m.
 PRETRAVEL, LOBING = 8e-6, 1.5e-6
 
 
@@ -40,7 +40,7 @@ class Balls:
     nominal_radius : float
         m.
     radius : ndarray, (ball,)
-        Mean radius of each, m.
+        Mean radius of each ball, m.
     form : ndarray, (ball, 3, 3)
         The surface is ``n @ form @ n`` above the mean radius in the direction n, m.
     """
@@ -60,20 +60,16 @@ class Balls:
         return [f"B{i + 1}" for i in range(len(self))]
 
     def first(self, count: int) -> Balls:
-        """Return the first ones."""
+        """Return the first ``count`` balls."""
         if not 1 <= count <= len(self):
             raise BenchError(f"expected 1 to {len(self)} balls; found {count}")
         part = slice(count)
         return replace(
-            self,
-            nominal=self.nominal[part],
-            centre=self.centre[part],
-            radius=self.radius[part],
-            form=self.form[part],
+            self, nominal=self.nominal[part], centre=self.centre[part], radius=self.radius[part], form=self.form[part]
         )
 
     def moved(self, ball: int, shift: ArrayLike) -> Balls:
-        """Return the same balls, one of them (counted from 0) displaced by ``shift`` (3,), m."""
+        """Return the balls with one of them (counted from 0) displaced by ``shift`` (3,), m."""
         if not 0 <= ball < len(self):
             raise BenchError(f"expected the number of a ball, 0 to {len(self) - 1}; found {ball}")
         centre = self.centre.copy()
@@ -90,9 +86,8 @@ class Balls:
 class Probe:
     """A touch-trigger probe.
 
-    After the contact the machine moves on by the pre-travel before the probe trips; it is a little longer where
-    the three contacts of the probe's seat are stiffer. It is positive, so measured spheres appear
-    smaller by its mean.
+    After the contact the machine moves by the pre-travel before the probe trips. The pre-travel is larger in the
+    directions of the three contacts of the probe's seat. It is positive: measured spheres appear smaller by its mean.
 
     Attributes
     ----------
@@ -114,9 +109,9 @@ class Probe:
     phase: float
 
     def pretravel(self, normal: ArrayLike) -> Array:
-        """Return the pre-travel for outward unit normals (n, 3) of the surface that is touched, m, shape (n,).
+        """Return the pre-travel for outward unit normals (n, 3) of the touched surface, m, shape (n,).
 
-        ``mean + lobing sin(theta)^3 cos(3 (azimuth - phase))``, theta from the axis of the spindle: without lobes along
+        ``mean + lobing sin(theta)^3 cos(3 (azimuth - phase))``, with theta from the axis of the spindle: no lobes along
         the stylus.
         """
         n = np.atleast_2d(np.asarray(normal, dtype=float))
@@ -125,13 +120,13 @@ class Probe:
 
 
 def seeded_balls(rng: np.random.Generator, travel: Mapping[str, tuple[float, float]]) -> Balls:
-    """Return all balls, spread over the travel at different heights."""
+    """Return all balls, distributed over the travel at different heights."""
     low, high = np.array([travel.get(axis, (0.0, 0.0)) for axis in "XYZ"]).T
-    share = np.array(PLACES)
+    share = np.array(POSITIONS)
     share[:, :2] = (1 + share[:, :2]) / 2
     nominal = low + share * (high - low)
     count = len(nominal)
-    off = np.clip(rng.normal(0, PLACING, (count, 3)), -3 * PLACING, 3 * PLACING)
+    off = np.clip(rng.normal(0, POSITION_DEVIATION, (count, 3)), -3 * POSITION_DEVIATION, 3 * POSITION_DEVIATION)
     radius = RADIUS + rng.uniform(-RADIUS_ERROR, RADIUS_ERROR, count)
     form = rng.normal(size=(count, 3, 3))
     form += form.transpose(0, 2, 1)
@@ -141,7 +136,7 @@ def seeded_balls(rng: np.random.Generator, travel: Mapping[str, tuple[float, flo
 
 
 def seeded_probe(rng: np.random.Generator) -> Probe:
-    """Return a good probe."""
+    """Return a probe with the deviations of a good one."""
     mean, lobing = PRETRAVEL * rng.uniform(0.9, 1.1), LOBING * rng.uniform(0.9, 1.1)
     tip = TIP_RADIUS + rng.uniform(-TIP_ERROR, TIP_ERROR)
     return Probe(TIP_RADIUS, tip, NOISE, mean, lobing, rng.uniform(0, 2 * np.pi / 3))

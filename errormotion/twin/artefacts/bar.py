@@ -10,7 +10,7 @@ from errormotion.arrays import Array
 from errormotion.twin import intersections
 
 RADIUS = 5e-3
-#: angles in the table of what repeats in every turn, and the highest harmonic in it
+#: Number of angles in the table of the pattern that repeats in every turn, and its highest harmonic.
 ANGLES = 1024
 HARMONICS = 36
 
@@ -32,11 +32,11 @@ class Bar:
     wobble : ndarray, (2,)
         Inclination of the bar's axis to the axis of rotation about x and y at turn 0, rad.
     face_tilt : ndarray, (2,)
-        Inclination of the end face to the plane across the axis of rotation, at turn 0, rad.
+        Inclination of the end face to the plane perpendicular to the axis of rotation, at turn 0, rad.
     axial_runout : float
         Amplitude of the axial motion once per turn, m.
     texture : ndarray, (channel, ANGLES)
-        Roughness and speckle along the track of each beam, m, without a mean.
+        Roughness and speckle along the track of each beam, m, with mean 0.
     """
 
     radius: float
@@ -77,26 +77,26 @@ class Bar:
             Axis of rotation, m, unit.
         """
         angle = 2 * np.pi * np.arange(ANGLES) / ANGLES
-        turned = np.stack([np.cos(angle), np.sin(angle), np.zeros(ANGLES)], axis=-1)
-        ahead = np.stack([-np.sin(angle), np.cos(angle), np.zeros(ANGLES)], axis=-1)
+        x = np.stack([np.cos(angle), np.sin(angle), np.zeros(ANGLES)], axis=-1)  # axes that rotate with the spindle
+        y = np.stack([-np.sin(angle), np.cos(angle), np.zeros(ANGLES)], axis=-1)
 
-        def leaning(tilt: Array) -> Array:  # unit z tilted by two angles, turning with the spindle, about the axis
-            lean = axis + tilt[1] * turned - tilt[0] * ahead
-            return np.asarray(lean / np.linalg.norm(lean, axis=-1, keepdims=True))
+        def tilted(tilt: Array) -> Array:  # the axis of rotation tilted by two angles that rotate with the spindle
+            vector = axis + tilt[1] * x - tilt[0] * y
+            return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
 
-        start = np.cos(self.eccentricity_angle) * turned + np.sin(self.eccentricity_angle) * ahead
+        start = np.cos(self.eccentricity_angle) * x + np.sin(self.eccentricity_angle) * y
         centre = point + self.eccentricity * start
         face = point + self.axial_runout * np.cos(angle)[:, None] * axis
         o, u = origin[:, None, :], direction[:, None, :]
-        side = intersections.to_cylinder(o[:-1], u[:-1], centre, leaning(self.wobble), self.radius)
-        end = intersections.to_plane(o[-1:], u[-1:], face, leaning(self.face_tilt))
+        side = intersections.to_cylinder(o[:-1], u[:-1], centre, tilted(self.wobble), self.radius)
+        end = intersections.to_plane(o[-1:], u[-1:], face, tilted(self.face_tilt))
         readings = np.concatenate([side, end])
         pattern = readings - self.still_readings(o, direction, point[None], axis[None]) + self.texture
         return np.concatenate([pattern, pattern[:, :1]], axis=1)
 
 
 def seeded_texture(rng: np.random.Generator, channels: int, sigma: float) -> Array:
-    """Return a band-limited pattern around the bar with this standard deviation and no mean, (channels, ANGLES)."""
+    """Return a band-limited pattern around the bar with this standard deviation and mean 0, (channels, ANGLES)."""
     harmonic = np.zeros((channels, ANGLES // 2 + 1), dtype=complex)
     harmonic[:, 1 : HARMONICS + 1] = rng.normal(size=(channels, HARMONICS)) + 1j * rng.normal(
         size=(channels, HARMONICS)

@@ -15,7 +15,8 @@ from errormotion.twin.artefacts import surfaces
 
 Surface = Callable[[Array, Array], ArrayLike]
 
-#: distance of the knots of a free form, m, and their number beyond the outline: effects of the end fall by 0.27 a knot
+#: Distance of the knots of a free form, m, and their number beyond the outline; effects of the ends decrease by a
+#: factor of 0.27 for each knot.
 KNOTS = 0.1e-3
 MARGIN = 20
 
@@ -65,7 +66,7 @@ def freeform(z: Surface, half_size: tuple[float, float] = (22e-3, 30e-3), *, nam
     Parameters
     ----------
     z : callable
-        Takes x and y, arrays of one shape in m, and returns heights in m; also up to 2 mm beyond the outline.
+        Function of arrays x and y of one shape, m, that returns heights, m; also up to 2 mm beyond the outline.
     half_size : (float, float)
         Half of the size in x and y, m.
     name : str

@@ -11,9 +11,9 @@ from errormotion.errors import BenchError
 from errormotion.kinematics.beams import turned
 from errormotion.twin import kernels
 
-#: radius and length of the check bar by its certificate, m, and deviation of the true radius (one sigma), m
+#: Radius and length of the check bar in its certificate, m, and deviation of the true radius, m (one sigma).
 BAR_RADIUS, BAR_LENGTH, BAR_RADIUS_ERROR = 25e-3, 0.2, 0.3e-6
-#: deviation of the bar from the machine's axis, rad (one sigma, each direction)
+#: Deviation of the bar from the machine's axis, rad (one sigma, each direction).
 BAR_MISALIGNMENT = 0.2e-3
 
 
@@ -58,7 +58,7 @@ class CheckBar:
     nominal_axis : ndarray, (3,)
         Nominal direction.
     radius, certified_radius : float
-        True, and in the certificate, m.
+        True radius, and that in the certificate, m.
     length : float
         m.
     """
@@ -88,14 +88,14 @@ Target = Plane | CheckBar
 
 @dataclass(frozen=True)
 class SineGauge:
-    """A sine gauge on a turntable about Z: its face at any inclination and rotation goes nearly through one point.
+    """A sine gauge on a turntable about Z: its face contains nearly the same point at all inclinations and rotations.
 
     Attributes
     ----------
     seed : int
-        Of the deviations of each setting.
+        Seed of the deviations of each setting.
     pivot : ndarray, (3,)
-        That point, m.
+        This point, m.
     point_uncertainty : float
         Deviation of the face along its normal, independent at every setting, m (one sigma).
     angle_uncertainty : float
@@ -103,7 +103,7 @@ class SineGauge:
     reach : float
         Radius of the face about the pivot, m.
     steepest : float
-        Greatest inclination, rad.
+        Largest inclination, rad.
     """
 
     seed: int

@@ -1,7 +1,7 @@
 """The compiled loops of the line profiler: surfaces, rays on them, and the disturbances of a real sensor.
 
-A surface is a number for its shape, a vector of parameters and a table: all shapes share one loop without a call back
-into Python. All lengths are metres, in the frame of the artefact: z up, 0 in the middle of its top.
+A surface consists of a number for its shape, a vector of parameters and a table, so that one loop without calls into
+Python evaluates all shapes. All lengths are in metres, in the frame of the artefact: z up, 0 in the middle of its top.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.twin.kernels import compiled, mixed, normal
 
-#: shapes
+#: Shapes.
 FREEFORM, PLANE, SPHERE, POCKET = 0, 1, 2, 3
-#: parameters: half size in x and y; then of the free form x0, y0 (of the first coefficient) and knots per metre,
-#: of the sphere its radius, of the pocket radius, depth and spot
+#: Number of parameters: half size in x and y; then for the free form x0, y0 (of the first coefficient) and knots per
+#: metre, for the sphere its radius, for the pocket radius, depth and spot.
 PARAMETERS = 5
-#: Newton's iteration on a ray: largest last step, m, and largest number of steps
+#: Newton's iteration on a ray: largest last step, m, and largest number of steps.
 STEP, STEPS = 1e-13, 20
 
 _ROOT_2 = math.sqrt(2.0)
@@ -91,9 +91,9 @@ def edge_distance(shape: int, p: Array, x: float, y: float) -> float:
 
 @compiled
 def _pocket(p: Array, pose: Array, x: float) -> tuple[float, float, float]:
-    """Return where a ray meets a pocket: z in the profiler's frame, and x, y in the artefact's at the rim.
+    """Return the point of a ray on a pocket: z in the profiler's frame, and x, y at the rim in the artefact's frame.
 
-    Across the rim, the reading is the mean of both levels, weighted by the shares of the spot.
+    At the rim, the reading is the mean of both levels, weighted by the shares of the spot.
     """
     z = -(pose[2, 3] + pose[2, 0] * x) / pose[2, 2]
     qx = pose[0, 0] * x + pose[0, 2] * z + pose[0, 3]
@@ -181,7 +181,7 @@ def scan(
     out : ndarray, (line, point)
         Heights, m; NaN = none.
     sizes : ndarray, (11,)
-        Noise, jitter of a line in z, speckle (m), correlation of neighbouring points' speckle, greatest slope,
+        Noise, jitter of a line in z, speckle (m), correlation of the speckle of neighbouring points, largest slope,
         lift at an edge and its range (m), share of points lost at an edge, share of outliers and their spread
         (m), share of points lost elsewhere.
     low, high : float

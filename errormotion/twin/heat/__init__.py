@@ -1,1 +1,1 @@
-"""Heat of the virtual machine: a thermal network, and the state that follows from a schedule."""
+"""Heat of the virtual machine: a thermal network, and the thermal state under a schedule."""

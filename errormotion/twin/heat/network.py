@@ -1,9 +1,9 @@
 """Heat in the machine: a network of lumped bodies, solved in closed form.
 
-The bodies obey ``C dT/dt = -G T + g T_ambient + h P``: C heat capacities (J/K), G conductances among the bodies and to
-the air (W/K), g conductances to the air, h the share of each body in the spindle's heat P (W). The eigenvectors of
-C^-1/2 G C^-1/2 decouple it into first-order lags, for which the response to a piecewise constant P and to a sinusoidal
-T_ambient is known exactly: temperatures at any time need no time stepping.
+The equation is ``C dT/dt = -G T + g T_ambient + h P``, with C the heat capacities (J/K), G the conductances among the
+bodies and to the air (W/K), g the conductances to the air, and h the share of each body in the spindle's heat P (W).
+The eigenvectors of C^-1/2 G C^-1/2 decouple it into first-order lags, whose response to a piecewise constant P and to a
+sinusoidal T_ambient is known exactly: temperatures at any time need no time steps.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Ambient:
 
 @dataclass(frozen=True)
 class ThermalNetwork:
-    """Bodies that heat one another.
+    """Bodies that exchange heat.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class ThermalNetwork:
         to_air: Mapping[str, float],
         heat_share: Mapping[str, float],
     ) -> ThermalNetwork:
-        """Build from tables by name (J/K, W/K, W/K, 1)."""
+        """Return a network from tables by name (J/K, W/K, W/K, 1)."""
         names = tuple(capacity)
         conductance = np.zeros((len(names), len(names)))
         for one, other, value in links:
@@ -126,7 +126,7 @@ class ThermalNetwork:
         return cls(names, c, conductance, g, h)
 
     def heating(self, t: ArrayLike, times: Array, power: Array) -> Array:
-        """Return the rise of each body by the spindle's heat ``power`` (W, from ``times`` on), K, shape (n, body)."""
+        """Return the temperature rise due to the spindle's heat ``power`` (W, from ``times`` on), K, (n, body)."""
         return _combine(lag_response(t, self.rates, times, power) * self._heat, self._modes)
 
     def air_response(self, t: ArrayLike, ambient: Ambient) -> Array:
@@ -138,7 +138,7 @@ class ThermalNetwork:
 
 
 def _combine(values: Array, weights: Array) -> Array:
-    """Return values @ weights.T, (n, k) with (m, k), in an order of summation that does not depend on n."""
+    """Return values @ weights.T, (n, k) and (m, k), in an order of summation that does not depend on n."""
     out = np.zeros((values.shape[0], weights.shape[0]))
     for k in range(values.shape[1]):
         out += values[:, k, None] * weights[:, k]

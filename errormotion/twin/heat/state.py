@@ -34,8 +34,8 @@ class ThermalState:
     schedule : Schedule
         The commands.
     offset : (times, offsets), optional
-        What a compensation adds to the commands: times (n,), s, and X, Y, Z, (n, 3), m; linear between, constant
-        before and after.
+        Offsets that a compensation adds to the commands: times (n,), s, and X, Y, Z, (n, 3), m; linear between,
+        constant before and after.
     """
 
     kind: MachineKind
@@ -74,8 +74,8 @@ class ThermalState:
 
     def warming(self, body: str, t: ArrayLike) -> Array:
         """Return the temperature rise of a body since the cold state, K, shape (n,)."""
-        place = self.network.names.index(body)
-        return np.asarray(self.bodies(t)[:, place] - self._cold[place])
+        index = self.network.names.index(body)
+        return np.asarray(self.bodies(t)[:, index] - self._cold[index])
 
     def correction_at(self, t: ArrayLike) -> Array:
         """Return the full correction of X, Y, Z by the control's model, m, shape (n, 3)."""
@@ -84,7 +84,7 @@ class ThermalState:
         return np.asarray(lag_response(t, rates, self.schedule.speed_times, load) * rates * self.correction)
 
     def twist(self, t: ArrayLike) -> Array:
-        """Return the spindle's thermal error at the end of the bar, m and rad, shape (n, 6), 0 in the cold state."""
+        """Return the spindle's thermal error at the end of the bar, m and rad, shape (n, 6); 0 in the cold state."""
         return self.twist_and_turn(t)[0]
 
     def twist_and_turn(self, t: ArrayLike) -> tuple[Array, Array]:
@@ -113,7 +113,7 @@ def seeded_ambient(rng: np.random.Generator) -> Ambient:
 
 
 def seeded_state(kind: MachineKind, rng: np.random.Generator, schedule: Schedule) -> ThermalState:
-    """Return the thermal side of one machine: the tables, with amplitudes within 1.5 percent."""
+    """Return the thermal state of one machine: the tables, with amplitudes varied by up to 1.5 percent."""
     network = ThermalNetwork.of(kind.capacity, kind.links, kind.to_air, kind.heat_share)
     growth = np.array([[kind.growth[dof].get(body, 0.0) * 1e-6 for body in network.names] for dof in _DOF])
     growth *= rng.uniform(0.985, 1.015, (6, 1))

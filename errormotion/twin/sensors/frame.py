@@ -11,22 +11,22 @@ from errormotion.arrays import Array
 
 CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 RANGE = 2e-3
-#: z of the levels L1 and L2, m
+#: z of the levels L1 and L2, m.
 LEVELS = (0.010, 0.050)
-#: expansion of the frame per kelvin at the sensors looking along X, Y, Z, m/K
+#: Expansion of the frame per kelvin at the sensors that measure along X, Y, Z, m/K.
 EXPANSION = (2.1e-6, 2.4e-6, 1.3e-6)
-#: deviation of the true expansion of a frame from the drawing, relative (one sigma)
+#: Relative deviation of the true expansion of a frame from the drawing (one sigma).
 EXPANSION_SPREAD = 0.1
-#: rise of a sensor's reading after it is switched on, m, and its time constant, s: settled after two hours
+#: Rise of a sensor's reading after switching on, m, and its time constant, s: settled after two hours.
 WARM_UP = 10.5e-6
 WARM_UP_TIME = 1440.0
-#: white noise of one sample, m
+#: White noise of one sample, m.
 NOISE = 0.3e-6
 
 
 @dataclass(frozen=True)
 class FrameGeometry:
-    """Five beams; a reading d puts a surface point at origin + d direction, in machine coordinates.
+    """Five beams; a reading d means a surface point at origin + d direction, in machine coordinates.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class FrameGeometry:
     warm_up_time : float
         Its time constant, s.
     expansion, true_expansion : ndarray, (channel, 3)
-        Displacement of the origins per kelvin of the frame, m/K: of the drawing, and true (10 % off, one sigma).
+        Displacement of the origins per kelvin of the frame, m/K: in the drawing, and true (deviation 10 %, one sigma).
     """
 
     channels: tuple[str, ...]
@@ -69,7 +69,7 @@ class FrameGeometry:
         return np.asarray(self.true_origin[:, None, :] + self.true_expansion[:, None, :] * rise[:, None])
 
     def warm_up_offset(self, since_on: ArrayLike) -> Array:
-        """Return the readings less their settled values, m (not positive), shape (channel, n)."""
+        """Return the readings minus their settled values, m (not positive), shape (channel, n)."""
         age = np.asarray(since_on, dtype=float) / self.warm_up_time
         return np.asarray(-self.warm_up[:, None] * np.exp(-age))
 
@@ -84,9 +84,9 @@ def nominal_beams(bar_radius: float) -> tuple[Array, Array]:
 
 
 def seeded_frame(rng: np.random.Generator, bar_radius: float) -> FrameGeometry:
-    """Return a frame whose beams are off by about 0.1 mm across, 0.03 mm along, and 5 mrad.
+    """Return a frame whose beams deviate by about 0.1 mm laterally, 0.03 mm along the beam, and 5 mrad.
 
-    Along the beam the error is small because the sensors are set to mid-range on the machine.
+    Along the beam the deviation is small, because the sensors are adjusted to mid-range on the machine.
     """
     origin, direction = nominal_beams(bar_radius)
     across = np.clip(rng.normal(0, 0.1e-3, origin.shape), -0.15e-3, 0.15e-3)

@@ -12,17 +12,17 @@ from errormotion.kinematics.beams import tilt, turned
 from errormotion.twin.artefacts.planes import Target
 from errormotion.twin.sensors.triangulation import Optics, key_of, speckle
 
-#: nominal position of the zero point with the stage at 0, m
+#: Nominal position of the zero point with the stage at 0, m.
 NOMINAL_ORIGIN = (0.05, 0.0, -0.08)
-#: nominal angle of the beam to -Z, rad
-NOMINAL_LEAN = np.radians(20.0)
-#: deviation of the beam: zero point in each direction, m; direction, rad; about itself, rad (one sigma)
-OFF_ORIGIN, OFF_DIRECTION, OFF_ROLL = 0.1e-3, np.radians(0.3), np.radians(0.5)
+#: Nominal angle of the beam to -Z, rad.
+NOMINAL_TILT = np.radians(20.0)
+#: Deviation of the beam: zero point in each direction, m; direction, rad; rotation about itself, rad (one sigma).
+ORIGIN_DEVIATION, DIRECTION_DEVIATION, ROLL_DEVIATION = 0.1e-3, np.radians(0.3), np.radians(0.5)
 
 
 @dataclass(frozen=True)
 class PointSensor:
-    """A beam from a zero point along a direction; a reading d puts a surface point at origin + stage + d direction.
+    """A beam from a zero point along a direction; a reading d means a surface point at origin + stage + d direction.
 
     Depth is the true distance from the zero point.
 
@@ -32,7 +32,7 @@ class PointSensor:
         Nominal: point where the reading is 0 with the stage at 0, m; unit vector from the sensor to the target;
         unit normal of the plane of emitted and received beam.
     true_origin, true_direction, triangulation_normal : ndarray, (3,)
-        The same, true.
+        The true ones.
     range : (low, high)
         Measuring range in depth, m.
     optics : Optics
@@ -40,8 +40,7 @@ class PointSensor:
     noise : float
         White noise of one reading, m (one sigma).
     speckle, speckle_length : float
-        Effect of the surface's texture on a reading, m (one sigma), and the path over it on which the effect
-        loses its correlation, m.
+        Effect of the surface texture on a reading, m (one sigma), and its correlation length on the surface, m.
     warm_up, warm_up_time : float
         Rise of the reading after switching on, m, and its time constant, s.
     """
@@ -66,7 +65,7 @@ class PointSensor:
         return (self.range[0] + self.range[1]) / 2
 
     def from_start(self, measuring_range: float) -> PointSensor:
-        """Return the same beam of a sensor with another range, whose readings count from the start of the range, m."""
+        """Return the beam as that of a sensor with another range, whose readings are relative to its start, m."""
         shift = self.mid_range - measuring_range / 2
         return replace(
             self,
@@ -89,9 +88,9 @@ class PointSensor:
         stage : ndarray, (n, 3)
             Positions of the stage, m.
         inclination_error : bool
-            Whether the tilt of the surface has its effect.
+            Whether the tilt of the surface has an effect.
         beyond : bool
-            Whether a surface before or behind the range reads as minus or plus infinity, and not as NaN.
+            Whether the reading of a surface before or after the range is minus or plus infinity instead of NaN.
 
         Returns
         -------
@@ -113,24 +112,24 @@ class PointSensor:
         Parameters
         ----------
         key : tuple of int
-            Of the texture; each target has its own.
+            Key of the texture, different for each target.
         stage : ndarray, (n, 3)
-            Positions of the sensor relative to the target, m, across it and towards it.
+            Positions of the sensor relative to the target, m.
         """
         return self.speckle * speckle(key_of(*key), stage, self.speckle_length)
 
     def warm_up_offset(self, since_on: ArrayLike) -> Array:
-        """Return the readings less their settled values, m (not positive)."""
+        """Return the readings minus their settled values, m (not positive)."""
         return np.asarray(-self.warm_up * np.exp(-np.asarray(since_on, dtype=float) / self.warm_up_time))
 
 
-def seeded_point_sensor(rng: np.random.Generator, lean: float = NOMINAL_LEAN, azimuth: float = 0.0) -> PointSensor:
+def seeded_point_sensor(rng: np.random.Generator, lean: float = NOMINAL_TILT, azimuth: float = 0.0) -> PointSensor:
     """Return a sensor whose beam deviates from nominal by about 0.1 mm and 0.3 deg.
 
     Parameters
     ----------
     rng : Generator
-        Of the individual.
+        Selects the individual.
     lean : float
         Angle of the nominal beam to -Z, rad.
     azimuth : float
@@ -140,10 +139,10 @@ def seeded_point_sensor(rng: np.random.Generator, lean: float = NOMINAL_LEAN, az
     nominal = np.sin(lean) * towards - np.cos(lean) * np.array([0.0, 0.0, 1.0])
     plane = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     origin = np.array(NOMINAL_ORIGIN)
-    direction = turned(nominal, OFF_DIRECTION * _limited(rng, 2))
+    direction = turned(nominal, DIRECTION_DEVIATION * _limited(rng, 2))
     rolled = plane - (plane @ direction) * direction
     rolled /= np.linalg.norm(rolled)
-    rolled = rolled + OFF_ROLL * float(_limited(rng, 1)[0]) * np.cross(direction, rolled)
+    rolled = rolled + ROLL_DEVIATION * float(_limited(rng, 1)[0]) * np.cross(direction, rolled)
     optics = Optics(
         roughness=float(rng.uniform(0.5, 0.6)),
         glossy=float(rng.uniform(0.3, 0.4)),
@@ -154,7 +153,7 @@ def seeded_point_sensor(rng: np.random.Generator, lean: float = NOMINAL_LEAN, az
         nominal_origin=origin,
         nominal_direction=nominal,
         nominal_triangulation_normal=plane,
-        true_origin=origin + OFF_ORIGIN * _limited(rng, 3),
+        true_origin=origin + ORIGIN_DEVIATION * _limited(rng, 3),
         true_direction=direction,
         triangulation_normal=rolled / np.linalg.norm(rolled),
         optics=optics,
@@ -163,5 +162,5 @@ def seeded_point_sensor(rng: np.random.Generator, lean: float = NOMINAL_LEAN, az
 
 
 def _limited(rng: np.random.Generator, n: int) -> Array:
-    """Return normal numbers within 2."""
+    """Return standard normal numbers limited to -2 .. 2."""
     return np.clip(rng.normal(size=n), -2.0, 2.0)

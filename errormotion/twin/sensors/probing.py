@@ -25,11 +25,11 @@ from errormotion.twin.heat.state import ThermalState
 
 ErrorAt = Callable[[Array], Array]
 
-#: default number of balls on the table
+#: Default number of balls on the table.
 BALLS = 4
-#: noise of a temperature sensor, K (one sigma)
+#: Noise of a temperature sensor, K (one sigma).
 TEMPERATURE_NOISE = 0.02
-#: distance of the tip from a ball at which the probe is released, m
+#: Distance of the tip from a ball at which the probe is released, m.
 RELEASE = 3e-6
 
 _TRIGGER, _THERMOMETER = 60, 61
@@ -98,7 +98,7 @@ class ProbeMeasurements:
         return self.spindle_functional_point
 
     def balls_on_table(self, count: int = BALLS) -> Balls:
-        """Return 1 to 8 balls; the first ones are always the same."""
+        """Return the first ``count`` balls, 1 to 8."""
         return self._all_balls.first(count)
 
     def probe_error(self, p: ArrayLike, t: ArrayLike) -> Array:
@@ -111,24 +111,23 @@ class ProbeMeasurements:
         t : (n,) or scalar
             s.
         """
-        places = np.atleast_2d(np.asarray(p, dtype=float))
         times = np.atleast_1d(np.asarray(t, dtype=float))
-        return self._error_at(times)(places)
+        return self._error_at(times)(np.atleast_2d(np.asarray(p, dtype=float)))
 
     def truth_probing(self, t: ArrayLike, functional_point: ArrayLike | None = None) -> xr.Dataset:
         """Return the thermal error that probing can determine, as an error dataset over ``time``, without uncertainty.
 
         EX, EY, EZ are the displacement of the tip at ``functional_point``; EA, EB, EC the rotation of the frame of the
-        axes. A tilt of the spindle behind the last axis displaces all balls equally and is in the displacement only.
-        On a machine whose table moves, call this for each functional point: the error there is not the rigid motion of
-        the one at another point.
+        axes. A tilt of the spindle relative to the last axis displaces all balls equally and affects the displacement
+        only. On a machine whose table moves, the errors at two functional points are not related by a rigid motion:
+        call this method for each point.
 
         Parameters
         ----------
         t : (n,)
             Times, s, increasing.
         functional_point : (3,), optional
-            Commanded position of the tip, m; ``probing_functional_point`` where not given.
+            Commanded position of the tip, m; by default ``probing_functional_point``.
         """
         times = np.atleast_1d(np.asarray(t, dtype=float))
         point = self.probing_functional_point if functional_point is None else np.asarray(functional_point, dtype=float)
@@ -146,7 +145,7 @@ class ProbeMeasurements:
     def thermal_twist(self, p: ArrayLike, t: ArrayLike) -> Array:
         """Return the thermal error of the tool at commanded positions p and times t, m and rad, shape (n, 6).
 
-        The displacement is that of the end of the bar, the rotation that of the spindle: relative to the cold state.
+        It is the displacement of the end of the bar and the rotation of the spindle, relative to the cold state.
 
         Parameters
         ----------
@@ -160,26 +159,26 @@ class ProbeMeasurements:
         displacement = twist[:, :3] + np.cross(turn, lever)
         return np.hstack([displacement, np.broadcast_to(twist[:, 3:], displacement.shape)])
 
-    def _carried(self, place: Array) -> Array:
-        """Return M (p - f): the lever that rotates with the frame of the axes, m."""
+    def _carried(self, position: Array) -> Array:
+        """Return M (p - f), the lever that rotates with the frame of the axes, m."""
         carried = np.array([axis in self.tool_axes for axis in "XYZ"], dtype=float)
-        return np.asarray(carried * (place - self.probing_functional_point))
+        return np.asarray(carried * (position - self.probing_functional_point))
 
     def _error_at(self, times: Array) -> ErrorAt:
         """Return the error of the tip at given times as a function of its commanded positions (n, 3)."""
         twist, turn = self.state.twist_and_turn(times)
 
-        def error(places: Array) -> Array:
-            return np.asarray(twist[:, :3] + np.cross(turn, self._carried(places)) + self.geometry.displacement(places))
+        def error(p: Array) -> Array:
+            return np.asarray(twist[:, :3] + np.cross(turn, self._carried(p)) + self.geometry.displacement(p))
 
         return error
 
     # ------------------------------------------------------------------ contacts
 
     def probe_gap(self, p: ArrayLike, t: ArrayLike, *, balls: Balls | None = None) -> Array:
-        """Return the distance of the tip from tripping on the nearest ball, m, shape (n,); 0 or less: tripped.
+        """Return the distance of the tip to a trip on the nearest ball, m, shape (n,); 0 or less if it has tripped.
 
-        Without the scatter of the trigger.
+        The scatter of the trigger is not included.
 
         Parameters
         ----------
@@ -188,20 +187,20 @@ class ProbeMeasurements:
         t : (n,) or scalar
             s.
         balls : Balls, optional
-            `balls` where not given.
+            By default those of the attribute.
         """
         balls = self.balls if balls is None else balls
-        there = np.atleast_2d(np.asarray(p, dtype=float)) + self.probe_error(p, t)
+        tip = np.atleast_2d(np.asarray(p, dtype=float)) + self.probe_error(p, t)
         gaps = []
         for ball in range(len(balls)):
-            way = there - balls.centre[ball]
-            distance = np.linalg.norm(way, axis=1)
-            normal = way / np.maximum(distance, _SETTLED)[:, None]
-            gaps.append(distance - self._reach(balls, np.full(len(way), ball), normal))
+            offset = tip - balls.centre[ball]
+            distance = np.linalg.norm(offset, axis=1)
+            normal = offset / np.maximum(distance, _SETTLED)[:, None]
+            gaps.append(distance - self._reach(balls, np.full(len(offset), ball), normal))
         return np.asarray(np.min(gaps, axis=0))
 
     def released(self, p: ArrayLike, t: float, *, balls: Balls | None = None) -> bool:
-        """Whether a probe that has tripped is released with the tip at a commanded position p (3,), m."""
+        """Return whether a tripped probe is released with the tip at a commanded position p (3,), m."""
         return bool(self.probe_gap(p, t, balls=balls)[0] > RELEASE)
 
     def contact(
@@ -224,41 +223,41 @@ class ProbeMeasurements:
         t : float
             Time at the start, s.
         feed : float, optional
-            m/s; where not given, the path takes no time.
+            m/s; by default the path takes no time.
         balls : Balls, optional
-            `balls` where not given.
+            By default those of the attribute.
         noise : bool
-            Whether the trigger scatters, by a number that depends on the path and the time.
+            Whether the trigger scatters; its scatter depends on the path and the time.
         leaving : bool
-            Whether the probe may have tripped at the start on a ball from which it moves away.
+            Whether the probe may be in contact at the start with a ball from which it moves away.
 
         Returns
         -------
         position : ndarray (3,) or None
-            Commanded position of the tip when the probe trips, m; None without contact. The start, where the
-            probe has tripped there.
+            Commanded position of the tip when the probe trips, m; the start if it has tripped there; None without
+            contact.
         distance : float
-            Path length from the start to there, or to the target, m.
+            Path length from the start to this position, or to the target, m.
         """
         balls = self.balls if balls is None else balls
-        begin, end = np.asarray(start, dtype=float), np.asarray(target, dtype=float)
-        length = float(np.linalg.norm(end - begin))
-        if not leaving and self.probe_gap(begin, t, balls=balls)[0] <= 0:
-            return begin.copy(), 0.0
+        first, last = np.asarray(start, dtype=float), np.asarray(target, dtype=float)
+        length = float(np.linalg.norm(last - first))
+        if not leaving and self.probe_gap(first, t, balls=balls)[0] <= 0:
+            return first.copy(), 0.0
         if length == 0:
             return None, 0.0
         count = len(balls)
-        direction = np.tile((end - begin) / length, (count, 1))
-        scatter = self.probe.noise * self._trigger(begin, end, t) if noise else 0.0
+        direction = np.tile((last - first) / length, (count, 1))
+        scatter = np.full(count, self.probe.noise * self._trigger(first, last, t) if noise else 0.0)
         times = np.full(count, float(t))
-        way = np.full(count, np.nan)
-        for _ in range(1 if feed is None else 3):  # with a feed, the time of the contact follows from its position
-            way = self._way(begin, direction, np.arange(count), balls, self._error_at(times), np.full(count, scatter))
-            times = t + np.where(np.isfinite(way), way, 0.0) / feed if feed else times
-        way = way[way <= length]
-        if way.size == 0:
+        path = np.full(count, np.nan)
+        for _ in range(1 if feed is None else 3):  # with a feed, the time of the contact depends on its position
+            path = self._path_to_trip(first, direction, np.arange(count), balls, self._error_at(times), scatter)
+            times = t + np.where(np.isfinite(path), path, 0.0) / feed if feed else times
+        path = path[path <= length]
+        if path.size == 0:
             return None, length
-        return begin + way.min() * direction[0], float(way.min())
+        return first + path.min() * direction[0], float(path.min())
 
     def trip_positions(
         self,
@@ -291,14 +290,14 @@ class ProbeMeasurements:
         ndarray, (n, 3)
             Commanded positions of the tip, m; NaN where the path misses the ball.
         """
-        distance = self._way(start, direction, ball, balls, self._error_at(t), scatter, shift)
+        distance = self._path_to_trip(start, direction, ball, balls, self._error_at(t), scatter, shift)
         return np.asarray(start + distance[:, None] * direction)
 
     def _reach(self, balls: Balls, ball: NDArray[np.intp], normal: Array) -> Array:
         """Return the distance of the tip's centre from that of a ball when the probe trips, m."""
         return np.asarray(balls.height(ball, normal) + self.probe.tip_radius - self.probe.pretravel(normal))
 
-    def _way(
+    def _path_to_trip(
         self,
         start: Array,
         direction: Array,
@@ -310,26 +309,25 @@ class ProbeMeasurements:
     ) -> Array:
         """Return the path length of the tip along unit directions (n, 3) to the trip on a ball each (n,), m; NaN: none.
 
-        It does not trip on a ball from which it moves away, and trips immediately where it touches and approaches.
-
-        The error of the tip and the reach towards a ball vary by 1e-4 of the path at most: a few iterations converge.
+        It does not trip on a ball from which it moves away, and trips immediately where it touches and approaches one.
+        The error of the tip and the reach towards a ball vary by at most 1e-4 of the path: a few iterations converge.
         """
         centre = balls.centre[ball] + shift
-        way = np.einsum("ni,ni->n", centre - start, direction)
+        path = np.einsum("ni,ni->n", centre - start, direction)
         normal = -direction
         for _ in range(60):
-            offset = start + error(start + np.where(np.isfinite(way), way, 0.0)[:, None] * direction) - centre
+            offset = start + error(start + np.where(np.isfinite(path), path, 0.0)[:, None] * direction) - centre
             along = np.einsum("ni,ni->n", offset, direction)
             reach = self._reach(balls, ball, normal) + scatter
             inside = along**2 - np.einsum("ni,ni->n", offset, offset) + reach**2
             found = np.where((inside >= 0) & (along < 0), -along - np.sqrt(np.maximum(inside, 0.0)), np.nan)
-            change = np.abs(found - way)
-            way = found
-            normal = offset + np.where(np.isfinite(way), way, -along)[:, None] * direction
+            change = np.abs(found - path)
+            path = found
+            normal = offset + np.where(np.isfinite(path), path, -along)[:, None] * direction
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
             if not np.any(change > _SETTLED):
                 break
-        return np.asarray(np.maximum(way, 0.0))
+        return np.asarray(np.maximum(path, 0.0))
 
     def _trigger(self, start: Array, target: Array, t: float) -> float:
         """Return a standard normal number that depends on a path and a time."""

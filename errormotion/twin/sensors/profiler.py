@@ -17,7 +17,7 @@ _JITTER_Y, _BLOBS, _STREAMS = 1, 2, 10
 
 @dataclass(frozen=True)
 class Disturbances:
-    """Disturbances of the heights by a real profiler. Zero switches a part off, infinity the limit of the slope.
+    """Disturbances of the heights of a real profiler; zero disables a part, infinity the limit of the slope.
 
     Attributes
     ----------
@@ -30,8 +30,8 @@ class Disturbances:
     steepest : float
         Slope above which there is no reading, 1.
     edge_lift, edge_reach, edge_loss : float
-        Stray light at edges: a lift in m, half of it random, which falls off within the reach (m); in the innermost
-        third of it this share of the points is lost.
+        Stray light at edges: a lift, m, half of it random, which decreases within the reach, m; in the third of the
+        reach next to the edge, this share of the points is lost.
     outliers, outlier_spread : float
         Ambient light: share of outliers, and their standard deviation, m.
     missing : float
@@ -62,7 +62,7 @@ class Disturbances:
 
     @classmethod
     def white(cls, noise: float = 0.5e-6) -> Disturbances:
-        """Return a sensor with white noise (m) alone."""
+        """Return a sensor with white noise (m) only."""
         off = dict.fromkeys(("jitter_z", "jitter_y", "speckle", "edge_lift", "edge_reach", "edge_loss"), 0.0)
         return cls(noise=noise, steepest=np.inf, outliers=0.0, missing=0.0, blobs=0, **off)
 
@@ -76,12 +76,12 @@ class Disturbances:
 
 @dataclass(frozen=True)
 class Profiler:
-    """A line profiler: it measures z at positions x of its own frame, in the plane y = 0.
+    """A line profiler: it measures z at positions x in its frame, in the plane y = 0.
 
     Attributes
     ----------
     points : int
-        Of a profile.
+        Number of points of a profile.
     pitch : float
         m; point i is at x = (i - points // 2) * pitch.
     low, high : float
@@ -109,10 +109,10 @@ class Profiler:
         artefact : Artefact
             The piece.
         poses : ndarray, (line, 4, 4)
-            From the profiler's frame at each line to the artefact's; m. Jitter along the feed
-            shifts a line in the direction from its neighbour before to its neighbour behind.
+            From the profiler's frame at each line to the artefact's; m. Jitter along the feed shifts a line in the
+            direction from the previous line to the next one.
         key : tuple of int
-            Of the random streams: the same key gives the same numbers.
+            Key of the random streams, which depend on it only.
 
         Returns
         -------
@@ -120,7 +120,7 @@ class Profiler:
             z in the profiler's frame, m; NaN = no reading.
         """
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) < 2:
-            raise BenchError(f"expected poses of shape (line, 4, 4) with two lines at least; found {poses.shape}")
+            raise BenchError(f"expected poses of shape (line, 4, 4) with at least two lines; found {poses.shape}")
         wrong = self.disturbances
         poses = np.ascontiguousarray(poses, dtype=float)
         if wrong.jitter_y > 0:
@@ -152,8 +152,8 @@ class Profiler:
         pitch = float(np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3])) / (lines - 1)
         rng = np.random.default_rng(int(key))
         for _ in range(self.disturbances.blobs):
-            line, place = rng.uniform(0, lines), rng.uniform(x[0], x[-1])
+            line, centre = rng.uniform(0, lines), rng.uniform(x[0], x[-1])
             radius = self.disturbances.blob_radius * rng.uniform(0.5, 1.5)
             near = np.abs(np.arange(lines) - line) * pitch < radius
-            gap = ((np.arange(lines)[near, None] - line) * pitch) ** 2 + (x - place) ** 2 < radius**2
+            gap = ((np.arange(lines)[near, None] - line) * pitch) ** 2 + (x - centre) ** 2 < radius**2
             out[near] = np.where(gap, np.nan, out[near])

@@ -17,12 +17,12 @@ from errormotion.twin.sensors.frame import FrameGeometry
 
 Channels = NDArray[np.int64]
 
-#: grid of the slow motion, s, and its intervals per chunk
+#: Interval of the slow motion, s, and number of intervals in a chunk.
 GRID = 0.5
 CHUNK = 64
-#: repeatability of a position of the machine, m (one sigma, each axis)
+#: Repeatability of a position of the machine, m (one sigma, each axis).
 REPEATABILITY = 0.3e-6
-#: effect of the speckle on a reading on the sphere at rest, m (one sigma)
+#: Effect of the speckle on a reading on the sphere at rest, m (one sigma).
 SPECKLE = 0.5e-6
 
 _BAR_NOISE, _SPHERE_NOISE, _STEPS = 1, 2, 3
@@ -30,7 +30,7 @@ _BAR_NOISE, _SPHERE_NOISE, _STEPS = 1, 2, 3
 
 @dataclass(frozen=True)
 class _Piece:
-    """The slow motion over an interval in which it is nearly linear, as the kernel takes it."""
+    """The slow motion over an interval in which it is nearly linear, as the input of the kernel."""
 
     times: Array
     slow: Array
@@ -45,7 +45,7 @@ class Sensing:
     Attributes
     ----------
     seed : int
-        Of the noise.
+        Seed of the noise.
     frame, bar, sphere_radius, state
         The sensors, their targets, and the motion.
     sensors_on_for : float
@@ -92,7 +92,7 @@ class Sensing:
                 )
 
     def _pieces(self, chunk: int) -> tuple[_Piece, ...]:
-        """Return the slow motion of one chunk of time, divided where its slope changes; independent of the caller."""
+        """Return the slow motion in one chunk of time, divided where its slope changes; independent of the request."""
         pieces = self._chunks.get(chunk)
         if pieces is None:
             grid = (chunk * CHUNK + np.arange(CHUNK + 1)) * GRID
@@ -136,7 +136,7 @@ class Sensing:
         )
 
     def _draws(self, motion: StepProgram, streams: Channels | tuple[int, ...]) -> Array:
-        """Return standard normal numbers (stream, place) that depend on this program and this machine."""
+        """Return standard normal numbers (stream, position) that depend on the program and the machine."""
         bits = np.array([motion.begin, *motion.places[1], *motion.places[-2]]).view(np.int64)
         labels = (self.seed, _STEPS, *(int(b) for b in bits))
         return np.array([kernels.normals(kernels.stream_key(*labels, s), 0, len(motion.places)) for s in streams])

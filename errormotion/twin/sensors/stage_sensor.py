@@ -22,7 +22,7 @@ class StageSensor:
     Attributes
     ----------
     point_sensor : PointSensor
-        A seeded individual. Its nominal beam leans by 20 deg from -Z towards +X.
+        A seeded individual. Its nominal beam is tilted by 20 deg from -Z towards +X.
     sine_gauge : SineGauge
         On a turntable.
     check_bar : CheckBar
@@ -62,19 +62,19 @@ class StageSensor:
         Parameters
         ----------
         t : (n,)
-            Times of the simulated clock, s.
+            Times on the simulated clock, s.
         stage : (n, 3) or (3,)
             Positions of the stage, m.
         target : Plane or CheckBar
             The surface.
         sensor : PointSensor, optional
-            ``point_sensor`` where not given.
+            By default ``point_sensor``.
         first : int
-            Number of the first reading; the noise depends on it.
+            Number of the first reading, on which the noise depends.
         key : tuple of int
             Selects the noise of the sensor and the texture of the target.
         beyond : bool
-            Whether a reading outside of the range is minus or plus infinity, and not NaN.
+            Whether a reading outside of the range is minus or plus infinity instead of NaN.
 
         Returns
         -------

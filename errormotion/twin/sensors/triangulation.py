@@ -1,8 +1,8 @@
-"""Effects of laser triangulation on a reading: the surface's tilt, and its speckle.
+"""Effects of laser triangulation on a reading: tilt and speckle of the surface.
 
-The receiving lens has an aperture. A surface that is tilted scatters unevenly into it, so that the light's centre of
-gravity in the aperture shifts, and with it the apparent angle of the received beam. Out of focus that moves
-the image: in proportion to the depth, not at all at mid-range.
+The receiving lens has an aperture. A tilted surface scatters light into it unevenly, so that the centre of gravity of
+the light in the aperture shifts, and with it the apparent angle of the received beam. Out of focus this shifts the
+image, in proportion to the depth from mid-range.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 from errormotion.twin import kernels
 
-#: rings of points in the aperture: radius as a share of the aperture's, number of points, weight of each
+#: Rings of points in the aperture: radius as a share of that of the aperture, number of points, weight of each.
 _RINGS = ((0.0, 1, 1.0), (0.55, 6, 1.2), (0.9, 12, 1.0))
-#: least cosine between surface normal and received beam with light at the receiver
-_LEAST_COSINE = 0.02
-#: number of waves of a speckle field
+#: Smallest cosine between surface normal and received beam with light at the receiver.
+_SMALLEST_COSINE = 0.02
+#: Number of waves of a speckle field.
 _WAVES = 256
 
 
@@ -31,17 +31,17 @@ class Optics:
     Attributes
     ----------
     triangulation_angle : float
-        Between emitted and received beam, rad; the receiver lies where a surface of rotation 180 deg inclines to.
+        Between emitted and received beam, rad; a surface at a rotation of 180 deg is inclined towards the receiver.
     aperture : float
-        Half angle of the receiving lens as seen from the spot, rad.
+        Half angle of the receiving lens seen from the spot, rad.
     roughness : float
         Slope of the facets of the surface, root mean square, 1.
     glossy : float
-        Share of the light that these facets reflect; the rest scatters evenly (Lambert).
+        Share of the light that these facets reflect; the rest is scattered evenly (Lambert).
     defocus : float
-        Relative error of the reading per radian by which the light's centre shifts in the aperture, 1.
+        Relative error of the reading per radian of shift of the light's centre in the aperture, 1.
     scale : float
-        Relative error of the reading at right angles, 1.
+        Relative error of the reading on a surface perpendicular to the beam, 1.
     steepest : float
         Largest inclination with light at the receiver, rad.
     """
@@ -70,7 +70,7 @@ class Optics:
         tilts = np.asarray(q, dtype=float)
         steep = np.hypot(tilts[..., 0], tilts[..., 1])
         with np.errstate(invalid="ignore"):
-            seen = (steep <= np.tan(self.steepest)) & (self._receiver_cosine(tilts, steep) > _LEAST_COSINE)
+            seen = (steep <= np.tan(self.steepest)) & (self._receiver_cosine(tilts, steep) > _SMALLEST_COSINE)
         shift = self._light_centre(np.where(seen[..., None], tilts, 0.0)) - self._light_centre(np.zeros(2))
         return np.where(seen, self.scale + self.defocus * shift, np.nan)
 
@@ -81,7 +81,7 @@ class Optics:
     def _light_centre(self, q: Array) -> Array:
         """Return the position of the light's centre in the aperture, towards the emitted beam, rad.
 
-        In coordinates (in the triangulation plane, across it, towards the sensor) of the emitted beam.
+        Vectors have the components in the triangulation plane, perpendicular to it, and towards the sensor.
         """
         sine, cosine = np.sin(self.triangulation_angle), np.cos(self.triangulation_angle)
         along, across, weight = _aperture(self.aperture)
@@ -101,24 +101,24 @@ def _unit(vectors: Array) -> Array:
 
 @lru_cache(maxsize=32)
 def _aperture(half_angle: float) -> tuple[Array, Array, Array]:
-    """Return points in the aperture along and across the triangulation plane, rad, and their weights, each (n,)."""
+    """Return points in the aperture, in and perpendicular to the triangulation plane, rad, and their weights, (n,)."""
     radius = np.concatenate([np.full(n, share) for share, n, _ in _RINGS]) * half_angle
     angle = np.concatenate([2 * np.pi * np.arange(n) / n for _, n, _ in _RINGS])
     weight = np.concatenate([np.full(n, each) for _, n, each in _RINGS])
     return radius * np.cos(angle), radius * np.sin(angle), weight
 
 
-def speckle(key: int, places: Array, length: float) -> Array:
-    """Return a random field of variance 1 that loses its correlation as exp(-distance / length).
+def speckle(key: int, positions: Array, length: float) -> Array:
+    """Return a random field of variance 1 with the correlation exp(-distance / length).
 
-    A sum of plane waves: where a field is isotropic and its correlation exponential, wave vectors follow a Cauchy
-    distribution of width 1 / length, a normal vector over the size of a normal number.
+    The field is a sum of plane waves. For an isotropic field with exponential correlation, the wave vectors have a
+    Cauchy distribution of width 1 / length: that of a normal vector divided by the absolute value of a normal number.
 
     Parameters
     ----------
     key : int
-        Of the field.
-    places : ndarray, (n, 3)
+        Key of the field.
+    positions : ndarray, (n, 3)
         m. The value at a position does not depend on the other positions.
     length : float
         m.
@@ -128,7 +128,7 @@ def speckle(key: int, places: Array, length: float) -> Array:
     ndarray, (n,)
     """
     waves, phases = _waves(key)
-    return np.asarray(np.sqrt(2 / _WAVES) * np.cos(places @ (waves / length) + phases).sum(axis=1))
+    return np.asarray(np.sqrt(2 / _WAVES) * np.cos(positions @ (waves / length) + phases).sum(axis=1))
 
 
 @lru_cache(maxsize=64)

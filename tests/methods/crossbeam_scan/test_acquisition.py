@@ -36,9 +36,9 @@ SETTINGS = Settings(
 
 
 class Machine:
-    """A control and a profiler on one clock; the first point of a line says where the axis was, the second when.
+    """A control and a profiler on one clock; the points of a line are the position of the axis and the time.
 
-    ``breaks`` maps the number of a pass (repeats counted) to a place and what the profiler raises there.
+    ``breaks`` maps the number of a pass (repeats counted) to a position and the error that the profiler raises there.
     """
 
     def __init__(self, breaks=None, scale=1e-6, real=False):
@@ -130,7 +130,7 @@ def bench_of(machine):
 
 
 def store(chunks, path, *, append=False):
-    """Return chunks as they come back from the disk."""
+    """Return chunks as read from disk."""
     chunks = iter(chunks)
     first = next(chunks)
     raw = RawStore(path, "line") if append else RawStore.create(path, first, "line", 1000)
@@ -147,7 +147,7 @@ def record(machine, path, settings=SETTINGS, done=None, **keywords):
     return store(record_scans(bench_of(machine), settings, None, done), path, append=done is not None, **keywords)
 
 
-def test_a_campaign_is_cold_passes_then_moves_and_a_pass_for_each_warm_up_time(tmp_path):
+def test_campaign_has_cold_passes_then_moves_and_a_pass_for_each_warm_up_time(tmp_path):
     machine = Machine()
     raw = record(machine, tmp_path / "raw.zarr")
     assert machine.orders == [
@@ -197,13 +197,13 @@ def test_chunks_are_small_and_counts_are_kept(tmp_path):
     assert raw.attrs["dropped"] == 0
 
 
-def test_the_dataset_tells_schedule_and_programs(tmp_path):
+def test_dataset_contains_schedule_and_programs(tmp_path):
     raw = record(Machine(), tmp_path / "raw.zarr")
     assert json.loads(raw.attrs["schedule"])[2]["program"] == "warm_up_1.nc"
     assert json.loads(raw.attrs["programs"])["pass.nc"].splitlines()[-2] == "M30"
 
 
-def test_a_stream_that_breaks_costs_the_rest_of_its_pass_only(tmp_path):
+def test_failure_of_the_stream_loses_only_the_rest_of_the_pass(tmp_path):
     machine = Machine({3: (0.4, InstrumentError("profiler: connection lost"))})
     raw = record(machine, tmp_path / "raw.zarr")
     assert machine.opened == 0  # closed and opened once
@@ -217,15 +217,15 @@ def test_a_stream_that_breaks_costs_the_rest_of_its_pass_only(tmp_path):
     assert 0.39 < broken.position < 0.4
 
 
-def test_silence_in_a_pass_breaks_it_and_silence_before_it_does_not(tmp_path):
+def test_timeout_in_a_pass_interrupts_it_but_not_before_it(tmp_path):
     silent = InstrumentTimeoutError("profiler: no data for 1 s")
     raw = record(Machine({2: (0.3, silent)}), tmp_path / "raw.zarr")
-    with pytest.raises(MethodError, match=r"of it is there, .* m: pass 2 broke at 0\.29\d m \(profiler: no"):
+    with pytest.raises(MethodError, match=r"complete, .* m: pass 2 broke at 0\.29\d m \(profiler: no"):
         Scans(raw).scan(2, 0)
     assert [broken.cycle for broken in interruptions(raw)] == [2]
 
 
-def test_a_cold_pass_that_breaks_is_made_again_while_the_machine_is_cold(tmp_path):
+def test_interrupted_cold_pass_is_repeated_while_the_machine_is_cold(tmp_path):
     machine = Machine({0: (0.4, InstrumentError("connection lost"))})
     raw = record(machine, tmp_path / "raw.zarr")
     assert machine.orders.count("pass.nc") == 6
@@ -235,7 +235,7 @@ def test_a_cold_pass_that_breaks_is_made_again_while_the_machine_is_cold(tmp_pat
     assert scans.scan(0, 1)[3] < 0
 
 
-def test_three_broken_passes_in_a_row_end_the_campaign_and_keep_what_came(tmp_path):
+def test_three_successive_failed_passes_end_the_campaign_and_keep_the_data(tmp_path):
     lost = InstrumentError("connection lost")
     machine = Machine(dict.fromkeys(range(2, 9), (0.4, lost)))
     with pytest.raises(InstrumentError, match="3 successive passes failed, the last one is number 4: connection lost"):
@@ -245,7 +245,7 @@ def test_three_broken_passes_in_a_row_end_the_campaign_and_keep_what_came(tmp_pa
     assert Scans(raw).scan(4, 0)[0].shape == (800, POINTS)
 
 
-def test_broken_passes_that_are_not_in_a_row_do_not_end_it(tmp_path):
+def test_failed_passes_that_are_not_successive_do_not_end_the_campaign(tmp_path):
     lost = InstrumentError("connection lost")
     raw = record(Machine({0: (0.4, lost), 2: (0.4, lost), 4: (0.4, lost)}), tmp_path / "raw.zarr")
     assert [broken.cycle for broken in interruptions(raw)] == [0, 1, 2]
@@ -260,18 +260,18 @@ def test_a_wrong_encoder_pitch_is_reported_at_the_first_pass(tmp_path, pitch):
         record(Machine(), tmp_path / "raw.zarr", SETTINGS.model_copy(update={"encoder_pitch": pitch}))
 
 
-def test_an_encoder_that_counts_backwards_from_somewhere_is_read(tmp_path):
+def test_encoder_with_negative_pitch_and_offset_is_read(tmp_path):
     other = SETTINGS.model_copy(update={"encoder_pitch": -1e-6, "encoder_zero": 0.0})
     raw = record(Machine(scale=-1e-6), tmp_path / "raw.zarr", other)
     assert Scans(raw).scan(2, 1)[0].shape == (800, POINTS)
 
 
-def test_without_a_pose_it_says_how_to_come_by_one():
+def test_missing_pose_is_reported_with_ways_to_obtain_it():
     with pytest.raises(MethodError, match="procedure = 'profiler_pose'"):
         record_scans(bench_of(Machine()), SETTINGS.model_copy(update={"profiler_pose": None}), None, None)
 
 
-def test_the_pose_of_an_earlier_test_counts_before_that_of_the_settings(tmp_path):
+def test_pose_of_an_earlier_test_has_priority_over_the_settings(tmp_path):
     pose = np.eye(4)
     pose[2, 3] = -0.2
     found = xr.Dataset({"profiler_pose": (("row", "column"), pose), "pose_covariance": (("p", "p_"), np.eye(6) * 1e-9)})
@@ -290,7 +290,7 @@ def test_a_stated_pose_has_its_stated_uncertainty(tmp_path):
 
 
 def cut_off(tmp_path, cycle, place):
-    """Return what a run on the disk holds that was killed in a pass when the axis was at a place."""
+    """Return the record of a run that was killed in a pass at a position of the axis."""
     chunks = list(record_scans(bench_of(Machine()), SETTINGS, None, None))
     kept = []
     for chunk in chunks:
@@ -321,19 +321,19 @@ def still_there(done):
     return machine
 
 
-def test_on_a_virtual_machine_that_is_still_there_the_broken_pass_stays_and_the_next_one_follows(tmp_path):
+def test_running_virtual_machine_keeps_the_interrupted_pass_and_makes_the_next_one(tmp_path):
     done = cut_off(tmp_path, 3, 0.4)
     machine = still_there(done)
     raw = record(machine, tmp_path / "raw.zarr", done=done)
     assert machine.orders == ["warm_up_3.nc", "pass.nc"]
     scans = Scans(raw)
     assert [scans.scan(cycle, 0)[0].shape for cycle in range(5)] == [(800, POINTS)] * 5
-    with pytest.raises(MethodError, match="there is no line of it"):
+    with pytest.raises(MethodError, match="the scan has no lines"):
         scans.scan(3, 1)
     assert 1800 < scans.scan(4, 1)[3] < 1820
 
 
-def test_after_a_crash_in_the_cold_a_cold_pass_is_made_again(tmp_path):
+def test_cold_pass_is_repeated_after_a_crash_before_the_warm_up(tmp_path):
     done = cut_off(tmp_path, 1, 0.4)
     machine = still_there(done)
     raw = record(machine, tmp_path / "raw.zarr", done=done)
@@ -344,7 +344,7 @@ def test_after_a_crash_in_the_cold_a_cold_pass_is_made_again(tmp_path):
 
 @pytest.fixture
 def day(monkeypatch):
-    """Let a machine's clock be the time of the day."""
+    """Use the time of the day as the clock of a machine."""
 
     def use(machine):
         def sleep(seconds):
@@ -357,7 +357,7 @@ def day(monkeypatch):
     return use
 
 
-def test_a_real_machine_is_waited_for(tmp_path, day):
+def test_passes_on_a_real_machine_start_at_their_warm_up_times(tmp_path, day):
     machine = day(Machine(real=True))
     raw = record(machine, tmp_path / "raw.zarr")
     scans = Scans(raw)
@@ -369,9 +369,7 @@ def test_a_real_machine_is_waited_for(tmp_path, day):
 
 
 @pytest.mark.parametrize(("ago", "made", "first"), [(700.0, [3, 4], 900), (1300.0, [3, 4], 1300), (1900.0, [4], 1900)])
-def test_on_a_real_machine_the_warm_up_goes_on_by_the_clock_and_overdue_passes_are_left_out(
-    tmp_path, day, ago, made, first
-):
+def test_warm_up_of_a_real_machine_continues_by_the_clock_without_overdue_passes(tmp_path, day, ago, made, first):
     done = cut_off(tmp_path, 2, 0.4)
     mark = int(np.flatnonzero(done["line_time"].values == 0)[0])
     began = datetime.now(UTC) - timedelta(seconds=ago + float(done["line_clock"][mark]))
@@ -389,14 +387,14 @@ def test_on_a_real_machine_the_warm_up_goes_on_by_the_clock_and_overdue_passes_a
             Scans(raw).scan(cycle, 0)
 
 
-def test_a_record_that_does_not_say_when_it_began_is_not_gone_on_with(tmp_path, day):
+def test_record_without_a_start_time_is_not_resumed(tmp_path, day):
     done = cut_off(tmp_path, 2, 0.4)
     del done.attrs["start"]
     with pytest.raises(MethodError, match="does not state when it started"):
         record_scans(bench_of(day(Machine(real=True))), SETTINGS, None, done)
 
 
-def test_the_operator_is_reported_which_program_and_what_it_does(tmp_path, day):
+def test_operator_is_prompted_with_program_and_purpose(tmp_path, day):
     machine = day(Machine(real=True))
     texts = {program.name: program.text() for program in schedule(SETTINGS).programs.values()}
 
@@ -410,7 +408,7 @@ def test_the_operator_is_reported_which_program_and_what_it_does(tmp_path, day):
     bench = Bench(asks=obey, line_profiler=machine)
     raw = store(record_scans(bench, SETTINGS, None, None), tmp_path / "raw.zarr")
     assert bench.asked[0].startswith(
-        "make pass.nc (measuring pass over 2 artefacts; 19 s) ready, confirm, and start it"
+        "prepare pass.nc (measuring pass over 2 artefacts; 19 s), confirm, and then start it"
     )
     assert bench.asked[2].startswith("When pass.nc has ended: start warm_up_1.nc (warm-up moves, 6.9 min;")
     assert len(bench.asked) == 8
@@ -419,7 +417,7 @@ def test_the_operator_is_reported_which_program_and_what_it_does(tmp_path, day):
     np.testing.assert_allclose(raw["line_time"].values[warm], true, atol=1e-3)
 
 
-def test_leaving_between_two_chunks_stops_the_stream():
+def test_end_of_the_acquisition_between_two_chunks_stops_the_stream():
     machine = Machine()
     chunks = record_scans(bench_of(machine), SETTINGS, None, None)
     next(chunks)
@@ -443,7 +441,7 @@ def gantry(seed, parameters=""):
     return VirtualController(f"sim://gantry/controller?seed={seed}", CONTROLLER), KeyenceLJX(address)
 
 
-def test_on_the_virtual_gantry_times_and_places_are_those_of_the_twin(tmp_path):
+def test_times_and_positions_on_the_virtual_gantry_are_true(tmp_path):
     control, profiler = gantry(11)
     with control, profiler:
         raw = store(
@@ -459,7 +457,7 @@ def test_on_the_virtual_gantry_times_and_places_are_those_of_the_twin(tmp_path):
     assert scans.notes == []
 
 
-def test_the_overflow_of_the_encoder_is_undone(tmp_path):
+def test_overflow_of_the_encoder_is_corrected(tmp_path):
     half = 1 << 31
     control, profiler = gantry(12, f"&encoder_start={half + 100_000}")  # overflows between the artefacts, at -0.1 m
     zero = -(half + 100_000) * 1e-6
@@ -474,7 +472,7 @@ def test_the_overflow_of_the_encoder_is_undone(tmp_path):
     assert np.nanmax(np.abs(np.diff(raw["encoder"].values[raw["cycle_of_line"].values == 1]))) < 1e6
 
 
-def test_a_profiler_whose_line_is_cut_is_opened_again(tmp_path):
+def test_profiler_is_reopened_after_a_lost_connection(tmp_path):
     settings = ON_GANTRY.model_copy(update={"cold_repeats": 1})
     control, profiler = gantry(13, "&fault=disconnect&fault_at=5000")
     with control, profiler:
@@ -491,7 +489,7 @@ def test_a_profiler_whose_line_is_cut_is_opened_again(tmp_path):
     assert interruptions(raw)[0].position == pytest.approx(0.017, abs=0.02)
 
 
-def test_stopping_leaves_no_thread_and_the_instruments_can_go_on():
+def test_stop_leaves_no_thread_and_instruments_are_usable():
     control, profiler = gantry(14)
     with control, profiler:
         before = set(threading.enumerate())
@@ -509,7 +507,7 @@ def test_stopping_leaves_no_thread_and_the_instruments_can_go_on():
 
 
 def write_files(folder, count, *, lines=400, spoil=None):
-    """Write scans as NetCDF files; the first point of a line says its place in its file."""
+    """Write scans as NetCDF files; the first point of a line is its number in the file."""
     for number in range(count):
         y = np.arange(lines) * PITCH + (number % 3) * 1e-5
         heights = np.tile(y[:, None], (1, POINTS)) * 1e-2
@@ -548,19 +546,19 @@ def test_files_are_scans_pass_by_pass_and_artefact_by_artefact(tmp_path):
             assert at == pytest.approx([at, 420.0, 900.0][cycle])
 
 
-def test_a_wrong_number_of_files_says_how_many_and_why(tmp_path):
+def test_wrong_number_of_files_is_reported_with_the_expected_number(tmp_path):
     with pytest.raises(
         MethodError, match=r"Expected 6 files.*3 passes \(1 cold and 2 warm\) over 2 artefacts; found 5"
     ):
         from_files(write_files(tmp_path, 5), tmp_path / "raw.zarr")
 
 
-def test_half_a_file_is_a_scan_with_a_reason(tmp_path):
+def test_incomplete_file_is_a_missing_scan_with_a_reason(tmp_path):
     raw = from_files(
         write_files(tmp_path, 6, spoil=lambda k, ds: ds.isel(profile=slice(0, 200)) if k == 3 else ds),
         tmp_path / "raw.zarr",
     )
-    with pytest.raises(MethodError, match="50% of it is there"):
+    with pytest.raises(MethodError, match="50% complete"):
         Scans(raw).scan(1, 1)
     assert Scans(raw).scan(2, 1)[2].size in (399, 400)
 
@@ -571,7 +569,7 @@ def test_files_with_other_points_are_refused_by_name(tmp_path):
         from_files(files, tmp_path / "raw.zarr")
 
 
-def test_files_that_were_read_are_not_read_twice(tmp_path):
+def test_recorded_files_are_not_read_again(tmp_path):
     files = write_files(tmp_path, 6)
     whole = from_files(files, tmp_path / "whole.zarr")
     with files:

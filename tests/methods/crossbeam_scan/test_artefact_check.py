@@ -35,7 +35,7 @@ def scan(machine, times, places, seed=3):
 
 
 def knocked(machine, step):
-    """Return the machine with artefacts that have moved by a twist, each at its place."""
+    """Return the machine with artefacts that moved by a twist, each at its position."""
 
     class Knocked(type(machine.crossbeam)):
         def artefact_pose(self, seed, position):
@@ -82,7 +82,7 @@ def clean(raw):
 
 
 @pytest.mark.parametrize("strain", ["free", "guided"])
-def test_nobody_is_named_where_nothing_moved(strain, clean):
+def test_no_artefact_is_reported_if_none_moved(strain, clean):
     ds = clean[strain]
     assert not ds["moved"].any()
     assert np.isnan(ds["moved_since"].values).all()
@@ -100,7 +100,7 @@ def test_nobody_is_named_where_nothing_moved(strain, clean):
         pytest.param(0, 4, [0, 0, 5e-6, 0, 0, 0], id="the first of all"),
     ],
 )
-def test_an_artefact_that_moved_is_named_and_left_out(machine, raw, clean, artefact, since, step):
+def test_moved_artefact_is_reported_and_excluded(machine, raw, clean, artefact, since, step):
     spoilt = replaced(raw, machine, slice(since, None), artefact, step)
     ds = identify(spoilt)
     gone = np.zeros((len(TIMES) - 1, len(PLACES)), dtype=bool)
@@ -115,7 +115,7 @@ def test_an_artefact_that_moved_is_named_and_left_out(machine, raw, clean, artef
 
 
 @pytest.mark.parametrize("step", [[5e-6, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 20e-6]], ids=["5 um", "20 urad"])
-def test_a_guide_does_not_hand_it_on_to_the_neighbours(machine, raw, step):
+def test_guide_does_not_transfer_the_motion_to_neighbours(machine, raw, step):
     ds = identify(replaced(raw, machine, slice(4, None), 3, step), strain="guided")
     assert np.flatnonzero(ds["moved"].values).tolist() == [3]
     miss = ds.em.twist().values - simulation.truth_axis(machine, ds["time"].values, PLACES).em.twist().values
@@ -124,7 +124,7 @@ def test_a_guide_does_not_hand_it_on_to_the_neighbours(machine, raw, step):
     assert np.all(np.abs(miss[there]) <= 4 * u[there])
 
 
-def test_it_is_kept_where_that_is_asked_for(machine, raw, clean):
+def test_moved_artefact_is_kept_on_request(machine, raw, clean):
     spoilt = replaced(raw, machine, slice(4, None), 3, [0, 0, 5e-6, 0, 0, 0])
     ds = identify(spoilt, moved="keep")
     assert np.isfinite(ds.em.twist().values).all()
@@ -136,7 +136,7 @@ def test_it_is_kept_where_that_is_asked_for(machine, raw, clean):
     assert rise == pytest.approx(-5e-6, abs=2.5e-6)
 
 
-def test_a_cold_scan_that_does_not_repeat_is_named(machine, raw):
+def test_cold_scan_that_does_not_repeat_is_reported(machine, raw):
     spoilt = replaced(raw, machine, slice(1, 2), 5, [0, 0, 5e-6, 0, 0, 0])
     ds = identify(spoilt)
     assert len(named(ds, "cold scan and its repetition")) == 1
@@ -147,7 +147,7 @@ def test_a_cold_scan_that_does_not_repeat_is_named(machine, raw):
     assert ds["cold_repeat"].shape == (1, len(PLACES), 6)
 
 
-def test_three_artefacts_cannot_tell_and_say_so(raw):
+def test_three_artefacts_are_reported_as_too_few(raw):
     ds = identify(raw.isel(artefact=[0, 3, 6]))
     assert named(ds, "Too few artefacts to detect one that moved: at least four are needed.")
     assert not ds["moved"].any()
@@ -157,7 +157,7 @@ def test_three_artefacts_cannot_tell_and_say_so(raw):
 
 
 def judged(seed, step=None):
-    """Return what is said of registrations of the twin with noise as planned, one artefact moved by a twist."""
+    """Return the check of simulated registrations with the planned noise, one artefact moved by a twist."""
     crossbeam, rng = VirtualMachine("gantry", seed=seed).crossbeam, np.random.default_rng(seed)
     pose = RigidTransform.from_matrix(crossbeam.pose)
     W, A = from_maps(pose)[:6], chain.carriage_adjoint(pose, crossbeam.lever)
@@ -176,7 +176,7 @@ def judged(seed, step=None):
     return check_artefacts(axis, found, Settings(), PLACES, TIMES[2:], [0, 1], [2, 3, 4, 5])
 
 
-def test_clean_campaigns_name_nobody():
+def test_campaigns_without_motion_report_no_artefact():
     # one false alarm in a hundred campaigns is what is asked for
     assert sum(judged(seed).wrong.any() for seed in range(25)) <= 1
 

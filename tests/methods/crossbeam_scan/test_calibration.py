@@ -107,20 +107,20 @@ def test_uncertainty_is_as_small_as_the_sensor_allows(scan_pocket):
     assert (size[3:] < 0.5e-6).all()
 
 
-def test_uncertainty_of_the_centre_is_carried_on(scan_pocket):
+def test_uncertainty_of_the_centre_is_propagated(scan_pocket):
     scan = scan_pocket(1)
     plain = calibrate(*scan, POCKET).covariance
     more = calibrate(*scan, Pocket(RADIUS, centre_uncertainty=(3e-6, 4e-6, 5e-6))).covariance
     assert np.diag(more - plain)[3:] == pytest.approx(np.square([3e-6, 4e-6, 5e-6]))
 
 
-def test_a_place_of_the_pocket_shifts_the_pose(scan_pocket):
+def test_position_of_the_pocket_shifts_the_pose(scan_pocket):
     scan, centre = scan_pocket(1), np.array([1e-3, -2e-3, 3e-3])
     plain, moved = calibrate(*scan, POCKET), calibrate(*scan, Pocket(RADIUS, centre=centre))
     assert moved.values[3:] - plain.values[3:] == pytest.approx(centre, abs=1e-9)
 
 
-def test_one_height_leaves_the_angle_a_open(scan_pocket, truth):
+def test_one_height_does_not_determine_the_angle_a(scan_pocket, truth):
     scan = scan_pocket(1, lifts=(0.174,))
     with pytest.raises(MethodError, match=r"do not determine a.*two heights"):
         calibrate(*scan, POCKET)
@@ -134,13 +134,13 @@ def test_one_height_leaves_the_angle_a_open(scan_pocket, truth):
     ("change", "message"),
     [
         (lambda x, z, s: (x, z[:, :, :-1], s), "found .*3199"),
-        (lambda x, z, s: (x, np.where(z < 0, np.nan, z) * 0, s), "0.2 mm deep is needed"),
+        (lambda x, z, s: (x, np.where(z < 0, np.nan, z) * 0, s), "0.2 mm deep, with ten lines"),
         (lambda x, z, s: (x, z * 1e-3, s), "Check the unit"),
         (lambda x, z, s: (x, z[:, :6], s[:, :6]), "ten lines"),
         (lambda x, z, s: (x, z, s + np.linspace(0, 1e-3, s.shape[1])[:, None]), "one height of the spindle"),
     ],
 )
-def test_what_is_no_scan_of_a_pocket_is_refused_in_words(scan_pocket, change, message):
+def test_invalid_scans_of_a_pocket_are_refused(scan_pocket, change, message):
     with pytest.raises(MethodError, match=message):
         calibrate(*change(*scan_pocket(1, Disturbances.white(), lines=40)), POCKET)
 
@@ -151,7 +151,7 @@ def test_lines_that_all_cross_the_rim_obliquely_are_counted(scan_pocket, monkeyp
         calibrate(*scan_pocket(1, Disturbances.white(), lines=40), POCKET)
 
 
-def test_a_raw_dataset_gives_what_its_arrays_give(gantry, truth, tmp_path):
+def test_raw_dataset_and_its_arrays_give_the_same_result(gantry, truth, tmp_path):
     raw = simulation.raw_pocket(gantry, seed=1, profiles=80, feed=350e-6)
     save(raw, tmp_path / "pocket.nc")
     stored = load(tmp_path / "pocket.nc")
@@ -164,10 +164,10 @@ def test_a_raw_dataset_gives_what_its_arrays_give(gantry, truth, tmp_path):
     assert np.diag(wider)[3:] == pytest.approx(1e-10, rel=1e-3)
 
 
-def test_scans_of_artefacts_are_no_calibration(gantry):
+def test_scans_of_artefacts_are_refused_for_calibration(gantry):
     profiler = Profiler(80, 0.4e-3, disturbances=Disturbances.white())
     raw = simulation.raw_scans(gantry, [0], [0], seed=1, profiler=profiler, profiles=3, feed=1e-3)
-    with pytest.raises(MethodError, match="needs scans of a pocket"):
+    with pytest.raises(MethodError, match="Expected scans of a pocket"):
         calibration.calibrate_dataset(raw)
 
 

@@ -25,13 +25,13 @@ SHARE = 0.5
 
 @pytest.fixture
 def rig(gantry):
-    """Pose and lever as they truly are, known to 1 mrad, 10 um and 1 mm."""
+    """True pose and lever, with uncertainties of 1 mrad, 10 um and 1 mm."""
     pose = RigidTransform.from_matrix(gantry.crossbeam.pose)
     return Rig(pose, gantry.crossbeam.lever, POSE_COVARIANCE, LEVER_UNCERTAINTY)
 
 
 def true_maps(crossbeam, times=TIMES):
-    """Return what perfect registrations say, (cycle, artefact, 9): the motion of the profiler and its drift."""
+    """Return perfect registrations, (cycle, artefact, 9): the motion of the profiler and its drift."""
     pose, lever = RigidTransform.from_matrix(crossbeam.pose), crossbeam.lever
     to_profiler = np.linalg.inv(chain.carriage_adjoint(pose, lever))
     at = crossbeam.twist(times[:, None], PLACES)
@@ -88,7 +88,7 @@ def total(found, weights):
 
 
 @pytest.mark.parametrize("guide", [None, 1e-6])
-def test_errors_come_back_from_perfect_registrations(gantry, rig, guide):
+def test_perfect_registrations_give_the_true_errors(gantry, rig, guide):
     found = carriage(registrations(true_maps(gantry.crossbeam)), PLACES, rig, guide=guide)
     # all is linear; the guide of the twin bends as the spline does
     assert found.values == pytest.approx(gantry.crossbeam.twist(TIMES[:, None], PLACES), abs=1e-10)
@@ -98,7 +98,7 @@ def test_errors_come_back_from_perfect_registrations(gantry, rig, guide):
 
 
 @pytest.mark.parametrize("guide", [None, 1e-6])
-def test_truth_lies_within_what_is_stated(gantry, rig, guide):
+def test_truth_lies_within_the_stated_uncertainty(gantry, rig, guide):
     maps, truth = true_maps(gantry.crossbeam), gantry.crossbeam.twist(TIMES[:, None], PLACES)
     rng = np.random.default_rng(1)
     squares = []
@@ -115,7 +115,7 @@ def test_truth_lies_within_what_is_stated(gantry, rig, guide):
 
 
 def difference(gantry, rig, first, second, maps, noise, draws=120):
-    """Return NEES/6 of a difference of two values by what they share, and as if they shared nothing."""
+    """Return NEES/6 of a difference of two values with their correlation, and without it."""
     weights = np.zeros((len(TIMES), len(PLACES)))
     weights[first], weights[second] = 1.0, -1.0
     known, _ = total(carriage(registrations(maps), PLACES, rig, guide=None), weights)
@@ -129,14 +129,14 @@ def difference(gantry, rig, first, second, maps, noise, draws=120):
     return np.mean(squares, axis=0)
 
 
-def test_two_times_share_their_cold_scan(gantry, rig):
+def test_values_at_two_times_share_the_cold_scan(gantry, rig):
     shared, apart = difference(gantry, rig, (2, 1), (1, 1), true_maps(gantry.crossbeam), COVARIANCE)
     # 120 draws of 6: 1 +- 0.05; half of the variance is common and falls out of the difference
     assert shared == pytest.approx(1, abs=0.16)
     assert apart < 0.7
 
 
-def test_two_places_share_pose_and_lever(gantry, rig):
+def test_values_at_two_positions_share_pose_and_lever(gantry, rig):
     shared, _ = difference(gantry, rig, (2, 0), (2, 3), true_maps(gantry.crossbeam), 1e-6 * COVARIANCE)
     assert shared == pytest.approx(1, abs=0.16)
     alike = np.repeat(true_maps(gantry.crossbeam)[:, 1:2], len(PLACES), axis=1)
@@ -146,7 +146,7 @@ def test_two_places_share_pose_and_lever(gantry, rig):
     assert apart < 0.5
 
 
-def test_pose_and_lever_do_what_running_again_with_others_does(gantry, rig):
+def test_influence_of_pose_and_lever_equals_evaluation_with_changed_values(gantry, rig):
     noisy = registrations(true_maps(gantry.crossbeam), np.random.default_rng(3))
     found = carriage(noisy, PLACES, rig, guide=None)
     for k, (pose, lever) in enumerate(up for up, _ in rig.changed()):
@@ -156,14 +156,14 @@ def test_pose_and_lever_do_what_running_again_with_others_does(gantry, rig):
     assert np.abs(found.influence[: len(chain.SOURCES)]).max() > 1e-8
 
 
-def test_what_is_taken_as_exact_adds_nothing(gantry, rig):
+def test_exact_quantities_add_no_uncertainty(gantry, rig):
     exact = replace(rig, pose_covariance=None, lever_uncertainty=np.zeros(3))
     found = carriage(registrations(true_maps(gantry.crossbeam)), PLACES, exact, guide=None)
     assert not found.influence[: len(chain.SOURCES)].any()
 
 
 @pytest.mark.parametrize("guide", [None, 1e-6])
-def test_a_missing_registration_is_nan_alone(gantry, rig, guide):
+def test_only_a_missing_registration_is_nan(gantry, rig, guide):
     whole = registrations(true_maps(gantry.crossbeam), np.random.default_rng(4))
     lacking = replace(whole, twist=whole.twist.copy(), covariance=whole.covariance.copy())
     lacking.twist[1, 1], lacking.covariance[1, 1] = np.nan, np.nan
@@ -181,7 +181,7 @@ def test_a_missing_registration_is_nan_alone(gantry, rig, guide):
     assert np.all(miss[~gone] <= 5 * u[~gone])
 
 
-def test_an_artefact_without_a_cold_scan_is_unknown_and_harms_nobody(gantry, rig):
+def test_artefact_without_a_cold_scan_is_unknown_and_affects_no_other(gantry, rig):
     whole = registrations(true_maps(gantry.crossbeam), np.random.default_rng(5))
     whole.cold[1] = -1
     whole.twist[:, 1], whole.covariance[:, 1], whole.bound[1] = np.nan, np.nan, np.nan
@@ -193,7 +193,7 @@ def test_an_artefact_without_a_cold_scan_is_unknown_and_harms_nobody(gantry, rig
     assert np.isfinite(np.delete(found.predicted, 1, axis=0)).all()
 
 
-def test_a_guide_helps_most_where_a_line_sees_least(gantry, rig):
+def test_guide_improves_the_least_determined_freedoms_most(gantry, rig):
     noisy = registrations(true_maps(gantry.crossbeam), np.random.default_rng(6))
     free, guided = (carriage(noisy, PLACES, rig, guide=guide) for guide in (None, 1e-6))
     u = [np.sqrt(np.diagonal(one.covariance[2, 1])) for one in (free, guided)]
@@ -205,7 +205,7 @@ def test_a_guide_helps_most_where_a_line_sees_least(gantry, rig):
     assert np.all(np.linalg.eigvalsh(guided.covariance[2, 1] - guided.predicted[1]) > 0)
 
 
-def test_a_guide_that_the_carriage_does_not_follow_misleads(gantry, rig):
+def test_guide_that_the_carriage_does_not_follow_causes_errors(gantry, rig):
     # 20 urad of pitch of its own against a stated 1 urad
     wild = replace(gantry.crossbeam, own=20e-6 * np.eye(6)[3])
     noisy, truth = registrations(true_maps(wild), np.random.default_rng(7)), wild.twist(TIMES[:, None], PLACES)

@@ -73,7 +73,7 @@ def registered(gantry, raw, cycle, by_line=False, assumed=None):
     return p[:6] * 1e-6
 
 
-def test_errors_of_the_carriage_come_back_from_the_motion_of_the_profiler(gantry, H, lever):
+def test_errors_of_the_carriage_follow_from_the_motion_of_the_profiler(gantry, H, lever):
     truth = simulation.truth_axis(gantry, [0, 600, T], [-0.5, Y]).em.twist().values
     found = chain.carriage_errors(motions(truth, H, lever), np.zeros((3, 2, 6, 6)), H, lever)
     # second order: 2.2 m times (30 urad)^2
@@ -100,7 +100,7 @@ def missed(machine, by_line):
     return found.values - simulation.truth_axis(machine, [T], [Y]).em.twist().values[0, 0]
 
 
-def test_a_rigid_motion_takes_a_strained_scan_for_yaw(gantry):
+def test_rigid_registration_takes_strain_for_yaw(gantry):
     # roll changes along Y by some 5 urad/m: at 2.2 m below the carriage a shear of the scan by 12 urad
     rigid, by_line = (np.abs(missed(gantry, way)) for way in (False, True))
     assert 3e-6 < rigid[5] < 12e-6
@@ -108,7 +108,7 @@ def test_a_rigid_motion_takes_a_strained_scan_for_yaw(gantry):
 
 
 @pytest.mark.parametrize(("freedom", "share"), [(3, 0.9), (5, 0.5)])
-def test_a_rigid_motion_hardly_sees_the_carriage_turn_by_itself(freedom, share):
+def test_rigid_registration_hardly_shows_a_rotation_of_the_carriage_alone(freedom, share):
     # every line stands as far off as its neighbour: there is no slope along the feed, where a rigid motion looks for it
     machine = VirtualMachine("gantry", seed=3)
     own = 10e-6 * np.eye(6)[freedom]
@@ -125,7 +125,7 @@ def test_pose_twists_are_the_derivatives_of_the_pose(H, lever):
         assert log(there * back.inv()) / 2e-6 == pytest.approx(twist, abs=1e-8)
 
 
-def test_effect_of_a_wrong_pose_is_that_of_running_again(H, lever):
+def test_effect_of_a_wrong_pose_equals_a_new_evaluation(H, lever):
     # errors and calibration errors of the size in section 5 of Zhao et al.
     rng = np.random.default_rng(1)
     errors = rng.normal(0, [1e-5] * 6, (50, 6))
@@ -139,7 +139,7 @@ def test_effect_of_a_wrong_pose_is_that_of_running_again(H, lever):
 
 
 @pytest.mark.parametrize("by_line", [False, True])
-def test_scans_put_together_by_a_wrong_pose_add_no_more_than_the_chain(gantry, H, lever, by_line):
+def test_assembly_with_a_wrong_pose_has_no_larger_effect_than_the_chain(gantry, H, lever, by_line):
     # 10 mrad against errors of 33 um and 10 urad: products of the two, some of them on the lever of 2.2 m
     raw = simulation.raw_scans(gantry, [0, T], [Y], seed=1, profiles=40, feed=1e-3, profiler=PERFECT, motion="rigid")
     right = chain.carriage_errors(registered(gantry, raw, 1, by_line), np.zeros((6, 6)), H, lever).values
@@ -172,7 +172,7 @@ def test_influence_is_the_effect_of_one_standard_uncertainty(H, lever):
     assert np.einsum("si,sj", found.influence, found.influence) == pytest.approx(found.covariance)
 
 
-def test_lever_counts_as_a_source_of_its_own(H, lever):
+def test_lever_is_a_separate_source(H, lever):
     errors = np.array([0, 0, 0, 20e-6, 10e-6, -5e-6])
     M = motions(errors, H, lever)
     found = chain.carriage_errors(M, np.zeros((6, 6)), H, lever, lever_uncertainty=(2e-3, 0, 2e-3))
@@ -239,7 +239,7 @@ def test_feed_is_along_the_machine(H):
         ({"pose_covariance": -np.eye(6)}, "symmetric"),
     ],
 )
-def test_shapes_that_do_not_fit_are_refused_in_words(H, lever, changes, message):
+def test_wrong_shapes_are_refused(H, lever, changes, message):
     given = {"motion": np.zeros(6), "covariance": np.zeros((6, 6)), "profiler_pose": H, "lever": lever} | changes
     with pytest.raises(MethodError, match=message):
         chain.carriage_errors(**given)

@@ -55,7 +55,7 @@ def test_cold_repeats_alarm_as_often_as_stated():
     assert 25 <= alarms <= 75
 
 
-def test_cold_repeat_names_the_artefact_scanned_off_its_place():
+def test_cold_repeat_reports_the_artefact_scanned_at_a_wrong_position():
     twist = noise(np.random.default_rng(1), 1, 8)
     twist[0, 5] += step(1e-6, "EY")  # 14 sigma
     found = cold_repeats(twist, np.broadcast_to(COVARIANCE, (1, 8, 6, 6)))
@@ -63,7 +63,7 @@ def test_cold_repeat_names_the_artefact_scanned_off_its_place():
     assert found.probability[0, 5] < found.limit == 0.01 / 8
 
 
-def test_machine_that_comes_back_less_well_than_the_registration_does_not_alarm():
+def test_stated_repeatability_of_the_machine_prevents_false_alarms():
     rng = np.random.default_rng(2)
     machine = np.array([0.5e-6] * 3 + [2e-6] * 3)
     twist = noise(rng, 1, 8) + machine * rng.normal(size=(1, 8, 6))
@@ -123,7 +123,7 @@ def test_step_is_measured_with_its_covariance():
 
 
 @pytest.mark.slow
-def test_clean_campaigns_stay_quiet():
+def test_campaigns_without_motion_raise_no_alarm():
     cycles, places = CYCLES[[0, 3, 6, 8]], PLACES[:6]
     alarms = sum(bool(moved(cycles, places, *campaign(seed, cycles, places)[:2])) for seed in range(200))
     # 2 expected at 1 percent; 6 or more come once in 60 runs of an exact test, and this one is on the safe side
@@ -144,7 +144,7 @@ def test_rough_guide_is_not_taken_for_moved_artefacts():
     assert alarms <= 3
 
 
-def test_several_artefacts_are_found_the_worst_first():
+def test_several_moved_artefacts_are_found_with_the_worst_first():
     errors, C, _ = campaign(seed=5)
     errors[2:, 6] += step(5e-6, "EX")
     errors[4:, 2] += step(50e-6, "EY")
@@ -154,7 +154,7 @@ def test_several_artefacts_are_found_the_worst_first():
     assert found[0] == (2, 4)
 
 
-def test_artefact_that_moved_within_the_repeatability_is_let_be():
+def test_motion_within_the_repeatability_is_not_reported():
     errors, C, _ = campaign(seed=6)
     errors[4:, 3] += step(2e-6, "EY")
     assert moved(CYCLES, PLACES, errors, C) == [(3, 4)]
@@ -169,7 +169,7 @@ def test_missing_scans_do_not_hide_a_step():
     assert moved(CYCLES, PLACES, errors, C) == [(3, 5)]
 
 
-def test_twists_at_the_carriage_do_as_well_where_the_step_is_large():
+def test_large_step_is_found_in_twists_at_the_carriage_too():
     errors, C, to_carriage = campaign(seed=8)
     errors[4:, 3] += step(20e-6, "EA")
     assert moved(CYCLES, PLACES, errors @ to_carriage.T, to_carriage @ C @ to_carriage.T) == [(3, 4)]
@@ -183,7 +183,7 @@ def test_cold_share_need_not_be_known():
 
 
 @pytest.mark.parametrize("artefacts", [0, 1, 3])
-def test_too_few_artefacts_cannot_tell(artefacts):
+def test_too_few_artefacts_are_not_tested(artefacts):
     errors, C, _ = campaign(seed=0)
     errors[4:, 0] += step(1e-3, "EZ")
     found = moved_artefacts(CYCLES, PLACES[:artefacts], errors[:, :artefacts], C[:, :artefacts])
@@ -191,14 +191,14 @@ def test_too_few_artefacts_cannot_tell(artefacts):
     assert not found.tested
 
 
-def test_artefact_never_scanned_counts_for_nothing():
+def test_artefact_without_scans_has_no_effect():
     errors, C, _ = campaign(seed=0)
     errors[4:, 0] += step(1e-3, "EZ")
     errors[:, 3:] = np.nan
     assert not moved_artefacts(CYCLES, PLACES, errors, C).tested
 
 
-def test_four_artefacts_find_a_gross_step():
+def test_large_step_is_found_with_four_artefacts():
     errors, C, _ = campaign(seed=1, places=PLACES[:4])
     errors[4:, 1] += step(100e-6, "EY")
     assert moved(CYCLES, PLACES[:4], errors, C) == [(1, 4)]

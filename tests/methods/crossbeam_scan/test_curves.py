@@ -100,7 +100,7 @@ def test_curves_are_more_certain_than_the_points():
     assert np.all(curve["smooth_position_u"][-1, inner].mean(axis=0) < u.mean(axis=0))
 
 
-def test_cold_is_zero_and_certain(runs):
+def test_cold_cycle_is_zero_without_uncertainty(runs):
     for _, curve in runs:
         for name in ("smooth_position", "smooth_position_u"):
             assert not curve[name][0].any()
@@ -130,7 +130,7 @@ def test_one_artefact_has_curves_over_time():
 
 
 @pytest.mark.parametrize("how", ["missing", "wrong"])
-def test_what_is_missing_or_wrong_is_left_out(how):
+def test_missing_and_wrong_points_are_excluded(how):
     crossbeam, axis, found, rig = campaign(2)
     gone = np.zeros((len(TIMES), len(PLACES)), dtype=bool)
     gone[4:, 2], gone[3, 5] = True, True
@@ -154,7 +154,7 @@ def test_what_is_missing_or_wrong_is_left_out(how):
     assert np.all(miss[:, others] <= 5 * curve["smooth_time_u"][:, others] + 1e-12)
 
 
-def test_an_artefact_that_was_never_seen_is_unknown_over_time_alone():
+def test_artefact_without_scans_is_unknown_only_over_time():
     crossbeam, axis, found, rig = campaign(3)
     axis.profiler[:, 4], axis.profiler_covariance[:, 4], found.cold_share[:, 4] = np.nan, np.nan, np.nan
     curve = drawn(axis, found, rig)

@@ -17,13 +17,13 @@ LENGTH = 56e-3
 
 
 def a_pass(cycle, low=0.267, high=0.483):
-    """Return places of the lines and the number of the pass, as they come."""
+    """Return positions of the lines and number of the pass, in the order of acquisition."""
     y = np.arange(np.ceil(low / PITCH), np.ceil(high / PITCH)) * PITCH
     return y, np.full(y.size, cycle)
 
 
 def record(passes, **attributes):
-    """Return a raw dataset of passes; all points of a line say its place."""
+    """Return a raw dataset of passes; all points of a line are its position."""
     place = np.concatenate([y for y, _ in passes])
     cycle = np.concatenate([c for _, c in passes])
     ds = xr.Dataset(
@@ -92,7 +92,7 @@ def test_only_the_lines_of_the_scan_are_read(tmp_path, whole):
     assert read == [800]
 
 
-def test_lost_lines_stand_as_nan_where_they_would_have_been(whole):
+def test_lost_lines_are_nan_at_their_positions(whole):
     scan = whole.copy(deep=True)
     lost = np.flatnonzero((scan["cycle_of_line"] == 1) & (np.abs(scan["encoder"] * COUNT - 0.3) < 0.01))[[5, 6, 90]]
     scan["encoder"][lost] = np.nan
@@ -104,7 +104,7 @@ def test_lost_lines_stand_as_nan_where_they_would_have_been(whole):
     assert scans.notes == ["Pass 1 at 0.3 m: 3 of 800 lines are lost and NaN."]
 
 
-def test_lines_that_never_came_are_left_open_as_well(whole):
+def test_lines_that_were_not_received_are_nan(whole):
     keep = np.ones(whole.sizes["line"], bool)
     keep[1000:1004] = False
     found = Scans(whole.isel(line=keep)).scan(0, 0)
@@ -112,7 +112,7 @@ def test_lines_that_never_came_are_left_open_as_well(whole):
     np.testing.assert_allclose(found[2], first[2], atol=1.1e-6)
 
 
-def test_a_scan_with_a_long_gap_says_where(whole):
+def test_long_gap_is_reported_with_its_position(whole):
     middle = int(np.argmin(np.abs(whole["encoder"].values[:3000] * COUNT - 0.31)))
     gap = whole.isel(line=np.r_[0:middle, middle + 30 : whole.sizes["line"]])
     with pytest.raises(MethodError, match=r"lines are lost over 2\.17 mm at \+0\.0\d+ m from the artefact"):
@@ -123,11 +123,11 @@ def test_a_scan_with_a_long_gap_says_where(whole):
 def test_a_scan_that_lost_many_single_lines_is_refused(whole):
     scan = whole.copy(deep=True)
     scan["encoder"][::10] = np.nan
-    with pytest.raises(MethodError, match="10% of its lines are lost; at most 5% may be"):
+    with pytest.raises(MethodError, match="10% of its lines are lost; expected at most 5%"):
         Scans(scan).scan(0, 0)
 
 
-def test_lines_in_the_wrong_order_are_put_in_order_and_it_is_noted(whole):
+def test_lines_in_the_wrong_order_are_sorted_with_a_note(whole):
     order = np.arange(whole.sizes["line"])
     order[[800, 801]] = order[[801, 800]]
     order[[900, 902]] = order[[902, 900]]
@@ -136,27 +136,29 @@ def test_lines_in_the_wrong_order_are_put_in_order_and_it_is_noted(whole):
     assert "were before the previous one" in scans.notes[0]
 
 
-def test_lines_that_came_twice_are_taken_once(whole):
+def test_repeated_lines_are_used_once(whole):
     scans = Scans(whole.isel(line=np.r_[0:700, 690 : whole.sizes["line"]]))
     assert_whole(scans.scan(0, 0), 0)
     assert any("10 lines were repeated" in note for note in scans.notes)
 
 
-def test_a_pass_the_other_way_gives_the_same_scan(whole):
+def test_pass_in_the_opposite_direction_gives_the_same_scan(whole):
     there = Scans(whole)
     back = Scans(whole.isel(line=slice(None, None, -1)))
     for one, other in zip(there.scan(1, 1), back.scan(1, 1), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-def test_an_encoder_that_goes_to_and_fro_is_refused(whole):
+def test_encoder_that_moves_back_and_forth_is_refused(whole):
     shaken = whole.copy(deep=True)
     shaken["encoder"] += 300.0 * np.sin(np.arange(whole.sizes["line"]) * 0.9)
-    with pytest.raises(MethodError, match=r"expected y to rise from line to line; \d+ of \d+ lines lie behind"):
+    with pytest.raises(
+        MethodError, match=r"expected y to increase from line to line; \d+ of \d+ lines are at or before"
+    ):
         Scans(shaken).scan(0, 0)
 
 
-def test_the_second_attempt_at_a_pass_counts_where_the_first_is_not_whole():
+def test_second_attempt_is_used_where_the_first_is_incomplete():
     first = a_pass(0, high=0.44)
     raw = record([first, a_pass(0), a_pass(1)])
     raw["line_time"][first[0].size :] += 100.0
@@ -166,7 +168,7 @@ def test_the_second_attempt_at_a_pass_counts_where_the_first_is_not_whole():
     assert scans.scan(0, 0)[3] == pytest.approx(100.3, abs=1e-3)  # both are whole: the later one
 
 
-def test_the_overflow_of_a_count_is_mended_and_noted(whole):
+def test_overflow_of_the_count_is_corrected_with_a_note(whole):
     jumped = whole.copy(deep=True)
     jumped["encoder"][1500:] -= 2.0**32
     scans = Scans(jumped)
@@ -177,7 +179,7 @@ def test_the_overflow_of_a_count_is_mended_and_noted(whole):
 
 @pytest.mark.parametrize(
     ("pitch", "found"),
-    [(1e-3, r"none of \d+ lines there, but at 267"), (1e-9, "none of"), (-1e-6, r"at -0\.48")],
+    [(1e-3, r"none of \d+ lines there; they are at 267"), (1e-9, "none of"), (-1e-6, r"at -0\.48")],
 )
 def test_a_wrong_encoder_pitch_is_reported(whole, pitch, found):
     with pytest.raises(MethodError, match=rf"Expected lines at the artefacts .*{found}.*Check\s+encoder_pitch"):
@@ -190,18 +192,18 @@ def test_a_pitch_that_puts_all_lines_into_one_scan_is_reported(whole):
         Scans(near)
 
 
-def test_half_a_record_says_what_lacks():
+def test_half_a_record_states_the_missing_scans():
     raw = record([a_pass(0), a_pass(1, high=0.45)])
     scans = Scans(raw)
     assert scans.cycles == 3
-    with pytest.raises(MethodError, match=r"50% of it is there, .*: the record ends in pass 1"):
+    with pytest.raises(MethodError, match=r"50% complete, .*: the record ends in pass 1"):
         scans.scan(1, 1)
     with pytest.raises(MethodError, match="pass 2 was not made"):
         scans.scan(2, 0)
 
 
 def test_a_pass_that_was_cut_off_between_others_says_where():
-    with pytest.raises(MethodError, match=r"there is no line of it: pass 1 was cut off at 0\.400 m"):
+    with pytest.raises(MethodError, match=r"the scan has no lines: pass 1 was cut off at 0\.400 m"):
         Scans(record([a_pass(0), a_pass(1, high=0.4), a_pass(2)])).scan(1, 1)
 
 
@@ -209,7 +211,7 @@ def test_a_broken_pass_says_where_it_broke_and_why():
     text = interruption(1, 0.42, "keyence_ljx: no data for 1 s; is it on, is the cable in?")
     raw = record([a_pass(0), a_pass(1, high=0.42), a_pass(2)], invalid=json.dumps({"blind spot": 12, text: 1}))
     assert interruptions(raw) == [Interruption(1, 0.42, "keyence_ljx: no data for 1 s; is it on, is the cable in?")]
-    with pytest.raises(MethodError, match=r"no line of it: pass 1 broke at 0\.420 m \(keyence_ljx: no data for 1 s"):
+    with pytest.raises(MethodError, match=r"no lines: pass 1 broke at 0\.420 m \(keyence_ljx: no data for 1 s"):
         Scans(raw).scan(1, 1)
     assert_whole(Scans(raw).scan(1, 0), 0)
 
@@ -224,14 +226,14 @@ def test_scans_that_are_cut_already_are_handed_over_one_by_one(gantry):
     np.testing.assert_array_equal(height, raw["height"][1, 0, :90])
     np.testing.assert_array_equal(y, raw["y"][1, 0, :90])
     assert (x.size, time) == (3200, 600.0)
-    with pytest.raises(MethodError, match="all of it is NaN"):
+    with pytest.raises(MethodError, match="all values are NaN"):
         scans.scan(1, 1)
 
 
 def test_cut_scans_whose_y_turns_are_refused(gantry):
     raw = simulation.raw_scans(gantry, [0.0], [0.1], seed=1, profiles=100)
     raw["y"][0, 0, 50] = -0.002
-    with pytest.raises(MethodError, match="1 of 100 lines lie behind"):
+    with pytest.raises(MethodError, match="1 of 100 lines are at or before"):
         Scans(raw).scan(0, 0)
     backwards = raw.isel(profile=slice(None, 40)).isel(profile=slice(None, None, -1))
     assert np.all(np.diff(Scans(backwards).scan(0, 0)[2]) > 0)

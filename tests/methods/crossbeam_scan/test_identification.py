@@ -108,7 +108,7 @@ def nees(ds, machine):
 # ---------------------------------------------------------------- truth
 
 
-def test_truth_lies_within_what_is_stated(found, machines):
+def test_truth_lies_within_the_stated_uncertainty(found, machines):
     """All values of a campaign at once, with what they share: pose, lever, cold scans."""
     total = 0.0
     for ds, machine in zip(found["free"], machines, strict=True):
@@ -152,19 +152,19 @@ def test_trials_of_a_guided_carriage_draw_the_guide(campaigns, found):
     assert np.all(share < 1.1)
 
 
-def test_a_rigid_picture_is_wrong_where_the_roll_changes(found, machines):
+def test_rigid_registration_is_wrong_where_the_roll_changes(found, machines):
     # every campaign: the picture is turned in itself by what the roll changes along it
     assert all(nees(ds, machine) > 3 for ds, machine in zip(found["rigid"], machines, strict=True))
 
 
-def test_a_rigid_picture_is_right_where_the_scans_are_one(machines):
+def test_rigid_registration_is_right_for_rigid_scans(machines):
     raw = campaign(machines[0], 0, times=[0.0, 7200.0], places=[0.0], motion="rigid")
     for strain in ("free", "rigid"):
         ds = identify(raw, strain=strain)
         assert np.all(np.abs(miss(ds, machines[0])) < 4 * stated(ds))
 
 
-def test_a_carriage_that_turns_by_itself_is_seen_by_the_free_way_alone():
+def test_rotation_of_the_carriage_alone_is_found_with_free_strain_only():
     machine = VirtualMachine("gantry", seed=3)
     # 40 urad of pitch that no guide explains
     machine.crossbeam = dataclasses.replace(machine.crossbeam, own=40e-6 * np.eye(6)[3])
@@ -176,7 +176,7 @@ def test_a_carriage_that_turns_by_itself_is_seen_by_the_free_way_alone():
     assert np.all(np.abs(miss(loose, machine)) < 4 * stated(loose))
 
 
-def test_a_difference_of_two_times_has_the_covariance_of_what_they_do_not_share(found, machines):
+def test_difference_of_two_times_has_the_covariance_of_its_independent_parts(found, machines):
     together, apart = [], []
     for ds, machine in zip(found["free"], machines, strict=True):
         rise = ds.em.combine([0, -1, 1], "time")
@@ -188,7 +188,7 @@ def test_a_difference_of_two_times_has_the_covariance_of_what_they_do_not_share(
     assert np.mean(apart) < 0.75 * np.mean(together)
 
 
-def test_a_difference_of_two_places_shares_pose_and_lever(found, machines):
+def test_difference_of_two_positions_shares_pose_and_lever(found, machines):
     squares = []
     for ds, machine in zip(found["free"], machines, strict=True):
         step = ds.em.combine([-1, 0, 1], "position")
@@ -197,7 +197,7 @@ def test_a_difference_of_two_places_shares_pose_and_lever(found, machines):
     assert np.mean(squares) == pytest.approx(6, abs=2.5)
 
 
-def test_budget_tells_pose_lever_and_cold_scans_apart(found):
+def test_budget_separates_pose_lever_and_cold_scans(found):
     budget = found["free"][0].em.budget()
     assert budget["group"].values.tolist() == ["profiler pose", "lever", "cold scan", "independent"]
     total = np.sqrt((budget.values[:, 1:] ** 2).sum(axis=0))
@@ -213,7 +213,7 @@ def test_budget_tells_pose_lever_and_cold_scans_apart(found):
 # ---------------------------------------------------------------- the dataset
 
 
-def test_the_cold_row_is_zero_and_certain(found):
+def test_cold_row_is_zero_without_uncertainty(found):
     for runs in found.values():
         ds = runs[0]
         assert ds["time"].values.tolist() == TIMES
@@ -223,7 +223,7 @@ def test_the_cold_row_is_zero_and_certain(found):
         assert set(ds["reason"].values[0]) == {""}
 
 
-def test_the_dataset_says_what_it_is(found, machines, tmp_path):
+def test_dataset_has_its_attributes(found, machines, tmp_path):
     ds = found["free"][0]
     datasets.validate(ds)
     assert (ds.attrs["component"], ds.attrs["method"]) == ("Y", "crossbeam_scan")
@@ -252,7 +252,7 @@ def test_quality_is_that_of_the_sensor(found):
     assert np.all(ds["predicted_u"].values[1:] < ds["registration_u"].values[1:])
 
 
-def test_what_is_left_after_registration_is_noise(found):
+def test_residual_of_the_registration_is_noise(found):
     ds = found["free"][0]
     before, after = ds["difference_before"].values[1:], ds["difference_after"].values[1:]
     assert np.nanstd(before) > 5e-6  # EZ of some micrometres, and slopes times EX and EY
@@ -262,7 +262,7 @@ def test_what_is_left_after_registration_is_noise(found):
     assert np.nanmax(np.abs(ds["surface"].values)) < 6e-3
 
 
-def test_strain_is_what_the_axis_does_along_a_scan(found, machines):
+def test_strain_is_the_motion_of_the_axis_along_a_scan(found, machines):
     ds, crossbeam = found["free"][0], machines[0].crossbeam
     H, places = RigidTransform.from_matrix(crossbeam.pose), np.array(PLACES)
     slope = (crossbeam.twist(7200.0, places + 1e-3) - crossbeam.twist(7200.0, places - 1e-3)) / 2e-3
@@ -273,7 +273,7 @@ def test_strain_is_what_the_axis_does_along_a_scan(found, machines):
     assert not found["rigid"][0]["strain"].sel(direction="x").values[0].any()
 
 
-def test_raw_stays_as_it_was_and_is_named(campaigns, found):
+def test_raw_dataset_is_not_modified_and_is_identified(campaigns, found):
     hashed = provenance.hash_dataset(campaigns[0])
     identify(campaigns[0])
     assert provenance.hash_dataset(campaigns[0]) == hashed
@@ -289,12 +289,12 @@ def test_unknown_uncertainties_are_reported(campaigns):
     assert "pose_u" not in ds
 
 
-def test_times_count_from_the_beginning_of_the_warm_up(campaigns):
+def test_times_are_relative_to_the_start_of_the_warm_up(campaigns):
     late = campaigns[0].assign_coords(time=("cycle", [100.0, 1900.0, 7300.0], {"units": "s"}))
     assert identify(late)["time"].values.tolist() == TIMES
 
 
-def test_a_cold_repeat_is_judged_and_no_row_of_its_own(with_repeat):
+def test_cold_repeat_is_assessed_and_has_no_row(with_repeat):
     _, raw = with_repeat
     ds = identify(raw)
     assert ds["time"].values.tolist() == [0.0, 1800.0]
@@ -310,7 +310,7 @@ def assert_same(first, second):
     xr.testing.assert_identical(first.drop_attrs(), second.drop_attrs())
 
 
-def test_twice_is_the_same_to_the_bit(campaigns, found):
+def test_repeated_identification_gives_the_same_bits(campaigns, found):
     assert_same(identify(campaigns[1]), found["free"][1])
 
 
@@ -370,7 +370,7 @@ def _open3d(thin_by_maps):
 
 @pytest.mark.usefixtures("_open3d")
 @pytest.mark.parametrize("backend", ["open3d_plane", "paper"])
-def test_other_registrations_state_that_they_are_worth_less(backend, thin, thin_by_maps):
+def test_other_registrations_state_a_larger_uncertainty(backend, thin, thin_by_maps):
     machine, raw = thin
     ds = identify(raw, strain="rigid", registration=backend)
     assert ds.attrs["registration"] == backend

@@ -41,7 +41,7 @@ def chunks(scans, size=150):
             )
 
 
-def test_it_says_where_it_is_and_what_the_last_scan_shows(scans, gantry):
+def test_progress_states_pass_artefact_and_last_registration(scans, gantry):
     live = LiveScans(SETTINGS)
     said = []
     for chunk in chunks(scans):
@@ -59,7 +59,7 @@ def test_it_says_where_it_is_and_what_the_last_scan_shows(scans, gantry):
         assert abs(value - true[k]) < 5 * size + 0.06  # what is printed is rounded to 0.1 um
 
 
-def test_it_never_waits_and_its_thread_ends(scans, monkeypatch):
+def test_update_never_waits_and_the_thread_ends(scans, monkeypatch):
     live = LiveScans(SETTINGS)
     import threading
 
@@ -76,7 +76,7 @@ def test_it_never_waits_and_its_thread_ends(scans, monkeypatch):
     assert live._thread is None
 
 
-def test_a_scan_that_cannot_be_registered_is_reported_and_nothing_ends(scans):
+def test_failed_registration_is_reported_without_an_end(scans):
     live = LiveScans(SETTINGS)
     for chunk in chunks(scans):
         flat = xr.zeros_like(chunk["record"])
@@ -86,13 +86,13 @@ def test_a_scan_that_cannot_be_registered_is_reported_and_nothing_ends(scans):
     assert ": " in live.text(2, 2)
 
 
-def test_a_line_that_marks_something_is_no_scan(scans):
+def test_mark_is_not_taken_for_a_scan(scans):
     live = LiveScans(SETTINGS)
     first = next(chunks(scans))
     mark = first.isel(line=slice(0, 1)).assign(encoder=("line", [np.nan]))
     assert live.update(mark) == ""
 
 
-def test_of_the_pocket_it_tells_the_lift(gantry):
+def test_progress_of_a_pocket_states_the_lift(gantry):
     raw = simulation.raw_pocket(gantry, seed=1, profiles=20)
     assert LiveScans(Settings(procedure="profiler_pose")).update(raw) == "pocket, scan at a lift of 182 mm"

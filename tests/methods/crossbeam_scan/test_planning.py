@@ -70,7 +70,7 @@ def pose(machine):
         pytest.param(Disturbances(speckle=0.0), "rigid", id="jitter, as a rigid picture"),
     ],
 )
-def test_a_plan_says_what_identification_will_state(machine, pose, wrong, strain):
+def test_plan_agrees_with_the_stated_uncertainty_of_the_identification(machine, pose, wrong, strain):
     motion = "rigid" if strain == "rigid" else "axis"
     raw = simulation.raw_scans(machine,
         [0.0, 7200.0], [0.0], seed=1, profiles=400, feed=70e-6, motion=motion,
@@ -97,12 +97,12 @@ def test_a_plan_of_scans_is_a_valid_dataset_of_zeros():
     assert ds.em.budget()["group"].values.tolist() == ["profiler pose", "lever", "independent"]
 
 
-def test_a_plan_without_places_says_what_it_needs():
+def test_plan_without_positions_states_what_it_needs():
     with pytest.raises(MethodError, match="set positions, such as"):
         plan()
 
 
-def test_a_guide_promises_more():
+def test_guide_reduces_the_expected_uncertainty():
     free, guided = (uncertainty(plan(positions=PLACES, strain=strain, **NOTHING))[1:] for strain in ("free", "guided"))
     assert np.all(guided <= free * (1 + 1e-9))
     assert np.all(guided[..., 3] < 0.6 * free[..., 3])
@@ -126,7 +126,7 @@ def test_a_guide_promises_more():
     ],
     ids=str,
 )
-def test_what_is_better_promises_more(better):
+def test_better_layout_reduces_the_expected_uncertainty(better):
     usual, good = (registration_covariance(Settings(**changes)) for changes in ({}, better))
     # in no direction worse, in some better
     known = np.diag(good)[:6] > 0
@@ -141,7 +141,7 @@ def test_twice_the_noise_is_twice_the_uncertainty():
     assert twice == pytest.approx(4 * once, rel=1e-6)
 
 
-def test_a_plan_of_the_pose_says_what_calibration_will_state(machine):
+def test_plan_of_the_pose_agrees_with_the_stated_uncertainty_of_the_calibration(machine):
     raw = simulation.raw_pocket(machine, seed=1)
     stated = uncertainty(CrossbeamScan().identify(raw))[0]
     planned = plan(procedure="profiler_pose", profiler_pose={"dz": -0.174})
@@ -153,8 +153,8 @@ def test_a_plan_of_the_pose_says_what_calibration_will_state(machine):
     assert np.all((ratio > 0.5) & (ratio < 2))
 
 
-def test_one_lift_leaves_the_pose_open():
-    with pytest.raises(MethodError, match=r"expected two lifts of the spindle at least"):
+def test_one_lift_does_not_determine_the_pose():
+    with pytest.raises(MethodError, match=r"expected at least two lifts of the spindle"):
         plan(procedure="profiler_pose", pocket_lifts=(0.166,), profiler_pose={"dz": -0.174})
 
 

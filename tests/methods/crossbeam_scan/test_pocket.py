@@ -53,7 +53,7 @@ def joined(chunks):
     return raw
 
 
-def test_the_pose_that_comes_of_it_is_that_of_the_twin():
+def test_identified_pose_is_the_true_one():
     control, profiler = gantry(21)
     with control, profiler:
         raw = joined(list(record_pocket(Bench(controller=control, line_profiler=profiler), SETTINGS, None)))
@@ -67,7 +67,7 @@ def test_the_pose_that_comes_of_it_is_that_of_the_twin():
     assert np.abs(off).max() < 4.5  # one draw of six; 3e-5 of all draws are further off
 
 
-def test_stage_is_where_the_encoder_and_the_lift_say():
+def test_stage_follows_encoder_and_lift():
     control, profiler = gantry(22)
     with control, profiler:
         raw = joined(list(record_pocket(Bench(controller=control, line_profiler=profiler), SETTINGS, None)))
@@ -79,7 +79,7 @@ def test_stage_is_where_the_encoder_and_the_lift_say():
     np.testing.assert_array_equal(raw["stage"].values[..., 2], np.tile([[0.166], [0.182]], (1, 400)))
 
 
-def test_lifts_that_are_there_are_not_scanned_again():
+def test_recorded_lifts_are_not_scanned_again():
     control, profiler = gantry(23)
     with control, profiler:
         bench = Bench(controller=control, line_profiler=profiler)
@@ -88,13 +88,13 @@ def test_lifts_that_are_there_are_not_scanned_again():
     assert [float(chunk["stage"][0, 0, 2]) for chunk in rest] == [0.182]
 
 
-def test_a_profiler_that_breaks_every_time_is_given_up():
+def test_profiler_that_always_fails_ends_the_test():
     control, profiler = gantry(24, "&fault=disconnect&fault_at=200")
     with control, profiler, pytest.raises(InstrumentError, match=r"pocket_1\.nc failed 3 times\. The last line"):
         list(record_pocket(Bench(controller=control, line_profiler=profiler), SETTINGS, None))
 
 
-def test_lost_lines_stay_open():
+def test_lost_lines_are_nan():
     control, profiler = gantry(25, "&fault=drop&fault_at=100&fault_every=50")
     with control, profiler:
         raw = joined(list(record_pocket(Bench(controller=control, line_profiler=profiler), SETTINGS, None)))
@@ -104,7 +104,7 @@ def test_lost_lines_stay_open():
     assert raw.attrs["dropped"] > 0
 
 
-def test_lines_that_lie_further_apart_than_stated_are_reported():
+def test_lines_farther_apart_than_stated_are_reported():
     control, profiler = gantry(26)
     with control, profiler, pytest.raises(MethodError, match=r"Expected 700 lines 40 um apart .* found 4\d\d"):
         list(record_pocket(
@@ -112,6 +112,6 @@ def test_lines_that_lie_further_apart_than_stated_are_reported():
         ))  # fmt: skip
 
 
-def test_files_are_no_source_of_pockets(tmp_path):
+def test_pockets_are_not_read_from_files(tmp_path):
     with pytest.raises(MethodError, match="not read from files"):
         list(record_pocket(Bench(line_profiler=ProfileFiles(str(tmp_path / "*.ply"))), SETTINGS, None))

@@ -9,7 +9,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.poses import displacement
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
-from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import given, given_covariance
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
 from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
 from errormotion.twin import VirtualMachine
 
@@ -35,7 +35,7 @@ def found(raws):
     return [identify(raw) for _, raw in raws]
 
 
-def test_truth_lies_within_what_is_stated(raws, found):
+def test_truth_lies_within_the_stated_uncertainty(raws, found):
     squares = []
     for (machine, _), ds in zip(raws, found, strict=True):
         true = RigidTransform.from_matrix(machine.crossbeam.pose)
@@ -56,7 +56,7 @@ def test_pose_and_covariance_are_those_of_the_calibration(raws, found):
         assert ds.attrs["lines_used"] == known.lines
 
 
-def test_errors_lead_from_the_nominal_pose_to_the_found_one(found):
+def test_errors_transform_the_nominal_pose_to_the_found_one(found):
     ds = found[0]
     H = RigidTransform.from_matrix(ds["profiler_pose"].values)
     assert ds["nominal_pose"].values == pytest.approx(NOMINAL.as_matrix())
@@ -80,7 +80,7 @@ def test_covariance_is_that_of_small_changes_of_the_parameters(found):
     assert sampled == pytest.approx(ds["covariance"].values[0] / np.outer(u, u), abs=0.08)
 
 
-def test_without_a_nominal_pose_it_is_square_and_in_whole_centimetres(raws):
+def test_default_nominal_pose_has_no_angles_and_rounded_position(raws):
     ds = identify(raws[0][1], Settings())
     assert ds["nominal_pose"].values[:3, :3] == pytest.approx(np.eye(3))
     place = ds["nominal_pose"].values[:3, 3] / 0.01
@@ -88,7 +88,7 @@ def test_without_a_nominal_pose_it_is_square_and_in_whole_centimetres(raws):
     assert ds["profiler_pose"].values == pytest.approx(identify(raws[0][1])["profiler_pose"].values)
 
 
-def test_dataset_is_valid_and_outlives_a_file(found, tmp_path):
+def test_dataset_is_valid_and_survives_a_round_trip(found, tmp_path):
     datasets.validate(found[0])
     assert found[0].attrs["component"] == "beam"
     assert found[0]["beam"].values.tolist() == ["profiler"]
@@ -98,7 +98,7 @@ def test_dataset_is_valid_and_outlives_a_file(found, tmp_path):
     np.testing.assert_array_equal(again["pose_covariance"].values, found[0]["pose_covariance"].values)
 
 
-def test_the_pose_found_serves_the_scans(raws, found):
+def test_found_pose_is_used_for_scans(raws, found):
     machine, _ = raws[0]
     raw = simulation.raw_scans(
         machine, [0.0, 7200.0], [0.0], seed=1, profiles=200, pose=found[0]["profiler_pose"].values
@@ -114,8 +114,8 @@ def test_the_pose_found_serves_the_scans(raws, found):
 
 def test_settings_give_a_pose_and_its_covariance():
     pose = PoseSettings(a=0.01, b=-0.02, g=0.03, dx=0.001, dy=0.002, dz=-0.17, angle_uncertainty=1e-3)
-    assert calibration.parameters(given(pose)) == pytest.approx([0.01, -0.02, 0.03, 0.001, 0.002, -0.17])
-    assert np.sqrt(np.diag(given_covariance(pose))) == pytest.approx([1e-3] * 3 + [5e-3] * 3)
+    assert calibration.parameters(stated_pose(pose)) == pytest.approx([0.01, -0.02, 0.03, 0.001, 0.002, -0.17])
+    assert np.sqrt(np.diag(stated_covariance(pose))) == pytest.approx([1e-3] * 3 + [5e-3] * 3)
 
 
 def test_one_lift_is_refused_unless_angles_are_known(raws):

@@ -41,7 +41,7 @@ def test_the_pass_goes_from_a_margin_before_the_first_scan_to_a_margin_behind_th
     np.testing.assert_allclose(np.abs(np.diff(path.places[:, 1])) / np.diff(path.times), [0.025, 0, 0.025], atol=1e-9)
 
 
-def test_warm_up_moves_take_exactly_the_time_that_there_is():
+def test_warm_up_moves_take_exactly_the_available_time():
     for seconds in (10.0, 100.0, 1234.5):
         program = warm_up_piece(SETTINGS, 1, seconds, start=0.317)
         # half a micrometre of rounding in each of some hundred moves at 60 mm/s
@@ -55,15 +55,15 @@ def test_warm_up_moves_may_have_other_ends():
     assert (y.min(), y.max()) == (pytest.approx(-0.1), pytest.approx(0.9))
 
 
-def test_warm_up_moves_between_one_place_are_refused():
-    with pytest.raises(MethodError, match="two ends apart"):
+def test_warm_up_moves_with_equal_ends_are_refused():
+    with pytest.raises(MethodError, match="two different ends"):
         program_texts(SETTINGS.model_copy(update={"warm_up_travel": (0.4, 0.4)}))
 
 
 def test_a_program_that_leaves_the_travel_is_refused_with_its_name_and_both_ends():
     short = SETTINGS.model_copy(update={"travel": (0.3, 0.58)})
     with pytest.raises(
-        MethodError, match=r"pass\.nc would move from Y317\.000 to Y583\.000 .* from 300\.000 to 580\.000"
+        MethodError, match=r"pass\.nc would move from Y317\.000 to Y583\.000, .* from 300\.000 to 580\.000"
     ):
         program_texts(short)
     assert program_texts(SETTINGS.model_copy(update={"travel": (0.317, 0.583)}))
@@ -86,7 +86,7 @@ def test_a_pass_goes_to_the_height_of_the_scans_where_that_is_given():
     assert " Z" not in program_texts(SETTINGS)["pass.nc"]
 
 
-def test_no_place_is_written_as_minus_zero():
+def test_no_position_is_written_as_minus_zero():
     text = measuring_pass(Settings(positions=(0.033 - 1e-8, 0.2), warm_up=())).text()
     assert "Y0.000" in text
     assert "Y-0.000" not in text

@@ -217,7 +217,7 @@ def test_the_chapter_has_its_sections(html):
         assert f'id="{name}-1"' in html
 
 
-def test_the_file_stays_small_and_leads_nowhere(html):
+def test_file_is_small_and_has_no_external_links(html):
     assert len(html.encode()) < 3_000_000
     assert not re.findall(r"https?:", html)
     assert html.count("<script") == 1  # that of the page
@@ -225,14 +225,14 @@ def test_the_file_stays_small_and_leads_nowhere(html):
     assert re.findall(r"url\((?!#)", html) == []
 
 
-def test_every_figure_is_drawn_and_told_in_words(html):
+def test_every_figure_is_drawn_with_a_text_alternative(html):
     assert len(drawings(html)) == 5
     message = re.findall(r'<figure role="img" aria-label="([^"]+)"', html)
     assert len(message) == 5
     assert all(len(words) > 60 for words in message)
 
 
-def test_key_figures_are_the_largest_warm_errors_with_place_and_time(html, whole):
+def test_key_figures_are_the_largest_warm_errors_with_position_and_time(html, whole):
     values = whole["EY"].values * 1e6
     expanded = 2e6 * np.sqrt(whole["covariance"].values[..., 1, 1])
     cycle, artefact = np.unravel_index(np.nanargmax(np.abs(values)), values.shape)
@@ -244,14 +244,14 @@ def test_key_figures_are_the_largest_warm_errors_with_place_and_time(html, whole
     assert int(largest[4]) == MINUTES[cycle]
 
 
-def test_registrations_are_counted_and_holes_told_apart(html):
+def test_registrations_are_counted_and_missing_ones_by_reason(html):
     text = words_of(html)
     assert "registrations made 70 of 72 1 without a scan, 1 refused" in text
     for _, _, reason, _ in HOLES:
         assert f"mm, 45 min: {reason}." in text or f"mm, 120 min: {reason}." in text
 
 
-def test_a_hole_is_a_dash_with_its_reason_as_a_footnote(html):
+def test_missing_value_is_a_dash_with_its_reason_as_a_footnote(html):
     rows = table(html, "Quality of every registration")
     holes = [row for row in rows if len(row) > 1 and row[1].startswith("—")]
     assert [row[0] for row in holes] == ["y = −300 mm", "y = 500 mm"]
@@ -285,10 +285,10 @@ def test_a_long_campaign_has_a_row_for_each_cycle(page):
     assert float(rows[2][5]) == pytest.approx(worst, abs=6e-4)
 
 
-def test_the_sentence_on_the_residual_counts_what_a_wrong_pose_would_add(html, whole):
+def test_text_on_the_residual_states_the_effect_of_a_wrong_pose(html, whole):
     found = re.search(
-        r"rotation (\w+) by the registration is (\S+) µrad, and a pose that is wrong by 10 times as much would bring "
-        r"the residual from (\S+) nm to (\S+) nm",
+        r"rotation (\w+) of the registration is (\S+) µrad, and an error of the pose of 10 times this value would "
+        r"change the residual from (\S+) nm to (\S+) nm",
         words_of(html),
     )
     assert found[1] == "ECY"
@@ -327,11 +327,11 @@ def test_remarks_may_be_a_list_or_its_json(notes, message):
     assert remarks(xr.Dataset(attrs={"notes": notes})) == message
 
 
-def test_the_cold_repeat_is_judged_by_its_uncertainty(page, small):
+def test_cold_repeat_is_assessed_by_its_uncertainty(page, small):
     errors = small.copy(deep=True)
     errors["cold_repeat"][0, 2, 1] = 5 * 2 * errors["cold_repeat_u"][0, 2, 1]
     found = re.search(r'<p class="warning">(Cold repeat: .*?)</p>', page(errors))
-    assert "the largest is EYY at y = −300 mm with 5 times its own" in words_of(found[1])
+    assert "the largest is EYY at y = −300 mm with 5 times its uncertainty" in words_of(found[1])
 
 
 def test_the_pose_is_reported_in_angles_and_shifts(html):
@@ -344,7 +344,7 @@ def test_the_pose_is_reported_in_angles_and_shifts(html):
     assert rows["lever in x"] == ["mm", "−900.000"]
 
 
-def test_the_budget_stands_where_the_map_does(html):
+def test_budget_is_at_the_position_of_the_map(html):
     assert "Uncertainty budget at y = 700 mm, 180 min of warm-up" in words_of(html)
     names = [row[0] for row in table(html, "Uncertainty budget")]
     assert names[:3] == ["profiler pose", "cold scan", "noise of the warm scan, independent from scan to scan"]
@@ -375,14 +375,14 @@ def test_one_cycle_or_one_artefact_is_a_report_without_empty_figures(page, minut
 
 
 @pytest.mark.parametrize("kept", [(), BESIDE, set(EXTRAS) - set(BESIDE)])
-def test_whatever_extra_is_missing_the_rest_is_reported(page, small, kept):
+def test_report_without_any_of_the_extras_has_the_rest(page, small, kept):
     html = page(small.drop_vars([name for name in EXTRAS if name not in kept]))
     assert "registrations made 5 of 6" in words_of(html)
     assert "The six errors in the last cycle" in html
     assert "nan" not in words_of(html).lower().split()
 
 
-def test_extras_of_nothing_but_nan_are_no_values(page, small):
+def test_extras_of_nan_only_are_not_shown_as_values(page, small):
     errors = small.copy()
     for name in EXTRAS:
         if errors[name].dtype.kind == "f":
@@ -392,7 +392,7 @@ def test_extras_of_nothing_but_nan_are_no_values(page, small):
     assert "nan" not in words_of(html).lower().split()
 
 
-def test_a_freedom_that_is_never_seen_says_so(page, small):
+def test_freedom_that_is_never_observed_is_reported(page, small):
     errors = small.assign(EB=small["EB"] * np.nan).copy(deep=True)
     k = list(errors["dof"].values).index("EB")
     errors["covariance"].values[..., k, :] = errors["covariance"].values[..., :, k] = np.nan
@@ -402,17 +402,17 @@ def test_a_freedom_that_is_never_seen_says_so(page, small):
     assert html.count(">not determined<") == 3
 
 
-def test_the_order_of_artefacts_is_that_of_their_places(page):
+def test_artefacts_are_in_the_order_of_their_positions(page):
     html = page(campaign_dataset(minutes=(0, 30, 60), places=[0.3, -0.1, 0.1]))
     assert [row[0] for row in table(html, "The six errors in the last cycle")] == ["−100 mm", "100 mm", "300 mm"]
 
 
-def test_the_truth_of_the_machine_keeps_its_plain_chapter(page):
+def test_truth_of_the_machine_has_the_generic_chapter(page):
     truth = simulation.truth_axis(VirtualMachine("gantry", seed=3), [0.0, 600.0], PLACES)
     assert "Errors of component Y" in page(truth)
 
 
-def test_the_pose_of_the_profiler_has_a_chapter_of_its_own(page):
+def test_pose_of_the_profiler_has_a_separate_chapter(page):
     html = page(pose_dataset())
     text = words_of(html)
     assert "Pose of the line profiler" in text
@@ -427,7 +427,7 @@ def test_an_error_that_is_the_same_everywhere_is_drawn_without_a_warning(page, s
     assert "largest EXY 0.000 µm" in words_of(page(errors))
 
 
-def test_a_map_is_a_path_for_each_colour_and_keeps_its_holes():
+def test_map_is_one_path_for_each_colour_with_its_gaps():
     from matplotlib.figure import Figure
 
     from errormotion.report.drawings.maps import DIVERGING, cells, scale_of

@@ -8,7 +8,7 @@ import pytest
 from errormotion.errors import MethodError
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition.programs import measuring_pass
-from errormotion.methods.crossbeam_scan.acquisition.schedule import PAUSE, schedule
+from errormotion.methods.crossbeam_scan.acquisition.schedule import PROGRAM_INTERVAL, schedule
 from errormotion.methods.crossbeam_scan.settings import MINUTE, Settings
 
 TRAVEL = {"X": (0.0, 1.0), "Y": (0.0, 3.0), "Z": (0.0, 1.0)}
@@ -20,14 +20,14 @@ def settings():
     return Settings(positions=tuple(0.35 + 0.2 * k for k in range(8)))
 
 
-def test_every_pass_begins_at_its_warm_up_time_and_moves_fill_the_time_between(settings):
+def test_every_pass_starts_at_its_warm_up_time_with_moves_between(settings):
     plan = schedule(settings)
     assert plan.cold == 2
     assert [plan.of_cycle(2 + k).start for k in range(9)] == list(settings.warm_up)
     gaps = [second.start - first.end for first, second in pairwise(plan.items)]
     # a rest that is too short for a stroke of a millimetre there and back is not moved
-    assert min(gaps) > PAUSE - 1e-6
-    assert max(gaps) < PAUSE + 0.05
+    assert min(gaps) > PROGRAM_INTERVAL - 1e-6
+    assert max(gaps) < PROGRAM_INTERVAL + 0.05
 
 
 def test_cold_passes_come_before_the_warm_up(settings):
@@ -39,11 +39,11 @@ def test_cold_passes_come_before_the_warm_up(settings):
     assert plan.before(2).start == 0
 
 
-def test_the_whole_takes_the_last_warm_up_time_and_the_passes_at_both_ends(settings):
+def test_duration_is_the_last_warm_up_time_and_the_passes_at_both_ends(settings):
     plan = schedule(settings)
     one = plan.of_cycle(0).seconds
     way = (1.4 + 0.056 + 2 * 0.005) / settings.measuring_feed  # back to where the pass begins
-    assert plan.seconds == pytest.approx(180 * MINUTE + 3 * one + way + 2 * PAUSE)
+    assert plan.seconds == pytest.approx(180 * MINUTE + 3 * one + way + 2 * PROGRAM_INTERVAL)
 
 
 def test_predicted_durations_are_those_of_a_control_that_moves_with_constant_feed(settings):
@@ -59,12 +59,12 @@ def test_predicted_durations_are_those_of_a_control_that_moves_with_constant_fee
 
 def test_warm_up_times_without_time_for_a_pass_between_them_are_refused(settings):
     close = settings.model_copy(update={"warm_up": (7 * MINUTE, 8 * MINUTE)})
-    with pytest.raises(MethodError, match=r"at 8 min the axis is not free before 8\.\d min"):
+    with pytest.raises(MethodError, match=r"the pass at 8 min can start at 8\.\d min"):
         schedule(close)
 
 
-def test_a_campaign_without_artefacts_says_what_is_missing():
-    with pytest.raises(MethodError, match="give 'positions'"):
+def test_campaign_without_artefacts_states_what_is_missing():
+    with pytest.raises(MethodError, match="set 'positions'"):
         schedule(Settings())
 
 
@@ -73,6 +73,6 @@ def test_a_campaign_may_be_cold_passes_only(settings):
     assert [item.program for item in plan.items] == ["pass.nc", "pass.nc"]
 
 
-def test_the_schedule_goes_into_the_dataset_as_json(settings):
+def test_schedule_is_stored_in_the_dataset_as_json(settings):
     items = json.loads(schedule(settings).to_json())
     assert items[3] == {"program": "pass.nc", "start": 420.0, "seconds": pytest.approx(60.64, abs=0.01), "cycle": 2}

@@ -50,7 +50,7 @@ def test_scans_are_a_valid_raw_dataset(gantry):
     assert float(raw.height_noise) == 0.5e-6
 
 
-def test_noise_seed_leaves_the_machine_as_it_is(gantry):
+def test_noise_seed_does_not_change_the_machine(gantry):
     one, same, other = (simulation.raw_scans(gantry, [0], [0.1], seed=s, profiler=PERFECT, **SMALL) for s in (1, 1, 2))
     assert one.identical(same)
     assert one.drop_vars(["height", "y"]).identical(other.drop_vars(["height", "y"]))
@@ -103,7 +103,7 @@ def test_true_motion_differs_from_a_rigid_one_by_the_strain_of_the_scan(gantry):
     assert 0.05e-6 < float(difference[1]) < 3e-6
 
 
-def test_what_cannot_be_is_refused_in_words(gantry):
+def test_invalid_arguments_are_refused(gantry):
     with pytest.raises(BenchError, match="'gantry' has a crossbeam; this one is 'cframe'"):
         simulation.truth_axis(VirtualMachine("cframe"), [0], [0])
     with pytest.raises(BenchError, match=r"travels from -0\.9 to 0\.9 m; the scans reach from"):

@@ -73,7 +73,7 @@ def test_curve_and_band_are_those_of_the_gaussian_process_averaged_over_its_evid
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])
-def test_polynomial_below_the_order_comes_back_and_needs_no_amplitude(order):
+def test_polynomial_below_the_order_is_reproduced_with_amplitude_zero(order):
     polynomial = np.polynomial.Polynomial([1.0, -2.0, 3.0][:order])
     to = np.linspace(-0.2, 1.2, 7)
     curve = smooth(PLACES, polynomial(PLACES), np.full(8, 1e-6), to, order=order)
@@ -91,7 +91,7 @@ def test_band_of_a_polynomial_is_at_least_that_of_its_least_squares_fit():
     assert (curve.variance < 1.5 * 1e-12).all()
 
 
-def test_exact_points_are_met_however_small_their_noise():
+def test_curve_passes_through_points_of_tiny_noise():
     x, y = wavy(8, 0.0)
     for sigma in (1e-4, 1e-6):  # of a curve of size 1
         curve = smooth(x, y, np.full(8, sigma**2), x)
@@ -103,7 +103,7 @@ def test_exact_points_are_met_however_small_their_noise():
     assert (np.sqrt(curve.variance) < 1e-6).all()  # rounding of what lies between the points, amplified by the root
 
 
-def test_smoother_is_linear_and_carries_shared_errors():
+def test_smoother_is_linear_and_propagates_shared_errors():
     x, y = wavy(8, 0.05)
     to = np.linspace(0, 1.2, 5)
     curve = smooth(x, y, np.full(8, 0.05**2), to)
@@ -113,7 +113,7 @@ def test_smoother_is_linear_and_carries_shared_errors():
     np.testing.assert_allclose(curve.carry(shared), [np.full(5, 3e-6), 1e-6 * to], atol=1e-15)
 
 
-def test_missing_points_are_left_out_and_counted():
+def test_missing_points_are_excluded_and_counted():
     x, y = wavy(9, 0.05)
     variance = np.full(9, 0.05**2)
     to = np.linspace(0.1, 1.1, 4)
@@ -146,7 +146,7 @@ def test_curve_without_evidence_is_unknown():
     assert np.isnan(all_missing.values).all()
 
 
-def test_curve_with_three_points_borrows_the_amplitude_of_the_others():
+def test_curve_with_three_points_uses_the_amplitude_of_the_others():
     rng = np.random.default_rng(1)
     y = np.sin(3 * PLACES) * np.array([[1.0], [0.9], [1.1]]) + 1e-3 * rng.normal(size=(3, 8))
     y[2, 3:] = np.nan
@@ -161,7 +161,7 @@ def test_curve_with_three_points_borrows_the_amplitude_of_the_others():
     assert (np.abs(error) < 3 * np.sqrt(together.variance[2])).all()
 
 
-def test_warm_up_begins_at_exactly_zero():
+def test_curve_of_a_warm_up_starts_at_exactly_zero():
     times = warm_up_scale(CYCLES)
     y = 10e-6 * (1 - np.exp(-CYCLES / 2700))
     curve = smooth(times, y, np.full(9, 1e-16), warm_up_scale([-0.0, 0.0, 60.0]), exact_zero=True)
@@ -180,7 +180,7 @@ def coverage(seeds, smoothed):
     return np.mean(inside, axis=0)
 
 
-def test_band_between_the_places_holds_the_truth():
+def test_band_between_the_positions_contains_the_truth():
     between = PLACES[:-1, None] + [0.05, 0.1, 0.15]
 
     def smoothed(seed):
@@ -197,7 +197,7 @@ def test_band_between_the_places_holds_the_truth():
     assert (found < 0.985).all()
 
 
-def test_band_between_the_cycles_holds_the_truth_with_a_shared_cold_scan():
+def test_band_between_the_cycles_contains_the_truth_with_a_shared_cold_scan():
     moments = 60.0 * np.array([2, 5, 10, 22, 37, 52, 75, 105, 135, 165])
     root = np.linalg.cholesky(COVARIANCE / 2).T  # of the cold scan's half of the noise
 
@@ -232,7 +232,7 @@ def test_covariance_between_freedoms_is_that_of_the_noise_through_the_weights():
     assert np.unique(curves.freedoms.amplitude[:, 0]).size == 1
 
 
-def test_unknown_freedom_spoils_itself_alone():
+def test_unknown_freedom_affects_no_other():
     points = truth(3, CYCLES, PLACES)[0] + noise(np.random.default_rng(3), 9, 8)
     C = np.broadcast_to(COVARIANCE, (9, 8, 6, 6)).copy()
     points[..., 1] = np.nan
@@ -256,7 +256,7 @@ def test_wrong_inputs_are_refused():
         smooth(x, y, v, x, order=4)
     with pytest.raises(MethodError, match="finite"):
         smooth(np.where(x > 1, np.nan, x), y, v, x)
-    with pytest.raises(MethodError, match="lie above 0"):
+    with pytest.raises(MethodError, match="positions above 0"):
         smooth(x - x[0], y, v, x, exact_zero=True)
     with pytest.raises(MethodError, match=r"\(\.\.\., n, 6\)"):
         smooth_twists(x, y, v, x)

@@ -17,11 +17,11 @@ RECORD = xr.Dataset(
 COLD = np.array([[-80.0], [1800.0]])
 
 
-def test_the_warm_up_starts_as_much_later_as_both_times_of_a_warm_line_differ():
+def test_start_of_the_warm_up_follows_from_both_times_of_a_warm_line():
     assert warm_up_start(RECORD, COLD, [0]) == "2026-03-02T07:01:35.500000+00:00"
 
 
-def test_errors_that_count_from_the_cold_scans_start_with_them():
+def test_errors_relative_to_late_cold_scans_start_with_them():
     shifted = np.array([[4.5], [1800.0]])
     assert warm_up_start(RECORD, shifted, [0]) == "2026-03-02T07:01:40+00:00"
 

@@ -50,7 +50,7 @@ def displacement_of_map(H, twist, g, Q):
     return seen(moved, s) - Q
 
 
-def test_maps_move_as_the_matrix_says():
+def test_maps_move_according_to_the_matrix():
     H = calibration.pose(0.02, -0.015, 0.03, 0.0, 0.0, 0.0)
     rng = np.random.default_rng(1)
     W = strain.from_maps(H)
@@ -71,14 +71,14 @@ def test_a_square_profiler_changes_nothing_but_the_drift():
     assert (W @ [0, 0, 0, 1, 2, 3, 0, 0, 0])[6:] == pytest.approx([-3, 0, 1])
 
 
-def test_drift_is_the_slope_of_the_profilers_place(gantry, H, to_profiler):
+def test_drift_is_the_slope_of_the_profiler_position(gantry, H, to_profiler):
     lever = gantry.crossbeam.lever
     slope = (gantry.crossbeam.twist(T, PLACES + 1e-3) - gantry.crossbeam.twist(T, PLACES - 1e-3)) / 2e-3
     by_hand = slope[:, :3] + np.cross(slope[:, 3:], lever + H.translation)
     assert drift(gantry, to_profiler, PLACES) == pytest.approx(H.rotation.inv().apply(by_hand), abs=1e-12)
 
 
-def test_a_guide_tells_pitch_and_yaw(gantry, H, to_profiler):
+def test_guide_determines_pitch_and_yaw(gantry, H, to_profiler):
     A = np.linalg.inv(to_profiler)
     truth = transform(gantry.crossbeam.twist(T, PLACES), to_profiler)
     rng = np.random.default_rng(2)
@@ -94,14 +94,14 @@ def test_a_guide_tells_pitch_and_yaw(gantry, H, to_profiler):
     assert squares[[0, 1, 2, 4]] == pytest.approx(1, abs=0.2)
 
 
-def test_a_carriage_on_its_guide_stays_as_it_is(gantry, to_profiler):
+def test_carriage_on_its_guide_is_not_changed(gantry, to_profiler):
     truth = transform(gantry.crossbeam.twist(T, PLACES), to_profiler)
     found = strain.guided(truth, covariance(8), PLACES, np.linalg.inv(to_profiler), 1e-7)
     # the twin bends as cubics do, which the spline follows
     assert found.twist == pytest.approx(truth, abs=1e-11)
 
 
-def test_what_the_spline_misses_is_counted():
+def test_error_of_the_spline_is_included():
     bent = np.zeros((8, 6))
     bent[:, 2] = 1e-6 * np.sin(2 * np.pi * PLACES / 0.8)  # one wave over four artefacts
     slope = 1e-6 * 2 * np.pi / 0.8 * np.cos(2 * np.pi * PLACES / 0.8)
@@ -124,7 +124,7 @@ def test_noise_and_assumptions_together_are_the_covariance(gantry, to_profiler):
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
-def test_any_number_of_artefacts_will_do(n, gantry, to_profiler):
+def test_any_number_of_artefacts_is_accepted(n, gantry, to_profiler):
     truth = transform(gantry.crossbeam.twist(T, PLACES[:n]), to_profiler)
     found = strain.guided(truth, covariance(n), PLACES[:n], np.linalg.inv(to_profiler), 1e-6)
     miss = np.abs(found.twist - truth) / np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))

@@ -42,7 +42,7 @@ def errors(whole):
 
 @pytest.fixture
 def raw(whole):
-    """Return a copy of the scans, to be spoilt."""
+    """Return a copy of the scans, to be modified."""
     return whole.copy(deep=True)
 
 
@@ -60,7 +60,7 @@ def spoil(raw, heights, cycle=CYCLE, artefact=ARTEFACT):
 
 
 def assert_lost_alone(found, errors, reason, cycles=(CYCLE,), artefact=ARTEFACT):
-    """Check that there is nothing but a reason where there was a fault, and the same bits as without it elsewhere."""
+    """Check that a faulty scan has only a reason, and all others the same bits as without the fault."""
     rows = [c - 1 for c in cycles]  # the second cold cycle is no row of its own
     lost = np.zeros((3, 3), dtype=bool)
     lost[rows, artefact] = True
@@ -81,7 +81,7 @@ def notes(found):
 
 
 def bumpy(x, y):
-    """Another free form than the one that stands there."""
+    """A free form other than that of the artefact."""
     waves = np.sin(2 * np.pi * x / 21e-3 + 1) + np.cos(2 * np.pi * y / 19e-3)
     return 1.2e-3 * waves + 0.4e-3 * np.sin(2 * np.pi * (x + y) / 13e-3)
 
@@ -91,7 +91,7 @@ def bumpy(x, y):
 
 def test_a_scan_that_is_all_nan(raw, errors):
     spoil(raw, np.nan)
-    assert_lost_alone(identify(raw), errors, "all of it is NaN")
+    assert_lost_alone(identify(raw), errors, "all values are NaN")
 
 
 def test_a_scan_of_another_artefact(gantry, raw, errors):
@@ -112,12 +112,12 @@ def test_heights_that_are_no_surface(raw, errors):
     assert_lost_alone(identify(raw), errors, "expected ")
 
 
-def test_a_strip_is_too_little(raw, errors):
+def test_narrow_strip_is_refused(raw, errors):
     raw["height"][CYCLE, ARTEFACT, 50:] = np.nan
     assert_lost_alone(identify(raw), errors, "found a warm scan that leaves 2 of them undetermined: EY, EC")
 
 
-def test_half_a_scan_is_worth_less_and_says_so(gantry, raw, errors):
+def test_half_a_scan_states_a_larger_uncertainty(gantry, raw, errors):
     raw["height"][CYCLE, ARTEFACT, LINES // 2 :] = np.nan
     found = identify(raw)
     assert not (found["reason"] != "").any()
@@ -127,9 +127,11 @@ def test_half_a_scan_is_worth_less_and_says_so(gantry, raw, errors):
     assert np.all(np.abs(found.em.twist().values[1, 1] - truth) < 4 * found["registration_u"][1, 1].values)
 
 
-def test_lines_that_do_not_rise(raw, errors):
+def test_lines_that_do_not_increase(raw, errors):
     raw["y"][CYCLE, ARTEFACT, 50] = raw["y"][CYCLE, ARTEFACT, 40].values
-    assert_lost_alone(identify(raw), errors, "expected y to rise from line to line; 1 of 400 lines lie behind")
+    assert_lost_alone(
+        identify(raw), errors, "expected y to increase from line to line; 1 of 400 lines are at or before"
+    )
 
 
 def test_a_scan_backwards_is_the_same_scan(raw, errors):
@@ -138,12 +140,12 @@ def test_a_scan_backwards_is_the_same_scan(raw, errors):
     np.testing.assert_array_equal(identify(raw).em.twist().values, errors.em.twist().values)
 
 
-def test_places_that_run_against_the_heights(raw, errors):
+def test_positions_opposite_to_the_heights(raw, errors):
     raw["y"][CYCLE, ARTEFACT] = raw["y"][CYCLE, ARTEFACT, ::-1].values
     assert_lost_alone(identify(raw), errors, "start both scans at the same position of the artefact")
 
 
-def test_places_in_millimetres(raw, errors):
+def test_positions_in_millimetres(raw, errors):
     raw["y"][CYCLE, ARTEFACT] *= 1000
     assert_lost_alone(identify(raw), errors, "if these are millimetres, divide by 1000")
 
@@ -154,7 +156,7 @@ def test_a_dataset_in_millimetres_is_refused(raw, name):
         identify(raw.assign({name: raw[name] * 1000}))
 
 
-def test_one_scan_in_millimetres_is_refused_before_it_does_harm(raw):
+def test_one_scan_in_millimetres_is_refused_before_registration(raw):
     raw["height"][CYCLE, ARTEFACT] *= 1000
     with pytest.raises(DatasetError, match=r"is it in mm\?"):
         identify(raw)
@@ -163,7 +165,7 @@ def test_one_scan_in_millimetres_is_refused_before_it_does_harm(raw):
 # ---------------------------------------------------------------- the cold scan
 
 
-def test_a_cold_repeat_takes_the_place_of_a_broken_cold_scan(gantry, raw, errors):
+def test_cold_repeat_replaces_an_incomplete_cold_scan(gantry, raw, errors):
     spoil(raw, np.nan, cycle=0)
     found = identify(raw)
     assert not (found["reason"] != "").any()
@@ -174,7 +176,7 @@ def test_a_cold_repeat_takes_the_place_of_a_broken_cold_scan(gantry, raw, errors
     assert np.all(np.abs(found.em.twist().values[1:, 1] - truth) < 4 * u)
 
 
-def test_a_whole_cold_pass_may_break(raw):
+def test_complete_cold_pass_may_fail(raw):
     raw["height"][0] = np.nan
     found = identify(raw)
     assert np.isfinite(found.em.twist().values).all()
@@ -182,7 +184,7 @@ def test_a_whole_cold_pass_may_break(raw):
     assert found["time"].values.tolist() == [0, 1800, 7200]
 
 
-def test_without_any_cold_scan_an_artefact_tells_nothing(raw, errors):
+def test_artefact_without_any_cold_scan_is_unknown(raw, errors):
     raw["height"][:2, ARTEFACT] = np.nan
     found = identify(raw)
     assert found["reason"][1:, ARTEFACT].values.tolist() == ["there is no cold scan to register it onto"] * 2
@@ -190,7 +192,7 @@ def test_without_any_cold_scan_an_artefact_tells_nothing(raw, errors):
     np.testing.assert_array_equal(found.em.twist().values[:, [0, 2]], errors.em.twist().values[:, [0, 2]])
 
 
-def test_a_flat_artefact_is_refused_with_what_it_leaves_open(gantry, raw, errors):
+def test_flat_artefact_is_refused_with_its_undetermined_freedoms(gantry, raw, errors):
     spoil(raw, scan(gantry, places=[0.0], artefact=plane())["height"][:, 0].values, cycle=slice(None))
     reason = "found a cold scan that leaves 3 of them undetermined: EX, EY, EC"
     assert_lost_alone(identify(raw), errors, reason, cycles=(2, 3))
@@ -212,7 +214,7 @@ def test_cold_scans_alone_are_refused(raw):
         identify(raw.isel(cycle=slice(None, 2)))
 
 
-def test_places_that_do_not_rise_are_refused(raw):
+def test_positions_that_do_not_increase_are_refused(raw):
     with pytest.raises((MethodError, DatasetError), match="position: expected"):
         identify(raw.isel(artefact=[0, 2, 1]))
 
@@ -227,7 +229,7 @@ def test_a_pose_that_is_no_rotation_is_refused(raw):
 
 
 def recorded(raw, pitch=1e-6, zero=0.0):
-    """Return the scans as a profiler gives them: line by line, with a count of whole micrometres."""
+    """Return the scans as recorded by a profiler: line by line, with a count of whole micrometres."""
     cycles, artefacts, lines = raw["y"].shape
     place = raw["position"].values[:, None] + raw["y"].values
     out = raw[["x", "position", "profiler_pose", "lever", "height_noise", "warm_up"]]
@@ -254,14 +256,14 @@ def record_errors(record):
     return identify(record)
 
 
-def test_a_record_says_what_its_scans_say(record_errors, errors):
+def test_record_and_its_scans_give_the_same_errors(record_errors, errors):
     # the counts put every line up to half a micrometre off, of which the mean is left: a jitter along the feed
     miss = record_errors.em.twist().values - errors.em.twist().values
     assert np.all(np.abs(miss) <= 0.5 * errors["registration_u"].values)
     assert not (record_errors["reason"] != "").any()
 
 
-def test_exact_places_give_the_same_errors(whole, errors):
+def test_exact_positions_give_the_same_errors(whole, errors):
     # every line is 0.3 nm off: less than a thousandth of the jitter
     found = identify(recorded(whole, pitch=1e-9))
     miss = found.em.twist().values - errors.em.twist().values
@@ -269,7 +271,7 @@ def test_exact_places_give_the_same_errors(whole, errors):
     assert found["registration_u"].values == pytest.approx(errors["registration_u"].values, rel=2e-3)
 
 
-def test_the_overflow_of_the_encoder_is_mended_and_told(record, record_errors):
+def test_overflow_of_the_encoder_is_corrected_and_noted(record, record_errors):
     jumped = record.copy(deep=True)
     jumped["encoder"][record.sizes["line"] // 2 + 5 :] += 2.0**32
     found = identify(jumped)
@@ -277,7 +279,7 @@ def test_the_overflow_of_the_encoder_is_mended_and_told(record, record_errors):
     assert any("overflowed" in note for note in notes(found))
 
 
-def test_half_a_file_keeps_what_came(record, record_errors):
+def test_half_a_file_keeps_its_complete_scans(record, record_errors):
     # the record breaks off in the second of the three scans of cycle 2
     lines = (2 * 3 + 1) * LINES + LINES // 2
     found = identify(record.isel(line=slice(None, lines)))
@@ -292,14 +294,14 @@ def test_half_a_file_keeps_what_came(record, record_errors):
     np.testing.assert_array_equal(found.em.twist().values[1, 0], record_errors.em.twist().values[1, 0])
 
 
-def test_a_pass_that_broke_says_where_and_why(record, record_errors):
+def test_interrupted_pass_states_position_and_reason(record, record_errors):
     cut = (record["cycle_of_line"] == CYCLE) & (record["encoder"] > 0.1e6)
     text = interruption(CYCLE, 0.1, "no data for 1 s; is the cable in?")
     broken = record.isel(line=~cut.values).assign_attrs(invalid=json.dumps({text: 1}))
     found = identify(broken)
     assert (
         found["reason"].values[1, 2]
-        == "there is no line of it: pass 2 broke at 0.100 m (no data for 1 s; is the cable in?)"
+        == "the scan has no lines: pass 2 broke at 0.100 m (no data for 1 s; is the cable in?)"
     )
     np.testing.assert_array_equal(found.em.twist().values[:, :2], record_errors.em.twist().values[:, :2])
     np.testing.assert_array_equal(found.em.twist().values[2, 2], record_errors.em.twist().values[2, 2])

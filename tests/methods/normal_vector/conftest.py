@@ -29,7 +29,7 @@ def probed() -> Callable[..., tuple[VirtualMachine, xr.Dataset]]:
 
 @pytest.fixture(scope="session")
 def off() -> Callable[[VirtualMachine, xr.Dataset], np.ndarray]:
-    """Return how far a result is off the truth, (cycle, 6), in its own standard uncertainties; NaN where unknown."""
+    """Return the deviation of a result from the truth, (cycle, 6), in standard uncertainties; NaN where unknown."""
 
     def compare(machine: VirtualMachine, errors: xr.Dataset) -> np.ndarray:
         truth = machine.truth_probing(errors["time"].values, errors.attrs["functional_point"])

@@ -1,4 +1,4 @@
-"""Acquisition on machines of which a test knows everything: real ones that take their time, printers, broken wires."""
+"""Acquisition with simulated machines: real-time controls, printed lines, lost connections."""
 
 import json
 import logging
@@ -29,7 +29,7 @@ def settings(**options) -> Settings:
 
 
 class Control:
-    """A real machine; its clock began long ago."""
+    """A real machine; its clock started long ago."""
 
     def __init__(self, time: float = 5000.0, *, simulated: bool = False) -> None:
         self.time, self.place, self.simulated = time, (0.0, 0.0, 0.9), simulated
@@ -197,7 +197,7 @@ def joined(chunks, **attrs):
 # ---------------------------------------------------------------------- a machine that is driven
 
 
-def test_cycles_begin_by_the_clock_and_the_spindle_stands_in_them() -> None:
+def test_cycles_start_by_the_clock_with_a_stopped_spindle() -> None:
     control, bench, chunks = driven()
     assert [float(chunk["time"][0]) for chunk in chunks] == pytest.approx([0, 600, 1200, 1800, 2400])
     assert [each for each in control.log if each[0] == "spindle"] == [
@@ -211,7 +211,7 @@ def test_cycles_begin_by_the_clock_and_the_spindle_stands_in_them() -> None:
     assert "with the probe in it" in bench.asked[0]
 
 
-def test_a_spindle_that_never_turns_asks_nothing() -> None:
+def test_no_prompt_for_a_spindle_that_never_turns() -> None:
     _, bench, chunks = driven(chosen=settings(schedule=()))
     assert bench.asked == []
     assert len(chunks) == 5
@@ -227,7 +227,7 @@ def test_the_tool_is_changed_by_lines_of_a_program() -> None:
         driven(chosen=chosen)
 
 
-def test_a_machine_that_is_not_well_is_not_moved() -> None:
+def test_machine_in_alarm_is_not_moved() -> None:
     control = Control()
     control.alarms.append("door open")
     with pytest.raises(InstrumentError, match="in alarm: door open; nothing was moved"):
@@ -235,7 +235,7 @@ def test_a_machine_that_is_not_well_is_not_moved() -> None:
     assert control.log == []
 
 
-def test_a_cycle_that_breaks_is_handed_over_after_the_machine_was_stopped() -> None:
+def test_interrupted_cycle_is_yielded_after_the_machine_was_stopped() -> None:
     control = Control()
     bench = Bench(controller=control, touch_probe=Probe(control, {(2, 5): InstrumentError("something in the way")}))
     source = acquire(bench)
@@ -251,7 +251,7 @@ def test_a_cycle_that_breaks_is_handed_over_after_the_machine_was_stopped() -> N
 
 
 @pytest.mark.parametrize("error", [InstrumentError("alarm"), KeyboardInterrupt()])
-def test_what_interrupts_the_cold_cycle_leaves_nothing_that_could_be_a_reference(error) -> None:
+def test_interrupted_cold_cycle_is_discarded(error) -> None:
     control, chunks = Control(), []
     with pytest.raises(type(error)):
         driven({(0, 7): error}, control, into=chunks)
@@ -266,7 +266,7 @@ def test_the_operator_may_interrupt_a_cycle_and_keeps_its_touches() -> None:
     assert [(chunk["touch_flag"].values == 0).sum() for chunk in chunks] == [12, 3]
 
 
-def test_who_takes_no_more_cycles_leaves_a_machine_that_stands() -> None:
+def test_machine_is_stopped_when_the_acquisition_ends_early() -> None:
     control = Control()
     source = acquire(Bench(controller=control, touch_probe=Probe(control)))
     next(source)
@@ -289,7 +289,7 @@ def test_a_machine_that_cannot_be_stopped_is_reported() -> None:
     assert control.turning == 9000.0
 
 
-def test_a_cycle_that_is_too_late_is_left_out(caplog) -> None:
+def test_late_cycle_is_omitted(caplog) -> None:
     """A cycle of 100 s at intervals of 60 s: every other one is made."""
     with caplog.at_level(logging.WARNING):
         _, _, chunks = driven(chosen=settings(interval=60.0, duration=240.0, settle=0.0))
@@ -305,7 +305,7 @@ def began(seconds_ago: float) -> str:
     return (datetime.now(UTC) - timedelta(seconds=seconds_ago)).isoformat()
 
 
-def test_a_real_machine_goes_on_by_the_clock_on_the_wall(caplog) -> None:
+def test_resumed_run_on_a_real_machine_continues_by_the_clock(caplog) -> None:
     chunks = []
     with pytest.raises(InstrumentError):
         driven({(2, 5): InstrumentError("alarm")}, into=chunks)
@@ -320,19 +320,19 @@ def test_a_real_machine_goes_on_by_the_clock_on_the_wall(caplog) -> None:
     assert {chunk.attrs["start"] for chunk in more} == {more[0].attrs["start"]}
 
 
-def test_a_run_that_was_left_too_long_ends_with_what_it_has() -> None:
+def test_run_resumed_too_late_ends_with_its_cycles() -> None:
     _, _, chunks = driven(chosen=settings(duration=600.0))
     _, _, more = driven(done=joined(chunks, start=began(1e5)))
     assert more == []
 
 
-def test_a_run_that_does_not_say_when_it_began_cannot_go_on() -> None:
+def test_run_without_a_start_time_is_not_resumed() -> None:
     _, _, chunks = driven(chosen=settings(duration=600.0))
     with pytest.raises(MethodError, match="does not state its start"):
         driven(done=joined(chunks, start="once"))
 
 
-def test_a_virtual_machine_goes_through_the_same_heat_first() -> None:
+def test_restarted_virtual_machine_repeats_the_warm_up() -> None:
     _, _, chunks = driven(control=Control(time=0.0, simulated=True), chosen=settings(duration=1200.0))
     control = Control(time=0.0, simulated=True)
     _, _, more = driven(control=control, done=joined(chunks))
@@ -342,7 +342,7 @@ def test_a_virtual_machine_goes_through_the_same_heat_first() -> None:
     assert float(more[0]["spindle_speed"][0]) == pytest.approx(9000.0 * 498 / 600)
 
 
-def test_a_virtual_machine_that_is_still_there_just_goes_on() -> None:
+def test_running_virtual_machine_continues() -> None:
     control = Control(time=40.0, simulated=True)
     _, _, chunks = driven(control=control, chosen=settings(duration=1200.0))
     control.log.clear()
@@ -358,7 +358,7 @@ def lines(begin: float, count: int = 12) -> list[float]:
     return [begin + 5.0 * i for i in range(count)]
 
 
-def test_a_program_that_the_operator_starts_is_listened_to() -> None:
+def test_lines_of_a_program_started_by_the_operator_are_read() -> None:
     thermometer = Thermometer()
     bench = Bench({"t": thermometer}, touch_probe=Printer([lines(700.0 + 600 * k) for k in range(5)]))
     chunks = list(acquire(bench))
@@ -382,7 +382,7 @@ def test_lines_without_the_time_have_the_planned_one() -> None:
     assert "touch_time" not in chunks[0]
 
 
-def test_an_interrupted_program_keeps_its_lines_and_says_where_to_begin_again() -> None:
+def test_interrupted_program_keeps_its_lines_and_states_where_to_restart() -> None:
     silent = InstrumentTimeoutError("Touch 5 of 12: no line for 60 s")
     source = acquire(Bench(touch_probe=Printer([lines(0.0), [*lines(600.0, 4), silent]])))
     chunks = [next(source), next(source)]
@@ -396,7 +396,7 @@ def test_an_interrupted_program_keeps_its_lines_and_says_where_to_begin_again() 
     assert [float(chunk["time"][0]) for chunk in more] == pytest.approx([2000, 2600, 3200], abs=2)
 
 
-def test_a_control_that_can_be_asked_says_why_its_program_prints_no_more() -> None:
+def test_state_of_the_control_explains_missing_lines() -> None:
     class ReadOnly:
         def state(self):
             return {"estop": False, "alarms": ["2042 spindle overload"]}
@@ -427,17 +427,17 @@ def test_an_old_line_is_not_taken_for_a_touch_of_this_cycle() -> None:
 # ---------------------------------------------------------------------- benches and settings that cannot do it
 
 
-def test_a_probe_that_has_the_machine_moved_needs_a_control() -> None:
+def test_probe_that_moves_the_machine_needs_a_control() -> None:
     with pytest.raises(MethodError, match="needs an instrument of kind 'controller' that turns the spindle"):
         next(acquire(Bench(touch_probe=Probe(Control()))))
 
 
-def test_three_balls_are_the_least() -> None:
+def test_three_balls_are_required() -> None:
     with pytest.raises(MethodError, match="three or more balls; found 2"):
         next(acquire(Bench(), settings(balls=BALLS[:2])))
 
 
-def test_a_ball_that_was_not_found_cold_is_reported_at_once() -> None:
+def test_ball_not_found_in_the_cold_cycle_is_reported_immediately() -> None:
     class Blind(Probe):
         def measure(self, touches):
             for contact, touch in zip(super().measure(touches), touches, strict=True):
@@ -465,7 +465,7 @@ def test_each_cycle_is_reported_in_a_line() -> None:
     assert "too few touches; 0 of 20 touches good" in text
 
 
-def test_a_line_after_an_interruption_says_since_when() -> None:
+def test_line_after_an_interruption_states_its_reference() -> None:
     _, _, chunks = driven()
     live = LiveBalls(settings())
     live.update(chunks[2])

@@ -48,7 +48,7 @@ class Bench:
 
 
 @pytest.mark.parametrize("moves", [(), ((1.0, 0.0, 0.8), (3.0, 0.5, 0.9))])
-def test_the_steps_are_what_the_machine_does(monkeypatch, moves) -> None:
+def test_steps_equal_the_motions_of_the_machine(monkeypatch, moves) -> None:
     chosen = settings(
         schedule=[{"at": 0.0, "spindle_speed": 9000.0}, {"at": 900.0, "spindle_speed": 0.0}], moves=moves,
         moves_feed=1 / MINUTE,
@@ -87,7 +87,7 @@ def test_the_steps_are_what_the_machine_does(monkeypatch, moves) -> None:
     assert slowest[1:] == pytest.approx(ends, rel=0.05)
 
 
-def test_without_balls_there_is_nothing_to_do() -> None:
+def test_no_steps_without_balls() -> None:
     assert cycle.cycle_steps(Settings()) == []
 
 
@@ -98,9 +98,7 @@ def test_without_balls_there_is_nothing_to_do() -> None:
     clearance=st.floats(1e-3, 0.1),
     elevation=st.floats(0, 0.5),
 )
-def test_every_ball_is_touched_as_often_as_asked_and_no_way_leads_through_it(
-    touches, balls, order, clearance, elevation
-) -> None:
+def test_every_ball_has_the_stated_touches_and_no_path_crosses_it(touches, balls, order, clearance, elevation) -> None:
     chosen = settings(touches=touches, balls=BALLS[:balls], order=order, clearance=clearance, elevation=elevation)
     planned, which = cycle.cycle_touches(chosen, 3e-3)
     assert sorted(which) == [(ball, touch) for ball in range(balls) for touch in range(touches)]
@@ -119,7 +117,7 @@ def test_every_ball_is_touched_as_often_as_asked_and_no_way_leads_through_it(
 
 
 @given(interval=st.integers(1, 60), count=st.integers(1, 20), number=st.integers(0, 30), late=st.floats(0, 5000))
-def test_a_late_cycle_is_made_at_once_and_those_before_it_are_left_out(interval, count, number, late) -> None:
+def test_late_cycle_starts_immediately_and_earlier_ones_are_omitted(interval, count, number, late) -> None:
     chosen = settings(interval=float(interval), duration=float(interval * count))
     assert cycle.cycles(chosen) == count + 1
     found = cycle.due(chosen, number, number * interval + late)
@@ -129,7 +127,7 @@ def test_a_late_cycle_is_made_at_once_and_those_before_it_are_left_out(interval,
     assert cycle.following(chosen, found * interval) == found + 1
 
 
-def test_cycles_that_overlap_leave_out_every_other_one() -> None:
+def test_overlapping_cycles_are_omitted() -> None:
     length = math.fsum(step.seconds for step in cycle.cycle_steps(settings()))
     numbers = [part.number for part in cycle.parts(settings(interval=length / 1.5, duration=6 * length / 1.5))]
     assert numbers == [0, 1, 3, 4, 6]
@@ -141,7 +139,7 @@ def test_cycles_that_overlap_leave_out_every_other_one() -> None:
     events=st.lists(st.tuples(st.integers(1, 3000), st.integers(0, 15000)), max_size=5, unique_by=lambda e: e[0]),
     moves=st.sampled_from([(), ((0.0, 0.0, 0.9),), ((0.0, 0.0, 0.9), (1.0, 0.0, 0.9)), ((0.0, 0.0, 0.9),) * 2]),
 )
-def test_warm_up_fills_its_time_with_what_the_schedule_says(begin, length, events, moves) -> None:
+def test_warm_up_follows_the_schedule(begin, length, events, moves) -> None:
     schedule = [{"at": float(at), "spindle_speed": float(speed)} for at, speed in sorted(events)]
     chosen = settings(schedule=schedule, moves=moves)
     steps = cycle.warm_up_steps(chosen, begin, begin + length, (0.5, 0.5, 0.9))

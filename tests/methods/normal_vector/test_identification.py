@@ -36,7 +36,7 @@ def test_recovers_truth_with_true_uncertainty(probed, off, kind, seen):
     assert alarms == 0
 
 
-def test_c_frame_taken_for_a_gantry_is_wrong_and_says_so(probed, off):
+def test_c_frame_taken_for_a_gantry_is_reported(probed, off):
     machine, raw = probed("cframe", seed=3)
     del raw.attrs["tool_axes"]
     right, wrong = (METHOD.identify(raw, Settings(tool_axes=axes, robust=False)) for axes in ("Z", "XYZ"))
@@ -47,7 +47,7 @@ def test_c_frame_taken_for_a_gantry_is_wrong_and_says_so(probed, off):
     assert np.abs(wrong["EA"].values[-1] - right["EA"].values[-1]) > 10 * sigma(right)[-1, 3]
 
 
-def test_data_say_which_axes_carry_the_tool(probed):
+def test_data_state_the_axes_that_carry_the_tool(probed):
     _, raw = probed("cframe")
     errors = METHOD.identify(raw, Settings(tool_axes="XYZ"))
     assert errors.attrs["tool_axes"] == "Z"
@@ -57,7 +57,7 @@ def test_data_say_which_axes_carry_the_tool(probed):
     assert "shears" in errors.attrs["notes"][1]
 
 
-def test_result_holds_what_reports_and_models_need(probed):
+def test_result_contains_the_variables_for_reports_and_models(probed):
     machine, raw = probed()
     errors = METHOD.identify(raw)
     validate(errors)
@@ -74,7 +74,7 @@ def test_result_holds_what_reports_and_models_need(probed):
     assert json.loads(errors.attrs["provenance"])["settings"]["procedure"] == "rigid"
 
 
-def test_balls_seem_to_move_against_the_error(probed):
+def test_apparent_motion_of_balls_is_opposite_to_the_error(probed):
     _, raw = probed()
     errors = METHOD.identify(raw)
     shift = errors["ball_displacement"].values[-1].mean(axis=0)
@@ -92,7 +92,7 @@ def test_error_at_another_point_is_that_of_the_moved_twist(probed):
     np.testing.assert_allclose(sigma(there), sigma(moved), rtol=1e-3)
 
 
-def test_touches_that_are_missing_cost_precision_and_no_more(probed, off):
+def test_missing_touches_only_increase_the_uncertainty(probed, off):
     machine, raw = probed(missing=0.15)
     errors, whole = METHOD.identify(raw), METHOD.identify(probed()[1])
     assert np.nanmax(np.abs(off(machine, errors))) < 4
@@ -110,7 +110,7 @@ def test_cycle_without_touches_is_unknown_and_the_others_are_not(probed, off):
     assert any("unknown: 3" in note for note in errors.attrs["notes"])
 
 
-def test_ball_that_is_missing_in_one_cycle_leaves_the_twist_less_certain(probed, off):
+def test_missing_ball_in_a_cycle_increases_its_uncertainty(probed, off):
     machine, raw = probed()
     raw["touch"][3, 1] = np.nan
     errors = METHOD.identify(raw)
@@ -119,7 +119,7 @@ def test_ball_that_is_missing_in_one_cycle_leaves_the_twist_less_certain(probed,
     assert (u[3] > u[5]).all()
 
 
-def test_ball_that_was_forgotten_in_the_cold_cycle_still_helps_with_turns(probed, off):
+def test_ball_missing_in_the_cold_cycle_still_helps_with_rotations(probed, off):
     machine, raw = probed(balls=5)
     raw["touch"][0, 2] = np.nan
     errors = METHOD.identify(raw)
@@ -127,7 +127,7 @@ def test_ball_that_was_forgotten_in_the_cold_cycle_still_helps_with_turns(probed
     assert np.isfinite(errors["EX"]).all()
 
 
-def test_noise_that_nobody_stated_comes_from_the_residuals(probed):
+def test_unstated_noise_is_estimated_from_the_residuals(probed):
     _, raw = probed(touches=9)
     stated, found = METHOD.identify(raw), METHOD.identify(raw.drop_vars("touch_noise"))
     # 192 degrees of freedom tell a standard deviation to 5 %; the interval is widened by Student's factor, 1.006.
@@ -135,7 +135,7 @@ def test_noise_that_nobody_stated_comes_from_the_residuals(probed):
     assert "from the residuals" in found.attrs["notes"][0]
 
 
-def test_noise_above_the_stated_one_is_reported_and_counted(probed):
+def test_noise_above_the_stated_one_is_reported_and_included(probed):
     _, raw = probed(noise=0.8e-6)
     raw["touch_noise"] = raw["touch_noise"] * 0 + 0.25e-6
     raised, kept = (
@@ -149,7 +149,7 @@ def test_noise_above_the_stated_one_is_reported_and_counted(probed):
 
 
 @pytest.mark.parametrize("kind", ["gantry", "cframe"])
-def test_centres_alone_do_as_well(probed, off, kind):
+def test_centres_determine_the_errors_with_a_larger_uncertainty_along_z(probed, off, kind):
     machine, raw = probed(kind, variant="centres", cycle=0.0)
     errors = METHOD.identify(raw)
     assert np.nanmax(np.abs(off(machine, errors))) < 4

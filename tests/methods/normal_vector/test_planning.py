@@ -75,7 +75,7 @@ def test_touches_lie_around_the_ball_and_on_top():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"balls": ({"centre": (0, 0, 0), "name": "A"}, {"centre": (1, 0, 0), "name": "A"})}, "names that differ"),
+        ({"balls": ({"centre": (0, 0, 0), "name": "A"}, {"centre": (1, 0, 0), "name": "A"})}, "different names"),
         (
             {"schedule": ({"at": 60.0, "spindle_speed": 1e3}, {"at": 0.0, "spindle_speed": 0.0})},
             "expected increasing times",

@@ -89,7 +89,7 @@ def test_the_lobes_are_found_and_nothing_else_without_noise() -> None:
     np.testing.assert_allclose(found.met(points, n), [0.1, 0.2, 0.3] + contact * n, atol=1e-12)
 
 
-def test_the_map_holds_the_truth_as_often_as_it_says() -> None:
+def test_map_contains_the_truth_as_often_as_stated() -> None:
     seeds = 200
     deviation = np.empty((seeds, 200))
     highest = []
@@ -135,7 +135,7 @@ def test_touches_are_spread_over_the_upper_half_along_the_normals() -> None:
     assert angle.min() / angle.max() > 0.5
 
 
-def test_a_wrong_touch_is_left_out_and_harms_nothing() -> None:
+def test_wrong_touch_is_excluded_without_effect() -> None:
     points, known, _ = touched(7)
     good = fit_pretravel(points, known)
     spoilt = points.copy()

@@ -81,7 +81,7 @@ schedules = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 15000)), max_s
     moves=st.sampled_from([(), ((1.0, 0.0, 0.8), (3.0, 0.5, 0.9))]),
     feed=st.integers(1, 20),
 )
-def test_a_program_goes_where_and_when_the_steps_go(shifts, touches, order, events, settle, moves, feed) -> None:
+def test_program_has_the_positions_and_times_of_the_steps(shifts, touches, order, events, settle, moves, feed) -> None:
     balls = [
         {"centre": tuple(c + 1e-6 * d for c, d in zip(ball["centre"], shift, strict=True))}
         for ball, shift in zip(BALLS, shifts, strict=False)
@@ -112,7 +112,7 @@ def test_a_program_goes_where_and_when_the_steps_go(shifts, touches, order, even
     assert numbers == [*range(1, 3 * touches + 1)] * cycles
 
 
-def test_a_cycle_begins_upwards_and_every_touch_is_printed_once_behind_its_skip_move() -> None:
+def test_cycle_starts_upwards_and_every_touch_is_printed_once_after_its_skip_move() -> None:
     text = NormalVector().programs(settings())[CYCLE]
     lines = text.splitlines()
     moves = [line for line in lines if line.startswith("G1 ")]
@@ -145,7 +145,7 @@ def test_each_cycle_has_a_sequence_number_before_its_warm_up() -> None:
     assert after[1] == "M3 S9000"
 
 
-def test_the_tool_is_changed_while_the_spindle_stands() -> None:
+def test_tool_is_changed_with_a_stopped_spindle() -> None:
     chosen = settings(schedule=[{"at": 0.0, "spindle_speed": 9000.0}], to_probe=("T9 M6", "M19"), to_warm_up=("T1 M6",))
     lines = NormalVector().programs(chosen)[WARM_UP].splitlines()
     orders = [line for line in lines if line.startswith(("M3 ", "M5", "T", "POPEN", "M19"))]
@@ -161,6 +161,6 @@ def test_the_first_touch_of_a_ball_names_it_as_a_control_can_read_it() -> None:
     assert named == ["front)", "S?d)", "rear ?left?)", "S?d)", "front)"]
 
 
-def test_without_balls_there_is_no_program() -> None:
+def test_no_program_without_balls() -> None:
     with pytest.raises(MethodError, match="three or more balls; found none"):
         NormalVector().programs(Settings())

@@ -88,7 +88,7 @@ def number(text):
     return float(text.replace("−", "-").replace("+", ""))
 
 
-def test_every_section_is_there_in_order(folder):
+def test_all_sections_are_in_order(folder):
     html = page(clean, folder)
     places = [html.index(f"<h2>{title}</h2>") for title in HEADINGS]
     assert places == sorted(places)
@@ -193,7 +193,7 @@ def test_centre_that_lost_its_top_touch_is_not_drawn_as_a_displacement():
     assert "Not drawn: 1 centres" in balls(seen, "k").caption
 
 
-def test_freedom_that_is_not_seen_is_a_dash_with_its_reason(folder):
+def test_undetermined_freedom_is_a_dash_with_its_reason(folder):
     html = page(cframe, folder)
     row = next(row for row in rows(html, "The six errors") if row[0] == "EC")
     assert row[2].startswith("—")
@@ -214,7 +214,7 @@ def test_temperatures_and_speed_share_the_time_axis_of_the_errors(folder):
         assert str(sensor) in figure
 
 
-def test_sensors_stand_at_the_places_of_their_thermometer(tmp_path):
+def test_sensors_are_at_the_positions_of_their_thermometer(tmp_path):
     errors, raw = clean()
     run = {
         "instruments": [
@@ -234,7 +234,7 @@ def test_sensors_stand_at_the_places_of_their_thermometer(tmp_path):
     assert re.search(r"Position unknown: .*bed", text)
 
 
-def test_temperature_that_is_never_known_is_no_number(tmp_path):
+def test_unknown_temperature_is_not_a_number(tmp_path):
     errors, raw = clean()
     values = errors["temperature"].values.copy()
     values[:, 0] = np.nan
@@ -249,7 +249,7 @@ def test_temperature_that_is_never_known_is_no_number(tmp_path):
     assert f"Without a valid reading: {first[0]}" in words(html)
 
 
-def test_result_by_the_normals_says_so(tmp_path):
+def test_result_by_the_normals_is_labelled(tmp_path):
     raw = warm_up()
     errors = NormalVector().identify(raw, NormalVector.Settings(procedure="normals"))
     text = words(write_report(errors, tmp_path / "r.html", raw=raw).read_text(encoding="utf-8"))
@@ -281,7 +281,7 @@ def test_cycles_that_are_all_unknown_are_reported(tmp_path):
     assert "No cycle determines the errors" in text
 
 
-def test_flags_of_another_raw_dataset_are_not_taken():
+def test_flags_of_another_raw_dataset_are_not_used():
     errors, raw = clean()
     assert probing(errors, raw).flag is not None
     assert probing(errors, raw.isel(time=slice(0, 4))).flag is None

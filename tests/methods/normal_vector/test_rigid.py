@@ -45,7 +45,7 @@ def touches(axes, cycles=5, count=5, noise=0.0, drift=DRIFT, seed=0, duration=10
 
 
 @pytest.mark.parametrize("coupled", [False, True])
-def test_elimination_along_the_cycles_gives_what_dense_algebra_gives(coupled):
+def test_elimination_along_the_cycles_agrees_with_dense_algebra(coupled):
     rng = np.random.default_rng(3)
     n, p, q = 6, 4, 5
     A = rng.normal(size=(80, n * p + q))
@@ -72,7 +72,7 @@ def test_elimination_along_the_cycles_gives_what_dense_algebra_gives(coupled):
 
 @pytest.mark.parametrize("axes", ["XYZ", "Z", "YZ"])
 @pytest.mark.parametrize("uneven", [0.0, 1.5e-6])
-def test_without_noise_the_motion_comes_back_whatever_the_reaches_are(axes, uneven):
+def test_motion_is_exact_without_noise_for_any_reaches(axes, uneven):
     seen, motion, true = touches(axes, uneven=uneven, duration=0.0)
     found = fit(seen, motion)
     rows = list(motion.seen)
@@ -84,14 +84,14 @@ def test_without_noise_the_motion_comes_back_whatever_the_reaches_are(axes, unev
     np.testing.assert_allclose(found.anchor, BALLS[axes], atol=5e-6)  # reaches of 1.5 um shift their sphere
 
 
-def test_a_milliradian_is_turned_exactly():
+def test_rotation_of_a_milliradian_is_exact():
     drift = np.array([0, 0, 0, 1e-3, -0.7e-3, 0.5e-3])
     seen, motion, true = touches("XYZ", drift=drift, duration=0.0, uneven=0.0)
     # To first order the balls would be off by the square of the angle times 1 m: 1 um.
     np.testing.assert_allclose(fit(seen, motion).twist, true, atol=1e-10)
 
 
-def test_a_turn_leaves_lengths_as_they_are():
+def test_rotation_preserves_lengths():
     rng = np.random.default_rng(1)
     rotation, vector = rng.normal(size=(2, 50, 3))
     np.testing.assert_allclose(np.linalg.norm(rotated(rotation, vector), axis=1), np.linalg.norm(vector, axis=1))
@@ -113,7 +113,7 @@ def test_stated_covariance_is_the_bound(axes, interpolate):
     np.testing.assert_allclose((found.covariance[rows] - least[rows]) / np.outer(scale, scale), 0.0, atol=3e-3)
 
 
-def test_unknown_reaches_of_all_touches_cost_nothing_over_one_radius_a_ball():
+def test_unknown_reach_of_each_touch_costs_no_more_than_one_radius_for_each_ball():
     normal, motion = np.tile(touch_normals(5), (4, 1, 1)), Motion("XYZ", BALLS["XYZ"].mean(axis=0))
     place = BALLS["XYZ"][:, None] + REACH * normal
     each, one = (bound(place, normal, motion, noise=NOISE, cycles=4, reach=reach)[1:] for reach in ("touch", "ball"))
@@ -159,7 +159,7 @@ def test_weights_between_the_cycles_follow_a_parabola():
     np.testing.assert_allclose(weights[0], 0.0)
 
 
-def test_c_frame_never_sees_the_turn_about_the_axis_of_its_tool():
+def test_c_frame_does_not_determine_the_rotation_about_the_axis_of_its_tool():
     assert Motion("Z", np.zeros(3)).seen == (0, 1, 2, 3, 4)
     assert Motion("XYZ", np.zeros(3)).seen == Motion("YZ", np.zeros(3)).seen == (0, 1, 2, 3, 4, 5)
     assert Motion("", np.zeros(3)).seen == (0, 1, 2)

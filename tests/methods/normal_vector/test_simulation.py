@@ -50,7 +50,7 @@ def inverted(machine, data):
     return centres
 
 
-def test_contacts_inverted_give_the_balls_where_they_stand(machine):
+def test_inverted_contacts_give_the_true_balls(machine):
     data = raw(machine, HOURS, seed=1, touches=7, noise=0.0)
     found = inverted(machine, data)
     # Newton's steps of a sphere of 15 mm settle to rounding; asked for was a nanometre
@@ -66,7 +66,7 @@ def test_measured_centres_move_by_minus_the_error_of_the_tip(machine):
     assert np.abs(moved).max() > 15e-6
 
 
-def test_spheres_come_out_smaller_by_the_pretravel(machine):
+def test_measured_spheres_are_smaller_by_the_pretravel(machine):
     data = raw(machine, [0.0], seed=1, noise=0.0)
     across = data["touch"].values[0, :, 0, 0] - data["touch"].values[0, :, 1, 0]  # from +x to -x
     stylus = 2 * (machine.balls.radius + machine.probe.tip_radius)
@@ -74,7 +74,7 @@ def test_spheres_come_out_smaller_by_the_pretravel(machine):
     np.testing.assert_allclose(across - stylus, -2 * machine.probe.mean, atol=4e-6)
 
 
-def test_raw_data_scatter_by_their_seed_alone(machine):
+def test_scatter_of_raw_data_depends_on_the_seed_only(machine):
     one, same, other = (raw(machine, HOURS, seed=s) for s in (1, 1, 2))
     assert one.identical(same)
     still = raw(machine, HOURS, seed=1, noise=0.0)
@@ -104,7 +104,7 @@ def test_raw_data_follow_their_schema(machine, variant, balls):
     np.testing.assert_allclose(data["spindle_speed"][-1], 4000, rtol=1e-9)
 
 
-def test_centres_scatter_as_their_covariance_says(cframe):
+def test_scatter_of_centres_agrees_with_their_covariance(cframe):
     still = raw(cframe, HOURS, seed=0, variant="centres", noise=0.0)["centre"].values
     off = []
     for seed in range(60):
@@ -116,7 +116,7 @@ def test_centres_scatter_as_their_covariance_says(cframe):
     np.testing.assert_allclose(found, stated, atol=0.2 * stated.max())
 
 
-def test_a_ball_that_is_pushed_is_elsewhere_from_then_on(machine):
+def test_moved_ball_is_displaced_from_then_on(machine):
     shift = np.array([40e-6, 0.0, -25e-6])
     still = raw(machine, HOURS, seed=1, variant="centres", noise=0.0)["centre"]
     pushed = raw(machine, HOURS, seed=1, variant="centres", noise=0.0, moved=(2, 3000.0, shift))["centre"]
@@ -139,22 +139,22 @@ def test_missing_touches_are_flagged_and_nan(machine):
     ("arguments", "why"),
     [
         ({"balls": 9}, "1 to 8 balls"),
-        ({"touches": 4}, "5 times or more"),
-        ({"times": [0.0, 60.0]}, "Cycles of 120 s"),
-        ({"cycle": -1.0}, "Cycles of -1 s"),
+        ({"touches": 4}, "expected 5 or more"),
+        ({"times": [0.0, 60.0]}, "at least 120 s apart"),
+        ({"cycle": -1.0}, "at least -1 s apart"),
         ({"missing": 1.5}, "from 0 to 1"),
-        ({"moved": (4, 0.0, (0, 0, 0))}, "one of 0 to 3"),
-        ({"variant": "balls"}, "'touches' and 'centres'"),
+        ({"moved": (4, 0.0, (0, 0, 0))}, "from 0 to 3"),
+        ({"variant": "balls"}, "'touches' or 'centres'"),
     ],
 )
-def test_what_cannot_be_probed_is_refused_in_words(cframe, arguments, why):
+def test_invalid_arguments_of_a_simulation_are_refused(cframe, arguments, why):
     with pytest.raises(BenchError, match=why):
         raw(cframe, **{"times": HOURS, "seed": 1, **arguments})
 
 
 @pytest.mark.parametrize("kind", ["cframe", "gantry"])
 @pytest.mark.parametrize("seed", range(5))
-def test_every_touch_meets_its_ball(kind, seed):
+def test_every_touch_hits_its_ball(kind, seed):
     assert raw(VirtualMachine(kind, seed), [0.0], seed=0, balls=8, touches=9)["touch_flag"].values.max() == 0
 
 

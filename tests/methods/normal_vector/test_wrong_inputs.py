@@ -51,7 +51,7 @@ def test_no_axis_carries_the_tool_so_that_only_displacements_show(probed):
     assert np.isfinite(errors["EX"]).all()
 
 
-def test_axes_that_there_are_not(probed):
+def test_unknown_axes(probed):
     refused(probed()[1].assign_attrs(tool_axes="ZX"), "tool_axes: expected the linear axes.*found 'ZX'")
 
 
@@ -85,7 +85,7 @@ def test_balls_in_another_order_than_stated(probed):
     refused(raw, "Ball B1 was found at the position of ball B2")
 
 
-def test_ball_that_is_nowhere_near_its_place(probed):
+def test_ball_far_from_its_position(probed):
     _, raw = probed()
     raw["ball_nominal"][2, 0] += 0.05
     refused(raw, "Ball B3 was found 50.1 mm from its nominal position")
@@ -97,7 +97,7 @@ def test_balls_in_another_order_in_one_cycle(probed):
     refused(raw, "In cycle 3 ball B1 was touched at the position of ball B2")
 
 
-def test_something_else_was_touched(probed):
+def test_another_object_was_touched(probed):
     _, raw = probed()
     raw["touch"][3, 2] += 0.02
     refused(raw, "In cycle 3 ball B3 was touched 34.64 mm from its touches")
@@ -122,7 +122,7 @@ def test_cold_cycle_that_is_missing(probed):
     refused(raw, "cycle 0 has no good touch")
 
 
-def test_one_cycle_alone(probed):
+def test_one_cycle_only(probed):
     refused(probed()[1].isel(time=[0]), "at least one more")
 
 
@@ -141,14 +141,14 @@ def test_flags_are_counted_by_name(probed):
     assert errors["left_out"].values[2, 1, 3] == 1
 
 
-def test_noise_of_nothing(probed):
+def test_noise_of_zero(probed):
     _, raw = probed()
     raw["touch_noise"] = raw["touch_noise"] * 0
     raw["touch_noise"].attrs["units"] = "m"
     refused(raw, "touch_noise: expected more than 0 m")
 
 
-def test_normals_where_they_say_nothing(probed):
+def test_normals_where_they_are_not_determined(probed):
     refused(probed("cframe")[1], "procedure = normals: .*shears", procedure="normals")
     refused(probed(balls=3)[1], "procedure = normals: .*need four balls; found 3", procedure="normals")
     refused(probed()[1], "expected names of B1, B2, B3, B4; found B9", normals_balls=("B1", "B2", "B3", "B9"))
@@ -166,7 +166,7 @@ def test_data_of_another_method(probed):
         ({"centre_of_4": (0.42, 0.0, 0.0)}, "balls: expected separate balls; 2 and 4 overlap"),
     ],
 )
-def test_balls_that_cannot_be_are_refused_before_anything_is_touched(settings, said):
+def test_invalid_balls_are_refused_before_any_touch(settings, said):
     places = [(0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (0.0, 0.3, 0.0), settings.pop("centre_of_4", (0.4, 0.3, 0.2))]
     balls = [{"centre": [f"{x * 1e3} mm" for x in place]} for place in places]
     with pytest.raises(ValidationError, match=said):

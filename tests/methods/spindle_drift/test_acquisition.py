@@ -1,4 +1,4 @@
-"""Measuring, with instruments that do what real ones do: go on late, fall silent, start when the operator is ready."""
+"""Acquisition with instruments that behave like real ones: late, interrupted, started by the operator."""
 
 import json
 from datetime import UTC, datetime, timedelta
@@ -70,7 +70,7 @@ def record(bench, settings, done=None):
     return chunks, xr.concat(chunks, dim="time", data_vars="minimal", coords="minimal", compat="override", join="exact")
 
 
-def test_the_record_is_whole_and_counts_what_was_lost():
+def test_record_is_complete_and_counts_lost_samples():
     bench = Bench(spindle_frame=Frame(), thermometer=Thermometer())
     chunks, raw = record(bench, Settings(duration=10.2, schedule=(Event(at=2.0, spindle_speed=3000.0),)))
     assert raw.sizes["time"] == 10200
@@ -82,7 +82,7 @@ def test_the_record_is_whole_and_counts_what_was_lost():
     assert chunks[0]["distance"].encoding == ENCODING
 
 
-def test_the_record_begins_with_its_first_sample_and_not_with_the_question():
+def test_record_starts_with_its_first_sample_and_not_with_the_prompt():
     class Slow(Bench):
         def ask(self, message):
             self.answered = datetime.now(UTC)
@@ -93,7 +93,7 @@ def test_the_record_begins_with_its_first_sample_and_not_with_the_question():
     assert datetime.fromisoformat(chunks[0].attrs["start"]) > bench.answered - timedelta(seconds=0.51)
 
 
-def test_a_thermometer_that_falls_silent_for_a_while_costs_its_own_values_only():
+def test_interruption_of_the_thermometer_loses_only_temperatures():
     bench = Bench(spindle_frame=Frame(), thermometer=Thermometer(fails=(3, 4)))
     chunks, raw = record(bench, Settings(duration=10.0))
     warmth = raw["temperature"].sel(sensor="frame").values
@@ -103,19 +103,19 @@ def test_a_thermometer_that_falls_silent_for_a_while_costs_its_own_values_only()
     assert sum(chunk.attrs["invalid"].get("thermometer without answer", 0) for chunk in chunks) == 2
 
 
-def test_a_thermometer_that_is_gone_for_good_ends_the_record():
+def test_permanent_failure_of_the_thermometer_ends_the_record():
     bench = Bench(spindle_frame=Frame(), thermometer=Thermometer(fails=range(3, 1000)))
     with pytest.raises(InstrumentError, match="no answer"):
         record(bench, Settings(duration=2.0 * (MAX_FAILED_POLLS + 10)))
 
 
 def interrupted(ago):
-    """Return what a record holds that began ``ago`` seconds ago and was cut off after one second."""
+    """Return a record that started ``ago`` seconds ago and was interrupted after one second."""
     _, raw = record(Bench(spindle_frame=Frame(), thermometer=Thermometer()), Settings(duration=1.0))
     return raw.assign_attrs(start=(datetime.now(UTC) - timedelta(seconds=ago)).isoformat())
 
 
-def test_the_gap_of_an_interruption_is_nan_in_chunks_and_time_goes_on():
+def test_gap_of_an_interruption_is_nan_and_time_continues():
     bench = Bench(spindle_frame=Frame(), thermometer=Thermometer())
     settings = Settings(duration=900.0)
     chunks, raw = record(bench, settings, interrupted(600.0))
@@ -129,7 +129,7 @@ def test_the_gap_of_an_interruption_is_nan_in_chunks_and_time_goes_on():
 
 
 @pytest.mark.parametrize(("change", "restarted"), [(-3600.0, False), (86400.0, False), (-3600.0, True)])
-def test_a_clock_that_was_set_neither_hides_a_gap_nor_makes_one(change, restarted):
+def test_change_of_the_clock_neither_hides_nor_creates_a_gap(change, restarted):
     done = interrupted(600.0 + change)  # as the wall clock has it now: it was set by `change` since the last data
     started = datetime.fromisoformat(done.attrs["start"]).timestamp()
     now = clock.read()

@@ -1,4 +1,4 @@
-"""Means of a record: right for every layout, whatever the pieces it comes in."""
+"""Means of a record: correct for every memory layout and any division into chunks."""
 
 from itertools import pairwise
 
@@ -74,7 +74,7 @@ def test_even_times_give_the_means_of_the_same_times_one_by_one(pieces, length, 
     np.testing.assert_allclose(ours.time, theirs.time, rtol=1e-14, atol=1e-12)
 
 
-def test_times_that_do_not_increase_are_seen():
+def test_times_that_do_not_increase_are_detected():
     assert increases(EvenTimes(0.0, 0.1, 5))
     assert increases(np.array([0.0, 0.1]))
     assert not increases(EvenTimes(0.0, 0.0, 5))
@@ -89,7 +89,7 @@ def test_windows_follow_the_clock_and_not_the_samples():
     np.testing.assert_allclose(found.mean[0], found.time)
 
 
-def test_samples_further_apart_than_a_window_stay_as_they_are():
+def test_samples_farther_apart_than_a_window_are_not_changed():
     time = np.arange(0, 10, 0.5)
     values = np.sin(time)[None]
     found = Averager(1, 0.5).update(time, values)

@@ -45,7 +45,7 @@ def test_fit_agrees_with_scipy_to_a_picometre(beams):
         np.testing.assert_allclose(q[t], peer.x, rtol=0, atol=1e-12)
 
 
-def test_unknown_readings_give_unknown_axes_and_harm_no_neighbour(beams):
+def test_unknown_readings_give_unknown_axes_and_affect_no_others(beams):
     distance = np.full((5, 6), 1e-3)
     distance[1, 2] = np.nan
     distance[:4, 4] = 0.9  # no bar there

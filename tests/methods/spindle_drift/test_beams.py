@@ -70,7 +70,7 @@ def test_spread_meets_the_bound_and_the_stated_covariance():
     assert np.sqrt(np.mean(np.square(paper_ratio), axis=0))[0] > 1.2
 
 
-def test_outliers_are_named_and_left_out():
+def test_outliers_are_reported_and_excluded():
     rng = np.random.default_rng(3)
     P, u = true_beam(rng)
     readings = sphere_reading(P, u, CENTRE, R)[0] + rng.normal(0, NOISE, CENTRE.shape[:2])
@@ -81,7 +81,7 @@ def test_outliers_are_named_and_left_out():
     assert np.abs(beam.origin - P).max() < 5 * 0.5e-6
 
 
-def test_missed_steps_are_unknown_and_do_no_harm():
+def test_missed_steps_are_unknown_and_affect_no_others():
     rng = np.random.default_rng(4)
     P, u = true_beam(rng)
     readings = sphere_reading(P, u, CENTRE, R)[0] + rng.normal(0, NOISE, CENTRE.shape[:2])
@@ -105,7 +105,7 @@ def test_a_beam_far_from_nominal_is_found():
     [(np.full(CENTRE.shape[:2], np.nan), "0 of 606 readings"), (np.full(CENTRE.shape[:2], 0.5), "does not converge")],
     ids=["nothing", "nonsense"],
 )
-def test_hopeless_readings_are_refused_in_words(readings, message):
+def test_unusable_readings_are_refused(readings, message):
     with pytest.raises(MethodError, match=message):
         likelihood_fit(readings, CENTRE, R, P0, U0, "X1")
 

@@ -88,7 +88,7 @@ def test_beams_are_found_within_their_uncertainty_from_the_record(machine, metho
     assert beams.attrs["notes"] == [""]
 
 
-def test_of_a_scan_that_was_cut_off_and_made_anew_the_last_attempt_counts(method, recorded):
+def test_last_attempt_of_a_repeated_scan_is_used(method, recorded):
     whole = method.identify(recorded, SETTINGS)
     second = recorded.assign(attempt=recorded["attempt"] + 1)
     cut = recorded.isel(sample=slice(0, 9000))  # a part of the first scan, twice, then everything again
@@ -96,7 +96,7 @@ def test_of_a_scan_that_was_cut_off_and_made_anew_the_last_attempt_counts(method
     np.testing.assert_array_equal(method.identify(anew, SETTINGS)["beam_origin"], whole["beam_origin"])
 
 
-def test_a_scan_cut_off_twice_is_made_a_third_time(recorded):
+def test_scan_interrupted_twice_is_made_a_third_time(recorded):
     length = recorded.sizes["sample"] // 30
     parts = [recorded.isel(sample=slice(0, round(0.6 * length))).assign_coords() for _ in range(2)]
     parts[1] = parts[1].assign(attempt=parts[1]["attempt"] + 1)
@@ -104,7 +104,7 @@ def test_a_scan_cut_off_twice_is_made_a_third_time(recorded):
     assert last_attempts(done) == {0: (1, round(0.6 * length))}
 
 
-def test_a_scan_that_went_wrong_is_unknown_and_said(machine, method, recorded):
+def test_failed_scan_is_unknown_and_reported(machine, method, recorded):
     spoilt = recorded.copy(deep=True)
     scan = spoilt["scan"].values
     spoilt["record"][scan == 8] = 1e-3
@@ -115,7 +115,7 @@ def test_a_scan_that_went_wrong_is_unknown_and_said(machine, method, recorded):
 
 
 def test_correlation_of_shift_and_rotation_has_its_sign(machine, method):
-    """Joint misses of all five freedoms: a wrong sign of a covariance shows in no single interval."""
+    """Joint test of all five freedoms: no single interval shows a wrong sign of a covariance."""
     seeds, scores = 40, []
     for seed in range(seeds):
         beams = method.identify(simulation.raw_beam_detection(machine, seed=seed))

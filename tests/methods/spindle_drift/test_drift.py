@@ -39,7 +39,7 @@ def truth_of(machine, errors):
     return (twist - twist[0])[:, SEEN]
 
 
-def test_stated_intervals_hold_the_truth_and_the_joint_covariance_is_right(machine, method):
+def test_stated_intervals_contain_the_truth_and_the_joint_covariance_is_right(machine, method):
     seeds, inside, joint, slopes = 60, [], [], []
     for seed in range(seeds):
         raw = simulation.raw_drift(machine, TIMES, seed=seed, beams=detected(machine, method, 1000 + seed))
@@ -70,7 +70,7 @@ def test_noise_free_readings_give_the_truth_to_a_tenth_of_a_nanometre(machine, m
     assert np.abs(miss[:, 3:]).max() < 1e-9
 
 
-def test_nominal_beams_are_worse_and_say_so(machine, method):
+def test_nominal_beams_state_a_larger_uncertainty(machine, method):
     raw = simulation.raw_drift(machine, TIMES, seed=1, beams=detected(machine, method, 1))
     frame = machine.frame
     raw["nominal_origin"] = (("channel", "direction"), frame.nominal_origin)
@@ -83,7 +83,7 @@ def test_nominal_beams_are_worse_and_say_so(machine, method):
     assert (miss["nominal"][1:] < 4 * sigma["nominal"][1:]).all()
 
 
-def test_ec_is_not_seen_and_never_zero(machine, method):
+def test_ec_is_unknown_and_never_zero(machine, method):
     errors = method.identify(simulation.raw_drift(machine, TIMES, seed=0))
     assert np.isnan(errors["EC"]).all()
     assert np.isnan(errors["covariance"].sel(dof="EC")).all()
@@ -99,7 +99,7 @@ def test_the_functional_point_may_be_chosen_and_only_moves_the_errors(machine, m
         np.testing.assert_allclose(higher[name], moved[name], rtol=0, atol=1e-10)
 
 
-def test_the_record_stays_as_it_was(machine, method):
+def test_record_is_not_modified(machine, method):
     raw = simulation.raw_drift(machine, TIMES, seed=0)
     copy = raw.copy(deep=True)
     method.identify(raw)
@@ -129,7 +129,7 @@ def test_means_of_a_fast_record_are_those_of_the_slow_one(machine, method):
     np.testing.assert_allclose(a["covariance"], b["covariance"], rtol=1e-6, atol=1e-22)
 
 
-def test_more_noise_than_stated_is_noticed_and_raises_the_uncertainty(machine, method):
+def test_more_noise_than_stated_is_reported_and_increases_the_uncertainty(machine, method):
     t = np.arange(0, 200, 0.5)
     raw = simulation.raw_drift(machine, t, seed=6)
     noisy = raw.copy(deep=True)
@@ -156,7 +156,7 @@ def test_a_sensor_out_of_range_for_ten_minutes_loses_only_these(machine, method)
     assert float(errors["valid_fraction"].sel(channel="X2").mean()) == pytest.approx(5 / 6)
 
 
-def test_the_frames_expansion_is_taken_out_by_its_temperature(machine, method):
+def test_expansion_of_the_frame_is_corrected_by_its_temperature(machine, method):
     t = np.arange(0, 6000.0, 10.0)
     raw = simulation.raw_drift(machine, t, seed=8, expansion=True)
     raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
@@ -171,7 +171,7 @@ def test_the_frames_expansion_is_taken_out_by_its_temperature(machine, method):
     assert (sigma > 0.05 * miss[1]).all()  # a tenth of what was taken out is in the budget
 
 
-def test_a_record_that_begins_with_the_spindles_start_has_its_reference_after_it(machine, method):
+def test_record_that_starts_with_the_spindle_has_its_reference_after_spin_up(machine, method):
     machine = VirtualMachine("cframe", seed=4)
     machine.start([Event(0.0, 15000.0)])
     rate = 2500.0
@@ -226,17 +226,17 @@ def spoilt(machine, name):
         ("foreign schema", (MethodError, DatasetError), "crossbeam_scan|height"),
     ],
 )
-def test_wrong_inputs_are_refused_in_words_that_help(machine, method, name, error, message):
+def test_wrong_inputs_are_refused_with_a_helpful_message(machine, method, name, error, message):
     with pytest.raises(error, match=f"(?s){message}"):
         method.identify(spoilt(machine, name))
 
 
-def test_nominal_beams_that_are_not_there_are_missed(machine, method):
+def test_missing_nominal_beams_are_reported(machine, method):
     with pytest.raises(MethodError, match="nominal_origin"):
         method.identify(spoilt(machine, ""), Settings(beams="nominal"))
 
 
-def test_plan_predicts_what_the_twin_shows(machine, method):
+def test_plan_predicts_the_uncertainty_on_the_virtual_machine(machine, method):
     plan = method.plan()
     validate(plan)
     predicted = np.sqrt(np.diagonal(plan["covariance"].values[-1]))[SEEN]
@@ -262,7 +262,7 @@ def test_the_live_view_ends_where_the_identification_does(machine, method):
 # ------------------------------------------------------------------ starting and stopping
 
 
-def test_stopping_leaves_the_run_out_in_the_readings_and_the_uncertainty_says_so(method):
+def test_run_out_after_a_stop_is_part_of_the_uncertainty(method):
     machine = VirtualMachine("cframe", seed=4)
     machine.start([Event(0.0, 15000.0), Event(8.0, 0.0)])
     rate, seconds = 2500.0, 16
@@ -287,7 +287,7 @@ def test_stopping_leaves_the_run_out_in_the_readings_and_the_uncertainty_says_so
     assert np.sqrt(spread) < 0.1 * u[rest].min()
 
 
-def test_each_rest_is_a_draw_of_its_own_and_a_resting_reference_is_in_everything_else(method):
+def test_each_rest_is_an_independent_draw_and_a_resting_reference_affects_all_others(method):
     """Cold and still, then running, then still again: the bar stops at another angle than it started from."""
     machine = VirtualMachine("cframe", seed=4)
     machine.start([Event(6.0, 15000.0), Event(12.0, 0.0)])
@@ -308,7 +308,7 @@ def test_each_rest_is_a_draw_of_its_own_and_a_resting_reference_is_in_everything
     assert (off[last] < 3 * u[last]).all()
 
 
-def test_the_smoothed_frame_temperature_is_known_together_not_apart(machine, method):
+def test_errors_of_the_smoothed_frame_temperature_are_correlated(machine, method):
     """Means over half a minute share their smoothed temperature: their difference over seeds is what is stated."""
     t = np.arange(0, 1800.0, 2.0)
     late, later = (t > 600) & (t <= 630), (t > 1500) & (t <= 1530)
@@ -328,7 +328,7 @@ def test_the_smoothed_frame_temperature_is_known_together_not_apart(machine, met
     assert np.std(found) == pytest.approx(np.mean(stated), rel=0.4)
 
 
-def test_a_whole_curve_agrees_with_the_truth_where_the_frames_thermometer_is_noisy(method):
+def test_whole_curve_agrees_with_the_truth_with_a_noisy_frame_temperature(method):
     """Jointly, on the grid of the method: errors that neighbours do not share must be in their own covariance."""
     t = np.arange(0, 7200.0, 20.0)
     square, degrees = 0.0, 0
@@ -362,7 +362,7 @@ def test_beams_given_from_the_bar_to_the_sensor_are_refused(machine, method):
 
 
 @pytest.mark.parametrize("channel", [0, 3, 4])
-def test_one_reversed_beam_is_noticed(machine, method, channel):
+def test_one_reversed_beam_is_detected(machine, method, channel):
     raw = simulation.raw_drift(machine, TIMES, seed=0)
     # Reversed about the point that it sees, so that all five still meet the bar.
     seen = raw["beam_origin"].values[channel] + raw["beam_direction"].values[channel] * 1e-3
@@ -372,20 +372,20 @@ def test_one_reversed_beam_is_noticed(machine, method, channel):
         method.identify(raw)
 
 
-def test_levels_that_are_one_are_refused(machine, method):
+def test_equal_levels_are_refused(machine, method):
     raw = simulation.raw_drift(machine, TIMES, seed=0)
     raw["level"] = ("height", [0.01, 0.01])
     with pytest.raises(MethodError, match="expected two heights"):
         method.identify(raw)
 
 
-def test_a_record_of_one_mean_is_no_drift(machine, method):
+def test_record_of_one_mean_is_refused(machine, method):
     raw = simulation.raw_drift(machine, np.arange(0, 2, 1 / 500), seed=0)
     with pytest.raises(MethodError, match=r"gives 1 mean of 1\.5 s"):
         method.identify(raw, Settings(average=1.5))
 
 
-def test_a_stated_noise_of_zero_is_not_believed(machine, method):
+def test_stated_noise_of_zero_is_replaced_by_the_observed_noise(machine, method):
     raw = simulation.raw_drift(machine, np.arange(0, 200, 0.5), seed=6)
     honest = method.identify(raw)
     raw["distance_noise"] = 0.0

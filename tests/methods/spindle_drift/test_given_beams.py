@@ -18,7 +18,7 @@ def detected():
 
 
 def alone(beams, channel, name="beam"):
-    """Return one beam as a calibration of its own returns it: over ``beam`` of size 1, with a name of its own."""
+    """Return one beam as the result of a separate calibration: ``beam`` of size 1, with another name."""
     return beams.sel(beam=[channel]).assign_coords(beam=[name])
 
 
@@ -31,18 +31,18 @@ def test_beams_found_one_by_one_are_those_found_together(detected):
         np.testing.assert_array_equal(together[name].values, detected[name].values)
 
 
-def test_a_single_beam_goes_before_that_of_the_whole_frame(detected):
+def test_single_beam_has_priority_over_that_of_the_whole_frame(detected):
     better = alone(detected, "Y2").assign(beam_origin=detected["beam_origin"].sel(beam=["Y1"]).drop_vars("beam") + 1e-3)
     beams = given_beams({"beams": detected, "Y2": better})
     np.testing.assert_array_equal(beams["beam_origin"].sel(beam="Y2"), better["beam_origin"][0])
     np.testing.assert_array_equal(beams["beam_origin"].sel(beam="X1"), detected["beam_origin"].sel(beam="X1"))
 
 
-def test_without_any_the_nominal_beams_count():
+def test_nominal_beams_are_used_without_inputs():
     assert given_beams({}) is None
 
 
-def test_what_is_no_beam_of_the_frame_is_refused(detected):
+def test_inputs_that_are_no_beams_of_the_frame_are_refused(detected):
     one = alone(detected, "X1")
     with pytest.raises(MethodError, match="found X3"):
         given_beams({"X3": one})
@@ -56,5 +56,5 @@ def test_what_is_no_beam_of_the_frame_is_refused(detected):
         given_beams({"beams": detected, "X1": one.assign(beam_origin=one["beam_origin"] * np.nan)})
     with pytest.raises(MethodError, match="several frames"):
         given_beams({"beams": detected, "X1": one.assign_attrs(frame="table")})
-    with pytest.raises(MethodError, match="holds the beams X1, Z; expected X2 as well"):
+    with pytest.raises(MethodError, match="contains the beams X1, Z; expected X2 as well"):
         given_beams({"beams": detected.sel(beam=["X1", "Z"])})

@@ -84,7 +84,7 @@ def test_scale_and_offset_turn_a_reading_into_a_distance(run) -> None:
     np.testing.assert_allclose(raw["distance"].isel(time=0), np.array([0.9, 0.8, 0.7, 0.6, 0.5]) * 1e-3, rtol=1e-12)
 
 
-def test_speed_dates_and_stated_beam_uncertainty_come_in(run) -> None:
+def test_speed_dates_and_stated_beam_uncertainty_are_imported(run) -> None:
     head = HEAD.replace('{column = "t", unit = "min"}', '{column = "t", unit = "iso8601"}')
     mapping = map_text(head, 'origin_uncertainty = "10 um"\ndirection_uncertainty = "1 mrad"')
     mapping += '[spindle_speed]\ncolumn = "S"\nunit = "rpm"\n'
@@ -195,7 +195,7 @@ def test_many_mistakes_are_counted_and_the_first_are_reported(complaints) -> Non
     assert found == ["lines 4, 5, 6, 7, 8 and 95 more: expected 7 fields; found 8 in line 4"]
 
 
-def test_dates_that_are_none_are_reported(complaints) -> None:
+def test_invalid_dates_are_reported(complaints) -> None:
     head = HEAD.replace('unit = "min"', 'unit = "iso8601"')
     (found,) = complaints("t,X1,X2,Y1,Y2,Z,T\n14:05,1,1,1,1,1,20\n", map_text(head))
     assert found.startswith(
@@ -225,7 +225,7 @@ def test_mistakes_of_the_map_are_reported_by_key(complaints) -> None:
         ('[format]\nencoding = "utf8-ish"\n', "format.encoding: expected an encoding such as 'utf-8'"),
     ],
 )
-def test_a_format_that_cannot_be_is_reported(complaints, extra, message) -> None:
+def test_invalid_format_is_reported(complaints, extra, message) -> None:
     assert message in complaints(GOOD, map_text(HEAD + extra))[0]
 
 

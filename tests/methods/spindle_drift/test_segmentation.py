@@ -42,12 +42,12 @@ def test_every_step_is_found_whatever_the_machine_takes_to_move(seed):
     assert abs(steps.period - period) < 0.005
 
 
-def test_other_rates_and_rests_do_as_well():
+def test_other_rates_and_rests_are_segmented():
     distance, expected, *_ = record(1, dwell=0.5, rate=20e3, steps=41)
     np.testing.assert_allclose(segment_steps(distance, 20e3, 41, 0.5, 0.2).mean, expected, rtol=0, atol=5 * 4.8e-9)
 
 
-def test_a_step_that_the_sensor_did_not_see_is_unknown():
+def test_step_without_readings_is_unknown():
     distance, *_, start, period = record(2)
     lost = slice(int((start + 20 * period) * RATE), int((start + 21 * period) * RATE))
     distance[lost] = np.nan
@@ -68,7 +68,7 @@ def test_a_cut_off_record_is_refused():
         segment_steps(distance[: distance.size // 2], RATE, STEPS, 1.0)
 
 
-def test_another_number_of_steps_is_noticed():
+def test_wrong_number_of_steps_is_detected():
     distance, *_ = record(4)
     with pytest.raises(MethodError, match="number of steps and the dwell"):
         segment_steps(distance, RATE, 51, 1.0)

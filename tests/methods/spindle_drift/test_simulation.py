@@ -51,7 +51,7 @@ def test_beams_can_be_given_with_their_covariance(warming):
     assert np.array_equal(raw.beam_covariance, covariance)
 
 
-def test_unknown_beams_are_refused_in_words(warming):
+def test_unknown_beams_are_refused(warming):
     with pytest.raises(BenchError, match="'nominal'"):
         simulation.raw_drift(warming, T, beams="drawn", seed=1)
 
@@ -108,7 +108,7 @@ def test_systematic_effects_can_be_switched(warming):
     assert np.ptp(simulation.raw_drift(cold, T, seed=1, warm_up=False).distance.values[0]) < 3e-6
 
 
-def test_readings_and_truth_belong_together(warming):
+def test_readings_agree_with_the_truth(warming):
     # A bar fitted to the five readings, sample by sample, lies where the true twist says.
     raw = simulation.raw_drift(warming, T[[0, 20, 49]], averaged=10**12, seed=1, radius_error=False, warm_up=False)
     u, low, high = raw.beam_direction.values, *raw.level.values

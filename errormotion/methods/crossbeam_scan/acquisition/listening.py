@@ -12,7 +12,7 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
-from errormotion.methods.crossbeam_scan.encoder import folded
+from errormotion.methods.crossbeam_scan.encoder import unwrapped
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 BLOCK_LINES = 64
-"""Most lines that are requested in one call."""
+"""Largest number of lines requested in one call."""
 
 
 class BrokenPassError(InstrumentError):
@@ -62,8 +62,8 @@ class Lines:
 
     def within(self, low: Array, high: Array) -> Lines:
         """Return the lines between positions (m, one or several pairs); a lost line is kept with its neighbour."""
-        place = filled(self.position)[:, None]
-        kept = ((place >= low) & (place <= high)).any(axis=1)
+        position = filled(self.position)[:, None]
+        kept = ((position >= low) & (position <= high)).any(axis=1)
         if kept.all():
             return self
         part: dict[str, Any] = {name: getattr(self, name)[kept] for name in ("heights", "encoder", "position", "time")}
@@ -72,7 +72,7 @@ class Lines:
         return replace(self, **part)
 
     def after(self, count: int) -> Lines:
-        """Return the lines without the first ones."""
+        """Return the lines without the first ``count``."""
         names = ("heights", "encoder", "position", "time")
         return replace(self, **{name: getattr(self, name)[count:] for name in names}) if count else self
 
@@ -126,15 +126,15 @@ def listen(
 
 
 def _located(block: Any, middle: float, now: float, settings: Settings) -> Lines:
-    encoder = folded(block.encoder, middle)
+    encoder = unwrapped(block.encoder, middle)
     position = settings.encoder_zero + settings.encoder_pitch * encoder
-    place = filled(position)
-    ago = np.abs(place[-1] - place) / settings.measuring_feed
+    known = filled(position)
+    age = np.abs(known[-1] - known) / settings.measuring_feed
     return Lines(
         heights=block.heights.astype(np.float32),
         encoder=encoder,
         position=position,
-        time=now - np.where(np.isfinite(ago), ago, 0.0),
+        time=now - np.where(np.isfinite(age), age, 0.0),
         x=np.asarray(block.x, dtype=float),
         dropped=int(block.dropped),
         invalid=block.invalid,

@@ -1,4 +1,4 @@
-"""Progress of a campaign: the present pass and artefact, and the last registration."""
+"""Progress of a campaign: the current pass and artefact, and the last registration."""
 
 from __future__ import annotations
 
@@ -18,21 +18,23 @@ from errormotion.methods.crossbeam_scan.identification.cutting import Scan, Scan
 from errormotion.methods.crossbeam_scan.identification.registration import BlockMap, prepare, register
 
 if TYPE_CHECKING:
+    from errormotion.arrays import Array
     from errormotion.methods.crossbeam_scan.settings import Settings
 
 log = logging.getLogger(__name__)
 
 QUEUE_LENGTH = 2
-"""Number of scans that may wait before a warm scan is skipped."""
+"""Number of queued scans at which a further warm scan is skipped."""
 _ARCSEC = np.degrees(1.0) * 3600.0
 
 
 class LiveScans:
-    """Collect the present scan, and keep the cold scan of every artefact reduced to blocks.
+    """Register the scans of a campaign for display during acquisition.
 
-    The display is for the operator: rigid registration, without drift along the scan and without checks of the
-    artefacts. The result is identified from the complete record afterwards. Complete scans are registered one after the
-    other in a thread, which ends when none is left. A warm scan is skipped if others wait: the measurement never waits.
+    The registration is rigid, without drift along the scan and without checks of the artefacts; the result is
+    identified from the complete record afterwards. The cold scan of every artefact is kept, reduced to blocks. Complete
+    scans are registered in a thread that ends when the queue is empty. A warm scan is skipped when the queue is full,
+    so that the measurement is never delayed.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -44,24 +46,24 @@ class LiveScans:
         self._queued: set[int] = set()  # artefacts whose cold scan is known or queued
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
-        self._found = ""
+        self._last_result = ""
 
     def update(self, chunk: xr.Dataset) -> str:
         """Process a chunk of the raw dataset; return the progress as a line of text."""
         if "record" not in chunk:
             return f"pocket, scan at a lift of {float(chunk['stage'].values[-1, 0, 2]) * 1e3:g} mm"
         position = chunk["position"].values
-        place = float(chunk["encoder_zero"]) + float(chunk["encoder_pitch"]) * chunk["encoder"].values
+        axis = float(chunk["encoder_zero"]) + float(chunk["encoder_pitch"]) * chunk["encoder"].values
         cycle = chunk["cycle_of_line"].values
-        known = np.flatnonzero(np.isfinite(place))
+        known = np.flatnonzero(np.isfinite(axis))
         if not known.size:
             return self.text(chunk.sizes["cycle"], position.size)
-        artefact = np.abs(place[known, None] - position).argmin(axis=1)
+        artefact = np.abs(axis[known, None] - position).argmin(axis=1)
         keys = np.stack([cycle[known], artefact], axis=1)
         starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1), axis=1))
         for low, high in zip(starts, [*starts[1:], known.size], strict=True):
             self._take(chunk.isel(line=known[low:high]), (int(keys[low, 0]), int(keys[low, 1])))
-        self._complete(place[known])
+        self._complete(axis[known])
         return self.text(chunk.sizes["cycle"], position.size)
 
     def _take(self, part: xr.Dataset, at: tuple[int, int]) -> None:
@@ -70,15 +72,15 @@ class LiveScans:
             self._at = at
         self._parts.append(part)
 
-    def _complete(self, place: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+    def _complete(self, axis: Array) -> None:
         """Submit the scan when the axis is past it."""
-        if self._at[1] < 0 or not place.size:
+        if self._at[1] < 0 or not axis.size:
             return
-        if place[-1] > self._settings.positions[self._at[1]] + self._settings.scan_length / 2:
+        if axis[-1] > self._settings.positions[self._at[1]] + self._settings.scan_length / 2:
             self._submit()
 
     def _submit(self) -> None:
-        """Queue the collected scan; skip a warm one if others wait."""
+        """Queue the collected scan; skip a warm one when the queue is full."""
         parts, self._parts = self._parts, []
         if not parts:
             return
@@ -93,7 +95,7 @@ class LiveScans:
                 self._thread.start()
 
     def _work(self) -> None:
-        """Register scans until there is none left."""
+        """Register queued scans until the queue is empty."""
         while True:
             with self._lock:
                 if not self._waiting:
@@ -109,17 +111,17 @@ class LiveScans:
             warm = prepare(height, x, y)
             cold = self._cold.setdefault(job.artefact, warm)
             if cold is not warm:
-                self._found = where + _text(cold, warm, job.parts[0])
+                self._last_result = where + _text(cold, warm, job.parts[0])
         except MethodError as error:
-            self._found = f"{where}{error}"
+            self._last_result = f"{where}{error}"
         except Exception:  # any error: the measurement continues without this display
             log.exception("%sregistration for the display failed", where)
 
     def text(self, cycles: int, artefacts: int) -> str:
-        """Return the present pass and artefact, and the result of the last registration."""
+        """Return the current pass and artefact, and the result of the last registration."""
         cycle, artefact = self._at
         text = f"pass {cycle + 1} of {cycles}, artefact {artefact + 1} of {artefacts}" if artefact >= 0 else ""
-        return f"{text}; {self._found}" if self._found else text
+        return f"{text}; {self._last_result}" if self._last_result else text
 
     def wait(self) -> None:
         """Wait until every queued scan is registered."""
@@ -146,7 +148,7 @@ class _Job:
 
 
 def _text(cold: BlockMap, warm: BlockMap, raw: xr.Dataset) -> str:
-    """Return the errors of the carriage with their standard uncertainty by the registration, in field units."""
+    """Return the errors of the carriage with the standard uncertainty of the registration, in um and arcsec."""
     found = register(cold, warm, point=np.zeros(3))
     pose = RigidTransform.from_matrix(np.asarray(raw["profiler_pose"].values, dtype=float))
     errors = carriage_errors(found.twist, found.covariance, pose, raw["lever"].values)

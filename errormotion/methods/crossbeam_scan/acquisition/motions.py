@@ -1,4 +1,4 @@
-"""Steps of the machine in a campaign: those of its programs."""
+"""Steps of the machine in the NC programs of a campaign."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def steps(settings: Settings) -> list[Step]:
 
 
 def _steps(programs: list[Program]) -> Iterator[Step]:
-    place = dict.fromkeys("XYZ", math.nan)
+    position = dict.fromkeys("XYZ", math.nan)
     for program in programs:
         for step in program.steps:
             if isinstance(step, Dwell):
                 yield Step("rest", None, math.nan, step.seconds)
                 continue
-            way = abs(step.place - place[step.axis])
-            place[step.axis] = step.place
-            yield Step("move", (place["X"], place["Y"], place["Z"]), step.feed, way / step.feed)
+            distance = abs(step.position - position[step.axis])
+            position[step.axis] = step.position
+            yield Step("move", (position["X"], position["Y"], position["Z"]), step.feed, distance / step.feed)

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.acquisition.programs import Program
     from errormotion.plugins import Bench
 
-STEP = 0.1
-"""Interval at which the first motion is looked for, s."""
+MOTION_POLL_INTERVAL = 0.1
+"""Interval of the checks for the first motion, s."""
 POLL_INTERVAL = 0.5
 """Longest sleep, and interval at which the state of a control is read, s."""
 TIMEOUT_MARGIN = 30.0
 """Timeout of a program beyond 1.1 times its planned duration, s."""
 OPERATOR_TIMEOUT = 180.0
-"""Time for the operator to start a program after the confirmation, s."""
+"""Time in which the operator has to start a program after the confirmation, s."""
 NOTICE_TIME = 30.0
 """Time before a pass is due at which the operator is notified, s."""
 STALL_LIMIT = 4
@@ -30,7 +30,7 @@ STALL_LIMIT = 4
 
 
 class Mover(Protocol):
-    """What moves the axis.
+    """What moves the axis: a control or the operator.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Controlled:
     def start(self, program: Program, *, listening: bool = False) -> float:
         """Transfer a program and wait for its first motion; with ``listening`` return immediately."""
         self.finish()
-        before = self._place()
+        before = self._position()
         answer = self._control.run_program(program.text())
         lead_in = float(answer.get("longest_lead_in", 0.0))
         started = self.now()
@@ -90,19 +90,19 @@ class Controlled:
         self._checked_at, self._stalled = float("nan"), 0
         if listening:
             return started
-        while self._place() == before:
-            if self.now() > started + lead_in + STEP:
-                return started + lead_in / 2  # it starts with a dwell, or at its first position
-            self._pass(STEP)
-        return self.now() - STEP / 2
+        while self._position() == before:
+            if self.now() > started + lead_in + MOTION_POLL_INTERVAL:
+                return started + lead_in / 2  # the program starts with a dwell, or at its first position
+            self._elapse(MOTION_POLL_INTERVAL)
+        return self.now() - MOTION_POLL_INTERVAL / 2
 
     def wait_until(self, when: float) -> None:
         """Wait until a time, s."""
-        while (left := when - self.now()) > 1e-6:
-            self._pass(left)
+        while (remaining := when - self.now()) > 1e-6:
+            self._elapse(remaining)
 
     def may_still_move(self) -> bool:
-        """Return whether the program runs; not so where the virtual clock no longer advances."""
+        """Return whether the program runs; False where the virtual clock no longer advances."""
         now = self.now()
         self._stalled = self._stalled + 1 if self.virtual and now == self._checked_at else 0
         self._checked_at = now
@@ -114,7 +114,7 @@ class Controlled:
         Raises
         ------
         InstrumentError
-            The program takes far longer than planned.
+            The program runs much longer than planned.
         """
         while self._control.state().get("running", False):
             if self.now() > self._deadline:
@@ -122,12 +122,12 @@ class Controlled:
                     "The control still runs a program long after its planned end. Check whether it has stopped and "
                     "whether the feed override is reduced; let the program finish and resume the run."
                 )
-            self._pass(POLL_INTERVAL)
+            self._elapse(POLL_INTERVAL)
 
-    def _place(self) -> Any:
+    def _position(self) -> Any:
         return self._control.state().get("position")
 
-    def _pass(self, seconds: float) -> None:
+    def _elapse(self, seconds: float) -> None:
         if self.virtual:
             self._control.elapse(seconds)
         else:
@@ -154,13 +154,13 @@ class Operated:
         what = f"{program.name} ({program.purpose}; {_duration(program.seconds())})"
         if listening:
             self._bench.ask(
-                f"{ended}make {what} ready, confirm, and start it within {OPERATOR_TIMEOUT / 60:.0f} minutes after "
-                "that: the profiler waits for the motion."
+                f"{ended}prepare {what}, confirm, and then start it within {OPERATOR_TIMEOUT / 60:.0f} minutes: the "
+                "profiler waits for the motion."
             )
         else:
             self._bench.ask(
                 f"{ended}start {what}, and confirm at the moment it starts to move. In a resumed campaign the "
-                "program may be longer than this duration: stop it when the time is over."
+                "program may be longer than this duration: stop it when this time has elapsed."
             )
         self._running = program.name
         self._deadline = steady() + OPERATOR_TIMEOUT + program.seconds()
@@ -168,15 +168,15 @@ class Operated:
 
     def wait_until(self, when: float) -> None:
         """Wait until `NOTICE_TIME` before a time, s."""
-        while (left := when - NOTICE_TIME - steady()) > 0:
-            time.sleep(min(left, POLL_INTERVAL))
+        while (remaining := when - NOTICE_TIME - steady()) > 0:
+            time.sleep(min(remaining, POLL_INTERVAL))
 
     def may_still_move(self) -> bool:
-        """Return whether the time of the operator to start has not expired."""
+        """Return whether the operator may still start the program, or it may still run."""
         return steady() < self._deadline
 
     def finish(self) -> None:
-        """Do nothing: the next prompt waits for the end."""
+        """Do nothing: the next prompt states that the program has to end first."""
 
 
 def _duration(seconds: float) -> str:

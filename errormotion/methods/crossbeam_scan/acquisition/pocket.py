@@ -18,8 +18,9 @@ from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.crossbeam_scan.acquisition.listening import BrokenPassError, Lines, listen
 from errormotion.methods.crossbeam_scan.acquisition.moving import Mover, mover
 from errormotion.methods.crossbeam_scan.acquisition.programs import Program, pocket_pass
-from errormotion.methods.crossbeam_scan.acquisition.scans import FAILURE_LIMIT, SCHEMA, prepare_profiler, reopen
+from errormotion.methods.crossbeam_scan.acquisition.scans import FAILURE_LIMIT, prepare_profiler, reopen
 from errormotion.methods.crossbeam_scan.acquisition.schedule import program_texts
+from errormotion.methods.crossbeam_scan.schema import SCHEMA
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -56,7 +57,7 @@ def record_pocket(bench: Bench, settings: Settings, done: xr.Dataset | None) -> 
     if hasattr(profiler, "scans"):
         raise MethodError(
             "The scans of a pocket are not read from files: expected a line profiler that streams. A raw dataset of "
-            "the variant 'profiler pose' can be identified as it is."
+            "the variant 'profiler pose' can be identified directly."
         )
     programs = program_texts(settings)
     move = mover(bench)
@@ -114,10 +115,10 @@ def _scan(
             if attempt == FAILURE_LIMIT:
                 raise InstrumentError(
                     f"{program.name} failed {FAILURE_LIMIT} times. The last line of the last attempt was at "
-                    f"{error.position:g} m (nan: there was none): {error.reason}"
+                    f"{error.position:g} m (nan: no line was received): {error.reason}"
                 ) from error
             reopen(profiler)
-    raise InstrumentError(f"{program.name} was not made")
+    raise InstrumentError(f"{program.name} was not run")
 
 
 def _pass(profiler: Any, move: Mover, program: Program, settings: Settings) -> Iterator[Lines]:
@@ -133,7 +134,7 @@ def _pass(profiler: Any, move: Mover, program: Program, settings: Settings) -> I
 
 
 def _cut(parts: list[Lines], settings: Settings) -> tuple[Array, Heights, Array, dict[str, Any]]:
-    """Return the lines on an even grid, the same for every scan; positions without a line stay NaN."""
+    """Return the lines on an equidistant grid, the same for every scan; positions without a line are NaN."""
     count = int(settings.pocket_scan_length / settings.line_pitch)
     if not parts:
         raise MethodError(
@@ -145,21 +146,21 @@ def _cut(parts: list[Lines], settings: Settings) -> tuple[Array, Heights, Array,
     known = np.isfinite(y)
     y, heights = y[known], heights[known]
     pitch = settings.line_pitch
-    phase = y[0] - pitch * round(y[0] / pitch)  # of the received lines: none is midway between two positions
-    place = np.rint((y - phase) / pitch).astype(np.int64) + count // 2
-    inside = (place >= 0) & (place < count)
-    if np.unique(place[inside]).size < 0.9 * count:
+    phase = y[0] - pitch * round(y[0] / pitch)  # of the received lines, so that none is midway between grid points
+    index = np.rint((y - phase) / pitch).astype(np.int64) + count // 2
+    inside = (index >= 0) & (index < count)
+    if np.unique(index[inside]).size < 0.9 * count:
         raise MethodError(
             f"Expected {count} lines {settings.line_pitch * 1e6:g} um apart over the pocket; found "
-            f"{np.unique(place[inside]).size} different ones among {y.size}. Check line_pitch against the profiler's "
-            "trigger, and encoder_pitch."
+            f"{np.unique(index[inside]).size} different positions among {y.size} lines. Check line_pitch against the "
+            "profiler's trigger, and encoder_pitch."
         )
-    out: Heights = np.full((count, heights.shape[1]), np.nan, dtype=np.float32)
-    out[place[inside]] = heights[inside]
-    at: Array = (np.arange(count) - count // 2) * pitch + phase
-    at[place[inside]] = y[inside]
+    gridded: Heights = np.full((count, heights.shape[1]), np.nan, dtype=np.float32)
+    gridded[index[inside]] = heights[inside]
+    grid: Array = (np.arange(count) - count // 2) * pitch + phase
+    grid[index[inside]] = y[inside]
     invalid: dict[str, int] = {}
     for part in parts:
         for reason, points in part.invalid.items():
             invalid[reason] = invalid.get(reason, 0) + points
-    return at, out, parts[0].x, {"dropped": sum(part.dropped for part in parts), "invalid": invalid}
+    return grid, gridded, parts[0].x, {"dropped": sum(part.dropped for part in parts), "invalid": invalid}

@@ -1,4 +1,4 @@
-"""NC programs of a campaign in ISO 6983, their purpose and their duration.
+"""NC programs of a campaign (ISO 6983), with purpose and duration.
 
 Positions are absolute and in mm, feeds in mm/min, dwells in s. The duration is computed with constant feed; a real
 machine takes slightly longer because of its acceleration.
@@ -19,7 +19,7 @@ DWELL = 2.0
 """Dwell before the measuring move, s: the axis comes to rest and the profiler becomes ready."""
 MM, MINUTE = 1000.0, 60.0
 _SHORTEST = 1e-3
-"""Moves below this, m, are left out."""
+"""Shortest move that is written, m."""
 
 PASS = "pass.nc"
 
@@ -28,7 +28,7 @@ PASS = "pass.nc"
 class Move:
     """A move of one axis to a position, m, with a feed, m/s."""
 
-    place: float
+    position: float
     feed: float
     axis: str = "Y"
 
@@ -47,7 +47,7 @@ class Program:
     Attributes
     ----------
     name : str
-        Of its file.
+        File name.
     purpose : str
         A short description.
     steps : tuple of Move or Dwell
@@ -58,27 +58,27 @@ class Program:
     steps: tuple[Move | Dwell, ...]
 
     def seconds(self, start: float | None = None) -> float:
-        """Return the duration from a start position of Y, m; by default its own end, as in a repetition.
+        """Return the duration from a start position of Y, m; by default the end of the program, as in a repetition.
 
         Moves of other axes than Y are neglected.
         """
-        place = self.end if start is None else start
+        position = self.end if start is None else start
         total = 0.0
         for step in self.steps:
             if isinstance(step, Dwell):
                 total += step.seconds
             elif step.axis == "Y":
-                total += abs(step.place - place) / step.feed
-                place = step.place
+                total += abs(step.position - position) / step.feed
+                position = step.position
         return total
 
     @property
     def end(self) -> float:
         """Position of Y after the last move, m."""
-        return [step.place for step in self.steps if isinstance(step, Move) and step.axis == "Y"][-1]
+        return self._positions()[-1]
 
     def text(self) -> str:
-        """Return the program as the control reads it."""
+        """Return the program text."""
         low, high = self.reach()
         lines = [
             "%",
@@ -90,13 +90,15 @@ class Program:
             if isinstance(step, Dwell):
                 lines.append(f"G4 P{step.seconds:.1f}")
             else:
-                lines.append(f"G1 {step.axis}{_mm(step.place)} F{step.feed * MM * MINUTE:.10g}")
+                lines.append(f"G1 {step.axis}{_mm(step.position)} F{step.feed * MM * MINUTE:.10g}")
         return "\n".join([*lines, "M30", "%", ""])
 
     def reach(self) -> tuple[float, float]:
-        """Return lowest and highest position of Y, m."""
-        positions = [step.place for step in self.steps if isinstance(step, Move) and step.axis == "Y"]
-        return min(positions), max(positions)
+        """Return the lowest and the highest position of Y, m."""
+        return min(self._positions()), max(self._positions())
+
+    def _positions(self) -> list[float]:
+        return [step.position for step in self.steps if isinstance(step, Move) and step.axis == "Y"]
 
     def check(self, travel: tuple[float, float] | None) -> None:
         """Check that the program stays within the travel of the axis (m), where that is known.
@@ -111,7 +113,7 @@ class Program:
         low, high = self.reach()
         if low < travel[0] - 1e-9 or high > travel[1] + 1e-9:
             raise MethodError(
-                f"{self.name} would move from Y{_mm(low)} to Y{_mm(high)} and the axis travels from {_mm(travel[0])} "
+                f"{self.name} would move from Y{_mm(low)} to Y{_mm(high)}, but the axis travels from {_mm(travel[0])} "
                 f"to {_mm(travel[1])} mm (setting 'travel'): move the artefacts, or reduce 'margin' or "
                 "'warm_up_travel'. No program was written."
             )
@@ -123,9 +125,7 @@ def measuring_pass(settings: Settings) -> Program:
     count = len(settings.positions)
     height = () if settings.scan_z is None else (Move(settings.scan_z, settings.warm_up_feed, "Z"),)
     return Program(
-        PASS,
-        f"measuring pass over {count} artefact{'s' if count > 1 else ''}",
-        (*height, *_pass(low, high, settings)),
+        PASS, f"measuring pass over {count} artefact{'s' if count > 1 else ''}", (*height, *_pass(low, high, settings))
     )
 
 
@@ -133,8 +133,8 @@ def pass_ends(settings: Settings) -> tuple[float, float]:
     """Return start and end of a measuring pass, m."""
     if not settings.positions:
         raise MethodError(
-            "The scans need the positions of the artefacts: give 'positions', those of the axis with the profiler over "
-            "the middle of each, such as ['350 mm', '550 mm']."
+            "The scans need the positions of the artefacts: set 'positions' to the positions of the axis at which the "
+            "profiler is over the middle of each artefact, such as ['350 mm', '550 mm']."
         )
     beyond = settings.scan_length / 2 + settings.margin
     return settings.positions[0] - beyond, settings.positions[-1] + beyond
@@ -158,7 +158,7 @@ def _pass(low: float, high: float, settings: Settings) -> tuple[Move | Dwell, ..
 
 
 def warm_up_piece(settings: Settings, number: int, seconds: float, start: float) -> Program:
-    """Return warm-up moves to and fro of a given duration from a start (m); the last stroke is shorter.
+    """Return warm-up moves back and forth of a given duration from a start (m); the last stroke is shorter.
 
     Raises
     ------
@@ -169,21 +169,21 @@ def warm_up_piece(settings: Settings, number: int, seconds: float, start: float)
     feed = settings.warm_up_feed
     if high - low < _SHORTEST:
         raise MethodError(
-            f"warm_up_travel: expected two ends apart, so that the axis moves; found Y{_mm(low)} and Y{_mm(high)}."
+            f"warm_up_travel: expected two different ends, so that the axis moves; found Y{_mm(low)} and Y{_mm(high)}."
         )
     steps: list[Move] = [Move(low, feed)]
-    left = seconds - abs(start - low) / feed
+    remaining = seconds - abs(start - low) / feed
     stroke = (high - low) / feed
-    rounds = max(0, int(left / (2 * stroke)))
-    steps += [Move(high, feed), Move(low, feed)] * rounds
-    rest = (left - 2 * stroke * rounds) / 2 * feed
+    cycles = max(0, int(remaining / (2 * stroke)))
+    steps += [Move(high, feed), Move(low, feed)] * cycles
+    rest = (remaining - 2 * stroke * cycles) / 2 * feed
     if rest >= _SHORTEST:
         steps += [Move(low + rest, feed), Move(low, feed)]
     return Program(f"warm_up_{number}.nc", f"warm-up moves, {seconds / MINUTE:.1f} min", tuple(steps))
 
 
 def texts(programs: Sequence[Program], settings: Settings) -> dict[str, str]:
-    """Return the text of each program by its file's name, once all of them stay within the travel.
+    """Check that all programs stay within the travel; return their texts by file name.
 
     Raises
     ------

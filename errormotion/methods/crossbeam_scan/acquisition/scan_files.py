@@ -20,8 +20,8 @@ def record_files(
 ) -> Iterator[xr.Dataset]:
     """Yield the scans of files, one chunk along ``line`` for each.
 
-    The files follow each other cycle by cycle, artefact by artefact. The middle of an artefact's first scan is its
-    ``position``; the y of its further scans count from the same zero. All scans are as long as the first one. Their
+    The files are ordered by cycle, and within a cycle by artefact. The middle of an artefact's first scan is its
+    ``position``; y of its further scans refers to the same zero. All scans have the length of the first one. Their
     times are the planned ones.
 
     Parameters
@@ -32,18 +32,18 @@ def record_files(
     static : Dataset
         See ``acquisition.static_part``.
     done : Dataset, optional
-        The record of an interrupted run; files that it holds completely are skipped.
+        The record of an interrupted run; files that it contains completely are skipped.
 
     Raises
     ------
     MethodError
-        The number of files is not that of artefacts times passes, or the points of a line differ between files.
+        The number of files is not artefacts times passes, or the points of a line differ between files.
     """
     artefacts = len(settings.positions)
     names = list(profiler.identify().details["files"])
     if len(names) != plan.cycles * artefacts:
         raise MethodError(
-            f"Expected {plan.cycles * artefacts} files, pass by pass and artefact by artefact: {plan.cycles} passes "
+            f"Expected {plan.cycles * artefacts} files, ordered by pass and artefact: {plan.cycles} passes "
             f"({plan.cold} cold and {plan.cycles - plan.cold} warm) over {artefacts} artefacts; found {len(names)}. "
             "See the settings 'positions', 'warm_up' and 'cold_repeats'."
         )
@@ -58,7 +58,7 @@ def record_files(
             first_x, length = scan.x, float(y[-1] - y[0]) * y.size / (y.size - 1)
         if scan.x.shape != first_x.shape or not np.allclose(scan.x, first_x, atol=1e-7, rtol=0):
             raise MethodError(
-                f"{scan.path} has {scan.x.size} points from {scan.x[0]:.6f} to {scan.x[-1]:.6f} m on its line; "
+                f"{scan.path} has {scan.x.size} points from {scan.x[0]:.6f} to {scan.x[-1]:.6f} m on each line; "
                 f"expected {first_x.size} from {first_x[0]:.6f} to {first_x[-1]:.6f} m as in the first file."
             )
         if cycle == 0:
@@ -66,15 +66,15 @@ def record_files(
         read += y.size
         if read <= before:
             continue
-        fresh = slice(max(0, y.size - (read - before)), None)
-        place = settings.positions[artefact] + y[fresh] - zero[artefact]
-        lines = place.size
+        new = slice(max(0, y.size - (read - before)), None)
+        position = settings.positions[artefact] + y[new] - zero[artefact]
+        lines = position.size
         time = np.full(lines, plan.warm_up[cycle] if cycle >= plan.cold else plan.of_cycle(cycle).start)
         yield static.assign(
             x=("point", scan.x, {"units": "m"}),
             scan_length=((), length, {"units": "m"}),
-            record=(("line", "point"), heights[fresh].astype(np.float32), {"units": "m"}),
-            encoder=("line", (place - settings.encoder_zero) / settings.encoder_pitch),
+            record=(("line", "point"), heights[new].astype(np.float32), {"units": "m"}),
+            encoder=("line", (position - settings.encoder_zero) / settings.encoder_pitch),
             cycle_of_line=("line", np.full(lines, cycle, np.int32)),
             line_time=("line", time, {"units": "s"}),
         )

@@ -1,4 +1,4 @@
-"""Measuring scans: pass after pass over the artefacts while the machine warms up, each line with its encoder count.
+"""Acquisition of scans: passes over the artefacts during the warm-up, each line with its encoder count.
 
 Every line is stored in the raw dataset before anything is computed from it; scans are cut out later (``cutting``).
 A line of NaN, encoder included, marks the start of the warm-up (its time is 0) and each failure of the stream.
@@ -25,9 +25,10 @@ from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.crossbeam_scan.acquisition.listening import BrokenPassError, Lines, listen
 from errormotion.methods.crossbeam_scan.acquisition.moving import Mover, mover
 from errormotion.methods.crossbeam_scan.acquisition.programs import Program, pass_ends, warm_up_piece
-from errormotion.methods.crossbeam_scan.acquisition.schedule import PAUSE, Schedule, program_texts, schedule
+from errormotion.methods.crossbeam_scan.acquisition.schedule import PROGRAM_INTERVAL, Schedule, program_texts, schedule
 from errormotion.methods.crossbeam_scan.identification.cutting import interruption
-from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
+from errormotion.methods.crossbeam_scan.schema import SCHEMA
 
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
@@ -36,11 +37,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SCHEMA = "errormotion.raw.crossbeam_scan/1"
 CHUNK_INTERVAL = 0.4
-"""Longest time between two chunks, s: limits the loss in a crash."""
+"""Longest time between two chunks, s; limits the loss of data in a crash."""
 CHUNK_LINES = 512
-"""Lines of a chunk."""
+"""Number of lines of a chunk."""
 FAILURE_LIMIT = 3
 """Number of successive failed passes after which the campaign ends."""
 
@@ -56,7 +56,7 @@ def record_scans(
         With a ``line_profiler``; a ``controller`` where there is one, else the operator is prompted.
     settings : Settings
     pose : Dataset, optional
-        Error dataset of a test that found the profiler's pose; without it ``settings.profiler_pose`` counts.
+        Error dataset of a test that determined the profiler's pose; without it ``settings.profiler_pose`` is used.
     done : Dataset, optional
         The record of an interrupted run. Its last pass is not repeated, and the warm-up has continued: of the overdue
         passes only the last one is made. A virtual machine that was restarted repeats the whole campaign, and the lines
@@ -65,7 +65,7 @@ def record_scans(
     Raises
     ------
     MethodError
-        No pose, no positions, times too close, or no line is within a scan.
+        No pose, no positions, times too close together, or no line is within a scan.
     InstrumentError
         Three successive passes failed.
     """
@@ -129,12 +129,10 @@ def pose_of(settings: Settings, found: xr.Dataset | None) -> tuple[Array, Array]
     stated = settings.profiler_pose
     if stated is None:
         raise MethodError(
-            "The scans need the profiler's pose in the tool frame. Make a test with procedure = 'profiler_pose' before "
-            "this one and name it here, inputs = { pose = 'its name' }; or give the setting 'profiler_pose'."
+            "The scans need the profiler's pose in the tool frame. Run a test with procedure = 'profiler_pose' before "
+            "this one and refer to it by inputs = { pose = 'its name' }; or state the setting 'profiler_pose'."
         )
-    matrix = calibration.pose(stated.a, stated.b, stated.g, stated.dx, stated.dy, stated.dz).as_matrix()
-    size = np.repeat([stated.angle_uncertainty, stated.place_uncertainty], 3)
-    return np.asarray(matrix), np.diag(size**2)
+    return np.asarray(stated_pose(stated).as_matrix()), stated_covariance(stated)
 
 
 class _Campaign:
@@ -176,14 +174,14 @@ class _Campaign:
                 return
             self.origin = float(done.attrs[clock.ORIGIN])
         else:
-            # After an interruption of unknown duration, the clock goes on from the last line.
+            # After an interruption of unknown duration, the clock continues from the last line.
             age = _age(done)
             self.origin = self.move.now() - (last if math.isnan(age) else age)
         self.pending.x = np.asarray(done["x"].values, dtype=float)
-        tried = cycle[since != 0]  # time 0 is that of the mark
+        tried = cycle[since != 0]  # time 0 is the time of the mark
         self.next = int(tried.max()) + 1 if tried.size else 0
         if 0 < self.next <= self.plan.cold and not _complete(done, self.next - 1, self.high - self.settings.margin):
-            self.next -= 1  # nothing has warmed up yet: a cold pass can be made again
+            self.next -= 1  # the machine is still cold: a cold pass can be repeated
         warm = np.flatnonzero(cycle >= self.plan.cold)
         if warm.size:
             self.zero = self.origin + float(of_line[warm[-1]] - since[warm[-1]])
@@ -221,7 +219,7 @@ class _Campaign:
             self.next += 1
 
     def _warm_up(self) -> Iterator[xr.Dataset]:
-        """Move the axis until the next pass is due; mark the start the first time."""
+        """Move the axis until the next pass is due; the first time, yield the mark of the start."""
         item, due = self.plan.before(self.next), self.plan.warm_up[self.next]
         if item is not None and (piece := self._piece(item.program, due)) is not None:
             started = self.move.start(piece)
@@ -233,17 +231,17 @@ class _Campaign:
             self.move.wait_until(self.zero + due)
 
     def _piece(self, name: str, due: float) -> Program | None:
-        """Return the warm-up moves for the remaining time; None where it is shorter than `PAUSE`."""
+        """Return the warm-up moves for the remaining time; None where it is shorter than `PROGRAM_INTERVAL`."""
         planned = self.plan.programs[name]
         if self.zero is None:
             return planned
-        left = self.zero + due - self.move.now() - PAUSE
-        if left > planned.seconds(self.high) - 2 * PAUSE:
+        remaining = self.zero + due - self.move.now() - PROGRAM_INTERVAL
+        if remaining > planned.seconds(self.high) - 2 * PROGRAM_INTERVAL:
             return planned
-        if left < PAUSE:
+        if remaining < PROGRAM_INTERVAL:
             return None
         number = int(name.removesuffix(".nc").rpartition("_")[2])
-        return warm_up_piece(self.settings, number, left, self.high)
+        return warm_up_piece(self.settings, number, remaining, self.high)
 
     def _pass(self) -> Iterator[xr.Dataset]:
         item = self.plan.of_cycle(self.next)
@@ -274,8 +272,8 @@ class _Campaign:
     def _missed(self, received: int, low: float, high: float) -> str:
         s = self.settings
         return (
-            f"Pass {self.next}: {received} lines were received, at positions from {low:.6g} to {high:.6g} m, and none "
-            f"of them in a scan; the scans are at {', '.join(f'{y:g}' for y in s.positions)} m. Check encoder_pitch "
+            f"Pass {self.next}: {received} lines were received, at positions from {low:.6g} to {high:.6g} m, none of "
+            f"them in a scan; the scans are at {', '.join(f'{y:g}' for y in s.positions)} m. Check encoder_pitch "
             f"({s.encoder_pitch:g} m a count, negative where it counts backwards), encoder_zero ({s.encoder_zero:g} m) "
             "and the direction of the axis in which the profiler is triggered."
         )
@@ -283,7 +281,7 @@ class _Campaign:
     def _interrupted(self, error: BrokenPassError) -> Iterator[xr.Dataset]:
         """Yield the received lines, a mark after them, and the reason among the counts of invalid data."""
         text = interruption(self.next, error.position, error.reason)
-        if not self.pending.skip:  # else it has been counted
+        if not self.pending.skip:  # otherwise it is counted already
             self.pending.invalid[text] = self.pending.invalid.get(text, 0) + 1
         now = self.move.now()
         zero = self.zero if self.zero is not None and self.next >= self.plan.cold else None
@@ -291,7 +289,7 @@ class _Campaign:
         yield from self._mark(since, now)
 
     def _mark(self, since: float, now: float) -> Iterator[xr.Dataset]:
-        """Yield a line of NaN if the length of a line is already known."""
+        """Yield a line of NaN, if the number of points of a line is known already."""
         if self.pending.x is None:
             return
         unknown = np.full(1, np.nan)
@@ -305,7 +303,7 @@ class _Campaign:
 
 
 def reopen(profiler: Any) -> None:
-    """Reconnect a profiler; if that fails, the next pass fails as well."""
+    """Reconnect a profiler; if this fails, the next pass fails as well."""
     with suppress(InstrumentError):
         profiler.close()
     try:
@@ -315,7 +313,7 @@ def reopen(profiler: Any) -> None:
 
 
 def prepare_profiler(profiler: Any) -> None:
-    """Open the stream once at rest, so that the preparation of the driver is done when the axis starts."""
+    """Open the stream once at rest, so that the driver is prepared before the axis starts."""
     with suppress(InstrumentError), closing(profiler.stream(block=1)) as stream:
         next(stream, None)
 
@@ -345,7 +343,7 @@ class Pending:
     Attributes
     ----------
     skip : int
-        Lines that are recorded already and are omitted, with their counts.
+        Number of lines that are recorded already; they are omitted, with their counts.
     """
 
     static: xr.Dataset

@@ -25,8 +25,8 @@ from errormotion.methods.crossbeam_scan.acquisition.programs import (
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
 
-PAUSE = 5.0
-"""Time between two programs, s: the control starts the next one."""
+PROGRAM_INTERVAL = 5.0
+"""Time between two programs, in which the control starts the next one, s."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Item:
     Attributes
     ----------
     program : str
-        Name of its file.
+        File name.
     start, seconds : float
         Planned start since the start of the warm-up, and planned duration; s.
     cycle : int
@@ -56,13 +56,13 @@ class Item:
 
 @dataclass(frozen=True)
 class Schedule:
-    """The campaign in its order.
+    """The programs of a campaign in chronological order.
 
     Attributes
     ----------
     items : tuple of Item
     programs : mapping of str to Program
-        By the names of their files.
+        By file name.
     warm_up : tuple of float
         Warm-up time of each pass, 0 for the cold ones, s.
     """
@@ -73,12 +73,12 @@ class Schedule:
 
     @property
     def cycles(self) -> int:
-        """Measuring passes."""
+        """Number of measuring passes."""
         return len(self.warm_up)
 
     @property
     def cold(self) -> int:
-        """Measuring passes on the cold machine."""
+        """Number of measuring passes on the cold machine."""
         return self.warm_up.count(0.0)
 
     @property
@@ -87,13 +87,13 @@ class Schedule:
         return self.items[-1].end - self.items[0].start
 
     def of_cycle(self, cycle: int) -> Item:
-        """Return the measuring pass of this number."""
+        """Return the measuring pass with this number."""
         return next(item for item in self.items if item.cycle == cycle)
 
     def before(self, cycle: int) -> Item | None:
         """Return the warm-up moves before a pass; None before a cold one."""
-        place = self.items.index(self.of_cycle(cycle))
-        return self.items[place - 1] if place and self.items[place - 1].cycle < 0 else None
+        index = self.items.index(self.of_cycle(cycle))
+        return self.items[index - 1] if index and self.items[index - 1].cycle < 0 else None
 
     def to_json(self) -> str:
         """Return the items as JSON."""
@@ -106,38 +106,38 @@ def schedule(settings: Settings) -> Schedule:
     Raises
     ------
     MethodError
-        No artefacts, a program that leaves the travel, or warm-up times with no time for the pass between them.
+        No artefacts, a program that leaves the travel, or warm-up times too close together for a pass.
     """
     passing = measuring_pass(settings)
     low, high = pass_ends(settings)
     first, again = passing.seconds(low), passing.seconds(high)
     cold = 1 + settings.cold_repeats
-    start = -(first + PAUSE + settings.cold_repeats * (again + PAUSE))
+    start = -(first + PROGRAM_INTERVAL + settings.cold_repeats * (again + PROGRAM_INTERVAL))
     items: list[Item] = []
     for number in range(cold):
         items.append(Item(passing.name, start, again if number else first, number))
-        start = items[-1].end + PAUSE
+        start = items[-1].end + PROGRAM_INTERVAL
     programs = {passing.name: passing}
     free = 0.0  # end of the previous program
     for number, due in enumerate(settings.warm_up, 1):
-        seconds = due - PAUSE - free
+        seconds = due - PROGRAM_INTERVAL - free
         if seconds <= 0:
             raise MethodError(
-                f"warm_up: at {due / MINUTE:g} min the axis is not free before {(free + PAUSE) / MINUTE:.1f} min, a "
-                f"measuring pass takes {first / MINUTE:.1f} min; expected times further apart."
+                f"warm_up: the pass at {due / MINUTE:g} min can start at {(free + PROGRAM_INTERVAL) / MINUTE:.1f} min "
+                f"at the earliest: a measuring pass takes {first / MINUTE:.1f} min. Expected times further apart."
             )
         piece = warm_up_piece(settings, number, seconds, high)
         programs[piece.name] = piece
         items.append(Item(piece.name, free, piece.seconds(high)))
         items.append(Item(passing.name, due, passing.seconds(piece.end), cold + number - 1))
-        free = items[-1].end + PAUSE
+        free = items[-1].end + PROGRAM_INTERVAL
     for program in programs.values():
         program.check(settings.travel)
     return Schedule(tuple(items), programs, (*[0.0] * cold, *settings.warm_up))
 
 
 def program_texts(settings: Settings) -> dict[str, str]:
-    """Return the NC programs of a test by the names of their files, of scans or of the pocket.
+    """Return the NC programs of a test, of scans or of the pocket, by file name.
 
     Raises
     ------

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 MOVED = "the artefact had moved"
-"""Reason of errors that are left out because of it."""
+"""Reason stated for errors that are excluded because their artefact moved."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,7 @@ class ArtefactCheck:
 
     def extras(self) -> dict[str, Any]:
         """Return the extra variables of the error dataset."""
-        return {
-            "moved": ("position", np.isfinite(self.since)),
-            "moved_since": ("position", self.since, {"units": "s"}),
-        }
+        return {"moved": ("position", np.isfinite(self.since)), "moved_since": ("position", self.since, {"units": "s"})}
 
 
 def check_artefacts(
@@ -56,7 +53,7 @@ def check_artefacts(
     cold: list[int],
     warm: list[int],
 ) -> ArtefactCheck:
-    """Return which artefacts moved, by the repeated cold scans and by their neighbours.
+    """Return which artefacts moved, from the repeated cold scans and from a comparison with their neighbours.
 
     Parameters
     ----------
@@ -68,7 +65,7 @@ def check_artefacts(
     time : (warm cycle,)
         s, increasing.
     cold, warm : list of int
-        Cycles; those of ``cold`` after the first repeat it.
+        Cycles; those of ``cold`` after the first are repeats of it.
     """
     repeatability = (settings.repeatability_shift, settings.repeatability_turn)
     wrong, since = np.zeros(found.reason.shape, dtype=bool), np.full(positions.size, np.nan)

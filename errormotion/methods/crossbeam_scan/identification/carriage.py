@@ -1,8 +1,8 @@
 """From the registrations of a campaign to the errors of the carriage over time and position, with their correlation.
 
-All is linear in the registrations once the weights of the guide are fixed: E = A(H, lever) K W(H) y, with W from maps
-to the profiler's motion, K what the guide makes of it (1 without) and A the adjoint to the carriage. The effect
-of pose and lever is found by changing each by one standard uncertainty up and down.
+With fixed weights of the guide, the errors are linear in the registrations y: E = A(H, lever) K W(H) y. W converts maps
+to the motion of the profiler, K applies the guide (identity without one) and A is the adjoint to the carriage. The
+effects of pose and lever are central differences over plus and minus one standard uncertainty.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Rig:
     lever_uncertainty: Array
 
     def changed(self) -> list[tuple[tuple[RigidTransform, Array], tuple[RigidTransform, Array]]]:
-        """Return (pose, lever) after one standard uncertainty of every source of `chain.SOURCES`, up and down."""
+        """Return (pose, lever) changed by plus and by minus one standard uncertainty of each of `chain.SOURCES`."""
         p = calibration.parameters(self.pose)
         out = []
         for row in chain.root(self.pose_covariance):
@@ -61,22 +61,23 @@ class Carriage:
     Attributes
     ----------
     profiler : ndarray, (cycle, artefact, 6)
-        How the profiler moved, at its origin and in its frame, m and rad.
+        Motion of the profiler at its origin, in its frame, m and rad.
     profiler_covariance : ndarray, (cycle, artefact, 6, 6)
-        By the registrations.
+        From the registrations.
     values : ndarray, (cycle, artefact, 6)
         EX EY EZ (m), EA EB EC (rad); NaN where there is no registration.
     covariance : ndarray, (cycle, artefact, 6, 6)
-        By the registrations alone.
+        From the registrations alone.
     influence : ndarray, (source, cycle, artefact, 6)
         Of pose, lever and cold scans.
     sources, source_groups : list of str
     predicted : ndarray, (artefact, 6, 6)
-        Covariance by surface and stated noise alone.
+        Covariance from surface and stated noise alone.
     drift : ndarray, (cycle, artefact, 3)
         g, change of the profiler's position per metre of feed, profiler frame.
     assumed : ndarray, (2 artefact, cycle, artefact, 6)
-        Effect of one standard uncertainty of pitch and yaw against the guide, in each cycle anew; 0 without a guide.
+        Effect of one standard uncertainty of pitch and yaw relative to the guide, independent in each cycle; 0 without
+        a guide.
     """
 
     profiler: Array
@@ -98,7 +99,7 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
     ----------
     found : Registrations
     positions : (artefact,)
-        Positions of the axis, m, rising.
+        Positions of the axis, m, increasing.
     rig : Rig
     guide : float or None
         Standard uncertainty, rad, with which the carriage follows its guide, see `strain.guided`; None: not used.
@@ -122,13 +123,13 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
         maps = found.twist[c, used]
         seen = np.einsum("kj,ij->ki", maps, W)  # the same bits for any number of artefacts
         noise = W[:6] @ found.covariance[c, used] @ W[:6].T
-        settled = _settled(seen[:, :6], noise, y[used], A, guide)
-        e[c, used], C[c, used], gain = settled.twist, settled.covariance, settled.gain
-        assumed[:, used[:, None], c, used] = transform(settled.assumed.reshape(2, used.size, used.size, 6), A)
+        guided = _guided(seen[:, :6], noise, y[used], A, guide)
+        e[c, used], C[c, used], gain = guided.twist, guided.covariance, guided.gain
+        assumed[:, used[:, None], c, used] = transform(guided.assumed.reshape(2, used.size, used.size, 6), A)
         drift[c, used] = seen[:, 6:]
         for s, (up, down) in enumerate(changed):
-            there, back = (_errors(maps, gain, *rig_) for rig_ in (up, down))
-            influence[s, c, used] = (there - back) / 2
+            plus, minus = (_errors(maps, gain, *changed_rig) for changed_rig in (up, down))
+            influence[s, c, used] = (plus - minus) / 2
     covariance = transform_covariance(C, A)
     cold = _cold_influence(covariance, found)
     names = [f"cold scan {k + 1}, part {i + 1}" for k in range(artefacts) for i in range(6)]
@@ -146,10 +147,10 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
     )
 
 
-def _settled(
+def _guided(
     twist: Array, covariance: Array, positions: Array, to_carriage: Array, guide: float | None
 ) -> strain.Guided:
-    """Return the twists of one cycle, the guide taken into account where it is to be."""
+    """Return the twists of one cycle, with the guide taken into account where its uncertainty is given."""
     if guide is None:
         none = np.zeros((2 * len(twist), twist.size))
         return strain.Guided(twist, covariance, np.eye(twist.size), none, np.zeros(2))
@@ -157,7 +158,7 @@ def _settled(
 
 
 def _errors(maps: Array, gain: Array, pose: RigidTransform, lever: Array) -> Array:
-    """Return the errors (n, 6) that registrations (n, 9) mean with another pose and lever, the same gain."""
+    """Return the errors (n, 6) of registrations (n, 9) for another pose and lever, with the same gain."""
     motion = (gain @ (maps @ strain.from_maps(pose)[:6].T).ravel()).reshape(-1, 6)
     return transform(motion, chain.carriage_adjoint(pose, lever))
 
@@ -176,10 +177,10 @@ def _cold_influence(covariance: Array, found: Registrations) -> Array:
 
 
 def _predicted(found: Registrations, y: Array, W: Array, A: Array, guide: float | None) -> Array:
-    """Return what the bound of every registration makes of the errors' covariance, (artefact, 6, 6)."""
+    """Return the covariance of the errors that follows from the bounds of the registrations, (artefact, 6, 6)."""
     out = np.full((y.size, 6, 6), np.nan)
     known = np.flatnonzero(np.isfinite(found.bound[:, 0, 0]))
     if known.size:
         C = W[:6] @ found.bound[known] @ W[:6].T
-        out[known] = transform_covariance(_settled(np.zeros((known.size, 6)), C, y[known], A, guide).covariance, A)
+        out[known] = transform_covariance(_guided(np.zeros((known.size, 6)), C, y[known], A, guide).covariance, A)
     return out

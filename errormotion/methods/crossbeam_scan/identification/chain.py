@@ -1,12 +1,12 @@
 """From the registered motion of the profiler's frame to the six errors of the carriage, and the effect of a wrong pose.
 
-A warm scan registers onto the cold one with M: a point seen at p in the warm profiler frame is seen at M p in the cold
-one. With H the pose of the profiler in the tool frame and S the shift by the lever (x_y, 0, z_y), the error of the
-carriage is the conjugate E = S H M (S H)^-1 (eq. 3 of Zhao et al.), for small motions the adjoint of S H applied to the
-twist of M. The remainder is of second order: lever times angle squared, 1 nm at 2 m and 30 urad.
+M registers a warm scan onto the cold one: a point at p in the warm profiler frame is at M p in the cold one. With H the
+pose of the profiler in the tool frame and S the shift by the lever (x_y, 0, z_y), the error of the carriage is the
+conjugate E = S H M (S H)^-1 (eq. 3 of Zhao et al.), for small motions the adjoint of S H applied to the twist of M. The
+remainder is of second order: lever times angle squared, 1 nm at 2 m and 30 urad.
 
-A scan is put together along the feed. The carriage travels along Y of the machine, so line y lies off the profiler's
-plane by y times `feed_direction`, which is Y turned into the profiler's frame, and not by y along the frame's own Y.
+A scan is assembled along the feed. The carriage travels along Y of the machine: line y is displaced from the profiler's
+plane by y times `feed_direction`, which is Y of the machine in the profiler's frame, not Y of that frame.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.poses import adjoint_of
 from errormotion.kinematics.twists import adjoint, cross_matrix, transform, transform_covariance
 
-#: names of the influences and what they belong to in the budget
+#: Names of the influences, and their groups in the budget.
 SOURCES = (*(f"profiler pose {k}" for k in range(1, 7)), "lever x", "lever y", "lever z")
-POSE_UNIT = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])
-"""Sizes of (a, b, g, dx, dy, dz) that count alike in the parts of its covariance, rad and m."""
 SOURCE_GROUPS = ("profiler pose",) * 6 + ("lever",) * 3
+POSE_UNIT = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])
+"""Units of (a, b, g, dx, dy, dz) in which the principal axes of their covariance are determined, rad and m."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class CarriageErrors:
     influence : ndarray, (source, ..., 6)
         Effect of one standard uncertainty of each source, the same draw for all values.
     sources, source_groups : tuple of str
-        What the influences are, as `errormotion.datasets.build_errors` takes them.
+        Names and groups of the influences, for `errormotion.datasets.build_errors`.
     """
 
     values: Array
@@ -74,13 +74,13 @@ def carriage_errors(
     motion : (..., 6)
         Twists of M at the origin of the profiler's frame, in that frame: warm onto cold; m and rad.
     covariance : (..., 6, 6)
-        Of these, by the registration alone.
+        Covariance of the twists from the registration alone.
     profiler_pose : RigidTransform
         H, profiler to tool frame.
     lever : (3,)
         (x_y, 0, z_y), carriage to tool frame, m.
     pose_covariance : (6, 6), optional
-        Of (a, b, g, dx, dy, dz), as the calibration gives it; without it the pose counts as exact.
+        Of (a, b, g, dx, dy, dz), from the calibration; without it the pose is taken as exact.
     lever_uncertainty : (3,)
         Standard uncertainty of the lever, m.
 
@@ -92,7 +92,7 @@ def carriage_errors(
     M, C, x = (np.asarray(value, dtype=float) for value in (motion, covariance, lever))
     if M.shape[-1:] != (6,) or C.shape != (*M.shape, 6) or x.shape != (3,):
         raise MethodError(
-            "The chain needs motions (..., 6), covariances (..., 6, 6) and a lever (3,); found "
+            "Expected motions (..., 6), covariances (..., 6, 6) and a lever (3,); found "
             f"{M.shape}, {C.shape} and {x.shape}."
         )
     to_carriage = carriage_adjoint(profiler_pose, x)
@@ -109,16 +109,15 @@ def carriage_errors(
 
 
 def carriage_adjoint(profiler_pose: RigidTransform, lever: ArrayLike) -> Array:
-    """Return the matrix (6, 6) that takes twists in the profiler's frame to twists of the carriage."""
+    """Return the matrix (6, 6) that converts twists in the profiler's frame to twists of the carriage."""
     shift = np.asarray(lever, dtype=float)
     return adjoint(shift=-shift) @ adjoint_of(profiler_pose)
 
 
 def pose_twists(profiler_pose: RigidTransform, lever: ArrayLike) -> Array:
-    """Return what each parameter (a, b, g, dx, dy, dz) of the pose does to S H: twists of the carriage, (6, 6).
+    """Return the effect of each parameter (a, b, g, dx, dy, dz) of the pose on S H as a twist of the carriage, (6, 6).
 
-    Row k is the motion per radian or metre of parameter k from where the profiler is to where it would be, in the
-    carriage's frame and at its origin.
+    Row k is the motion of the profiler per radian or metre of parameter k, in the carriage's frame and at its origin.
     """
     a, b, _ = profiler_pose.rotation.as_euler("XYZ")
     axes = np.array(
@@ -129,14 +128,14 @@ def pose_twists(profiler_pose: RigidTransform, lever: ArrayLike) -> Array:
 
 
 def commutator(error: ArrayLike, twist: ArrayLike) -> Array:
-    """Return how a twist changes when its frame is off by a small motion: the Lie bracket of the two, (..., 6).
+    """Return the change of a twist when its frame is displaced by a small motion: their Lie bracket, (..., 6).
 
     Parameters
     ----------
     error : (6,)
         Small motion of the frame, m and rad.
     twist : (..., 6)
-        m and rad; both in the same frame and at the same point.
+        m and rad, in the same frame and at the same point.
     """
     v, w = np.split(np.asarray(error, dtype=float), 2)
     bracket = np.zeros((6, 6))
@@ -146,14 +145,14 @@ def commutator(error: ArrayLike, twist: ArrayLike) -> Array:
 
 
 def calibration_effect(errors: ArrayLike, profiler_pose: RigidTransform, lever: ArrayLike, change: ArrayLike) -> Array:
-    """Return how the errors of the carriage would change with the pose of the profiler, to first order (eq. 14).
+    """Return the change of the errors of the carriage with the pose of the profiler, to first order (eq. 14).
 
     Parameters
     ----------
     errors : (..., 6)
-        Errors of the carriage by this pose, m and rad.
+        Errors of the carriage for this pose, m and rad.
     profiler_pose : RigidTransform
-        Pose that they were found with.
+        Pose with which they were determined.
     lever : (3,)
         m.
     change : (6,)
@@ -162,14 +161,15 @@ def calibration_effect(errors: ArrayLike, profiler_pose: RigidTransform, lever: 
     Returns
     -------
     ndarray, (..., 6)
-        What to add to the errors; of the size of change times error. Scans that are put together along the
-        `feed_direction` of a wrong pose add an effect of the same order, which depends on artefact and registration.
+        To be added to the errors; of the order of change times error. It does not include that scans were assembled
+        along the `feed_direction` of the wrong pose: an effect of the same order that depends on artefact and
+        registration.
     """
     return commutator(np.asarray(change, dtype=float) @ pose_twists(profiler_pose, lever), errors)
 
 
 def pose_identities(profiler_pose: RigidTransform, covariance: ArrayLike | None) -> dict[str, str]:
-    """Return the identity of each source of a calibrated pose by its name; none for a pose that counts as exact."""
+    """Return the identity of each source of a calibrated pose by its name; none for a pose that is taken as exact."""
     if covariance is None:
         return {}
     rows = root(covariance)
@@ -182,11 +182,11 @@ def pose_identities(profiler_pose: RigidTransform, covariance: ArrayLike | None)
 
 
 def root(covariance: ArrayLike | None) -> Array:
-    """Return rows whose outer products add up to the covariance, (6, 6), largest first in units of 10 um and 1 mrad."""
+    """Return rows whose outer products add up to the covariance, (6, 6), largest first in units of `POSE_UNIT`."""
     if covariance is None:
         return np.zeros((6, 6))
     C = np.asarray(covariance, dtype=float)
     if C.shape != (6, 6) or not np.allclose(C, C.T, rtol=1e-6, atol=0) or np.any(np.diag(C) < 0):
-        raise MethodError(f"The covariance of the profiler's pose is a symmetric (6, 6); found shape {C.shape}.")
+        raise MethodError(f"Expected a symmetric covariance (6, 6) of the profiler's pose; found shape {C.shape}.")
     size, vectors = np.linalg.eigh(C / np.outer(POSE_UNIT, POSE_UNIT))
     return np.asarray((vectors * np.sqrt(np.maximum(size, 0.0)) * POSE_UNIT[:, None]).T[::-1])

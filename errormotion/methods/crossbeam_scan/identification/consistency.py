@@ -1,11 +1,12 @@
-"""Artefacts that moved between two scans, or were scanned off their position.
+"""Detection of artefacts that moved between two scans, or were not scanned at their position.
 
-A cold scan repeated must find no motion. And the errors of an axis are smooth over its position, so that those of one
-artefact follow from the others: one that moved adds the same step to all its later scans, which its neighbours lack.
+A repeated cold scan must show no motion. The errors of an axis are smooth over position, so that those at one artefact
+can be predicted from the others: an artefact that moved adds the same step to all its later scans, but its neighbours
+do not show it.
 
-Give the twists in the profiler's frame, at its origin, as they are registered. At the carriage, behind a lever of 2 m,
-the noise of the rotations is that of the displacements too, and all of them correlate. A step is what the motion of the
-artefact does to the errors: the artefact itself moved by the opposite.
+The twists are expected as registered: in the profiler's frame, at its origin. At the carriage, behind a lever of 2 m,
+the noise of the rotations dominates that of the displacements, and all of them are correlated. A step is the effect of
+the motion of the artefact on the errors: the artefact itself moved by the opposite.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.smoothing import ORDER, smooth
 
-#: artefacts without which their neighbours carry no information
-FEWEST = 4
-#: order of the curves that predict an artefact from the others: seven artefacts do not tell in one cycle how rough a
-#: guide is, and with order 3 one whose curvature jumps about would alarm nearly always
-CAUTIOUS = 2
-#: probability of any false alarm in a campaign
+#: Smallest number of artefacts that can be compared with each other.
+MINIMUM_ARTEFACTS = 4
+#: Order of the curves that predict an artefact from the others. Seven artefacts in one cycle do not determine the
+#: roughness of a guide; with order 3, a guide whose curvature changes abruptly would nearly always raise an alarm.
+PREDICTION_ORDER = 2
+#: Probability of any false alarm in a campaign.
 FALSE_ALARM = 0.01
 
 
@@ -39,13 +40,13 @@ class ColdRepeats:
     score : ndarray, (repeat, position)
         Chi-squared of the twist that should be zero; NaN where there is none.
     freedoms : ndarray of int, (repeat, position)
-        Freedoms that are known, of which the score has so many degrees.
+        Number of known freedoms: the degrees of freedom of the score.
     probability : ndarray, (repeat, position)
-        That a score is as high without a cause.
+        Probability of such a score by chance.
     suspicious : ndarray of bool, (repeat, position)
-        Where that is below ``limit``.
+        Whether the probability is below ``limit``.
     limit : float
-        Probability of a false alarm of one test: that of any, over the number of tests.
+        Probability of a false alarm of one test: that of any false alarm divided by the number of tests.
     """
 
     score: Array
@@ -64,9 +65,9 @@ class Moved:
     artefact : int
         Index of its position.
     since : int
-        Index of the first cycle that shows it: it moved after the scan before.
+        Index of the first cycle that shows the motion: the artefact moved after the preceding scan.
     step : ndarray, (6,)
-        What it adds to the errors from then on, m and rad.
+        Contribution of the motion to the errors from this cycle on, m and rad.
     covariance : ndarray, (6, 6)
         Of the step.
     score : float
@@ -92,7 +93,7 @@ class Consistency:
     moved : tuple of Moved
         Worst first.
     tested : bool
-        Whether there were enough artefacts; if not, ``moved`` is empty and carries no information.
+        Whether there were enough artefacts; if not, ``moved`` is empty without a test.
     limit : float
         Probability of a false alarm of one test; NaN where nothing was tested.
     """
@@ -109,22 +110,21 @@ def cold_repeats(
     repeatability: Sequence[float] = (0.0, 0.0),
     false_alarm: float = FALSE_ALARM,
 ) -> ColdRepeats:
-    """Return whether repeated cold scans find the artefacts where they were.
+    """Return whether repeated cold scans show the artefacts at their original positions.
 
     Parameters
     ----------
     twist, covariance : (repeat, position, 6), (repeat, position, 6, 6)
-        Registered motions against the first cold scan, m and rad, and their covariance; NaN for a freedom that is not
-        known.
+        Motions registered relative to the first cold scan, m and rad, and their covariance; NaN for an unknown freedom.
     repeatability : (float, float)
-        Standard deviation of how the machine comes back, m and rad, in each freedom.
+        Standard deviation of the repeatability of the machine in each freedom, m and rad.
     false_alarm : float
-        Probability of one false alarm or more over all tests (Bonferroni).
+        Probability of one or more false alarms in all tests (Bonferroni).
 
     Raises
     ------
     MethodError
-        Shapes that do not fit, a probability out of (0, 1).
+        Shapes that do not match, a probability outside (0, 1).
     """
     E, C = _checked(twist, covariance, repeatability, false_alarm, "repeat, position")
     C = C + np.diag(_spread(repeatability) ** 2)
@@ -152,161 +152,158 @@ def moved_artefacts(
 ) -> Consistency:
     """Return the artefacts that moved between two scans, and when.
 
-    What an artefact gains from one scan to the next is predicted from what the others gain, smooth over position. The
-    excess of all its scans, with its covariance, is searched for a step at each of them; the artefact with the
-    greatest is left out, and the rest searched again.
+    The change of the errors at one artefact from one scan to the next is predicted from the changes at the others by
+    curves that are smooth over position. The deviations of all scans of an artefact from their predictions, with their
+    covariance, are tested for a step at each scan. Of the artefacts with a significant step, the one without which the
+    others are most likely is excluded, and the test is repeated.
 
     Parameters
     ----------
     time : (t,)
-        Of the warm cycles, s, increasing; the cold one is not among them: it is the zero of all.
+        Of the warm cycles, s, increasing. The cold cycle is not included: all errors are relative to it.
     position : (n,)
         Of the artefacts, m.
     errors, covariance : (t, n, 6), (t, n, 6, 6)
-        Twists against the cold scans, m and rad, best those in the profiler's frame; a scan with a NaN is left out.
+        Twists relative to the cold scans, m and rad, preferably in the profiler's frame; a scan with NaN is not used.
     repeatability : (float, float)
-        Standard deviation of how the machine comes back from scan to scan, m and rad, in each freedom.
+        Standard deviation of the repeatability of the machine from scan to scan in each freedom, m and rad.
     cold_share : float or (t, n)
-        Share of the covariance that comes from the cold scan, one draw for all cycles of an artefact. Without it the
-        test is blunter, no worse.
+        Share of the covariance that is caused by the cold scan, one draw for all cycles of an artefact. Without it, the
+        test is less sensitive, but valid.
     false_alarm : float
-        Probability of one false alarm or more over all artefacts and cycles.
+        Probability of one or more false alarms over all artefacts and cycles.
 
     Returns
     -------
     Consistency
-        A step is sought over all six freedoms, so that its threshold at the ends, where the prediction reaches out,
-        is higher. Two artefacts that move alike in the same cycle may hide each other.
+        A step is tested in all six freedoms together. At the ends, where the prediction extrapolates, the threshold is
+        higher. Two artefacts that move equally in the same cycle may mask each other.
 
     Raises
     ------
     MethodError
-        Shapes that do not fit, times that do not increase, a probability out of (0, 1).
+        Shapes that do not match, times that do not increase, a probability outside (0, 1).
     """
     E, C = _checked(errors, covariance, repeatability, false_alarm, "t, n")
     t, y = np.asarray(time, dtype=float), np.asarray(position, dtype=float)
     if t.shape != E.shape[:1] or y.shape != E.shape[1:2] or not (np.diff(t) > 0).all():
         raise MethodError(
-            f"Errors of shape {E.shape} need increasing times ({E.shape[0]},) and positions ({E.shape[1]},); found "
-            f"{t.shape} and {y.shape}."
+            f"Expected increasing times ({E.shape[0]},) and positions ({E.shape[1]},) for errors of shape {E.shape}; "
+            f"found {t.shape} and {y.shape}."
         )
     share = np.broadcast_to(np.asarray(cold_share, dtype=float), E.shape[:2])[..., None, None]
-    there = np.asarray(np.isfinite(E).all(axis=-1) & np.isfinite(C).all(axis=(-2, -1)), dtype=bool)
+    known = np.asarray(np.isfinite(E).all(axis=-1) & np.isfinite(C).all(axis=(-2, -1)), dtype=bool)
     machine = np.diag(_spread(repeatability) ** 2)
-    scans = _Scans(y, E, (1 - share) * C + machine, _mean(share * C, there) + machine, there)
-    left = np.flatnonzero(there.any(axis=0))
-    tests = int(there[:, left].sum())
-    if left.size < FEWEST or not tests:
+    scans = _Scans(y, E, (1 - share) * C + machine, _mean(share * C, known) + machine, known)
+    used = np.flatnonzero(known.any(axis=0))
+    tests = int(known[:, used].sum())
+    if used.size < MINIMUM_ARTEFACTS or not tests:
         return Consistency((), False, np.nan)
     limit = false_alarm / tests
     moved: list[Moved] = []
-    while left.size >= FEWEST:
-        steps = [step for k in left if (step := scans.greatest_step(int(k), left)) is not None]
+    while used.size >= MINIMUM_ARTEFACTS:
+        steps = [step for k in used if (step := scans.greatest_step(int(k), used)) is not None]
         steps = [step for step in steps if step.probability < limit]
         if not steps:
             break
-        moved.append(max(steps, key=lambda step: scans.relief(step, left)))
-        left = left[left != moved[-1].artefact]
+        moved.append(max(steps, key=lambda step: scans.likelihood_gain(step, used)))
+        used = used[used != moved[-1].artefact]
     return Consistency(tuple(moved), True, limit)
 
 
 @dataclass(frozen=True)
 class _Scans:
-    """All scans of a campaign; their noise is independent, and the cold ones are zero but for it."""
+    """All scans of a campaign. Their noise is independent; apart from it, the cold scans are zero."""
 
     position: Array
     errors: Array  # (t, n, 6)
     noise: Array  # (t, n, 6, 6)
     cold: Array  # noise of the cold scans, (n, 6, 6)
-    there: NDArray[np.bool_]  # (t, n)
+    known: NDArray[np.bool_]  # (t, n)
 
-    def greatest_step(self, k: int, left: NDArray[np.intp]) -> Moved | None:
-        """Return the most significant step of artefact k against the others that are left; None where none is known."""
-        cycles = np.flatnonzero(self.there[:, k])
-        after, before, gain, noise = self.gains(k, left)
-        others = left != k
+    def greatest_step(self, k: int, used: NDArray[np.intp]) -> Moved | None:
+        """Return the most significant step of artefact k relative to the other artefacts used; None if unknown."""
+        cycles = np.flatnonzero(self.known[:, k])
+        after, before, change, noise = self.changes(k, used)
+        others = used != k
         s = cycles.size
-        excess, doubt = np.zeros((s, 6)), np.zeros((s, 6))
+        deviation, model_variance = np.zeros((s, 6)), np.zeros((s, 6))
         share = np.zeros((s, 6, self.errors.shape[0] + 1, self.errors.shape[1]))  # of the noise of each scan
         row = np.arange(s)
         for d in range(6):
-            known = np.where(others, gain[..., d], np.nan)
-            curve = smooth(self.position[left], known, noise[..., d, d], self.position[[k]], order=CAUTIOUS)
+            known = np.where(others, change[..., d], np.nan)
+            curve = smooth(self.position[used], known, noise[..., d, d], self.position[[k]], order=PREDICTION_ORDER)
             W = curve.weights[:, 0]
-            excess[:, d] = gain[:, ~others, d][:, 0] - curve.values[:, 0]
-            doubt[:, d] = curve.variance[:, 0] - (W**2 * np.nan_to_num(noise[..., d, d])).sum(axis=-1)
+            deviation[:, d] = change[:, ~others, d][:, 0] - curve.values[:, 0]
+            model_variance[:, d] = curve.variance[:, 0] - (W**2 * np.nan_to_num(noise[..., d, d])).sum(axis=-1)
             for sign, which in ((1.0, after), (-1.0, before)):
                 share[row, d, which, k] = sign
-                share[row[:, None], d, which[:, None], left[others]] = -sign * W[:, others]
-        usable = np.isfinite(excess).all(axis=-1)
+                share[row[:, None], d, which[:, None], used[others]] = -sign * W[:, others]
+        usable = np.isfinite(deviation).all(axis=-1)
         if not usable.any():
             return None
-        share, excess = share[usable], excess[usable]
+        share, deviation, model_variance = share[usable], deviation[usable], np.maximum(model_variance[usable], 0.0)
         N = np.nan_to_num(np.concatenate([self.cold[None], self.noise]))
         V = np.einsum("idtn,jetn,tnde->idje", share, share, N)
-        V = V.reshape(excess.size, excess.size) + np.diag(np.maximum(doubt[usable], 0.0).ravel())
-        spare = np.isfinite(gain[usable][:, others]).all(axis=-1).sum(axis=-1) - CAUTIOUS
-        return _greatest(k, cycles[usable], excess, V, np.maximum(doubt[usable], 0.0), spare)
+        V = V.reshape(deviation.size, deviation.size) + np.diag(model_variance.ravel())
+        degrees = np.isfinite(change[usable][:, others]).all(axis=-1).sum(axis=-1) - PREDICTION_ORDER
+        return _most_significant(k, cycles[usable], deviation, V, model_variance, degrees)
 
-    def relief(self, step: Moved, left: NDArray[np.intp]) -> float:
-        """Return by how much more likely all gains are, each freedom smooth, without one of one artefact (log).
+    def likelihood_gain(self, step: Moved, used: NDArray[np.intp]) -> float:
+        """Return by how much the log likelihood of all changes increases without the change of the step.
 
-        The artefact that moved and its neighbour at the end both look out of line; without the right one, the rest is
-        as smooth as in the other cycles: for that, all cycles share one amplitude.
+        An artefact that moved and its neighbour at the end both deviate. Without the right one, the others are as
+        smooth as in the other cycles; to use this, all cycles share one amplitude.
         """
         k = step.artefact
-        _, _, gain, noise = self.gains(k, left)
-        without = gain.copy()
-        without[np.flatnonzero(self.there[:, k]) == step.since, left == k] = np.nan
-        positions, order = self.position[left], _order(left)
+        _, _, change, noise = self.changes(k, used)
+        without = change.copy()
+        without[np.flatnonzero(self.known[:, k]) == step.since, used == k] = np.nan
+        positions = self.position[used]
+        order = min(ORDER, used.size - 2)  # one artefact less still provides evidence
         likelihood = [
             smooth(
                 positions, points[..., d], noise[..., d, d], positions[:1], order=order, together=True
             ).log_likelihood
-            for points in (gain, without)
+            for points in (change, without)
             for d in range(6)
         ]
         each = np.nanmax(likelihood, axis=-1)  # shared; NaN for a cycle with too few artefacts
         return float(each[6:].sum() - each[:6].sum())
 
-    def gains(self, k: int, left: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-        """Return what the artefacts left gain between the scans of artefact k.
+    def changes(self, k: int, used: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+        """Return the changes of the errors at the artefacts used between the scans of artefact k.
 
         Returns
         -------
         after, before : ndarray of int, (s,)
             Cycles, where 0 is the cold one.
-        gain, noise : ndarray, (s, left, 6), (s, left, 6, 6)
-            NaN where one of the two scans is not there.
+        change, noise : ndarray, (s, used, 6), (s, used, 6, 6)
+            NaN where one of the two scans is missing.
         """
-        cycles = np.flatnonzero(self.there[:, k])
+        cycles = np.flatnonzero(self.known[:, k])
         after, before = cycles + 1, np.concatenate([[0], cycles[:-1] + 1])
-        E = np.concatenate([np.zeros((1, *self.errors.shape[1:])), self.errors])[:, left]
-        N = np.concatenate([self.cold[None], self.noise])[:, left]
-        there = np.concatenate([np.any(self.there, axis=0, keepdims=True), self.there])[:, left]
-        both = (there[after] & there[before])[..., None]
-        gain = np.where(both, E[after] - E[before], np.nan)
-        return after, before, gain, np.where(both[..., None], N[after] + N[before], np.nan)
+        E = np.concatenate([np.zeros((1, *self.errors.shape[1:])), self.errors])[:, used]
+        N = np.concatenate([self.cold[None], self.noise])[:, used]
+        known = np.concatenate([np.any(self.known, axis=0, keepdims=True), self.known])[:, used]
+        both = (known[after] & known[before])[..., None]
+        change = np.where(both, E[after] - E[before], np.nan)
+        return after, before, change, np.where(both[..., None], N[after] + N[before], np.nan)
 
 
-def _order(left: NDArray[np.intp]) -> int:
-    """Return the order of curves that leaves evidence when one of the artefacts is left out."""
-    return min(ORDER, left.size - 2)
-
-
-def _greatest(
-    k: int, cycles: NDArray[np.intp], excess: Array, V: Array, doubt: Array, spare: NDArray[np.intp]
+def _most_significant(
+    k: int, cycles: NDArray[np.intp], deviation: Array, V: Array, model_variance: Array, degrees: NDArray[np.intp]
 ) -> Moved:
     """Return the most significant step, by generalised least squares for a step before each of the cycles.
 
-    How smooth a gain is, is known from the few artefacts to spare. As far as this doubt, and not the noise, makes up
-    the variance V of the excess, the score is judged by F with so few degrees of freedom (after Welch and
-    Satterthwaite, freedoms weighted by what they add to the score).
+    The variance V of the deviations consists of noise and of ``model_variance``, that of the smooth curve. The latter
+    is estimated with few degrees of freedom, so that the score is compared with an F distribution, whose degrees of
+    freedom follow from both parts (Welch and Satterthwaite; freedoms are weighted by their share of the score).
     """
     unit = np.sqrt(np.diag(V))
     inverse = np.linalg.inv(V / np.outer(unit, unit)) / np.outer(unit, unit)
-    pull = (inverse @ excess.ravel()).reshape(-1, 6)
-    doubtful = (doubt / (unit**2).reshape(-1, 6)) ** 2
+    pull = (inverse @ deviation.ravel()).reshape(-1, 6)
+    model_share = (model_variance / (unit**2).reshape(-1, 6)) ** 2
     found = []
     for i, since in enumerate(cycles):
         block = slice(6 * i, 6 * i + 6)
@@ -316,22 +313,22 @@ def _greatest(
         step = covariance @ pull[i]
         score = float(step @ pull[i])
         weight = np.abs(step * pull[i])
-        degrees = spare[i] * weight.sum() / max(float(weight @ doubtful[i]), 1e-9 * float(weight.sum()))
-        found.append(Moved(k, int(since), step, covariance, score, float(special.fdtrc(6, degrees, score / 6))))
+        total = degrees[i] * weight.sum() / max(float(weight @ model_share[i]), 1e-9 * float(weight.sum()))
+        found.append(Moved(k, int(since), step, covariance, score, float(special.fdtrc(6, total, score / 6))))
     return max(found, key=lambda step: step.score)
 
 
 def _checked(
     twist: ArrayLike, covariance: ArrayLike, repeatability: Sequence[float], false_alarm: float, dims: str
 ) -> tuple[Array, Array]:
-    """Return twists and covariance as arrays; raise MethodError where they do not fit."""
+    """Return twists and covariance as arrays; raise MethodError where their shapes do not match."""
     E, C = np.asarray(twist, dtype=float), np.asarray(covariance, dtype=float)
     if E.ndim != 3 or E.shape[-1] != 6 or C.shape != (*E.shape, 6):
         raise MethodError(f"Expected twists ({dims}, 6) and covariance ({dims}, 6, 6); found {E.shape} and {C.shape}.")
     if len(repeatability) != 2 or not all(0 <= sigma < np.inf for sigma in repeatability):
-        raise MethodError(f"The repeatability is two standard deviations, m and rad; found {tuple(repeatability)}.")
+        raise MethodError(f"repeatability: expected two standard deviations, m and rad; found {tuple(repeatability)}.")
     if not 0 < false_alarm < 1:
-        raise MethodError(f"The probability of a false alarm lies between 0 and 1; found {false_alarm}.")
+        raise MethodError(f"false_alarm: expected a probability between 0 and 1; found {false_alarm}.")
     return E, C
 
 
@@ -340,10 +337,10 @@ def _spread(repeatability: Sequence[float]) -> Array:
     return np.repeat(np.asarray(repeatability, dtype=float), 3)
 
 
-def _mean(covariance: Array, there: NDArray[np.bool_]) -> Array:
-    """Return the mean over cycles of what is there, (n, 6, 6)."""
-    total = np.where(there[..., None, None], covariance, 0.0).sum(axis=0)
-    return np.asarray(total / np.maximum(there.sum(axis=0), 1)[:, None, None])
+def _mean(covariance: Array, known: NDArray[np.bool_]) -> Array:
+    """Return the mean over the cycles in which a scan is known, (n, 6, 6)."""
+    total = np.where(known[..., None, None], covariance, 0.0).sum(axis=0)
+    return np.asarray(total / np.maximum(known.sum(axis=0), 1)[:, None, None])
 
 
 def _chi_squared(x: Array, C: Array) -> float:

@@ -1,7 +1,7 @@
 """Smooth curves of the axis errors over position and over time.
 
-The curves are drawn in the profiler's frame, where a displacement is not yet mixed with the rotations over the lever,
-and then taken through the chain as the points are, with the share of pose and lever.
+The curves are fitted in the profiler's frame, where displacements do not contain the rotations times the lever. They
+are then transformed to the carriage like the points, with the contributions of pose and lever.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from errormotion.methods.crossbeam_scan.identification.registrations import Regi
 from errormotion.methods.crossbeam_scan.identification.smoothing import smooth_twists, warm_up_scale
 
 PLACES, MOMENTS = 41, 41
-"""Points of a curve over position and over time."""
+"""Number of points of a curve over position and over time."""
 
 
 def curves(
@@ -44,7 +44,7 @@ def curves(
     warm : list of int
         The cycles.
     wrong : (cycle, artefact)
-        Points to leave out: an artefact has moved.
+        Points to exclude, because an artefact has moved.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def curves(
     e, C, share = (np.swapaxes(value, 0, 1) for value in (e, C, share))  # artefact, cycle
     own = C * (1 - share)[..., None, None]
     along = smooth_twists(warm_up_scale(time), e, own, warm_up_scale(moment), exact_zero=True)
-    common = np.linalg.cholesky(_safe(C * share[..., None, None]))  # one draw for all cycles of an artefact
+    common = np.linalg.cholesky(_regularised(C * share[..., None, None]))  # one draw for all cycles of an artefact
     effect = along.carry(np.moveaxis(common, -1, 0))  # (6, artefact, moment, 6)
     total = along.covariance + np.einsum("s...i,s...j->...ij", effect, effect)
     over_time, over_time_u = _chained(along.values, total, rig)
@@ -91,8 +91,8 @@ def _chained(twist: Array, covariance: Array, rig: Rig) -> tuple[Array, Array]:
     return found.values, np.sqrt(np.diagonal(found.covariance, axis1=-2, axis2=-1))
 
 
-def _safe(C: Array) -> Array:
-    """Return matrices that have a Cholesky factor: tiny where there is nothing."""
+def _regularised(C: Array) -> Array:
+    """Return matrices that have a Cholesky factor: with a tiny diagonal added, unknown ones as 0."""
     known = np.asarray(np.isfinite(C).all(axis=(-2, -1)))
     unit = np.full(6, 1e-12)
     return np.where(known[..., None, None], C, 0.0) + np.diag(unit**2)

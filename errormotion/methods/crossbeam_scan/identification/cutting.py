@@ -1,7 +1,7 @@
 """Scans cut out of a record of lines, one at a time: a campaign may be larger than memory.
 
-A scan is the lines whose encoder says that the axis was within half a scan's length of an artefact. They are
-sorted, repeated lines are used once, and lost lines are NaN at their positions.
+A scan consists of the lines at which, by the encoder, the axis was within half a scan length of an artefact. They are
+sorted; repeated lines are used once, and lost lines are NaN at their positions.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.encoder import OVERFLOW, folded
+from errormotion.methods.crossbeam_scan.encoder import OVERFLOW, unwrapped
 
 Scan = tuple[NDArray[np.float32], Array, Array, float]
 
 log = logging.getLogger(__name__)
 
 GAP = 0.5e-3
-"""Longest gap without lines, m, that is accepted in a scan."""
+"""Longest accepted gap without lines in a scan, m."""
 LOST_SHARE = 0.05
 """Largest accepted share of lost lines of a scan."""
-END = 0.01
+END_SHARE = 0.01
 """Largest accepted share of a scan's length that is missing at each end."""
-DISORDER = 0.05
+DISORDER_SHARE = 0.05
 """Largest accepted share of lines with a position before that of the previous line."""
 FEWEST_LINES = 16
 FINEST_PITCH = 1e-6
-"""m; lines closer than this come from a wrong encoder_pitch."""
+"""Smallest plausible distance of two lines, m; a smaller one is caused by a wrong encoder_pitch."""
 
 _INTERRUPTION = re.compile(r"pass (\d+) broke at (\S+) m: (.*)", re.DOTALL)
 
@@ -64,7 +64,7 @@ def interruptions(raw: xr.Dataset) -> list[Interruption]:
 
 
 class Scans:
-    """The scans of a campaign, each loaded on request; for both variants of the raw dataset.
+    """The scans of a campaign, each loaded on request, from either variant of the raw dataset.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Scans:
     Raises
     ------
     MethodError
-        It is neither.
+        The dataset is of neither variant.
 
     Attributes
     ----------
@@ -99,12 +99,13 @@ class Scans:
     def scan(self, cycle: int, artefact: int) -> Scan:
         """Return one scan: height (profile, point) m, x (point,) m, y (profile,) m, and its time, s.
 
-        y counts from the ``position`` of the artefact and rises. The time of a recorded scan is the mean of its lines.
+        y is relative to the ``position`` of the artefact and increases. The time of a recorded scan is the mean of its
+        lines.
 
         Raises
         ------
         MethodError
-            There is no such scan, it is incomplete, or its positions are inconsistent.
+            The scan is missing or incomplete, or its positions are inconsistent.
         """
         if self._record is not None:
             height, y, time = self._record.scan(cycle, artefact)
@@ -114,7 +115,7 @@ class Scans:
         height = part["height"].transpose("profile", "point").values
         known = np.isfinite(y)
         if not known.any() or not np.isfinite(height).any():
-            raise MethodError("there is no scan: all of it is NaN")
+            raise MethodError("there is no scan: all values are NaN")
         y, height = y[known], height[known]
         if y[0] > y[-1]:
             y, height = y[::-1], height[::-1]
@@ -128,7 +129,7 @@ class Scans:
 
 
 class _Record:
-    """Where the scans are in a record of lines."""
+    """A record of lines, from which scans are cut out."""
 
     def __init__(self, raw: xr.Dataset, note: Any) -> None:
         self._note = note
@@ -138,11 +139,11 @@ class _Record:
         self._length = float(raw["scan_length"])
         counts = np.asarray(raw["encoder"].values, dtype=float)
         pitch, zero = float(raw["encoder_pitch"]), float(raw["encoder_zero"])
-        corrected = folded(counts, (float(self._positions.mean()) - zero) / pitch)
+        corrected = unwrapped(counts, (float(self._positions.mean()) - zero) / pitch)
         jumped = np.isfinite(counts) & (corrected != counts)
         if jumped.any():
             note(f"The encoder's count overflowed ({OVERFLOW:.0f}) in {int(jumped.sum())} lines; this was corrected.")
-        self._place = zero + pitch * corrected
+        self._axis = zero + pitch * corrected  # position of the axis at each line, m
         self._cycle = np.asarray(raw["cycle_of_line"].values).astype(np.int64)
         self._time = np.asarray(raw["line_time"].values, dtype=float)
         planned = int(raw.sizes["cycle"]) if "warm_up" in raw else 0
@@ -151,8 +152,8 @@ class _Record:
         self._check_units()
 
     def _check_units(self) -> None:
-        """Refuse an encoder pitch that puts no line, a few of them, or all into a scan."""
-        known = self._place[np.isfinite(self._place)]
+        """Raise MethodError if no line is in a scan, or the lines are implausibly close together or far apart."""
+        known = self._axis[np.isfinite(self._axis)]
         inside = (np.abs(known[:, None] - self._positions) <= self._length / 2).any(axis=1)
         step = float(np.median(np.abs(np.diff(known)))) if known.size > 1 else np.nan
         where = ", ".join(f"{y:g}" for y in self._positions)
@@ -162,7 +163,7 @@ class _Record:
         found = (
             f"{step * 1e6:.3g} um from line to line"
             if inside.any()
-            else f"none of {known.size} lines there, but at {known.min(initial=np.inf):.6g} to "
+            else f"none of {known.size} lines there; they are at {known.min(initial=np.inf):.6g} to "
             f"{known.max(initial=-np.inf):.6g} m"
         )
         raise MethodError(
@@ -174,73 +175,75 @@ class _Record:
         middle = self._positions[artefact]
         attempts = list(self._attempts(cycle, middle))
         if not attempts:
-            raise MethodError(self._missing(cycle, "there is no line of it"))
+            raise MethodError(self._missing(cycle, "the scan has no lines"))
         rows, y = max(reversed(attempts), key=lambda attempt: float(np.ptp(attempt[1])))
         at = f"Pass {cycle} at {middle:g} m"
         order, y = self._ordered(y, at)
         rows = rows[order]
-        self._check_whole(y, cycle)
+        self._check_complete(y, cycle)
         height = self._load(rows)
         time = float(np.mean(self._time[rows]))
-        height, y, lost = _evened(height, y)
+        height, y, lost = _with_lost_lines(height, y)
         if lost:
             self._note(f"{at}: {lost} of {y.size} lines are lost and NaN.")
         return height, y, time
 
     def _attempts(self, cycle: int, middle: float) -> Iterator[tuple[NDArray[np.int64], Array]]:
         """Yield, for each time that the axis passed, the lines within the scan (n,) and their positions y (n,), m."""
-        lines = np.flatnonzero((self._cycle == cycle) & np.isfinite(self._place))
+        lines = np.flatnonzero((self._cycle == cycle) & np.isfinite(self._axis))
         if not lines.size:
             return
-        steps = np.diff(self._place[lines])
+        steps = np.diff(self._axis[lines])
         forwards = 1.0 if np.count_nonzero(steps > 0) >= steps.size / 2 else -1.0
         back = np.flatnonzero(steps * forwards < -self._length / 2) + 1
         for low, high in pairwise([0, *back.tolist(), lines.size]):
             rows = lines[low:high]
-            y = self._place[rows] - middle
+            y = self._axis[rows] - middle
             inside = np.abs(y) <= self._length / 2
             if inside.any():
                 yield rows[inside], y[inside]
 
     def _ordered(self, y: Array, at: str) -> tuple[NDArray[np.int64], Array]:
-        """Return the order that makes y rise, each position once, and y in that order."""
+        """Return the order in which y increases, each position once, and y in that order."""
         steps = np.diff(y)
         if np.count_nonzero(steps < 0) > steps.size / 2:
             backwards = np.arange(y.size)[::-1]
             order, sorted_y = self._ordered(y[::-1], at)
             return backwards[order], sorted_y
         behind = int(np.count_nonzero(steps < 0))
-        if behind > DISORDER * y.size:
+        if behind > DISORDER_SHARE * y.size:
             _refuse_disorder(y)
         order = np.argsort(y, kind="stable")
-        fresh = np.concatenate([[True], np.diff(y[order]) > FINEST_PITCH / 10])
+        first = np.concatenate([[True], np.diff(y[order]) > FINEST_PITCH / 10])
         if behind:
             self._note(f"{at}: {behind} lines were before the previous one; all lines were sorted.")
-        if not fresh.all():
-            self._note(f"{at}: {int(np.count_nonzero(~fresh))} lines were repeated.")
-        order = order[fresh]
+        if not first.all():
+            self._note(f"{at}: {int(np.count_nonzero(~first))} lines were repeated.")
+        order = order[first]
         return order, y[order]
 
-    def _check_whole(self, y: Array, cycle: int) -> None:
+    def _check_complete(self, y: Array, cycle: int) -> None:
         if y.size < FEWEST_LINES:
-            raise MethodError(self._missing(cycle, f"there are {y.size} lines of it"))
+            raise MethodError(self._missing(cycle, f"the scan has {y.size} lines only"))
         pitch = float(np.median(np.diff(y)))
-        lacking = -self._length / 2, self._length / 2
-        short = max(y[0] - lacking[0], lacking[1] - y[-1]) - pitch
-        if short > END * self._length:
+        low, high = -self._length / 2, self._length / 2
+        missing = max(y[0] - low, high - y[-1]) - pitch
+        if missing > END_SHARE * self._length:
             part = float(np.ptp(y)) / self._length
-            raise MethodError(self._missing(cycle, f"{part:.0%} of it is there, from {y[0]:+.4f} to {y[-1]:+.4f} m"))
+            raise MethodError(
+                self._missing(cycle, f"the scan is {part:.0%} complete, from {y[0]:+.4f} to {y[-1]:+.4f} m")
+            )
         gap = int(np.argmax(np.diff(y)))
         if y[gap + 1] - y[gap] > GAP + pitch:
             raise MethodError(
                 f"lines are lost over {(y[gap + 1] - y[gap]) * 1e3:.2f} mm at {y[gap]:+.4f} m from the artefact"
             )
-        unknown = 1 - y.size * pitch / (np.ptp(y) + pitch)
-        if unknown > LOST_SHARE:
-            raise MethodError(f"{unknown:.0%} of its lines are lost; at most {LOST_SHARE:.0%} may be")
+        lost = 1 - y.size * pitch / (np.ptp(y) + pitch)
+        if lost > LOST_SHARE:
+            raise MethodError(f"{lost:.0%} of its lines are lost; expected at most {LOST_SHARE:.0%}")
 
     def _missing(self, cycle: int, what: str) -> str:
-        """Return why a scan is not there, or not whole."""
+        """Return why a scan is missing or incomplete."""
         broken = self._broken.get(cycle)
         if broken is not None:
             where = f" at {broken.position:.3f} m" if np.isfinite(broken.position) else " before its first line"
@@ -249,8 +252,8 @@ class _Record:
             return f"pass {cycle} was not made"
         if cycle == int(self._cycle.max()):
             return f"{what}: the record ends in pass {cycle}"
-        reach = float(np.nanmax(self._place[self._cycle == cycle], initial=-np.inf))
-        if reach < self._positions.max() + self._length * (0.5 - END):
+        reach = float(np.nanmax(self._axis[self._cycle == cycle], initial=-np.inf))
+        if reach < self._positions.max() + self._length * (0.5 - END_SHARE):
             return f"{what}: pass {cycle} was cut off at {reach:.3f} m"
         return f"{what} in pass {cycle}"
 
@@ -263,15 +266,15 @@ class _Record:
         return np.ascontiguousarray(block[rows - first], dtype=np.float32)
 
 
-def _evened(height: NDArray[np.float32], y: Array) -> tuple[NDArray[np.float32], Array, int]:
-    """Insert a line of NaN for each missing line; return heights, y, and the number of missing lines."""
+def _with_lost_lines(height: NDArray[np.float32], y: Array) -> tuple[NDArray[np.float32], Array, int]:
+    """Insert a line of NaN for each lost line; return heights, y, and the number of lost lines."""
     steps = np.diff(y)
     pitch = float(np.median(steps))
-    lacking = np.maximum(np.rint(steps / pitch).astype(np.int64) - 1, 0)
-    lost = int(lacking.sum())
+    missing = np.maximum(np.rint(steps / pitch).astype(np.int64) - 1, 0)
+    lost = int(missing.sum())
     if not lost:
         return height, y, 0
-    rows = np.concatenate([[0], np.cumsum(1 + lacking)])
+    rows = np.concatenate([[0], np.cumsum(1 + missing)])
     full = np.full((rows[-1] + 1, height.shape[1]), np.nan, dtype=np.float32)
     full[rows] = height
     return full, np.interp(np.arange(full.shape[0]), rows, y), lost
@@ -283,7 +286,7 @@ def _refuse_disorder(y: Array) -> None:
     if behind:
         k = int(np.argmax(steps <= 0))
         raise MethodError(
-            f"expected y to rise from line to line; {behind} of {y.size} lines lie behind the one before them "
-            f"or on it, the first at {y[k]:.6f} m followed by {y[k + 1]:.6f} m. Check the encoder "
-            "signal for noise, and whether the axis stopped or reversed."
+            f"expected y to increase from line to line; {behind} of {y.size} lines are at or before the position of "
+            f"the previous line, the first one at {y[k + 1]:.6f} m after {y[k]:.6f} m. Check the encoder signal for "
+            "noise, and whether the axis stopped or reversed."
         )

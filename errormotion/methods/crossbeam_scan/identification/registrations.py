@@ -1,7 +1,7 @@
 """Registrations of all warm scans of a campaign onto their cold scans.
 
-Scans are read one by one, artefact by artefact, while the previous one is registered: the campaign may be larger than
-memory.
+Scans are read one at a time, artefact by artefact, each while the previous one is registered: the campaign may be
+larger than memory.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.identification.cutting import Scan
 from errormotion.methods.crossbeam_scan.identification.registration import BlockMap, Registration, prepare, register
 from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem
 from errormotion.methods.crossbeam_scan.identification.strain import DRIFT, FEED
 
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
-
-Scan = tuple[NDArray[np.float32], Array, Array, float]
 
 log = logging.getLogger(__name__)
 
@@ -51,20 +50,20 @@ class Scans(Protocol):
 
 @dataclass
 class Registrations:
-    """Registrations over (cycle, artefact), of the cold reference too: zero there.
+    """Registrations over (cycle, artefact); that of the cold reference is zero.
 
     Attributes
     ----------
     cold : ndarray of int, (artefact,)
-        Cycle that the others are registered onto; -1 where no cold scan is usable.
+        Cycle onto which the others are registered; -1 where no cold scan is usable.
     twist : ndarray, (cycle, artefact, 9)
         (T_Q, R_Q, drift per feed) at the map's origin; NaN where there is none.
     covariance : ndarray, (cycle, artefact, 9, 9)
-        Of these.
+        Of ``twist``.
     cold_share : ndarray, (cycle, artefact)
-        Share of the covariance that is the cold scan's noise.
+        Share of the covariance that is caused by the noise of the cold scan.
     bound : ndarray, (artefact, 9, 9)
-        Covariance by surface and stated noise alone.
+        Covariance from surface and stated noise alone.
     reason : ndarray of str, (cycle, artefact)
         Why there is no registration; empty where there is one.
     quality : dict of str to ndarray, (cycle, artefact)
@@ -89,7 +88,7 @@ class Registrations:
     notes: list[str] = field(default_factory=list)
 
     def without(self, excluded: NDArray[np.bool_]) -> Registrations:
-        """Return these with NaN for some, (cycle, artefact)."""
+        """Return the registrations with NaN where ``excluded`` (cycle, artefact) is True."""
         twist, covariance = self.twist.copy(), self.covariance.copy()
         twist[excluded], covariance[excluded] = np.nan, np.nan
         return replace(self, twist=twist, covariance=covariance)
@@ -118,7 +117,7 @@ def register_all(scans: Scans, cold_cycles: Sequence[int], height_noise: float, 
     cold_cycles : sequence of int
         Cycles that may be the reference, in order of preference.
     height_noise : float
-        Stated standard deviation of one height, m: for the bound.
+        Stated standard deviation of one height, m, for the bound.
     settings : Settings
     """
     shape = scans.cycles, scans.artefacts
@@ -145,7 +144,7 @@ def _artefact(
     order = [*cold_cycles, *(c for c in range(scans.cycles) if c not in cold_cycles)]
     cold: BlockMap | None = None
     maps: Maps | None = None
-    for cycle, scan in zip(order, _ahead(scans, order, k), strict=True):
+    for cycle, scan in zip(order, _prefetched(scans, order, k), strict=True):
         if cold is None and cycle not in cold_cycles:
             found.reason[cycle, k] = "there is no cold scan to register it onto"
             continue
@@ -186,8 +185,8 @@ def _coarse(cold: BlockMap, artefact: int) -> list[str]:
     ]
 
 
-def _ahead(scans: Scans, cycles: Sequence[int], artefact: int) -> Iterator[Scan | MethodError]:
-    """Yield scans; the next one is loaded meanwhile."""
+def _prefetched(scans: Scans, cycles: Sequence[int], artefact: int) -> Iterator[Scan | MethodError]:
+    """Yield scans; the next one is loaded in a thread."""
 
     def load(cycle: int) -> Scan | MethodError:
         try:
@@ -196,12 +195,12 @@ def _ahead(scans: Scans, cycles: Sequence[int], artefact: int) -> Iterator[Scan 
             return error
 
     with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(load, cycles[0])
+        future = pool.submit(load, cycles[0])
         for following in cycles[1:]:
-            scan = coming.result()
-            coming = pool.submit(load, following)
+            scan = future.result()
+            future = pool.submit(load, following)
             yield scan
-        yield coming.result()
+        yield future.result()
 
 
 def _register(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registration:
@@ -222,12 +221,12 @@ def _register(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registratio
 def _store(result: Registration, found: Registrations, cycle: int, k: int) -> None:
     """Store the twist and the drift along the feed; where it is no parameter, the drift is 0 without uncertainty."""
     names = [name for name in FEED if name in result.extra_names]
-    chosen = [*range(6), *(6 + result.extra_names.index(name) for name in names)]
-    there = [*range(6), *(6 + FEED.index(name) for name in names)]
+    source = [*range(6), *(6 + result.extra_names.index(name) for name in names)]
+    target = [*range(6), *(6 + FEED.index(name) for name in names)]
     found.twist[cycle, k] = 0.0
-    found.twist[cycle, k, there] = np.concatenate([result.twist, result.extra])[chosen]
+    found.twist[cycle, k, target] = np.concatenate([result.twist, result.extra])[source]
     found.covariance[cycle, k] = 0.0
-    found.covariance[cycle, k][np.ix_(there, there)] = result.joint_covariance[np.ix_(chosen, chosen)]
+    found.covariance[cycle, k][np.ix_(target, target)] = result.joint_covariance[np.ix_(source, source)]
     found.cold_share[cycle, k] = result.cold_share
 
 
@@ -246,7 +245,7 @@ def _store_quality(result: Registration, warm: BlockMap, quality: dict[str, Arra
 
 
 def bound(cold: BlockMap, noise: float, *, with_drift: bool) -> Array:
-    """Return the covariance (9, 9) of (T_Q, R_Q, drift) that white noise (m) of two scans of this surface allows.
+    """Return the covariance (9, 9) of (T_Q, R_Q, drift) that follows from white noise (m) of two scans of a surface.
 
     Rows and columns of the drift are 0 where it is no parameter.
     """
@@ -272,7 +271,7 @@ def _maps(cold: BlockMap) -> Maps:
 
 
 def _thin(block_map: BlockMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return which block rows and columns are kept."""
+    """Return the block rows and columns that are kept."""
     rows, columns = (np.linspace(0, n - 1, min(n, MAP_SIZE)).round().astype(int) for n in block_map.height.shape)
     return rows, columns
 

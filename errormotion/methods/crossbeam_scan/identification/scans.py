@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.arrays import Array
-from errormotion.datasets import DOF, build_errors, provenance
+from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.artefact_check import MOVED, ArtefactCheck, check_artefacts
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 _METRES = {"units": "m"}
 DOMINANCE = 10.0
 """A note is given if the uncertainty of EYY exceeds that of EXY and EZY by this factor."""
-_STEPS = ["cut scans", "register", "guide", "chain to carriage", "consistency", "smooth"]
+_STEPS = ["cut scans", "register", "guide", "chain to carriage", "consistency", "smooth"]  # in the provenance
 
 
 def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
@@ -49,14 +49,14 @@ def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: st
     Raises
     ------
     MethodError
-        No scan could be registered; the reasons are named.
+        No scan could be registered; the message states the reasons.
     """
     scans = Scans(raw)
     positions = np.asarray(raw["position"].values, dtype=float)
     if np.any(np.diff(positions) <= 0):
-        raise MethodError(f"position: expected positions of the artefacts that rise; found {positions.tolist()} m")
+        raise MethodError(f"position: expected increasing positions of the artefacts; found {positions.tolist()} m")
     cold = cold_cycles(raw, scans.cycles)
-    # The hash reads all raw data once more; meanwhile the scans are registered.
+    # The hash reads all raw data once more, at the same time as the scans are registered.
     with ThreadPoolExecutor(1) as pool:
         origin = pool.submit(provenance.make, settings, raw, None, steps=_STEPS)
         found = register_all(scans, cold, float(raw["height_noise"]), settings)
@@ -73,7 +73,7 @@ def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: st
         )
     rows = [cold[0], *warm]
     time = cycle_times(found.time, rows, _planned(raw, scans.cycles))
-    # Before a guide couples neighbours.
+    # The check comes before the guide, which couples neighbours.
     check = check_artefacts(axis, found, settings, positions, time[1:], cold, warm)
     if settings.strain == "guided":
         excluded = check.wrong & (settings.moved == "exclude")
@@ -84,7 +84,7 @@ def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: st
 
 
 def cold_cycles(raw: xr.Dataset, cycles: int) -> list[int]:
-    """Return the cycles without a warm-up before them: cycle 0, and those whose ``warm_up`` is 0."""
+    """Return the cycles before the warm-up: cycle 0, and those whose ``warm_up`` is 0."""
     if "warm_up" not in raw:
         return [0]
     warm_up = np.asarray(raw["warm_up"].values, dtype=float)[:cycles]
@@ -92,7 +92,7 @@ def cold_cycles(raw: xr.Dataset, cycles: int) -> list[int]:
 
 
 def rig_of(raw: xr.Dataset) -> Rig:
-    """Return pose and lever as a raw dataset states them."""
+    """Return the pose and the lever that a raw dataset states."""
     matrix = np.asarray(raw["profiler_pose"].transpose("row", "column").values, dtype=float)
     if not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(matrix[:3, :3]) < 0:
         raise MethodError("profiler_pose: expected a rotation in its first three rows and columns; found none")
@@ -125,10 +125,10 @@ def _dataset(
     origin: Mapping[str, Any],
 ) -> xr.Dataset:
     warm = rows[1:]
-    place = np.asarray(raw["position"].values, dtype=float)
+    position = np.asarray(raw["position"].values, dtype=float)
     reference = np.asarray(np.isfinite(axis.values[cold][:, :, 0]).any(axis=0))
     values, own, influence = axis.values[rows], axis.covariance[rows], axis.influence[:, rows]
-    values[0] = np.where(reference[:, None], 0.0, np.nan)  # for any choice of the cold scan
+    values[0] = np.where(reference[:, None], 0.0, np.nan)  # whichever cold scan is the reference
     own[0] = np.where(reference[:, None, None], 0.0, np.nan)
     influence[:, 0] = np.where(reference[:, None], 0.0, np.nan)
     reason = found.reason[rows]
@@ -137,20 +137,20 @@ def _dataset(
         excluded = check.wrong[rows]
         values[excluded], own[excluded], influence[:, excluded] = np.nan, np.nan, np.nan
         reason[excluded] = MOVED
-    notes = [*_notes(reason, place, rig), *check.notes, *corrected]
+    notes = [*_notes(reason, position, rig), *check.notes, *corrected]
     notes += found.notes
     if settings.strain == "free":
         notes += _pitch_note(own)
     for note in notes:
         log.warning(note)
-    curve = curves(axis, found, rig, place, time[1:], warm, check.wrong)
-    rig_share = influence[: len(SOURCES)]  # the noise of the cold scans is in `own` already
+    curve = curves(axis, found, rig, position, time[1:], warm, check.wrong)
+    rig_share = influence[: len(SOURCES)]  # `own` contains the noise of the cold scans already
     total = own + np.einsum("stki,stkj->tkij", rig_share, rig_share)
     ds = build_errors(
         values,
         total,
         dims=("time", "position"),
-        coords={"time": time, "y": ("position", place, _METRES)},
+        coords={"time": time, "y": ("position", position, _METRES)},
         component="Y",
         machine=str(raw.attrs.get("machine", "unknown")),
         frame="carriage, machine directions",
@@ -169,16 +169,16 @@ def _dataset(
         reference_sources=axis.sources[len(SOURCES) :],
         reference_interval=(0.0, 0.0),
     )
-    at = settings.carriage_origin
-    placed = {} if at is None else {"frame_origin": np.array(at)}
-    return ds.assign_attrs(notes=notes or [""], registration=settings.registration, strain=settings.strain, **placed)
+    origin_at = settings.carriage_origin
+    frame = {} if origin_at is None else {"frame_origin": np.array(origin_at)}
+    return ds.assign_attrs(notes=notes or [""], registration=settings.registration, strain=settings.strain, **frame)
 
 
 def cycle_times(scan_time: Array, rows: list[int], planned: Array | None = None) -> Array:
-    """Return the time of every cycle, s since the warm-up started: the mean of its scans; the cold one is 0.
+    """Return the time of every cycle, s since the start of the warm-up: the mean of its scans; 0 for the cold cycle.
 
-    The time of a cycle without a scan is interpolated between its neighbours, or extrapolated, by the ``planned`` times
-    (cycle,); evenly where no plan is known.
+    The time of a cycle without a scan is interpolated between its neighbours, or extrapolated, in proportion to the
+    ``planned`` times (cycle,), or in equal steps where they are unknown.
     """
     time = np.array([np.nanmean(scan_time[c]) if np.isfinite(scan_time[c]).any() else np.nan for c in rows])
     first = max(time[0], 0.0) if np.isfinite(time[0]) else 0.0
@@ -188,10 +188,10 @@ def cycle_times(scan_time: Array, rows: list[int], planned: Array | None = None)
     known = np.flatnonzero(np.isfinite(time))
     last = known[-1]
     pace = 1.0 if planned is not None else time[last] / max(last, 1)
-    behind = time[last] + pace * np.maximum(plan - plan[last], 0.0)
-    time = np.where(np.isfinite(time), time, np.interp(plan, plan[known], time[known]) + behind - time[last])
+    after = time[last] + pace * np.maximum(plan - plan[last], 0.0)
+    time = np.where(np.isfinite(time), time, np.interp(plan, plan[known], time[known]) + after - time[last])
     if np.any(np.diff(time) <= 0):
-        raise MethodError(f"time: expected cycles one after the other; found {np.round(time, 1).tolist()} s")
+        raise MethodError(f"time: expected increasing times of the cycles; found {np.round(time, 1).tolist()} s")
     return time
 
 
@@ -199,8 +199,8 @@ def warm_up_start(raw: xr.Dataset, scan_time: Array, cold: list[int]) -> str:
     """Return the instant of time 0 in UTC; empty where the raw data do not determine it.
 
     The attribute ``start`` is the start of the record. The lines of the warm cycles state both the time since the
-    warm-up started (``line_time``) and the time since that attribute (``line_clock``). Where the cold scans come after
-    time 0 of the raw data, the errors count from the cold scans, see `cycle_times`.
+    start of the warm-up (``line_time``) and the time since the start of the record (``line_clock``). Where the cold
+    scans are after time 0 of the raw data, time 0 of the errors is that of the cold scans, see `cycle_times`.
     """
     if "line_clock" not in raw:
         return ""
@@ -213,18 +213,18 @@ def warm_up_start(raw: xr.Dataset, scan_time: Array, cold: list[int]) -> str:
 
 
 def _planned(raw: xr.Dataset, cycles: int) -> Array | None:
-    """Return when every cycle was to be, s: as a raw dataset states it for scans, or else by its warm-up times."""
+    """Return the planned time of every cycle, s: ``time`` or else ``warm_up`` of the raw dataset; None if unknown."""
     name = next((name for name in ("time", "warm_up") if name in raw.variables and raw[name].dims == ("cycle",)), None)
     if name is None or raw.sizes["cycle"] < cycles:
         return None
     return np.asarray(raw[name].values, dtype=float)
 
 
-def _notes(reason: NDArray[np.object_], place: Array, rig: Rig) -> list[str]:
+def _notes(reason: NDArray[np.object_], position: Array, rig: Rig) -> list[str]:
     notes = []
     lost = np.argwhere((reason[1:] != "") & (reason[1:] != MOVED))
     if len(lost):
-        where = sorted({f"{place[k]:g} m" for _, k in lost}, key=lambda text: float(text.split()[0]))
+        where = sorted({f"{position[k]:g} m" for _, k in lost}, key=lambda text: float(text.split()[0]))
         notes.append(
             f"{len(lost)} of {reason[1:].size} warm scans have no errors (at {', '.join(where)}); the variable "
             "`reason` states why."
@@ -293,7 +293,7 @@ def _extras(
 
 
 def _map_extras(maps: list[Maps | None], rows: list[int]) -> dict[str, Any]:
-    """Return cold surfaces and differences over (time, position, v, u), of the artefacts that agree in size."""
+    """Return cold surfaces and differences over (time, position, v, u), of the artefacts with maps of equal size."""
     first = next((m for m in maps if m is not None), None)
     if first is None:
         return {}
@@ -315,6 +315,3 @@ def _map_extras(maps: list[Maps | None], rows: list[int]) -> dict[str, Any]:
         "difference_before": (two, before, _METRES),
         "difference_after": (two, after, _METRES),
     }
-
-
-__all__ = ["DOF", "cold_cycles", "cycle_times", "identify_scans", "rig_of"]

@@ -1,28 +1,29 @@
-"""Smooth curves through a few uncertain points, over position or time, with the band that they are due.
+"""Smooth curves through a few uncertain points, over position or time, with their uncertainty.
 
-The curve is white noise integrated ``order`` times, started anywhere (a Gaussian process; its mean is a smoothing
-spline: cubic for order 2, quintic for order 3; Wahba, Spline Models for Observational Data, chapter 1). One number is
-unknown, the amplitude of that noise: 0 is a polynomial of degree order - 1, infinity a curve through all points. Nobody
-sets it: curves of all amplitudes are averaged, each weighted by its evidence (the marginal likelihood of the points). A
-single best amplitude is 0 for about every other set of eight points, and its band then holds too little.
+The curve is white noise integrated ``order`` times, with a free start (a Gaussian process; its mean is a smoothing
+spline: cubic for order 2, quintic for order 3; Wahba, Spline Models for Observational Data, chapter 1). The amplitude
+of the noise is unknown: 0 is a polynomial of degree order - 1, infinity a curve through all points. Curves of all
+amplitudes are averaged, each weighted by its evidence (the marginal likelihood of the points). The single best
+amplitude would be 0 for about half of all sets of eight points, with an uncertainty that is then too small.
 
-Results of the choices on the virtual gantry (eight positions, nine times, leaving one point out each time):
+Reasons for the choices, from the virtual gantry (eight positions, nine times, each point predicted from the others):
 
-* Order 3 predicts the point that was left out far better than order 2, and its band is half as wide. A beam in a smooth
-  field of temperature has a continuous curvature, which order 3 grants and order 2 does not.
-* One amplitude for all cycles of a freedom does as well as one of each cycle, or one per size of the cycle, with a
-  ninth of the numbers: the cycles share the shape of the guide.
-* Over time, t itself is a bad scale: the early curve bends most, and its band holds too little. ``warm_up_scale`` puts
-  exponentials of 15 min to 2 h on an equal footing.
+* Order 3 predicts the omitted point far better than order 2, with half the uncertainty. A beam in a smooth temperature
+  field has a continuous curvature, as order 3 has and order 2 does not.
+* One amplitude for all cycles of a freedom is as good as one for each cycle, or one in proportion to the errors of the
+  cycle, with a ninth of the parameters: the cycles share the shape of the guide.
+* On a linear scale of time, the curves bend most at the beginning, where their uncertainty would be too small. On
+  ``warm_up_scale``, exponentials with time constants from 15 min to 2 h are about equally smooth.
 
-Errors that all points share (the pose of the profiler, the lever, the cold scan) cannot be smoothed away. Give the
-independent variance alone, and take the rest through the same weights with ``carry``.
+Errors that all points share (pose of the profiler, lever, cold scan) are not reduced by smoothing. Pass the independent
+variance only, and propagate the other errors with the same weights by ``carry``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import comb, factorial, prod
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,16 +31,16 @@ from numpy.typing import ArrayLike, NDArray
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
-#: of a curve that has the points for it
+#: Order of a curve with enough points.
 ORDER = 3
-#: where the scale of time turns from linear to logarithmic, s
-TURN = 1500.0
+#: Time at which the scale of time changes from linear to logarithmic, s.
+LINEAR_TIME = 1500.0
 
-#: amplitudes that are looked at, and that are averaged
-_LOOKED_AT, _AVERAGED = 400, 24
-#: the amplitude ends below where it is not distinguishable from zero, and above where the evidence decreases
-_BELOW, _ABOVE = 1e-2, 1e2
-#: amplitudes with less than this of the best evidence do not matter
+#: Number of amplitudes that are examined, and of those that are averaged.
+_EXAMINED, _AVERAGED = 400, 24
+#: Range of the amplitudes: from not distinguishable from zero to decreasing evidence.
+_LOWEST, _HIGHEST = 1e-2, 1e2
+#: Amplitudes with less than this share of the best evidence are neglected.
 _NEGLIGIBLE = 1e-5
 
 
@@ -50,23 +51,23 @@ class Smooth:
     Attributes
     ----------
     values, variance : ndarray, (..., m)
-        Of the curve itself, without the errors that the points share.
+        Of the curve, without the errors that the points share.
     weights : ndarray, (..., m, n)
         The curve is ``weights @ values`` of the points; 0 for a point that is NaN.
     amplitude : ndarray, (...)
-        Of the white noise, best by evidence, in units of the value per position**(order - 1/2) of the more likely
+        Of the white noise with the best evidence, in units of the value per position**(order - 1/2) of the more likely
         order; 0: a polynomial.
     evidence : ndarray, (...)
-        Log of the likelihood of that amplitude over that of a polynomial; 0 where a polynomial is enough.
+        Log of the likelihood of that amplitude over that of a polynomial; 0 where a polynomial is sufficient.
     log_likelihood : ndarray, (...)
-        Of that amplitude, comparable between points at the same ``positions`` with others of them left out. Curves that
-        share an amplitude share this and the evidence.
+        Of that amplitude, comparable between sets of points at the same ``positions`` of which different ones are
+        omitted. Curves that share an amplitude share this and the evidence.
     rough : ndarray, (...)
         Probability of the lower order.
     used : ndarray of int, (...)
-        Points that are not NaN.
+        Number of points that are not NaN.
     order : int
-        The higher of the two.
+        The higher of the two orders.
     """
 
     values: Array
@@ -80,7 +81,7 @@ class Smooth:
     order: int
 
     def carry(self, influence: ArrayLike) -> Array:
-        """Return what errors of the points, (source, ..., n), do to the curves: (source, ..., m)."""
+        """Return the effect of errors of the points, (source, ..., n), on the curves, (source, ..., m)."""
         effect = np.nan_to_num(np.asarray(influence, dtype=float))
         return np.asarray(np.einsum("...mn,s...n->s...m", self.weights, effect))
 
@@ -96,7 +97,7 @@ class SmoothTwists:
     covariance : ndarray, (..., m, 6, 6)
         Between the freedoms at each position.
     freedoms : Smooth
-        The curves one by one, (..., 6, m).
+        The curves of the single freedoms, (..., 6, m).
     """
 
     values: Array
@@ -104,14 +105,14 @@ class SmoothTwists:
     freedoms: Smooth
 
     def carry(self, influence: ArrayLike) -> Array:
-        """Return what errors of the points, (source, ..., n, 6), do to the curves: (source, ..., m, 6)."""
+        """Return the effect of errors of the points, (source, ..., n, 6), on the curves, (source, ..., m, 6)."""
         effect = np.swapaxes(np.asarray(influence, dtype=float), -1, -2)
         return np.swapaxes(self.freedoms.carry(effect), -1, -2)
 
 
 def warm_up_scale(time: ArrayLike) -> Array:
     """Return log(1 + t / 25 min) of times t (s): the scale on which the errors of a warm-up are equally smooth."""
-    return np.log1p(np.asarray(time, dtype=float) / TURN)
+    return np.log1p(np.asarray(time, dtype=float) / LINEAR_TIME)
 
 
 def smooth(
@@ -132,29 +133,29 @@ def smooth(
     positions : (n,)
         Of the points: position, or time on the `warm_up_scale`.
     values, variance : (..., n)
-        Points, and the variance of what is independent between them; NaN for a point that is not there.
+        Points, and the variance of their independent errors; NaN for a missing point.
     at : (m,)
-        Where the curves are requested.
+        Positions at which the curves are requested.
     exact_zero : bool
         Whether all curves start at position 0 with value 0; positions below 0 are then taken as 0.
     together : bool
         Whether all curves share one amplitude.
     order : {1, 2, 3}, optional
-        3 where not given, or less where even the fullest curve has too few points for evidence.
+        By default 3, or less where even the curve with the most points has too few for evidence.
     rougher : bool
-        Whether the order below counts too, by its evidence, about the same polynomial.
+        Whether the next lower order is averaged too, weighted by its evidence, about the same polynomial.
 
     Returns
     -------
     Smooth
-        A curve needs ``order`` points at different positions (one less with ``exact_zero``) to be determined, one of
-        those that share an amplitude needs one more for evidence on it; without these it is NaN. The variance is that
-        of a mixture over amplitudes: with one or two points more than the order it is very wide.
+        A curve is NaN unless it has ``order`` points at different positions (one less with ``exact_zero``) and at least
+        one of the curves that share its amplitude has one more, for evidence on the amplitude. The variance is that of
+        a mixture over amplitudes: very large with only one or two points more than the order.
 
     Raises
     ------
     MethodError
-        Shapes that do not fit, a variance that is not above 0, an order that there is not.
+        Shapes that do not match, a variance that is not above 0, an invalid order.
     """
     x, y, v, to = (np.asarray(given, dtype=float) for given in (positions, values, variance, at))
     _check(x, y, v, to, exact_zero)
@@ -162,24 +163,24 @@ def smooth(
     y, v = y.reshape(prod(batch), n), v.reshape(prod(batch), n)
     known = np.isfinite(y) & np.isfinite(v)
     if (v[known] <= 0).any():
-        raise MethodError("Points need a variance above 0 to be smoothed; leave out what is exact (the cold cycle).")
+        raise MethodError("Expected variances above 0 of all points; leave out what is exact (the cold cycle).")
     fixed = int(exact_zero)
     different = np.array([np.unique(x[k]).size + fixed for k in known], dtype=int)
     if order is None:
         order = int(np.clip(different.max(initial=0) - 1, 1, ORDER))
     if order not in (1, 2, 3):
-        raise MethodError(f"Curves have order 1, 2 or 3; found {order}.")
+        raise MethodError(f"Expected order 1, 2 or 3 of the curves; found {order}.")
     rows = np.flatnonzero(different >= order)
     orders = (order, order - 1) if rougher and order > 1 else (order,)
-    ways = [_series(_Basis.of(x, to, order, q, exact_zero), y, v, known, rows) for q in orders]
+    by_order = [_series(_Basis.of(x, to, order, q, exact_zero), y, v, known, rows) for q in orders]
 
     curves, spread = np.full((2, len(y), to.size), np.nan)
     W = np.full((len(y), to.size, n), np.nan)
     amplitude, evidence, likelihood, rough = np.full((4, len(y)), np.nan)
     for some in [range(rows.size)] if together else [[k] for k in range(rows.size)]:
-        share = _weigh_all([[way[k] for k in some] for way in ways])
+        share = _weigh_all([[series[k] for k in some] for series in by_order])
         for k in some if share.size else ():
-            each = [way[k] for way in ways]
+            each = [series[k] for series in by_order]
             best = max(each, key=lambda one: one.best_likelihood)
             row = rows[k]
             curves[row], spread[row], W[row] = _mixed(share, [one.mixture() for one in each])
@@ -209,45 +210,39 @@ def smooth_twists(
 ) -> SmoothTwists:
     """Return smooth curves of six freedoms, each with one amplitude for all its curves, and their covariance.
 
-    The freedoms are smoothed one by one, so choose the frame in which they are least correlated: that of the profiler.
-    Over the lever of 2 m, the noise of the rotations would be that of the displacements too. Take the curves through
-    the chain afterwards, which adds the share of pose and lever.
+    The freedoms are smoothed separately: use the frame in which they are least correlated, that of the profiler. Over
+    the lever of 2 m, the noise of the rotations would dominate that of the displacements. Transform the curves to the
+    carriage afterwards; this adds the contributions of pose and lever.
 
     Parameters
     ----------
     positions : (n,)
         Of the points: position, or time on the `warm_up_scale`.
     values, covariance : (..., n, 6), (..., n, 6, 6)
-        Twists, m and rad, and the covariance of what is independent between them; NaN for a freedom that is not there.
+        Twists, m and rad, and the covariance of their independent errors; NaN for a missing freedom.
     at : (m,)
-        Where the curves are requested.
+        Positions at which the curves are requested.
     exact_zero, order
         As in `smooth`.
 
     Raises
     ------
     MethodError
-        Shapes that do not fit, a variance that is not above 0.
+        Shapes that do not match, a variance that is not above 0.
     """
     y, C = np.asarray(values, dtype=float), np.asarray(covariance, dtype=float)
     if y.ndim < 2 or y.shape[-1] != 6 or C.shape != (*y.shape, 6):
-        raise MethodError(f"Twists need values (..., n, 6) and covariance (..., n, 6, 6); found {y.shape}, {C.shape}.")
+        raise MethodError(f"Expected values (..., n, 6) and covariance (..., n, 6, 6); found {y.shape}, {C.shape}.")
     each = [
         smooth(positions, y[..., d], C[..., d, d], at, exact_zero=exact_zero, together=True, order=order)
         for d in range(6)
     ]
-    batch = y.ndim - 2
-    merged = Smooth(
-        np.stack([one.values for one in each], axis=batch),
-        np.stack([one.variance for one in each], axis=batch),
-        np.stack([one.weights for one in each], axis=batch),
-        np.stack([one.amplitude for one in each], axis=batch),
-        np.stack([one.evidence for one in each], axis=batch),
-        np.stack([one.log_likelihood for one in each], axis=batch),
-        np.stack([one.rough for one in each], axis=batch),
-        np.stack([one.used for one in each], axis=batch),
-        min(one.order for one in each),
-    )
+    arrays: dict[str, Any] = {
+        name: np.stack([getattr(one, name) for one in each], axis=y.ndim - 2)
+        for name in Smooth.__dataclass_fields__
+        if name != "order"
+    }
+    merged = Smooth(**arrays, order=min(one.order for one in each))
     W = merged.weights  # (..., 6, m, n)
     noise = np.einsum("...imn,...nij,...jmn->...mij", W, np.nan_to_num(C), W)
     own = np.swapaxes(merged.variance, -1, -2) - np.diagonal(noise, axis1=-2, axis2=-1)  # of the curves without noise
@@ -256,21 +251,21 @@ def smooth_twists(
 
 
 def _check(x: Array, y: Array, v: Array, to: Array, exact_zero: bool) -> None:
-    """Raise MethodError where the arguments of `smooth` do not fit."""
+    """Raise MethodError where the arguments of `smooth` are invalid."""
     if x.ndim != 1 or to.ndim != 1 or y.shape[-1:] != x.shape or v.shape != y.shape:
         raise MethodError(
-            "Smoothing needs positions (n,), values and variance (..., n), and where to (m,); found "
+            "Expected positions (n,), values and variance (..., n), and requested positions (m,); found "
             f"{x.shape}, {y.shape}, {v.shape} and {to.shape}."
         )
     if not (np.isfinite(x).all() and np.isfinite(to).all()):
-        raise MethodError("Positions must be finite numbers; a point that is not there has a NaN value.")
+        raise MethodError("Expected finite positions; a missing point has the value NaN.")
     if exact_zero and (x <= 0).any():
-        raise MethodError(f"Points of curves that start at position 0 lie above 0; found {x.min():g}.")
+        raise MethodError(f"Expected positions above 0 for curves that start at position 0; found {x.min():g}.")
 
 
 @dataclass(frozen=True)
 class _Basis:
-    """Polynomials and covariances of integrated noise of amplitude 1, positions over their span."""
+    """Polynomials and covariances of integrated noise of amplitude 1, with positions in units of their span."""
 
     unit: float  # of amplitudes
     T: Array  # polynomials at the points, (n, p)
@@ -292,7 +287,7 @@ class _Basis:
 
 
 def _integrated(s: Array, t: Array, order: int) -> Array:
-    """Return the covariance (s, t) of white noise integrated ``order`` times from 0 on."""
+    """Return the covariance (s, t) of white noise integrated ``order`` times from 0."""
     low, apart = np.minimum(s[:, None], t), np.abs(s[:, None] - t)
     q = order - 1
     terms = (comb(q, j) * apart ** (q - j) * low ** (q + j + 1) / (q + j + 1) for j in range(q + 1))
@@ -303,18 +298,18 @@ def _integrated(s: Array, t: Array, order: int) -> Array:
 class _Design:
     """Information of points at known positions with known noise about a curve, independent of their values.
 
-    In units of its noise, a set of points is what a polynomial fits, and contrasts that no polynomial moves:
-    uncorrelated combinations of the points, of variance 1 + amplitude * gain. A curve is the polynomial fitted, plus
-    the reach of the contrasts to the positions requested. (Keeping the two apart is accurate where the noise is tiny.)
+    In units of the noise, a set of points consists of a fitted polynomial and of contrasts that no polynomial affects:
+    uncorrelated combinations of the points, of variance 1 + amplitude * gain. A curve is the fitted polynomial plus the
+    effect of the contrasts at the requested positions. (The separation is accurate even where the noise is tiny.)
     """
 
     known: NDArray[np.bool_]
     gain: Array  # (c,)
-    reach: Array  # (m, c), per amplitude
-    own: Array  # variance of the curve about the polynomial fitted, per amplitude, (m,)
-    fit: Array  # weights of the points in the polynomial fitted, (m, n)
+    reach: Array  # effect of the contrasts, (m, c), per amplitude
+    own: Array  # variance of the curve about the fitted polynomial, per amplitude, (m,)
+    fit: Array  # weights of the points in the fitted polynomial, (m, n)
     to_contrast: Array  # weights of the points in each contrast, (c, n)
-    noise: Array  # variance of the polynomial by the noise of the points, (m,)
+    noise: Array  # variance of the polynomial due to the noise of the points, (m,)
     unit: float  # log of the density of the contrasts over that of the points
 
     @classmethod
@@ -336,7 +331,7 @@ class _Design:
 
 @dataclass
 class _Series:
-    """The points of one curve, and how likely each amplitude (squared) is."""
+    """The points of one curve, and the likelihood of each amplitude (squared)."""
 
     design: _Design
     y: Array
@@ -353,7 +348,7 @@ class _Series:
         self.contrast = self.design.to_contrast @ self.y
 
     def log_likelihood(self, amplitudes: Array) -> Array:
-        """Return that of each amplitude, for any polynomial."""
+        """Return the log likelihood of each amplitude, for any polynomial."""
         grown = 1 + amplitudes[:, None] * self.design.gain
         return np.asarray(self.design.unit - (self.contrast**2 / grown + np.log(grown)).sum(axis=1) / 2)
 
@@ -372,7 +367,7 @@ class _Series:
 
 
 def _series(basis: _Basis, y: Array, v: Array, known: NDArray[np.bool_], rows: NDArray[np.intp]) -> list[_Series]:
-    """Return the points of the curves of some rows; curves whose points are alike share the design."""
+    """Return the points of the curves of some rows; curves with equal variances of their points share a design."""
     designs: dict[bytes, _Design] = {}
     series = []
     for row in rows:
@@ -383,30 +378,30 @@ def _series(basis: _Basis, y: Array, v: Array, known: NDArray[np.bool_], rows: N
     return series
 
 
-def _weigh_all(ways: list[list[_Series]]) -> Array:
-    """Return how likely each order is for the curves of a group, (order,); empty without contrasts."""
-    if not sum(one.contrast.size for one in ways[0]):
+def _weigh_all(by_order: list[list[_Series]]) -> Array:
+    """Return the probability of each order for the curves of a group, (order,); empty without contrasts."""
+    if not sum(one.contrast.size for one in by_order[0]):
         return np.empty(0)
-    log = np.array([_weigh(group) for group in ways])
+    log = np.array([_weigh(group) for group in by_order])
     share = np.exp(log - log.max())
     return np.asarray(share / share.sum())
 
 
 def _weigh(group: list[_Series]) -> float:
-    """Give each curve of a group the amplitudes that matter and their shares; return the log evidence of all."""
+    """Set the relevant amplitudes and their shares for each curve of a group; return the log evidence of all."""
     gains = np.concatenate([one.design.gain for one in group])
     contrasts = np.concatenate([one.contrast for one in group])
-    low, high = _BELOW / gains.max(), _ABOVE * (np.maximum(contrasts**2, 1.0) / gains).max()
+    low, high = _LOWEST / gains.max(), _HIGHEST * (np.maximum(contrasts**2, 1.0) / gains).max()
 
     def likelihood(amplitudes: Array) -> Array:
         return np.asarray(sum(one.log_likelihood(amplitudes) for one in group))
 
-    amplitudes = _spaced(low, high, _LOOKED_AT)
+    amplitudes = _log_spaced(low, high, _EXAMINED)
     log = likelihood(amplitudes)
     top = int(log.argmax())
-    matter = np.flatnonzero(log >= log[top] + np.log(_NEGLIGIBLE))
-    first, last = max(matter[0] - 1, 0), min(matter[-1] + 1, _LOOKED_AT - 1)
-    chosen = _spaced(amplitudes[first], amplitudes[last], _AVERAGED)
+    relevant = np.flatnonzero(log >= log[top] + np.log(_NEGLIGIBLE))
+    first, last = max(relevant[0] - 1, 0), min(relevant[-1] + 1, _EXAMINED - 1)
+    chosen = _log_spaced(amplitudes[first], amplitudes[last], _AVERAGED)
     share = np.exp(likelihood(chosen) - log[top])
     none = float(likelihood(np.zeros(1))[0])
     for one in group:
@@ -424,6 +419,6 @@ def _mixed(share: Array, parts: list[tuple[Array, Array, Array]]) -> tuple[Array
     return values, share @ (spread + (curves - values) ** 2), np.einsum("q,qmn->mn", share, weights)
 
 
-def _spaced(low: float, high: float, n: int) -> Array:
-    """Return n numbers from low to high, each the same times the one before."""
+def _log_spaced(low: float, high: float, n: int) -> Array:
+    """Return n numbers from low to high with a constant ratio."""
     return np.asarray(np.exp(np.linspace(np.log(low), np.log(high), n)))

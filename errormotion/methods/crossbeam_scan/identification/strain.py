@@ -1,21 +1,21 @@
-"""From registered maps to the motion of the profiler: a scan is not rigid, because the carriage turns during the feed.
+"""From registered maps to the motion of the profiler: a scan is not rigid, because the carriage moves during the feed.
 
-A line at the feed s shows (x, 0, z) in the profiler's frame. In the cold frame of the artefact's middle it lies at
-(x, 0, z) + s f, with f the feed's direction. What is registered is the map Q = (x, s, z), so P = B Q with
+A line at the feed s measures (x, 0, z) in the profiler's frame. In the cold frame at the artefact's middle, this point
+is P = (x, 0, z) + s f, with f the direction of the feed. The registered map is Q = (x, s, z), so that P = B Q with
 
     B = 1 + (f - e_y) e_y^T .
 
 The warm carriage displaces a point by T + r x (x, 0, z) + s g: (T, r) is the twist of the profiler at its origin when
-the axis stands over the artefact's middle, and g = dT/dY says how this changes along the scan. (A rigid picture would
-have g = r x f.) Two maps differ by B^-1 of that, which registration states as a twist (T_Q, R_Q) at the origin and
-displacements c per metre of feed. By equal coefficients of 1, x, z and s,
+the axis is over the artefact's middle, and g = dT/dY is its change along the scan. (For a rigid scan, g = r x f.) Two
+maps differ by B^-1 times this; the registration states it as a twist (T_Q, R_Q) at the origin and displacements c per
+metre of feed. Comparison of the coefficients of 1, x, z and s results in
 
     EC = f_y EC_Q,   EA = f_y EA_Q,   EB = EB_Q - f_z EC_Q,   T = B T_Q,   g = B (c + R_Q x e_y) .
 
-A line determines its own yaw and pitch by its relief alone: pitch EA moves a point along the feed by -z EA.
-A rigid picture would show both by its slope along the feed, but that is g, and the carriage may turn without it. Where
-the carriage follows a guide, pitch and yaw are the slopes of the guide, EA = dEZ/dY and EC = -dEX/dY: `guided` adds
-this with a stated uncertainty, the slopes being those of a spline through the artefacts.
+Yaw and pitch are determined by the relief along the lines alone: pitch EA moves a point along the feed by -z EA. The
+slope along the feed would show both if the scan were rigid, but it is g, which does not depend on them. Where the
+carriage follows a guide, pitch and yaw are the slopes of the guide, EA = dEZ/dY and EC = -dEX/dY: `guided` adds this
+with a stated uncertainty; the slopes are those of a spline through the artefacts.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from errormotion.kinematics.twists import cross_matrix
 from errormotion.methods.crossbeam_scan.identification.chain import feed_direction
 
 FEED = ("feed_x", "feed_y", "feed_z")
-"""Parameters of the registration that take the drift along a scan."""
+"""Parameters of the registration that describe the drift along a scan."""
 DRIFT = 1e-3
-"""Standard deviation of their prior, 1: a millimetre per metre, far more than any carriage drifts. It is there so that
-an artefact of little relief gives a large uncertainty and no refusal."""
-# Metres and radians of one size, so that the normal equations are well scaled.
+"""Standard deviation of their prior, 1: a millimetre per metre, far more than the drift of any carriage. With it, an
+artefact of little relief results in a large uncertainty instead of an error."""
+# Units of metres and radians, so that the normal equations are well scaled.
 _UNIT = np.array([1e-6] * 3 + [1e-5] * 3)
 # (rotation, displacement, sign): EA = dEZ/dY, EC = -dEX/dY
 _GUIDE = ((3, 2, 1.0), (5, 0, -1.0))
@@ -44,20 +44,20 @@ _GUIDE = ((3, 2, 1.0), (5, 0, -1.0))
 
 @dataclass(frozen=True)
 class Guided:
-    """Twists of the profiler at every artefact, the guide taken into account.
+    """Twists of the profiler at every artefact, with the guide taken into account.
 
     Attributes
     ----------
     twist : ndarray (n, 6)
         (T, r) at the profiler's origin and in its frame, m and rad.
     covariance : ndarray (n, 6, 6)
-        Of these.
+        Of ``twist``.
     gain : ndarray (6 n, 6 n)
-        What takes the twists given to these.
+        Derivative of ``twist`` with respect to the registered twists.
     assumed : ndarray (2 n, 6 n)
-        Effect of one standard uncertainty of each assumption on these: pitch and yaw of each artefact, and the guide.
+        Effect of one standard uncertainty of each assumption on ``twist``: pitch and yaw follow the guide.
     slope_error : ndarray (2,)
-        What the spline's slopes of EZ and EX are taken to be off by, standard deviation, 1.
+        Estimated standard deviation of the error of the spline's slopes of EZ and EX, 1.
     """
 
     twist: Array
@@ -68,7 +68,7 @@ class Guided:
 
 
 def from_maps(profiler_pose: RigidTransform) -> Array:
-    """Return the matrix (9, 9) that takes (T_Q, R_Q, c) at the map's origin to (T, r, g)."""
+    """Return the matrix (9, 9) that converts (T_Q, R_Q, c) at the map's origin to (T, r, g)."""
     f = feed_direction(profiler_pose)
     B = np.eye(3)
     B[:, 1] = f
@@ -106,11 +106,11 @@ def guided(
     Parameters
     ----------
     twist, covariance : (n, 6), (n, 6, 6)
-        (T, r) of every artefact by its registration alone, m and rad.
+        (T, r) of every artefact from its registration alone, m and rad.
     positions : (n,)
-        Of the artefacts along the axis, m, rising.
+        Of the artefacts along the axis, m, increasing.
     to_carriage : (6, 6)
-        Takes twists of the profiler to errors of the carriage.
+        Converts twists of the profiler to errors of the carriage.
     uncertainty : float
         Standard uncertainty of EA - dEZ/dY and of EC + dEX/dY, rad. The error of the spline's slopes is added.
     """
@@ -121,11 +121,11 @@ def guided(
     fine, coarse = slopes(positions)
     E = e @ A.T
     rows, errors = np.zeros((2, n, n, 6)), np.zeros(2)
-    missed = fine - coarse
-    for i, (turn, way, sign) in enumerate(_GUIDE):
-        by_noise = np.mean(missed**2 @ np.einsum("a,kab,b->k", A[way], C, A[way]))
-        errors[i] = np.sqrt(max(np.mean((missed @ E[:, way]) ** 2) - by_noise, 0.0))
-        rows[i] = np.eye(n)[:, :, None] * A[turn] - sign * fine[:, :, None] * A[way]
+    difference = fine - coarse
+    for i, (turn, shift, sign) in enumerate(_GUIDE):
+        by_noise = np.mean(difference**2 @ np.einsum("a,kab,b->k", A[shift], C, A[shift]))
+        errors[i] = np.sqrt(max(np.mean((difference @ E[:, shift]) ** 2) - by_noise, 0.0))
+        rows[i] = np.eye(n)[:, :, None] * A[turn] - sign * fine[:, :, None] * A[shift]
     sigma = np.sqrt(uncertainty**2 + errors**2)
     scaled = (rows * _UNIT).reshape(2, n, 6 * n) / sigma[:, None, None]
     weight = block_diag(*np.linalg.inv(C / np.outer(_UNIT, _UNIT)))

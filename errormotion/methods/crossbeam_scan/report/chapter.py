@@ -23,7 +23,7 @@ _INDEPENDENT = "noise of the warm scan, independent from scan to scan"
 
 
 def part(source: Source, key: str) -> Part:
-    """Return the chapter of one campaign; ``key`` keeps its figures' identifiers apart."""
+    """Return the chapter of one campaign; ``key`` distinguishes the identifiers of its figures."""
     seen = campaign(source.errors)
     axis = str(source.errors.attrs.get("component", ""))
     return Part(
@@ -61,7 +61,7 @@ def _key_figures(seen: Campaign) -> list[KeyFigure]:
     return found
 
 
-def _in_words(cell: Cell, unit: str) -> str:
+def _with_unit(cell: Cell, unit: str) -> str:
     return f"{cell.text} ± {cell.uncertainty} {unit}" if cell.uncertainty else f"{cell.text} {unit}"
 
 
@@ -69,23 +69,21 @@ def _summary(seen: Campaign) -> list[str]:
     warm = seen.warm
     if not (warm.size and seen.known[warm].any()):
         return ["No scan could be registered: there is no thermal error to report.", *_holes(seen)]
-    words = [_what_was_done(seen)]
-    place = seen.shown()
+    words = [_procedure(seen)]
+    shown = seen.shown()
     largest = max(range(3), key=lambda i: _extent(seen, i))
     at = seen.largest(largest)
-    if at is not None and place is not None:
+    if at is not None and shown is not None:
         name = seen.names[FREEDOMS[largest]]
-        cell = _value(seen, *at, largest)
-        words.append(f"The largest displacement is {name}: {_in_words(cell, unit_of(largest)[0])} ({seen.where(*at)}).")
-        words += _still_moving(seen, largest, at[1])
+        value = _with_unit(_value(seen, *at, largest), unit_of(largest)[0])
+        words.append(f"The largest displacement is {name}: {value} ({seen.where(*at)}).")
+        words += _last_change(seen, largest, at[1])
     words += _holes(seen)
-    moved = [
+    words += [
         block.text for block in crossbeam_quality.stability(seen) if isinstance(block, Text) and block.kind == "warning"
     ]
-    words += moved
     if at is not None and "influence" in seen.errors:
-        there = seen.errors.isel(time=at[0], position=at[1])
-        found = budget.largest(there, FREEDOMS[largest])
+        found = budget.largest(seen.errors.isel(time=at[0], position=at[1]), FREEDOMS[largest])
         if found:
             words.append(
                 f"The largest share in the variance of that {seen.names[FREEDOMS[largest]]}: {found[0]}, {found[1]}."
@@ -102,7 +100,7 @@ def _extent(seen: Campaign, i: int) -> float:
     return abs(float(seen.values[(*place, i)])) if place is not None else -1.0
 
 
-def _what_was_done(seen: Campaign) -> str:
+def _procedure(seen: Campaign) -> str:
     n, position = seen.position.size, np.sort(seen.position)
     positions = f"one artefact at {at_y(position[0])}"
     if n > 1:
@@ -116,7 +114,7 @@ def _what_was_done(seen: Campaign) -> str:
     )
 
 
-def _still_moving(seen: Campaign, i: int, artefact: int) -> list[str]:
+def _last_change(seen: Campaign, i: int, artefact: int) -> list[str]:
     """Return the change of the largest error between the last two cycles."""
     last = [int(k) for k in seen.warm if math.isfinite(seen.values[k, artefact, i])][-2:]
     if len(last) < 2:
@@ -129,12 +127,12 @@ def _still_moving(seen: Campaign, i: int, artefact: int) -> list[str]:
     variance = float(change.covariance.isel(position=artefact, dof=i, dof_=i))
     unit, size = unit_of(i)
     expanded = 2 * math.sqrt(variance) if variance >= 0 else math.nan
-    verdict = "still changing" if abs(value) > expanded else "steady within the uncertainty"
+    state = "still changing" if abs(value) > expanded else "steady within the uncertainty"
     if not math.isfinite(expanded) or expanded == 0:
-        verdict = "changing"
-    cell = _in_words(estimate(value / size, expanded / size), unit)
+        state = "changing"
+    cell = _with_unit(estimate(value / size, expanded / size), unit)
     times = f"between {after(seen.time[last[0]])} and {after(seen.time[last[1]])}"
-    return [f"There it is {verdict} at the end: {cell} {times}."]
+    return [f"At the end of the test it is {state} there: {cell} {times}."]
 
 
 def _holes(seen: Campaign) -> list[str]:
@@ -175,7 +173,7 @@ def _last(seen: Campaign) -> Table:
 def _uncertainty(seen: Campaign) -> list[Block]:
     place = seen.shown()
     if place is None:
-        return [Text("There is no value.", "warning")]
+        return [Text("No value is known.", "warning")]
     there = seen.errors.isel(time=place[0], position=place[1])
     point = ", ".join(fixed(1e3 * float(value), 3) for value in np.atleast_1d(seen.errors.attrs["functional_point"]))
     return [
@@ -183,8 +181,8 @@ def _uncertainty(seen: Campaign) -> list[Block]:
         _budget(there, seen.where(*place)),
         Text(
             f"Functional point ({point}) mm in the frame '{seen.errors.attrs.get('frame', 'not stated')}'. Pose and "
-            "lever are one draw for all values; the cold scan of an artefact is one for all its warm scans. "
-            "Differences take that into account. The budget covers the named sources only.",
+            "lever have one error for all values; the cold scan of an artefact has one for all its warm scans. "
+            "Differences take this correlation into account. The budget contains the named sources only.",
             "note",
         ),
     ]
@@ -222,5 +220,5 @@ def _quality(seen: Campaign, source: Source) -> list[Block]:
     counted = quality.counts(source.errors, source.raw)
     if counted:
         words = ", ".join(f"{name} {number}" for name, number in counted.items())
-        blocks.append(Text(f"Counted while measuring: {words}."))
+        blocks.append(Text(f"Counted during the measurement: {words}."))
     return blocks

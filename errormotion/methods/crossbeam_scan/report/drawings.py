@@ -22,7 +22,7 @@ from errormotion.report.drawings import maps as crossbeam_maps
 from errormotion.report.fields import field, unit_of
 from errormotion.report.text import finite, fixed
 
-_MOST = 10  # curves in one panel
+_MOST_CURVES = 10  # in one panel
 _ROW, _GAP, _FOOT, _HEAD = 1.42, 0.42, 0.46, 0.26  # inch: panels, room between them, below and above
 _LEFT, _BETWEEN, _END = 0.52, 0.45, 0.08  # inch
 _BAR, _LEGEND = 0.48, 0.3  # inch: colour bar with its numbers, a line of the legend
@@ -53,10 +53,10 @@ def surfaces(seen: Campaign, key: str) -> Figure | None:
 
     svg = _six(seen, paint, key, ("time / min", "y / mm"), [], right=_BAR)
     holes = int((~seen.known).sum())
-    missing = " Crosses: no value; nothing is drawn up to the next ones." if holes else ""
+    missing = " Crosses: no value; the area up to the neighbouring scans is blank." if holes else ""
     caption = (
         "The six thermal errors over warm-up time and position of the axis. Dots: the scans; between them the values "
-        f"are interpolated linearly. White is zero, with a dark line.{missing}"
+        f"are interpolated linearly. White and the dark line: zero.{missing}"
     )
     return Figure(svg, caption, f"Filled contours of the six errors over time and position: {spans(seen)}.")
 
@@ -122,7 +122,7 @@ def by_time(seen: Campaign, key: str) -> Figure | None:
 
 
 def spans(seen: Campaign) -> str:
-    """Say the lowest and the highest value of each freedom."""
+    """Return the lowest and the highest value of each freedom as text."""
     words = []
     for i, freedom in enumerate(FREEDOMS):
         unit, size = unit_of(i)
@@ -135,7 +135,7 @@ def spans(seen: Campaign) -> str:
 
 def _how(smooth: bool) -> str:
     if smooth:
-        return "Points: each registration with its expanded uncertainty; curves: smoothed, bands: theirs (k = 2)."
+        return "Points and curves: registrations and smoothed errors; bars and bands: expanded uncertainty (k = 2)."
     return "Points: each registration; bars and bands: expanded uncertainty, k = 2."
 
 
@@ -144,14 +144,14 @@ def _some(picks: Sequence[int], all_of_them: Sequence[int]) -> str:
 
 
 def _picked(indices: Sequence[int]) -> list[int]:
-    """Return at most `_MOST` of the indices, first and last among them."""
+    """Return at most `_MOST_CURVES` of the indices, including the first and the last."""
     if not len(indices):
         return []
-    return [int(indices[k]) for k in np.unique(np.linspace(0, len(indices) - 1, _MOST).round().astype(int))]
+    return [int(indices[k]) for k in np.unique(np.linspace(0, len(indices) - 1, _MOST_CURVES).round().astype(int))]
 
 
 def _ordered(n: int) -> list[str]:
-    """Return n colours from light to dark, which stand for an order and stay apart in grey."""
+    """Return n colours from light to dark that indicate an order and are distinguishable in grey."""
     scale = matplotlib.colormaps["viridis_r"]
     return [matplotlib.colors.to_hex(scale(place)) for place in np.linspace(0.22 if n > 1 else 1.0, 1.0, n)]
 
@@ -187,7 +187,7 @@ def _points(axes: Axes, x: Array, values: Array, expanded: Array, colour: str, *
 
 
 def _dots(axes: Axes, x: Array, y: Array, known: np.ndarray) -> None:
-    """Mark where there is a value and where there is none; ``known`` (y, x)."""
+    """Mark points with and without a value; ``known`` (y, x)."""
     across, up = np.meshgrid(x, y)
     look: dict[str, Any] = {"linestyle": "", "clip_on": False, "zorder": 5}
     axes.plot(across[known], up[known], marker="o", markersize=1.5, color="#333333", markeredgewidth=0, **look)

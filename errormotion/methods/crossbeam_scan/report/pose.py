@@ -44,7 +44,7 @@ def part(source: Source, _key: str) -> Part:
 
 
 def matrix(errors: xr.Dataset) -> Array | None:
-    """Return the pose (4, 4) of the profiler in the tool frame; None where it is not known or no pose."""
+    """Return the pose (4, 4) of the profiler in the tool frame; None where it is unknown or invalid."""
     if "profiler_pose" not in errors or set(errors["profiler_pose"].dims) != {"row", "column"}:
         return None
     pose = field(errors, "profiler_pose", "row", "column")
@@ -73,7 +73,8 @@ def cells_of(pose: Array, sigma: Array) -> list[Cell]:
     for value, u in zip(values, sigma, strict=True):
         cell = estimate(1e3 * value, 2e3 * u, digits=5)
         if not cell.uncertainty:
-            cell = Cell(fixed(1e3 * value, 3, signed=True), reason="no uncertainty is stated: the pose counts as exact")
+            exact = "no uncertainty is stated: the pose is taken as exact"
+            cell = Cell(fixed(1e3 * value, 3, signed=True), reason=exact)
         cells.append(cell)
     return cells
 
@@ -124,5 +125,5 @@ def _quality(source: Source) -> list[Block]:
     found: list[Block] = [Text(f"Of the pocket: {'; '.join(words)}.")] if words else []
     counted = quality.counts(errors, source.raw)
     if counted:
-        found.append(Text("Counted while measuring: " + ", ".join(f"{n} {c}" for n, c in counted.items()) + "."))
+        found.append(Text("Counted during the measurement: " + ", ".join(f"{n} {c}" for n, c in counted.items()) + "."))
     return found

@@ -13,11 +13,12 @@ from errormotion.report.document import Block, Cell, Table, Text, estimate, or_d
 from errormotion.report.fields import field, remarks, unit_of
 from errormotion.report.text import DASH, finite, fixed, integer, listed, significant
 
-_MOST = 240  # rows of single registrations; of more, each cycle is one row
+_MOST_ROWS = 240  # of single registrations; if there are more, each cycle is one row
 _NOTE = (
-    "Predicted: the bound that the slopes of the surface and the noise stated by the sensor set. By registration: what "
-    "the registration states with the noise and the jitter that it found. Both are standard uncertainties (k = 1) at "
-    "the carriage, the worst of three directions, without pose and lever. 1 arcsec = 4.848 µrad."
+    "Predicted: the bound that follows from the slopes of the surface and the noise stated for the sensor. By "
+    "registration: the uncertainty of the registration with the noise and the jitter found in the scans. Both are "
+    "standard uncertainties (k = 1) at the carriage, the worst of three directions, without pose and lever. "
+    "1 arcsec = 4.848 µrad."
 )
 _HEAD = ("shift / nm", "rotation / µrad", "shift / nm", "rotation / µrad", "rms / µm", "points", "noise / µm")
 _JITTER = ("in z / µm", "in y / µm")
@@ -25,20 +26,16 @@ _GROUPS = (("", 1), ("predicted", 2), ("by registration", 2), ("residual", 2), (
 
 
 def made(seen: Campaign) -> tuple[int, int]:
-    """Return how many registrations were planned, and how many made."""
+    """Return the numbers of registrations planned and made."""
     known = seen.known[seen.warm]
     return known.size, int(known.sum())
 
 
 def lost(seen: Campaign) -> str:
-    """Return how many registrations are missing, by reason; empty where none is."""
+    """Return the number of missing registrations by reason; empty where none is missing."""
     holes, absent = ~seen.known[seen.warm], seen.absent[seen.warm]
     silent = holes & ~absent & (seen.reason[seen.warm] == NO_REASON)
-    kinds = (
-        (absent, "without a scan"),
-        (holes & ~absent & ~silent, "refused"),
-        (silent, "without a stated reason"),
-    )
+    kinds = ((absent, "without a scan"), (holes & ~absent & ~silent, "refused"), (silent, "without a stated reason"))
     return ", ".join(f"{integer(kind.sum())} {words}" for kind, words in kinds if kind.any())
 
 
@@ -47,14 +44,14 @@ def blocks(seen: Campaign) -> list[Block]:
     found: list[Block] = [Text(note, "warning") for note in remarks(seen.errors)]
     planned, done = made(seen)
     if not planned:
-        return [*found, Text("There is no warm cycle to register.", "warning")]
+        return [*found, Text("The campaign has no warm cycle to register.", "warning")]
     words = f"{integer(done)} of {integer(planned)} registrations were made"
     if done < planned:
         words += f"; {lost(seen)}"
     found.append(Text(f"{words}.", "plain" if done == planned else "warning"))
     if done and not np.isfinite(_numbers(seen)[seen.known]).any():
-        return [*found, Text("The result holds no figures of the registrations' quality.", "note")]
-    found.append(_by_scan(seen) if planned <= _MOST else _by_cycle(seen))
+        return [*found, Text("The result does not contain data on the quality of the registrations.", "note")]
+    found.append(_by_scan(seen) if planned <= _MOST_ROWS else _by_cycle(seen))
     drift = _drift(seen)
     return [*found, drift] if drift is not None else found
 
@@ -164,8 +161,8 @@ def _drift(seen: Campaign) -> Text | None:
     largest = [finite(np.max, np.abs(strain[..., k])) for k in range(strain.shape[-1])]
     words = listed([f"{trimmed(fixed(value, 1))} µm/m in {axis}" for value, axis in zip(largest, "xyz", strict=False)])
     return Text(
-        "While a scan is fed, the error of the axis changes: a cold and a warm surface differ by more than a rigid "
-        f"motion. What was taken into account: at most {words} of the profiler.",
+        "The error of the axis changes during a scan: a cold and a warm surface differ by more than a rigid motion. "
+        f"Drift of the profiler that was taken into account: at most {words}.",
         "note",
     )
 
@@ -209,7 +206,7 @@ def _repeats(seen: Campaign) -> list[Block] | None:
     values = field(errors, "cold_repeat", *dims)
     sigma = field(errors, "cold_repeat_u", *dims) if "cold_repeat_u" in errors else np.full_like(values, np.nan)
     if not np.isfinite(values).any():
-        return [Text("The cold repeat gave no value.", "warning")]
+        return [Text("The cold repeat has no valid result.", "warning")]
     rows: list[list[Cell | str]] = []
     for r in range(values.shape[0]):
         if values.shape[0] > 1:
@@ -225,28 +222,28 @@ def _repeats(seen: Campaign) -> list[Block] | None:
                 )
             rows.append([at_y(seen.position[j]), *cells])
     table = Table(
-        "Cold repeat: the six errors between two scans of the cold machine, which are zero where machine and artefacts "
-        "stood still. After ±: expanded uncertainty, k = 2.",
+        "Cold repeat: the six errors between two scans of the cold machine, which are zero if machine and artefacts "
+        "did not change. After ±: expanded uncertainty, k = 2.",
         ["artefact", *(f"{seen.names[name]} / {unit_of(i)[0]}" for i, name in enumerate(FREEDOMS))],
         rows,
     )
-    return [_verdict(seen, values, sigma), table]
+    return [_assessment(seen, values, sigma), table]
 
 
-def _verdict(seen: Campaign, values: Array, sigma: Array) -> Text:
+def _assessment(seen: Campaign, values: Array, sigma: Array) -> Text:
     expanded = np.where(sigma > 0, 2 * sigma, np.nan)
     ratio = np.abs(values) / expanded
     judged = np.isfinite(ratio)
     if not judged.any():
-        return Text("The cold repeat has no stated uncertainty: it cannot be judged.", "note")
+        return Text("The cold repeat has no stated uncertainty: it cannot be assessed.", "note")
     outside = int((ratio[judged] > 1).sum())
     _, j, i = np.unravel_index(int(np.nanargmax(ratio)), ratio.shape)
     words = (
         f"Cold repeat: {integer(judged.sum() - outside)} of {integer(judged.sum())} values are within their expanded "
-        f"uncertainty (95 % are expected to be); the largest is {seen.names[FREEDOMS[int(i)]]} at "
-        f"{at_y(seen.position[int(j)])} with {trimmed(fixed(float(np.nanmax(ratio)), 2))} times its own."
+        f"uncertainty (expected: 95 %); relative to it, the largest is {seen.names[FREEDOMS[int(i)]]} at "
+        f"{at_y(seen.position[int(j)])} with {trimmed(fixed(float(np.nanmax(ratio)), 2))} times its uncertainty."
     )
     by_chance = 0.05 * judged.sum() + 3 * math.sqrt(0.05 * 0.95 * judged.sum())
     if outside > by_chance or np.nanmax(ratio) > 2:
-        return Text(f"{words} That is more than chance: something moved or changed between the two.", "warning")
+        return Text(f"{words} This is significant: machine or artefacts changed between the two scans.", "warning")
     return Text(words)

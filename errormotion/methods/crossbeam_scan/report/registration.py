@@ -17,23 +17,21 @@ from errormotion.report.drawings import maps as crossbeam_maps
 from errormotion.report.fields import field
 from errormotion.report.text import finite, fixed, integer, significant
 
-_WRONG = 10  # times its standard uncertainty: how wrong a pose is taken to be, to see what that does to the residual
+_WRONG = 10  # assumed error of a pose in standard uncertainties, to show its effect on the residual
 _MAPS = ("difference_before", "difference_after")
 _FINEST = 48  # cells a side
 
 
 def blocks(seen: Campaign, key: str) -> list[Block]:
-    """Return picture and words of the last registration of the artefact with the largest error."""
+    """Return figure and text of the last registration of the artefact with the largest error."""
     shown = seen.shown()
     if shown is None:
-        return [Text("No scan could be registered: there is none to show.", "warning")]
-    made = _figure(seen, *shown, key)
-    if made is None:
-        return [Text("The result holds no maps of the surfaces.", "note"), *_words(seen, *shown)]
-    return [made, *_words(seen, *shown)]
+        return [Text("No scan could be registered.", "warning")]
+    figure = _figure(seen, *shown, key) or Text("The result does not contain maps of the surfaces.", "note")
+    return [figure, *_residual(seen, *shown)]
 
 
-def _words(seen: Campaign, cycle: int, artefact: int) -> list[Block]:
+def _residual(seen: Campaign, cycle: int, artefact: int) -> list[Block]:
     rms = seen.get("residual_rms")[cycle, artefact]
     if not math.isfinite(rms):
         return []
@@ -45,25 +43,23 @@ def _words(seen: Campaign, cycle: int, artefact: int) -> list[Block]:
     if math.isfinite(noise):
         words += f"; noise of a point {_length(noise)}"
     turned = _wrong_pose(seen, cycle, artefact)
-    words += (
-        ". The residual shows noise and jitter of two scans; it gives no information about the accuracy of the pose"
-    )
+    words += ". The residual shows noise and jitter of two scans; it is no measure of the accuracy of the pose"
     if turned is not None:
         name, sigma, added = turned
         words += (
-            f": the standard uncertainty of the rotation {name} by the registration is {significant(1e6 * sigma)} "
-            f"µrad, and a pose that is wrong by {_WRONG} times as much would bring the residual from "
+            f": the standard uncertainty of the rotation {name} of the registration is {significant(1e6 * sigma)} "
+            f"µrad, and an error of the pose of {_WRONG} times this value would change the residual from "
             f"{_length(rms, 4)} to {_length(math.hypot(rms, added), 4)}"
         )
     return [Text(f"{words}. The accuracy of a registration is stated by its covariance.")]
 
 
 def _wrong_pose(seen: Campaign, cycle: int, artefact: int) -> tuple[str, float, float] | None:
-    """Return the rotation known best (ISO name), its uncertainty by the registration, and what a wrong one adds.
+    """Return the best known rotation (ISO name), its uncertainty from the registration, and the effect of its error.
 
-    The last is the root mean square, m, that a pose off by `_WRONG` times the uncertainty adds to the residual: the
-    rotation R about the middle of the artefact moves a point P by R x P, which along z shows as n . (R x P) with
-    n = (-dS/dx, -dS/dy, 1).
+    The effect is the root mean square, m, that an error of the pose of `_WRONG` times the uncertainty adds to the
+    residual: the rotation R about the middle of the artefact moves a point P by R x P, which appears along z as
+    n . (R x P) with n = (-dS/dx, -dS/dy, 1).
     """
     sigma = seen.get("registration_u", "dof")[cycle, artefact, 3:]
     if not np.isfinite(sigma).any():
@@ -91,7 +87,7 @@ def _length(metres: float, digits: int = 3) -> str:
 
 
 def _surface(seen: Campaign, artefact: int) -> tuple[Array, Array, Array] | None:
-    """Return (x (u,), y (v,), z (v, u)) of a cold surface in m; None where the dataset does not hold it."""
+    """Return (x (u,), y (v,), z (v, u)) of a cold surface in m; None where the dataset does not contain it."""
     errors = seen.errors
     if any(name not in errors for name in ("surface", "surface_x", "surface_y")):
         return None
@@ -135,8 +131,8 @@ def _figure(seen: Campaign, cycle: int, artefact: int, key: str) -> Figure | Non
             if k == 0:
                 axes.set_ylabel("y / mm (along the feed)")
             axes.grid(visible=False)
-            place = ((start + wide + 0.07) / canvas.WIDTH, canvas.BOTTOM / high, 0.09 / canvas.WIDTH, tall / high)
-            crossbeam_maps.colour_bar(axes, scale, place, unit)
+            box = ((start + wide + 0.07) / canvas.WIDTH, canvas.BOTTOM / high, 0.09 / canvas.WIDTH, tall / high)
+            crossbeam_maps.colour_bar(axes, scale, box, unit)
 
     where = f"the artefact at {at_y(seen.position[artefact])}, {after(seen.time[cycle])}"
     sizes = "; ".join(
@@ -144,7 +140,8 @@ def _figure(seen: Campaign, cycle: int, artefact: int, key: str) -> Figure | Non
         for title, unit, values, _ in maps
     )
     caption = (
-        f"One registration: {where}, the last of the artefact with the largest error. Left the cold surface, then warm "
-        "minus cold along z before and after registration, each with its own scale. Empty cells hold no point."
+        f"One registration: {where}, the last of the artefact with the largest error. From left to right: the cold "
+        "surface, warm minus cold along z before registration, and after it; each with a separate scale. Empty cells "
+        "contain no point."
     )
     return Figure(canvas.draw(paint, key, high), caption, f"Maps of {where}: {sizes}.")

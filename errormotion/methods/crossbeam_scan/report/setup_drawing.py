@@ -1,4 +1,4 @@
-"""The set-up of a crossbeam campaign: beam, carriage, lever, profiler and artefacts to scale; the pose as a table."""
+"""Set-up of a crossbeam campaign: beam, carriage, lever, profiler and artefacts to scale, and the pose as a table."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class Setup:
 
     @property
     def head(self) -> Array:
-        """Where the profiler's origin is; the tool frame where its pose is not known."""
+        """Position of the profiler's origin; that of the tool frame where its pose is not known."""
         return self.lever + np.nan_to_num(self.profiler)
 
 
 def setup_of(seen: Campaign) -> Setup | None:
-    """Return the set-up that the dataset holds; None without a lever."""
+    """Return the set-up stated in the dataset; None without a lever."""
     errors = seen.errors
     if "lever" not in errors:
         return None
@@ -64,17 +64,17 @@ def setup_of(seen: Campaign) -> Setup | None:
 
 
 def blocks(seen: Campaign, key: str) -> list[Block]:
-    """Return drawing and tables of the set-up, or words for what is not known."""
+    """Return drawing and tables of the set-up, or a text where they are unknown."""
     setup, tables = setup_of(seen), _tables(seen)
     if setup is None:
-        return [Text("The result does not hold the lever: the set-up cannot be drawn.", "note"), *tables]
+        return [Text("The result does not contain the lever: the set-up cannot be drawn.", "note"), *tables]
     return [_figure(seen, setup, key), *tables]
 
 
 def _tables(seen: Campaign) -> list[Block]:
     pose = crossbeam_pose.matrix(seen.errors)
     if pose is None:
-        return [Text("The result does not hold the pose of the profiler.", "note")]
+        return [Text("The result does not contain the pose of the profiler.", "note")]
     more: list[list[Cell | str]] = []
     if "lever" in seen.errors:
         lever = 1e3 * np.asarray(seen.errors["lever"].values, float)
@@ -117,7 +117,7 @@ def _figure(seen: Campaign, setup: Setup, key: str) -> Figure:
     caption = (
         "Set-up to scale, x and z from the origin of the carriage: the carriage on the crossbeam, the lever to the "
         "tool frame, and the profiler, drawn over the artefact with the largest error. Numbers: position y of the axis "
-        "over each artefact in mm. Thickness of beam and carriage and the height of the artefacts are symbols."
+        "over each artefact in mm. Thickness of beam and carriage and height of the artefacts are not to scale."
     )
     moved = _moved(seen)
     if moved.any():
@@ -133,7 +133,7 @@ def _moved(seen: Campaign) -> NDArray[np.bool_]:
 
 
 def _beam(seen: Campaign) -> tuple[float, float]:
-    """Return the ends of the drawn beam, m: its true ones are not known."""
+    """Return the ends of the drawn beam, m; the true ends are not known."""
     low, high = float(seen.position.min()), float(seen.position.max())
     more = max(_OVERHANG, (_SHORTEST - (high - low)) / 2)
     return low - more, high + more
@@ -184,8 +184,8 @@ def _side(axes: Axes, setup: Setup) -> None:
     head, tool = 1e3 * setup.head, 1e3 * setup.lever
     top = head[2] + 1e3 * setup.below
     axes.add_patch(Rectangle((head[0] - width / 2, top - 1e3 * _BLOCK), width, 1e3 * _BLOCK, color=GREEN, linewidth=0))
-    _length(axes, (0.0, tool[2]), (tool[0], tool[2]), f"{fixed(abs(tool[0]), 1)} mm")
-    _length(axes, (0.0, 0.0), (0.0, tool[2]), f"{fixed(abs(tool[2]), 1)} mm")
+    _dimension(axes, (0.0, tool[2]), (tool[0], tool[2]), f"{fixed(abs(tool[0]), 1)} mm")
+    _dimension(axes, (0.0, 0.0), (0.0, tool[2]), f"{fixed(abs(tool[2]), 1)} mm")
     names = [((0.0, 0.0), "carriage", (14, 8)), ((tool[0], tool[2]), "tool frame", (5, 6))]
     if np.isfinite(setup.profiler).all():
         lift = fixed(abs(head[2] - tool[2]), 1)
@@ -194,8 +194,8 @@ def _side(axes: Axes, setup: Setup) -> None:
         axes.annotate(name, place, xytext=aside, textcoords="offset points", fontsize=7, va="center")
 
 
-def _length(axes: Axes, start: tuple[float, float], end: tuple[float, float], words: str) -> None:
-    """Draw a dimension line with its length."""
+def _dimension(axes: Axes, start: tuple[float, float], end: tuple[float, float], text: str) -> None:
+    """Draw a dimension line with its text."""
     if math.dist(start, end) < 100:
         return
     axes.annotate(
@@ -206,7 +206,7 @@ def _length(axes: Axes, start: tuple[float, float], end: tuple[float, float], wo
     )
     level = abs(end[1] - start[1]) < abs(end[0] - start[0])
     axes.annotate(
-        words,
+        text,
         ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2),
         xytext=(0, -3) if level else (3, 0),
         textcoords="offset points",
@@ -219,7 +219,7 @@ def _length(axes: Axes, start: tuple[float, float], end: tuple[float, float], wo
 
 
 def _hanging(axes: Axes, setup: Setup, at: float, k: int) -> None:
-    """Draw carriage, lever, profiler and its light, seen along X (k = 1) or Y (k = 0), the carriage at ``at`` mm."""
+    """Draw carriage, lever and profiler, seen along X (k = 1) or Y (k = 0), with the carriage at ``at`` mm."""
     lever, head = 1e3 * setup.lever, 1e3 * setup.head
     half = 5e2 * _CARRIAGE
     axes.add_patch(

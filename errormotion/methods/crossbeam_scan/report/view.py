@@ -15,11 +15,11 @@ from errormotion.report.fields import field
 from errormotion.report.text import fixed
 
 AXES = ("time", "position")
-NO_REASON = "no value, and the result states no reason"
+NO_REASON = "no value; the result states no reason"
 
 
 def is_campaign(errors: xr.Dataset) -> bool:
-    """Return whether a dataset is the result of a campaign of crossbeam scans, and not of a step before it."""
+    """Return whether a dataset is the result of a campaign of crossbeam scans."""
     return errors.attrs.get("method") == "crossbeam_scan" and set(AXES) <= set(errors["EX"].dims)
 
 
@@ -30,7 +30,7 @@ def is_pose(errors: xr.Dataset) -> bool:
 
 @dataclass(frozen=True)
 class Campaign:
-    """The six errors of an axis over warm-up time and position, with the statements of the method.
+    """The six errors of an axis over warm-up time and position, with further results of the method.
 
     Attributes
     ----------
@@ -41,13 +41,13 @@ class Campaign:
     position : (p,)
         Of the axis over each artefact, m.
     scan_time : (t, p)
-        When each scan was taken, s of warm-up; that of the cycle where it is not known.
+        Warm-up time of each scan, s; that of the cycle where it is not known.
     values, sigma : (t, p, 6)
         Errors and standard uncertainties, m and rad; NaN where unknown.
     reason : (t, p) of str
         Why there is no value; empty where there is one.
     reference : (t,) of bool
-        Which cycles are the cold state that all others are relative to.
+        Which cycles are the cold state, to which all others are relative.
     """
 
     errors: xr.Dataset
@@ -69,7 +69,7 @@ class Campaign:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Where there is any value, (t, p)."""
+        """Whether any freedom has a value, (t, p)."""
         return np.asarray(np.isfinite(self.values).any(axis=2))
 
     @property
@@ -79,13 +79,13 @@ class Campaign:
 
     @property
     def absent(self) -> NDArray[np.bool_]:
-        """Where there was no scan to register, (t, p); nowhere if the dataset does not state scan times."""
+        """Whether the scan is missing, (t, p); False everywhere if the dataset does not state scan times."""
         if "scan_time" not in self.errors:
             return np.zeros_like(self.known)
         return np.asarray(~self.known & ~np.isfinite(field(self.errors, "scan_time", *AXES)))
 
     def get(self, name: str, *dims: str) -> Array:
-        """Return a variable over (time, position, and these dims); all NaN where the dataset does not hold it."""
+        """Return a variable over (time, position, and these dims); NaN where the dataset does not contain it."""
         if name in self.errors and set(self.errors[name].dims) == {*AXES, *dims}:
             return field(self.errors, name, *AXES, *dims)
         sizes = tuple(self.errors.sizes.get(dim, 1) for dim in (*AXES, *dims))
@@ -102,7 +102,7 @@ class Campaign:
     def shown(self) -> tuple[int, int] | None:
         """Return (cycle, artefact) of the registration to show: the last of the artefact with the largest error.
 
-        Displacements decide; rotations do where no displacement is known.
+        The largest displacement is used; the largest rotation where no displacement is known.
         """
         warm = np.where(self.reference[:, None, None], np.nan, np.abs(self.values))
         for columns in (slice(0, 3), slice(3, 6)):
@@ -114,7 +114,7 @@ class Campaign:
         return None
 
     def where(self, cycle: int, artefact: int) -> str:
-        """Return position and time of one registration in words."""
+        """Return position and time of one registration as text."""
         return f"{at_y(self.position[artefact])}, {after(self.time[cycle])}"
 
 
@@ -158,15 +158,15 @@ def millimetres(position: float) -> str:
 
 
 def at_y(position: float) -> str:
-    """Return a position in words that stay on one line."""
+    """Return a position as text without line breaks."""
     return f"y\u00a0=\u00a0{millimetres(position)}\u00a0mm"
 
 
 def after(seconds: float) -> str:
-    """Return a warm-up time in words."""
+    """Return a warm-up time as text."""
     return "cold" if seconds == 0 else f"{trimmed(fixed(seconds / 60, 1))}\u00a0min"
 
 
 def trimmed(number: str) -> str:
-    """Return a number without zeros behind its decimal point."""
+    """Return a number without trailing zeros after its decimal point."""
     return number.rstrip("0").rstrip(".") if "." in number else number

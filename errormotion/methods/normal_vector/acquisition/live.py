@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class LiveBalls:
     """Compares each cycle with the first one.
 
-    For the operator: one displacement common to all balls, by least squares from the touches that both cycles have,
-    without rotations and uncertainty. The result is identified from the whole record afterwards.
+    For display: one displacement common to all balls, by least squares from the touches in both cycles, without
+    rotations and uncertainty. The result is identified from the whole record afterwards.
     """
 
     def __init__(self, settings: Settings) -> None:

@@ -14,6 +14,7 @@ import xarray as xr
 
 from errormotion.errors import InstrumentError
 from errormotion.methods.normal_vector.acquisition import cycle, touching
+from errormotion.methods.normal_vector.schema import SCHEMA, TOUCH_FLAGS
 from errormotion.plugins import Bench, Contact
 
 if TYPE_CHECKING:
@@ -21,10 +22,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SCHEMA = "errormotion.raw.normal_vector/1"
-FLAGS = ("", "no trip", "tripped at the start", "repeat differs", "not made")
-"""Flags of contacts; the dataset contains the index in this list."""
-NOT_MADE = FLAGS.index("not made")
+NOT_MADE = TOUCH_FLAGS.index("not made")
 FEWEST_TOUCHES = 3
 """Smallest number of good touches of each ball in the cold cycle."""
 RUN_ATTRIBUTES = ("start", "cold_cycle_seconds", "clock_origin")
@@ -48,7 +46,7 @@ class Record:
     Attributes
     ----------
     first : int
-        Number of the first cycle to be made.
+        Number of the first cycle to be measured.
     touches : list of Touch
         Of every cycle, in order.
     """
@@ -110,7 +108,7 @@ class Record:
         Raises
         ------
         InstrumentError
-            Lists the balls without, and the flags of their touches.
+            A ball has too few; the message lists the flags of its touches.
         """
         flags: dict[int, Counter[str]] = {ball: Counter() for ball in range(len(self.settings.balls))}
         for (ball, _), contact in zip(self._order, contacts, strict=True):
@@ -136,7 +134,7 @@ class Record:
         contacts : sequence of Contact
             In the order of ``touches``; those missing in an interrupted cycle are ``not made``.
         start, end : float
-            Of the cycle, s since the start of the cold cycle. The end is used of the cold cycle alone.
+            Of the cycle, s since the start of the cold cycle. The end is used for the cold cycle only.
         origin : float
             Clock of the machine at the start of the cold cycle, s.
         history : (float, float)
@@ -147,7 +145,7 @@ class Record:
         flag = np.full((1, b, m), NOT_MADE, dtype=np.int8)
         for (ball, touch), contact in zip(self._order, contacts, strict=False):
             position[0, ball, touch], time[0, ball, touch] = contact.position, contact.time - origin
-            flag[0, ball, touch] = FLAGS.index(contact.flag) if contact.flag in FLAGS else NOT_MADE
+            flag[0, ball, touch] = TOUCH_FLAGS.index(contact.flag) if contact.flag in TOUCH_FLAGS else NOT_MADE
             self._invalid.update([contact.flag] if contact.flag else [])
         self._invalid.update({"not made": len(self._order) - len(contacts)} if len(contacts) < len(self._order) else {})
         if self._timed is None:

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 STATE_INTERVAL = 10.0
 """Longest interval of the checks of the machine's state, s."""
 PROGRAM_STATE_INTERVAL = 1.0
-"""The same while a program is executed, s."""
+"""Interval of these checks while a program is executed, s."""
 
 
 class Warming:
@@ -45,8 +45,8 @@ class Warming:
     warm_from : float or None
         Start of the warm-up, s since ``origin``: the end of the cold cycle.
     repeats : bool
-        Whether the recorded cycles have to be made again, since the virtual machine was restarted: it is then as warm,
-        and its axes and clock are where they were. The data that follow are those of a run without interruption.
+        Whether the recorded cycles have to be repeated, because the virtual machine was restarted. It reaches the same
+        state in this way, and the following data are those of a run without interruption.
 
     Raises
     ------
@@ -84,13 +84,13 @@ class Warming:
             self._check_state("during the warm-up")
             self._turned += self._speed * (self.now - now)
 
-    def _one_step(self, moves: int, until_change: float, left: float) -> int:
+    def _one_step(self, moves: int, until_change: float, remaining: float) -> int:
         """Make the next move if there is time for it, else wait; return the number of moves made."""
         if self.settings.moves:
             target = self.settings.moves[moves % len(self.settings.moves)]
             distance = math.dist(target, self.control.state()["commanded_position"])
             seconds = distance / self.settings.moves_feed
-            if cycle.SHORTEST_STEP < seconds <= left:
+            if cycle.SHORTEST_STEP < seconds <= remaining:
                 self.control.move_to(target, self.settings.moves_feed)
                 self._path += distance
                 return moves + 1
@@ -100,7 +100,7 @@ class Warming:
         return moves
 
     def turn(self, speed: float) -> None:
-        """Set the spindle speed, 1/min, if it differs from the present one."""
+        """Set the spindle speed, 1/min, if it differs from the current one."""
         if speed != self._speed:
             self.control.spindle(speed)
             self._speed = speed
@@ -206,7 +206,7 @@ def fault(state: dict[str, Any]) -> str:
 def age(done: xr.Dataset) -> float:
     """Return the time since the start of the cold cycle of an interrupted run, s.
 
-    That of its last touch where the duration of the interruption is unknown.
+    If the duration of the interruption is unknown, it is the time of the last touch.
 
     Raises
     ------

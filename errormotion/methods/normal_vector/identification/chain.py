@@ -1,4 +1,4 @@
-"""Least squares of cycles that are coupled with their neighbours alone, and with offsets common to all of them.
+"""Least squares of cycles that are coupled only with their neighbours, and with offsets common to all of them.
 
 The normal equations are
 

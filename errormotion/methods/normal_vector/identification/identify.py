@@ -115,7 +115,7 @@ def _motion(data: Readings, settings: Settings) -> Motion:
     seen, names = data.seen, data.names
     ever = np.any(seen.valid, axis=(0, 2))
     if not ever.all():
-        lost = ", ".join(name for name, there in zip(names, ever, strict=True) if not there)
+        lost = ", ".join(name for name, touched in zip(names, ever, strict=True) if not touched)
         raise MethodError(f"Ball {lost} was never touched: remove it from the data, or touch it.")
     check_jumps(seen, names, settings.ball_tolerance)
     if seen.touched:
@@ -185,20 +185,16 @@ def _normals_estimate(
     notes: list[str],
 ) -> Estimate | None:
     """Return the result of the published construction from four balls; None, with a note, if it is not applicable."""
-    names = data.names
-    chosen = settings.normals_balls or tuple(names[:4])
     if motion.tool_axes != "XYZ":
         notes.append(
             "The normals of planes through balls are not applicable: where axes carry the workpiece, a rotation of "
             "their frame shears the apparent arrangement of the balls instead of rotating it."
         )
         return None
-    if len(names) < 4:
-        notes.append(f"The normals of two planes need four balls; found {len(names)}.")
+    if len(data.names) < 4:
+        notes.append(f"The normals of two planes need four balls; found {len(data.names)}.")
         return None
-    if missing := [name for name in chosen if name not in names]:
-        raise MethodError(f"normals_balls: expected names of {', '.join(names)}; found {', '.join(missing)}")
-    four = [names.index(name) for name in chosen]
+    four = normals.chosen(data.names, settings.normals_balls)
     simultaneous = centres(_at_cycle_time(seen, cleaned, motion, settings), cleaned.fit.anchor, cleaned.fit.reach)
     centre, cofactor = simultaneous.centre[:, four], factor * simultaneous.cofactor[:, four]
     for move in cleaned.moves:

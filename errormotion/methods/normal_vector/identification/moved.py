@@ -29,7 +29,7 @@ FALSE_ALARM = 1e-3
 """Probability at which valid data are excluded."""
 MOST_ITERATIONS = 60
 AMBIGUITY = 12.0
-"""Difference in chi-square to the best gain below which another ball may be the one that moved."""
+"""Difference in chi-square from the best gain below which another ball may be the one that moved."""
 OUTLIER_PREFERENCE = 0.95
 """Gain of an outlier, relative to that of a move, above which the outlier is the simpler explanation."""
 ENOUGH_FOR_MEDIAN = 30
@@ -141,7 +141,7 @@ def _suspect(seen: Observations, found: Rigid, stated: bool, smallest_move: floa
     nWH = np.swapaxes(n, 2, 3) @ WH
     information = np.swapaxes(n, 2, 3) @ W @ n - nWH @ inverse[:, None] @ np.swapaxes(nWH, 2, 3)
     u = (np.swapaxes(n, 2, 3) @ (W @ residual[..., None]))[..., 0]
-    # Reduced by the motion of the cycle, as the information is: otherwise little information gives a large gain.
+    # Reduced by the motion of the cycle, as the information is: otherwise little information has a large gain.
     u -= np.einsum("kbip,kpq,kcmq,kcm->kbi", nWH, inverse, WH, residual, optimize=True)
     level = _Level(found, seen, H, inverse, stated)
     move = _move(information, u, smallest_move, level)

@@ -12,9 +12,12 @@ negative, as in its eqs. (1) to (3).)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from errormotion.arrays import Array
+from errormotion.errors import MethodError
 from errormotion.kinematics.twists import cross_matrix
 from errormotion.methods.normal_vector.identification.freedoms import rotated
 
@@ -28,6 +31,20 @@ ONE_PLANE = (
     "them is not determined."
 )
 """Note on such balls."""
+
+
+def chosen(names: Sequence[str], stated: Sequence[str] | None) -> list[int]:
+    """Return the indices of the stated balls P1 P2 P3 P4, by default of the first four.
+
+    Raises
+    ------
+    MethodError
+        A stated ball does not exist.
+    """
+    balls = stated or names[:4]
+    if missing := [name for name in balls if name not in names]:
+        raise MethodError(f"normals_balls: expected names of {', '.join(names)}; found {', '.join(missing)}")
+    return [names.index(name) for name in balls]
 
 
 def plane_normals(centre: Array) -> Array:
@@ -66,7 +83,10 @@ def twist(cold: Array, now: Array, point: Array) -> Array:
 
 
 def jacobian(cold: Array, point: Array) -> Array:
-    """Return the derivative of the twist by the present centres, (6, 4, 3); by the cold ones it is the negative."""
+    """Return the derivative of the twist with respect to the current centres, (6, 4, 3).
+
+    The derivative with respect to the cold centres is its negative.
+    """
     steps = STEP * np.eye(12).reshape(12, 4, 3)
     return np.asarray(((twist(cold, cold + steps, point) - twist(cold, cold - steps, point)) / (2 * STEP)).T).reshape(
         6, 4, 3
@@ -77,7 +97,7 @@ def covariance(cold: Array, now: Array, point: Array, centres: Array) -> Array:
     """Return the covariance (k, 6, 6) of the twists.
 
     It follows from the covariances ``now`` (k, 4, 3, 3) and ``cold`` (4, 3, 3) of the centres, m^2. ``centres`` (4, 3),
-    m, are those of the cold state; the errors are too small to change the derivative.
+    m, are those of the cold state; the effect of the errors on the derivative is negligible.
     """
     J = jacobian(centres, point)
     return np.asarray(np.einsum("ubi,kbij,vbj->kuv", J, now + cold, J, optimize=True))

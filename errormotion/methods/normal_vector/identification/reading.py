@@ -11,6 +11,7 @@ import numpy as np
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.normal_vector.identification.rigid import Observations
+from errormotion.methods.normal_vector.schema import flag_text
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
 
     from errormotion.methods.normal_vector.settings import Settings
 
-FLAGS = {1: "no trip", 2: "tripped at the start", 3: "repeat differs", 4: "not made"}
-"""Meanings of the flags of touches; 0 is a good touch."""
 _AXES = ("XYZ", "XY", "XZ", "YZ", "X", "Y", "Z", "")
 
 
@@ -220,7 +219,7 @@ def _flag_notes(flag: Array) -> list[str]:
     counts = [
         (value, int(np.count_nonzero(flag == value))) for value in np.unique(flag[np.isfinite(flag)]) if value > 0
     ]
-    return [f"{count} touches are flagged: {FLAGS.get(int(value), f'flag {value:g}')}." for value, count in counts]
+    return [f"{count} touches are flagged: {flag_text(value)}." for value, count in counts]
 
 
 def _coordinates(raw: xr.Dataset) -> Array:

@@ -1,4 +1,4 @@
-"""The centre of every ball in every cycle, from its touches alone."""
+"""The centre of every ball in every cycle, from its touches."""
 
 from __future__ import annotations
 

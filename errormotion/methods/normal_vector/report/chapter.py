@@ -9,16 +9,8 @@ import numpy as np
 import xarray as xr
 
 from errormotion.methods.normal_vector.report import drawings
-from errormotion.methods.normal_vector.report.view import (
-    FLAGS,
-    MISSING,
-    MOVED,
-    UNDETERMINED,
-    WRONG,
-    Probing,
-    is_normal_vector,
-    probing,
-)
+from errormotion.methods.normal_vector.report.view import MISSING, MOVED, UNDETERMINED, WRONG, Probing, probing
+from errormotion.methods.normal_vector.schema import flag_text
 from errormotion.report import budget, provenance, quality
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import (
@@ -39,8 +31,6 @@ from errormotion.report.drawings.series import commanded_speed, events
 from errormotion.report.parts import sensors
 from errormotion.report.parts.generic import unit_at
 from errormotion.report.text import finite, fixed, integer, listed, significant
-
-__all__ = ["is_normal_vector", "part"]
 
 _TILT = (
     "The position of the tip in the spindle is constant. A tilt of the spindle relative to the last axis therefore "
@@ -169,8 +159,8 @@ def errors_over_time(source: Source, key: str, seen: Probing) -> list[Block]:
     point = ", ".join(fixed(1e3 * float(value), 1) for value in np.atleast_1d(errors.attrs["functional_point"]))
     caption = (
         f"Errors of the tool side relative to the workpiece side at ({point}) mm since the cold cycle, temperatures "
-        "and spindle speed on one time axis. Bands: expanded uncertainty, k = 2 (about 95 %). Means are those since "
-        f"the previous cycle; the spindle stands still for probing.{timeline.events_in_words(done)}"
+        "and spindle speed on one time axis. Bands: expanded uncertainty, k = 2 (about 95 %). Mean speeds are those "
+        f"since the previous cycle; the spindle stands still for probing.{timeline.events_in_words(done)}"
     )
     words = ". ".join(panel.in_words() for panel in panels)
     figure = Figure(timeline.draw(seen.time, panels, key, done), caption, f"Over time: {words}.")
@@ -259,10 +249,9 @@ def _flagged(seen: Probing) -> list[Block]:
         return [Text("The probe flagged no touch.")]
     words = []
     for code in np.unique(seen.flag[seen.flag > 0]):
-        name = FLAGS[code] if code < len(FLAGS) else f"flag {code}"
         where = np.argwhere(seen.flag == code)
         first = f"the first of {seen.balls[where[0, 1]]} in cycle {where[0, 0]}"
-        words.append(f"{name}: {integer(len(where))} ({first})")
+        words.append(f"{flag_text(code)}: {integer(len(where))} ({first})")
     return [Text(f"Flagged by the probe: {'; '.join(words)}.", "warning")]
 
 
@@ -282,7 +271,7 @@ def _normals(seen: Probing, key: str) -> list[Block]:
     for i, name in enumerate(FREEDOMS):
         unit, size = unit_at(i)
         reason = seen.reason(i)
-        apart = _rms((seen.normals[:, i] - seen.values[:, i]) / size) if not seen.by_normals else math.nan
+        difference = _rms((seen.normals[:, i] - seen.values[:, i]) / size) if not seen.by_normals else math.nan
         own = "the result is that of the normals" if seen.by_normals else reason
         last = np.flatnonzero(np.isfinite(seen.normals[:, i]))
         value = (
@@ -295,7 +284,7 @@ def _normals(seen: Probing, key: str) -> list[Block]:
                 name,
                 unit,
                 value,
-                or_dash(significant(apart), own),
+                or_dash(significant(difference), own),
                 *(or_dash(fixed(finite(f, seen.loss[:, i]), 2), reason) for f in (np.median, np.max)),
             ]
         )

@@ -25,16 +25,16 @@ _MOST_BALLS = 8  # panels of residuals
 def balls(seen: Probing, key: str) -> Block:
     """Return the balls in space with their magnified displacement since the cold cycle, coloured by time."""
     cold = _cold(seen)
-    there = np.flatnonzero(np.isfinite(cold).all(axis=1))
+    known = np.flatnonzero(np.isfinite(cold).all(axis=1))
     size = np.where(seen.well_known, np.linalg.norm(seen.displacement, axis=2), np.nan)
-    if not there.size or not np.nan_to_num(size[:, there]).any():
+    if not known.size or not np.nan_to_num(size[:, known]).any():
         return Text("The result contains no displacements of balls.", "note")
-    longest = finite(np.max, size[:, there])
-    span = float(np.linalg.norm(np.ptp(cold[there], axis=0)))
+    longest = finite(np.max, size[:, known])
+    span = float(np.linalg.norm(np.ptp(cold[known], axis=0)))
     factor = enlargement(longest, max(_LONGEST * span, 2 * longest))
-    parts: list[Lines | Dots | Ellipsoids] = [Lines(_table(cold[there]), _FAINT, 0.6)]
-    feet = cold[there] * (1, 1, 0) + (0, 0, _floor(cold[there]))
-    parts.append(Lines(np.stack([cold[there], feet], axis=1), _FAINT, 0.5, dash="2 2"))
+    parts: list[Lines | Dots | Ellipsoids] = [Lines(_table(cold[known]), _FAINT, 0.6)]
+    feet = cold[known] * (1, 1, 0) + (0, 0, _floor(cold[known]))
+    parts.append(Lines(np.stack([cold[known], feet], axis=1), _FAINT, 0.5, dash="2 2"))
     whole, own = _paths(seen, cold, factor)
     for shade, ends in zip(_SHADES, whole, strict=True):
         if len(ends):
@@ -42,23 +42,27 @@ def balls(seen: Probing, key: str) -> Block:
     if len(own):
         parts.append(Lines(own, canvas.VERMILLION, 1.3, dash="3 2"))
     for moved, colour in ((False, _SOFT), (True, canvas.VERMILLION)):
-        picked = [i for i in there if (i in seen.moved_balls) is moved]
+        picked = [i for i in known if (i in seen.moved_balls) is moved]
         if picked:
             names = [seen.balls[i] + (" (moved)" if moved else "") for i in picked]
             parts.append(Dots(cold[picked], colour, 3.4, names))
-    tips = [(_last(seen, int(i)), i) for i in there]
+    tips = [(_last(seen, int(i)), i) for i in known]
     ends = np.array([cold[i] + factor * seen.displacement[k, i] for k, i in tips if k is not None])
     if len(ends):
         parts.append(Dots(ends, canvas.BLACK, 1.6))
     k, i = np.unravel_index(int(np.nanargmax(np.where(np.isfinite(size), size, -1.0))), size.shape)
-    gone = [seen.balls[j] for j in seen.moved_balls]
+    moved_names = [seen.balls[j] for j in seen.moved_balls]
     poor = int((np.isfinite(seen.displacement).all(axis=2) & ~seen.well_known).sum())
     caption = (
         f"Balls on the table in the cold cycle (grey), and their apparent displacements, magnified {integer(factor)} "
-        "times: pale in the first quarter of the record, dark in the last, with a black point at the last known cycle. "
-        f"The largest is {fixed(1e6 * float(size[k, i]), 1)} µm, of {seen.balls[i]}. The displacement of the tool side "
-        "is opposite."
-        + (f" Red, dashed: {listed(gone)}, which moved on the table and was not used afterwards." if gone else "")
+        "times: light in the first quarter of the record, dark in the last, with a black point at the last known "
+        f"cycle. The largest is {fixed(1e6 * float(size[k, i]), 1)} µm, of {seen.balls[i]}. The displacement of the "
+        "tool side is opposite."
+        + (
+            f" Red, dashed: {listed(moved_names)}, which moved on the table and was not used afterwards."
+            if moved_names
+            else ""
+        )
         + (
             f" Not drawn: {integer(poor)} centres that are poorly determined because of missing touches."
             if poor
@@ -182,20 +186,12 @@ def normals(seen: Probing, key: str) -> Block:
     """Return the published construction minus the fit of all touches, and its relative uncertainty, over time."""
     shown = [i for i in range(6) if np.isfinite(seen.normals[:, i]).any() and np.isfinite(seen.loss[:, i]).any()]
     if not shown:
-        return Text(
-            "The result contains no published normals; the reason is stated under data quality.",
-            "note",
-        )
+        return Text("The result contains no published normals; the reason is stated under data quality.", "note")
     panels = []
     if not seen.by_normals:
         for title, first, (unit, size) in (("displacements", 0, UM), ("rotations", 3, SECOND_OF_ARC)):
             lines = [
-                timeline.Line(
-                    FREEDOMS[i],
-                    (seen.normals[:, i] - seen.values[:, i]) / size,
-                    None,
-                    canvas.COLOURS[i % 3],
-                )
+                timeline.Line(FREEDOMS[i], (seen.normals[:, i] - seen.values[:, i]) / size, None, canvas.COLOURS[i % 3])
                 for i in shown
                 if first <= i < first + 3
             ]

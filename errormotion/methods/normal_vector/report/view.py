@@ -16,9 +16,6 @@ from errormotion.report.provenance import read
 USED, MISSING, WRONG, MOVED, UNDETERMINED = range(5)
 """Values of ``left_out``."""
 
-FLAGS = ("", "no trip", "tripped at the start", "repeat differs", "not made")
-"""Meanings of ``touch_flag`` in the raw dataset."""
-
 
 def is_normal_vector(errors: xr.Dataset) -> bool:
     """Return whether a dataset is a result of probing balls over time."""
@@ -51,9 +48,9 @@ class Probing:
     flag : (t, ball, touch) of int, or None
         Flags of the probe; None if unknown.
     normals, normals_u, loss : (t, 6)
-        Published construction: errors, standard uncertainty, and this over that of the fit.
+        Published construction: errors, standard uncertainty, and its ratio to that of the fit.
     noise : float
-        Of a touch, as used.
+        Of a touch, as used in the identification.
     by_touch : bool
         Whether residuals are of touches.
     by_normals : bool
@@ -91,8 +88,8 @@ class Probing:
         worst = np.max(self.centre_u, axis=2) if self.centre_u.size else np.empty(self.displacement.shape[:2])
         known = worst[np.isfinite(worst)]
         limit = LARGEST_UNCERTAINTY * float(np.median(known)) if known.size else np.inf
-        there = np.isfinite(self.displacement).all(axis=2)
-        return np.asarray(there & ~(worst > limit))
+        measured = np.isfinite(self.displacement).all(axis=2)
+        return np.asarray(measured & ~(worst > limit))
 
     @property
     def moved_balls(self) -> list[int]:

@@ -1,6 +1,6 @@
 """Acquisition of a beam detection: the machine steps a sphere through each beam.
 
-Every sample is stored; the rests are found in the record by the identification.
+Every sample is stored; the identification detects the rests in the record.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
     """Yield the record of a sphere that is stepped through every beam, chunk by chunk along ``sample``.
 
-    Sensor and machine need no synchronisation: the rests are found in the record. An interrupted scan is repeated as
-    another attempt. A virtual machine that was restarted repeats the whole detection, and what is recorded already is
-    omitted: the rest is that of a detection without interruption.
+    Sensor and machine need no synchronisation, because the rests are detected in the record. An interrupted scan is
+    repeated as another attempt. A virtual machine that was restarted repeats the whole detection; samples that are
+    recorded already are omitted, and the others are those of a detection without interruption.
     """
     frame = bench.of_kind("spindle_frame")
     if not bench.has_kind("controller"):
         raise MethodError(
-            "A beam detection needs an instrument of kind 'controller' that moves the sphere; the bench has none. Use "
-            "the beams of an earlier detection, or the nominal beams."
+            "A beam detection needs an instrument of kind 'controller' that moves the sphere; the bench has none. Add "
+            "one, or use the beams of an earlier detection or the nominal beams."
         )
     controller = bench.of_kind("controller")
     static = _scan_plan(bench, frame, settings)
@@ -75,8 +75,8 @@ def last_attempts(raw: xr.Dataset) -> dict[int, tuple[int, int]]:
     scan, attempt = raw["scan"].values.astype(np.int64), raw["attempt"].values.astype(np.int64)
     last: dict[int, tuple[int, int]] = {}
     for number in np.unique(scan):
-        tries = attempt[scan == number]
-        last[int(number)] = int(tries.max()), int((tries == tries.max()).sum())
+        attempts = attempt[scan == number]
+        last[int(number)] = int(attempts.max()), int((attempts == attempts.max()).sum())
     return last
 
 
@@ -111,30 +111,30 @@ def _record_scan(
     """Yield ``length`` samples of one channel."""
     name = CHANNELS[channel]
     taken, since = 0, time.monotonic()
-    waiting: list[Array] = []
+    pending: list[Array] = []
 
     def chunk() -> xr.Dataset:
-        record = np.concatenate(waiting)
+        record = np.concatenate(pending)
         found = static.assign(
             record=("sample", record, {"units": "m"}),
             scan=("sample", np.full(record.size, scan, np.int16)),
             attempt=("sample", np.full(record.size, attempt, np.int16)),
         )
         found["record"].encoding = dict(frame.encoding)
-        waiting.clear()
+        pending.clear()
         return found
 
     try:
         for samples in frame.stream([name]):
-            waiting.append(samples.values[0, : length - taken])
-            taken += waiting[-1].size
+            pending.append(samples.values[0, : length - taken])
+            taken += pending[-1].size
             if taken == length or time.monotonic() - since >= CHUNK_DURATION:
                 yield chunk()
                 since = time.monotonic()
             if taken == length:
                 return
     except InstrumentError:
-        if waiting:  # samples before the failure are kept
+        if pending:  # samples before the failure are kept
             yield chunk()
         raise
     raise MethodError(f"Channel {name}: the stream ended at {taken / frame.rate:.1f} s of {length / frame.rate:.1f} s.")

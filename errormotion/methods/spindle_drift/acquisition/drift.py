@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CHUNK_DURATION = 0.4
-"""Longest duration of a chunk, s: a crash loses no more than this."""
+"""Longest duration of a chunk, s; limits the loss of data in a crash."""
 CHUNK_SAMPLES = 1 << 18
 """Largest number of samples of a chunk."""
 POLL_INTERVAL = 2.0
@@ -54,9 +54,9 @@ def record_drift(
         With a ``spindle_frame``; ``controller`` and ``thermometer`` are optional.
     settings : Settings
     beams : Dataset, optional
-        Error dataset of a beam detection; default the nominal beams.
+        Error dataset of a beam detection; by default, the nominal beams are used.
     done : Dataset, optional
-        Data of an interrupted run. On a real machine the time of the interruption is filled with NaN.
+        Data of an interrupted run. On a real machine, the time of the interruption is filled with NaN.
     """
     frame = bench.of_kind("spindle_frame")
     rate = float(frame.rate)
@@ -68,9 +68,9 @@ def record_drift(
     virtual = _start_machine(bench, settings, first / rate)
     pending = _Pending(static, rate, settings, first, thermometer, frame.encoding)
     if done is not None and virtual:
-        pending.go_on(done)
+        pending.resume(done)
     elif done is not None:
-        due = min(_missed(done, rate), total)
+        due = min(_current_sample(done, rate), total)
         while pending.end < due:
             pending.fill_gap(due)
             yield pending.chunk()
@@ -89,7 +89,7 @@ def record_drift(
 
 
 def _start_machine(bench: Bench, settings: Settings, elapsed: float) -> bool:
-    """Mount the bar and start the schedule; return whether the machine is virtual, so that its time can be set."""
+    """Mount the bar and start the schedule; return whether the machine is virtual, with a time that can be set."""
     if not bench.has_kind("controller"):
         speeds = ", ".join(
             f"{e.spindle_speed:g} /min at {e.at:g} s" for e in settings.schedule if e.spindle_speed is not None
@@ -112,10 +112,10 @@ def _start_machine(bench: Bench, settings: Settings, elapsed: float) -> bool:
     return virtual
 
 
-def _missed(done: xr.Dataset, rate: float) -> int:
-    """Return the number of the present sample; the second sample to come where the interruption has no known duration.
+def _current_sample(done: xr.Dataset, rate: float) -> int:
+    """Return the number of the sample at the current time.
 
-    Its single row of NaN separates what was recorded before and after.
+    Where the duration of the interruption is unknown, one sample is skipped: its row of NaN separates the records.
     """
     try:
         seconds = clock.age(done)
@@ -181,7 +181,7 @@ class _Pending:
         self._sensors: list[str] = []
         self._temperature = np.zeros(0, np.float32)
         if self.thermometer is not None:
-            reading = self.thermometer.read()  # for the names, and to detect a missing thermometer before the bar turns
+            reading = self.thermometer.read()  # for the names; a missing thermometer is detected before the bar turns
             self._sensors = [str(name) for name in reading]
 
     @property
@@ -189,10 +189,10 @@ class _Pending:
         """Whether the chunk has its largest duration or size."""
         return self.samples >= CHUNK_SAMPLES or time.monotonic() - self._since >= CHUNK_DURATION
 
-    def go_on(self, done: xr.Dataset) -> None:
+    def resume(self, done: xr.Dataset) -> None:
         """Continue the record of a virtual machine, with its last temperatures until the next reading is due.
 
-        The noise of a simulated thermometer follows from the number of its readings: those so far are repeated.
+        The noise of a simulated thermometer depends on the number of its readings; the previous ones are repeated.
         """
         if "temperature" in done:
             for _ in range(math.ceil(done.sizes["time"] / self.rate / POLL_INTERVAL)):
@@ -202,10 +202,10 @@ class _Pending:
             self._overdue = False
 
     def _poll_is_due(self, size: int) -> bool:
-        """Return whether a multiple of `POLL_INTERVAL` has been reached since the previous block, of equal size."""
+        """Return whether a multiple of `POLL_INTERVAL` was reached since the previous block, of the same size."""
         before = self.end - size if self._before is None else self._before
-        now, then = (math.floor(sample / self.rate / POLL_INTERVAL + 1e-9) for sample in (self.end, before))
-        return self._overdue or now > then
+        now, last = (math.floor(sample / self.rate / POLL_INTERVAL + 1e-9) for sample in (self.end, before))
+        return self._overdue or now > last
 
     def add(self, block: Samples, total: int) -> None:
         """Add a block of samples, up to ``total`` samples of the record."""
@@ -234,7 +234,7 @@ class _Pending:
         self.samples += values.shape[1]
 
     def _poll(self) -> None:
-        """Read the temperatures; a failure is counted and gives NaN, and does not abort the record."""
+        """Read the temperatures; a failure is counted, results in NaN, and does not abort the record."""
         self._overdue = False
         try:
             reading = self.thermometer.read()

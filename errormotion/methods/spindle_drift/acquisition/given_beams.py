@@ -13,19 +13,19 @@ from errormotion.methods.spindle_drift.schema import CHANNELS
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-WHOLE = "beams"
-"""Name of an input that holds all beams."""
+ALL_BEAMS = "beams"
+"""Name of an input that contains all beams."""
 REQUIRED = ("beam_origin", "beam_direction", "beam_covariance")
 
 
 def given_beams(inputs: Mapping[str, xr.Dataset]) -> xr.Dataset | None:
-    """Return origin, direction and covariance of the beams over ``beam`` (X1 X2 Y1 Y2 Z), None without inputs.
+    """Return origin, direction and covariance of the beams over ``beam`` (X1 X2 Y1 Y2 Z); None without inputs.
 
     Parameters
     ----------
     inputs : mapping of str to Dataset
-        Error datasets of component ``beam``: ``beams`` holds all five; X1, X2, Y1, Y2, Z hold one each, under any name,
-        and take precedence over ``beams``.
+        Error datasets of component ``beam``: ``beams`` contains all five; X1, X2, Y1, Y2 and Z contain one each, under
+        any name, and take precedence over ``beams``.
 
     Raises
     ------
@@ -33,10 +33,11 @@ def given_beams(inputs: Mapping[str, xr.Dataset]) -> xr.Dataset | None:
         An input of another name, several beams where one is expected, a channel without a beam, or a beam without a
         known zero point.
     """
-    unknown = sorted(set(inputs) - {WHOLE, *CHANNELS})
+    unknown = sorted(set(inputs) - {ALL_BEAMS, *CHANNELS})
     if unknown:
         raise MethodError(
-            f"inputs: expected '{WHOLE}' or the names of channels ({', '.join(CHANNELS)}); found {', '.join(unknown)}"
+            f"inputs: expected '{ALL_BEAMS}' or the names of channels ({', '.join(CHANNELS)}); "
+            f"found {', '.join(unknown)}"
         )
     if not inputs:
         return None
@@ -44,18 +45,18 @@ def given_beams(inputs: Mapping[str, xr.Dataset]) -> xr.Dataset | None:
     frames = {str(part.attrs.get("frame", "machine")) for part in inputs.values()}
     if len(frames) > 1:
         raise MethodError(
-            f"The beams are stated in several frames ({', '.join(sorted(frames))}); expected one. State them in one, "
-            "with ds.em.in_frame."
+            f"The beams are stated in several frames ({', '.join(sorted(frames))}); expected one. Convert them to one "
+            "frame with ds.em.in_frame."
         )
     return xr.concat(found, dim="beam", join="override", combine_attrs="override").assign_coords(beam=list(CHANNELS))
 
 
 def _beam(inputs: Mapping[str, xr.Dataset], channel: str) -> xr.Dataset:
-    key = channel if channel in inputs else WHOLE
+    key = channel if channel in inputs else ALL_BEAMS
     if key not in inputs:
         raise MethodError(
             f"inputs: no beam for {channel}; found {', '.join(inputs)}. Expected one for each of "
-            f"{', '.join(CHANNELS)}, or all of them as '{WHOLE}'."
+            f"{', '.join(CHANNELS)}, or all of them as '{ALL_BEAMS}'."
         )
     ds = inputs[key]
     missing = [name for name in REQUIRED if name not in ds.variables]
@@ -63,10 +64,10 @@ def _beam(inputs: Mapping[str, xr.Dataset], channel: str) -> xr.Dataset:
         raise MethodError(
             f"inputs: '{key}' is not the result of a beam detection or beam direction; missing: {', '.join(missing)}"
         )
-    if key == WHOLE:
+    if key == ALL_BEAMS:
         if channel not in ds["beam"].values:
             names = ", ".join(str(name) for name in ds["beam"].values)
-            raise MethodError(f"inputs: '{key}' holds the beams {names}; expected {channel} as well")
+            raise MethodError(f"inputs: '{key}' contains the beams {names}; expected {channel} as well")
         one = ds[list(REQUIRED)].sel(beam=[channel])
     else:
         if ds.sizes.get("beam") != 1:

@@ -24,8 +24,8 @@ _ARCSEC = np.degrees(1.0) * 3600.0
 class LiveDrift:
     """Errors of a drift record while it is acquired, in constant memory.
 
-    For the operator: without uncertainty, and not corrected for the expansion of the frame. The result is identified
-    from the whole record afterwards.
+    For display: without uncertainty, and not corrected for the expansion of the frame. The result is identified from
+    the whole record afterwards.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -61,7 +61,7 @@ class LiveDrift:
         self.errors = twist(state(mean[:, -1:]), self._reference, self._reference.E[0])[0]
 
     def text(self) -> str:
-        """Return the last errors in the units of the field; empty before the first errors."""
+        """Return the last errors in um and arcsec; an empty text before the first errors."""
         if not np.isfinite(self.errors[:5]).all():
             return ""
         x, y, z = self.errors[:3] * 1e6

@@ -51,7 +51,7 @@ def _scans(settings: Settings, instruments: Mapping[str, Any]) -> list[Step]:
             "direction); without them the positions of the sphere are unknown"
         )
     unit = np.array([direction[name] for name in CHANNELS], np.float64)
-    stands = np.array(getattr(frame, "machine_position", (0.0, 0.0, 0.0)), np.float64)
+    frame_position = np.array(getattr(frame, "machine_position", (0.0, 0.0, 0.0)), np.float64)
     centres, _ = sphere_centres(
         settings,
         np.array([origin[name] for name in CHANNELS], np.float64),
@@ -59,7 +59,7 @@ def _scans(settings: Settings, instruments: Mapping[str, Any]) -> list[Step]:
     )
     return [
         Step("move", (float(x), float(y), float(z)), math.nan, settings.dwell)
-        for x, y, z in (stands + centres).reshape(-1, 3)
+        for x, y, z in (frame_position + centres).reshape(-1, 3)
     ]
 
 
@@ -67,13 +67,13 @@ def sphere_centres(settings: Settings, origin: Array, direction: Array) -> tuple
     """Return the centres of the sphere (channel, profile, step, 3), m, and the directions of the scans (.., 3)."""
     offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
     scans = np.array([[v for _ in settings.depths for v in machine_axes(u)] for u in direction])
-    ahead = np.repeat(settings.depths, 2) + settings.sphere_radius
-    middle = origin[:, None] + ahead[:, None] * direction[:, None]
+    distance = np.repeat(settings.depths, 2) + settings.sphere_radius
+    middle = origin[:, None] + distance[:, None] * direction[:, None]
     return middle[:, :, None] + offsets[:, None] * scans[:, :, None], scans
 
 
 def machine_axes(direction: Array) -> Array:
-    """Return the two machine axes across a beam; for a beam oblique to all axes, two vectors across it."""
+    """Return the two machine axes perpendicular to a beam; for a beam oblique to all axes, two such vectors."""
     axis = int(np.argmax(np.abs(direction)))
     if abs(direction[axis]) < 0.9:
         return across(direction)

@@ -1,4 +1,4 @@
-"""Logs of a drift: columns of text become a raw dataset."""
+"""Conversion of logs of a drift, columns of text, to a raw dataset."""
 
 from __future__ import annotations
 
@@ -31,12 +31,7 @@ _DRIFT = RAW_SCHEMAS[0]
 _ORIGIN = float(Settings.model_fields["nominal_origin_uncertainty"].default)
 _DIRECTION = float(Settings.model_fields["nominal_direction_uncertainty"].default)
 _ROWS = {row.name: row for row in _DRIFT.rows}
-_VARIABLE = {
-    "time": "time",
-    "channels": "distance",
-    "temperatures": "temperature",
-    "spindle_speed": "spindle_speed",
-}
+_VARIABLE = {"time": "time", "channels": "distance", "temperatures": "temperature", "spindle_speed": "spindle_speed"}
 
 
 def read_log(log: Path, map_file: Path) -> xr.Dataset:
@@ -47,7 +42,7 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     Raises
     ------
     DatasetError
-        The map or the log is wrong; all mistakes are reported together, each with its line.
+        The map or the log is invalid; all mistakes are reported together, each with its line.
     """
     settings = load_model(map_file, ImportMap, error=DatasetError)
     mistakes = Mistakes(log)

@@ -27,11 +27,11 @@ from errormotion.report.drawings.series import (
 )
 from errormotion.report.text import UM, finite, fixed, integer, listed, minutes
 
-_AT_ONCE, _AROUND = 1 / 60, 10 / 60  # min: what is left out about a switched compensation, and what is averaged
+_OMITTED, _AVERAGED = 1 / 60, 10 / 60  # interval before and after a switched compensation, min
 
 
 def part(source: Source, key: str) -> Part:
-    """Return the chapter of one spindle drift dataset; ``key`` keeps its figures' identifiers apart."""
+    """Return the chapter of one spindle drift dataset; ``key`` distinguishes the identifiers of its figures."""
     errors = source.errors
     return Part(
         "Thermal drift of the spindle",
@@ -81,7 +81,7 @@ def _summary(source: Source) -> list[str]:
     time, found, stop = minutes_of(errors), curves(errors), end_of_running(errors)
     if time.size < 2:
         return ["The record contains fewer than two instants: no drift can be reported."]
-    words = [_what_was_done(errors)]
+    words = [_procedure(errors)]
     by_size = sorted(
         (name for name in ("X1", "X2", "Y1", "Y2", "Z") if np.isfinite(found[name].values).any()),
         key=lambda name: -float(np.nanmax(np.abs(found[name].values))),
@@ -90,7 +90,7 @@ def _summary(source: Source) -> list[str]:
         words += _largest(errors, found[by_size[0]], by_size[0])
     words += _changes(errors, events(source))
     words += _first_hour(errors)
-    words += _still_moving(errors, by_size, events(source))
+    words += _course(errors, by_size, events(source))
     place = stop if stop is not None else time.size - 1
     largest = budget.largest(errors.isel(time=place), "EZ")
     if largest:
@@ -109,7 +109,7 @@ def _summary(source: Source) -> list[str]:
     return words
 
 
-def _what_was_done(errors: xr.Dataset) -> str:
+def _procedure(errors: xr.Dataset) -> str:
     time, stop = minutes_of(errors), end_of_running(errors)
     length = f"The record is {fixed(time[-1] - time[0], 1)} min long"
     if stop is None:
@@ -144,12 +144,12 @@ def _changes(errors: xr.Dataset, done: Sequence[Event]) -> list[str]:
         for axis in event.axes:
             freedom = f"E{axis}"
             known = np.isfinite(errors[freedom].values)
-            before = np.flatnonzero(known & (time < event.minute - _AT_ONCE))
-            after = np.flatnonzero(known & (time > event.minute + _AT_ONCE))
+            before = np.flatnonzero(known & (time < event.minute - _OMITTED))
+            after = np.flatnonzero(known & (time > event.minute + _OMITTED))
             if not (before.size and after.size):
                 continue
-            before = before[(time[before] >= event.minute - _AROUND) | (before == before[-1])]
-            after = after[(time[after] <= event.minute + _AROUND) | (after == after[0])]
+            before = before[(time[before] >= event.minute - _AVERAGED) | (before == before[-1])]
+            after = after[(time[after] <= event.minute + _AVERAGED) | (after == after[0])]
             near = errors.isel(time=np.concatenate([before, after]))
             weights = np.repeat([0.0, 1.0], [before.size, after.size]) / after.size
             mean_before = np.repeat([1.0, 0.0], [before.size, after.size]) / before.size
@@ -183,18 +183,18 @@ def _first_hour(errors: xr.Dataset) -> list[str]:
     return [f"Largest ranges within the first 60 min: {listed(ranges)}."] if ranges else []
 
 
-def _still_moving(errors: xr.Dataset, by_size: list[str], done: Sequence[Event]) -> list[str]:
+def _course(errors: xr.Dataset, by_size: list[str], done: Sequence[Event]) -> list[str]:
     if not by_size:
         return []
     name = by_size[0]
     slope, slope_u = iso230_3.value_of(errors, name, "end_slope")
     constant, _ = iso230_3.value_of(errors, name, "time_constant")
     words = []
-    if np.isfinite(slope) and not iso230_3.holds_step(errors, name, "end_slope", done):
+    if np.isfinite(slope) and not iso230_3.contains_step(errors, name, "end_slope", done):
         cell = iso230_3.cell(errors, name, "end_slope")
-        verdict = "still drifting" if abs(slope) > 2 * slope_u else "steady within the uncertainty"
+        state = "still drifting" if abs(slope) > 2 * slope_u else "steady within the uncertainty"
         words.append(
-            f"{_when(errors).capitalize()} d({name}) is {verdict}: {_with_uncertainty(cell)} {unit_of(name)[0]}/h."
+            f"{_when(errors).capitalize()} d({name}) is {state}: {_with_uncertainty(cell)} {unit_of(name)[0]}/h."
         )
     if np.isfinite(constant):
         cell = iso230_3.cell(errors, name, "time_constant")
@@ -285,9 +285,9 @@ def _uncertainty(errors: xr.Dataset) -> list[Block]:
         budget.twist_table(errors, places, iso_names("spindle")),
         budget.table(errors.isel(time=place), f"{_when(errors)} ({fixed(time[place], 1)} min)"),
         Text(
-            f"Functional point ({point}) mm in the frame '{errors.attrs.get('frame', 'not stated')}'. Sources that act "
-            "on many instants at once are common to all of them; differences between instants take their covariance "
-            "into account, so that the uncertainty of a difference may be smaller than that of either value. "
+            f"Functional point ({point}) mm in the frame '{errors.attrs.get('frame', 'not stated')}'. Sources that "
+            "affect many instants are common to all of them; differences between instants take their covariance into "
+            "account, so that the uncertainty of a difference may be smaller than that of either value. "
             "The budget covers only the listed sources.",
             "note",
         ),

@@ -29,11 +29,11 @@ def overview(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | No
         return None
     svg = _stack(errors, [found], ["µm"], done, key, titles=["Displacement"], height=1.6)
     caption = f"All displacements in one scale.{events_in_words(done)}"
-    return Figure(svg, caption, _in_words("All displacements over time", [found], minutes_of(errors)))
+    return Figure(svg, caption, _alt_text("All displacements over time", [found], minutes_of(errors)))
 
 
 def displacements(errors: xr.Dataset, done: Sequence[Event], key: str, limits: Limits) -> Figure | None:
-    """Return the displacement curves with their bands: X, Y and Z above one another; None where all are unknown."""
+    """Return the displacement curves with their bands in panels for X, Y and Z; None where all are unknown."""
     found = curves(errors)
     rows = [[found[name] for name in names] for names in (("X1", "X2"), ("Y1", "Y2"), ("Z",))]
     rows = [row for row in rows if any(np.isfinite(curve.values).any() for curve in row)]
@@ -43,10 +43,10 @@ def displacements(errors: xr.Dataset, done: Sequence[Event], key: str, limits: L
     titles = [f"Displacement in {row[0].name[0]}" for row in rows]
     svg = _stack(errors, rows, labels, done, key, speed=True, titles=titles, limits=limits)
     caption = (
-        "Displacement of the spindle side relative to the workpiece side, against the reference state. L1 and L2 are "
-        "the two levels of measurement. Bands: expanded uncertainty, k = 2."
+        "Displacement of the spindle side relative to the workpiece side since the reference state. L1 and L2 are the "
+        "two levels of measurement. Bands: expanded uncertainty, k = 2."
     )
-    return Figure(svg, caption + events_in_words(done), _in_words("Displacement over time", rows, minutes_of(errors)))
+    return Figure(svg, caption + events_in_words(done), _alt_text("Displacement over time", rows, minutes_of(errors)))
 
 
 def tilts(errors: xr.Dataset, done: Sequence[Event], key: str, limits: Limits) -> Figure | None:
@@ -61,7 +61,7 @@ def tilts(errors: xr.Dataset, done: Sequence[Event], key: str, limits: Limits) -
         "Tilt of the spindle axis about X (A, inclination in the YZ plane) and about Y (B, inclination in the XZ "
         "plane), right-handed. Bands: expanded uncertainty, k = 2."
     )
-    return Figure(svg, caption, _in_words("Tilt over time", rows, minutes_of(errors)))
+    return Figure(svg, caption, _alt_text("Tilt over time", rows, minutes_of(errors)))
 
 
 def temperatures(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | None:
@@ -79,9 +79,9 @@ def temperatures(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure 
 
     def paint(figure: Canvas) -> None:
         axes = canvas.stack(figure, [2.0], right)[0]
-        for place, i in enumerate(known):
-            colour = canvas.COLOURS[place % len(canvas.COLOURS)]
-            dash = DASHES[place // len(canvas.COLOURS) % len(DASHES)]
+        for number, i in enumerate(known):
+            colour = canvas.COLOURS[number % len(canvas.COLOURS)]
+            dash = DASHES[number // len(canvas.COLOURS) % len(DASHES)]
             canvas.curve(axes, time, values[:, i], colour=colour, dash=dash, name=names[i])
         handles = list(axes.get_lines())
         axes.legend(handles, [" " + names[i] for i in known], loc="center left", bbox_to_anchor=(1.01, 0.5))
@@ -104,10 +104,7 @@ def temperatures(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure 
 
 
 def channels(errors: xr.Dataset, name: str, title: str, caption: str, key: str) -> Figure | None:
-    """Return one panel a sensor channel of a variable (channel, time) in micrometres, lowest and highest kept.
-
-    The median of each channel is taken off where the variable is a reading and not a residual.
-    """
+    """Return one panel for each sensor channel of a variable (channel, time), in micrometres; None where unknown."""
     if name not in errors:
         return None
     values = errors[name].transpose("channel", "time").values / UM[1]
@@ -219,7 +216,7 @@ def _time_axis(axes: Axes, time: np.ndarray) -> None:
         axes.set_xlim(time[0], time[-1])
 
 
-def _in_words(what: str, rows: list[list[Curve]], time: np.ndarray) -> str:
+def _alt_text(what: str, rows: list[list[Curve]], time: np.ndarray) -> str:
     """Return a text alternative of the curves: extremes and last value of each."""
     words = []
     for line in (line for row in rows for line in row):

@@ -13,10 +13,9 @@ from errormotion.report.document import Cell, Table, estimate
 from errormotion.report.drawings.series import QUANTITIES, Event, curves, end_of_running, minutes_of, unit_of
 from errormotion.report.text import fixed
 
-#: Factor from a measure to its field unit, beyond the field unit of the quantity, and that unit's suffix.
 _STEP = "includes the step of a compensation that was switched in this interval"
-_SLOPE_SPAN = 10.0  # min before the end of running, over which an end slope is taken
-_RATES = {"end_slope": (3600.0, "/h"), "per_kelvin": (1.0, "/K")}
+_SLOPE_INTERVAL = 10.0  # before the end of running, for the end slope, min
+_PER_HOUR = 3600.0
 
 
 def value_of(errors: xr.Dataset, quantity: str, measure: str) -> tuple[float, float]:
@@ -26,37 +25,39 @@ def value_of(errors: xr.Dataset, quantity: str, measure: str) -> tuple[float, fl
     table = errors["iso_value"]
     if quantity not in table["quantity"].values or measure not in table["measure"].values:
         return math.nan, math.nan
-    place = {"quantity": quantity, "measure": measure}
-    value = float(table.sel(place))
-    uncertainty = float(errors["iso_uncertainty"].sel(place)) if "iso_uncertainty" in errors else math.nan
+    selected = {"quantity": quantity, "measure": measure}
+    value = float(table.sel(selected))
+    uncertainty = float(errors["iso_uncertainty"].sel(selected)) if "iso_uncertainty" in errors else math.nan
     return value, uncertainty
 
 
 def cell(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event] = ()) -> Cell:
-    """Return one value in field units with its expanded uncertainty, or a dash and the reason.
+    """Return one value in the units of the report with its expanded uncertainty, or a dash with the reason.
 
-    A value over an interval in which the quantity's compensation was switched carries that as its footnote.
+    A footnote states that the quantity's compensation was switched in the interval of the value.
     """
     value, uncertainty = value_of(errors, quantity, measure)
-    size = 60.0 if measure == "time_constant" else unit_of(quantity)[1] / _RATES.get(measure, (1.0, ""))[0]
+    size = 60.0 if measure == "time_constant" else unit_of(quantity)[1]
+    if measure == "end_slope":
+        size /= _PER_HOUR
     made = estimate(
         value / size,
         2 * uncertainty / size,
         reason=why_not(errors, quantity, measure),
         signed=not measure.startswith(("range", "time")),
     )
-    if math.isfinite(value) and holds_step(errors, quantity, measure, done):
+    if math.isfinite(value) and contains_step(errors, quantity, measure, done):
         return replace(made, reason=_STEP)
     return made
 
 
-def holds_step(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event]) -> bool:
-    """Return whether the quantity's compensation was switched within the interval that a measure is taken over."""
+def contains_step(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event]) -> bool:
+    """Return whether the quantity's compensation was switched within the interval of a measure."""
     time, stop = minutes_of(errors), end_of_running(errors)
     if not (time.size and done):
         return False
     running = time[stop] if stop is not None else time[-1]
-    start = running - _SLOPE_SPAN if measure == "end_slope" else time[0]
+    start = running - _SLOPE_INTERVAL if measure == "end_slope" else time[0]
     end = time[0] + 60 if measure.endswith("60min") else time[-1] if measure.endswith("total") else running
     return any(start < event.minute <= end and quantity[0] in event.axes for event in done)
 

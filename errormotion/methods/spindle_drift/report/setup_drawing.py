@@ -1,4 +1,4 @@
-"""The set-up as a drawing: the bar, its levels and the five beams on it, and where the bar went."""
+"""Drawing of the set-up: the bar with its levels and the five beams, and the displaced bar at the end of running."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _TAIL = 7e-3  # length of a beam drawn behind its origin, m
 
 @dataclass(frozen=True)
 class Setup:
-    """Beams and bar in machine coordinates, m; ``hit`` is where each beam meets the bar in the reference state."""
+    """Beams and bar in machine coordinates, m; ``hit`` is the point of each beam on the bar in the reference state."""
 
     names: list[str]
     origin: np.ndarray
@@ -45,9 +45,9 @@ class Setup:
         cross = np.cross(self.direction, self.axis_direction)
         size = np.linalg.norm(cross, axis=1)
         to_beam = self.hit - self.axis_point
-        apart = np.abs((to_beam * cross).sum(axis=1)) / np.where(size > 0.3, size, 1.0)
+        lateral = np.abs((to_beam * cross).sum(axis=1)) / np.where(size > 0.3, size, 1.0)
         radial = np.linalg.norm(to_beam - np.outer(to_beam @ self.axis_direction, self.axis_direction), axis=1)
-        offset: np.ndarray = np.where(size > 0.3, apart, radial)
+        offset: np.ndarray = np.where(size > 0.3, lateral, radial)
         return offset
 
 
@@ -95,7 +95,7 @@ def _levels(errors: xr.Dataset) -> np.ndarray:
 
 
 def figure(errors: xr.Dataset, key: str) -> Figure | None:
-    """Return the drawing in three views, to scale, the drift exaggerated; None where the geometry is not known."""
+    """Return the drawing in three views, to scale, with the drift enlarged; None where the geometry is not known."""
     setup = setup_of(errors)
     if setup is None:
         return None
@@ -163,7 +163,7 @@ def table(errors: xr.Dataset) -> Table | None:
 
 
 def _limits(setup: Setup, i: int) -> tuple[float, float]:
-    """Return what is shown along one machine axis, m: bar, beams, and room for their names."""
+    """Return the limits of the drawing along one machine axis, m: bar, beams, and room for their names."""
     tails = setup.origin[:, i] - _TAIL * setup.direction[:, i]
     bar = np.array(_ends(setup)) if i == setup.along else setup.axis_point[i] + setup.radius * np.array([-1.0, 1.0])
     room = 2e-3 if i == setup.along else 6e-3
@@ -171,7 +171,7 @@ def _limits(setup: Setup, i: int) -> tuple[float, float]:
 
 
 def _ends(setup: Setup) -> tuple[float, float]:
-    """Lowest and highest position of the drawn bar along its main axis."""
+    """Return the lowest and the highest position of the drawn bar along its main axis, m."""
     k = setup.along
     parallel = np.flatnonzero(np.abs(setup.direction[:, k]) > 0.7)
     heights = np.concatenate([setup.levels, setup.hit[:, k]])
@@ -190,7 +190,7 @@ def _axis_at(setup: Setup, height: float | np.ndarray) -> np.ndarray:
 
 
 def _moved(errors: xr.Dataset, setup: Setup) -> np.ndarray | None:
-    """Displacement (2, 3) of the axis at the two levels at the end of running; None where it is not known."""
+    """Return the displacement (2, 3) of the axis at the two levels at the end of running, m; None where unknown."""
     if setup.levels.size != 2 or setup.along != 2:
         return None
     found, stop = curves(errors), end_of_running(errors)
@@ -203,7 +203,7 @@ def _moved(errors: xr.Dataset, setup: Setup) -> np.ndarray | None:
 
 
 def _exaggeration(moved: np.ndarray | None) -> int:
-    """1, 2 or 5 times a power of ten that draws the largest displacement at most 4 mm long; 0 where there is none."""
+    """Return 1, 2 or 5 times a power of ten that enlarges the largest displacement to at most 4 mm; 0 without one."""
     if moved is None:
         return 0
     wanted = 4e-3 / np.abs(moved).max()
@@ -273,14 +273,14 @@ def _moved_bar(
     l1, l2 = setup.levels
     share = ((heights - l1) / (l2 - l1))[:, None]
     shift = factor * (moved[0] + share * (moved[1] - moved[0]))
-    place = 1e3 * (_axis_at(setup, heights) + shift)[:, list(view)]
+    ends_drawn = 1e3 * (_axis_at(setup, heights) + shift)[:, list(view)]
     across = 1e3 * np.array([setup.radius, 0.0])
-    outline = np.array([place[1] - across, place[0] - across, place[0] + across, place[1] + across])
+    outline = np.array([ends_drawn[1] - across, ends_drawn[0] - across, ends_drawn[0] + across, ends_drawn[1] + across])
     axes.plot(*outline.T, color="#222222", linewidth=0.8, linestyle=(0, (4, 2)))
 
 
 def _beam(axes: Axes, setup: Setup, view: tuple[int, int], i: int, name: str, aside: float) -> None:
-    """Draw one beam; ``aside`` moves its name across the beam, in points."""
+    """Draw one beam; ``aside`` is the displacement of its name perpendicular to the beam, in points."""
     plane = list(view)
     colour = LOOK.get(name, (canvas.BLACK, None))[0]
     origin, hit = 1e3 * setup.origin[i][plane], 1e3 * setup.hit[i][plane]

@@ -1,14 +1,14 @@
 """Pose of the profiler in the tool frame, from scans of a level plate with a circular pocket of known position.
 
-A point (x, 0, z) of a line is, in the tool frame at its position over the pocket, H (x, 0, z) + s, with s how far the
-carriage is from there and H = T(dx, dy, dz) R_X(a) R_Y(b) R_Z(g). The rim obeys
+A point (x, 0, z) of a line is at H (x, 0, z) + s in the tool frame at its position over the pocket, with s the
+displacement of the carriage from there and H = T(dx, dy, dz) R_X(a) R_Y(b) R_Z(g). The rim satisfies
 
     (X - X0)^2 + (Y - Y0)^2 = r^2,   Z = Z0,
 
-and the plate gives the tilt dz/dx. The feed s is along Y of the machine, not of the profiler: this determines g,
-since the circle is sheared in (x, s) and not turned. A turned circle (s put in the profiler's frame, as eq. (7) of Zhao
-et al. has it) would still be a circle and would not separate g from the position of its centre. For the same reason
-a is determined only when the plate is seen at two heights.
+and the plate provides the tilt dz/dx. The feed s is along Y of the machine, not of the profiler. This determines g: the
+circle is sheared in (x, s), not rotated. With s in the profiler's frame, as in eq. (7) of Zhao et al., it would be a
+rotated circle, from which g cannot be separated from the position of the centre. For the same reason, a is determined
+only when the plate is scanned at two heights.
 """
 
 from __future__ import annotations
@@ -31,14 +31,13 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose.edges impor
 #: a, b, g (rad), dx, dy, dz (m)
 PARAMETERS = ("a", "b", "g", "dx", "dy", "dz")
 _FEWEST_LINES = 10
-#: least |cos| of the angle at which a line crosses the rim, seen from the centre
+#: Smallest accepted |cos| of the angle of an edge point, seen from the centre: other lines cross the rim too obliquely.
 OBLIQUE = 0.35
-#: half differences and half sums of the edges' radii beyond this many standard deviations are left out. Edges scatter
-#: with long tails, as points at the rim are lost or not: a tighter limit cuts into them and makes the covariance too
-#: small
+#: Half differences and half sums of the edges' radii beyond this many standard deviations are excluded. The scatter of
+#: edges has long tails, because single points at the rim may be lost; a tighter limit makes the covariance too small.
 CLIP = 10.0
-#: a standard uncertainty beyond which a parameter counts as not determined: rad, m
-WORST_ANGLE, WORST_PLACE = 0.05, 2e-3
+#: Standard uncertainty beyond which a parameter is not determined: rad, m.
+WORST_ANGLE, WORST_POSITION = 0.05, 2e-3
 
 _UNIT = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 1e-5])
 
@@ -55,7 +54,7 @@ def parameters(H: RigidTransform) -> Array:
 
 @dataclass(frozen=True)
 class Pocket:
-    """A circular pocket whose position in the tool frame is known, because the machine has cut it.
+    """A circular pocket whose position in the tool frame is known, because the machine itself has cut it.
 
     Attributes
     ----------
@@ -75,20 +74,20 @@ class Pocket:
 
 @dataclass(frozen=True)
 class ProfilerPose:
-    """Where the profiler is in the tool frame.
+    """Pose of the profiler in the tool frame.
 
     Attributes
     ----------
     values : ndarray, (6,)
         (a, b, g, dx, dy, dz), rad and m.
     covariance : ndarray, (6, 6)
-        Of these.
+        Of ``values``.
     radius : float
-        Of the pocket, as fitted, m.
+        Fitted radius of the pocket, m.
     residual_x, residual_y : float
         Scatter of one edge along the profile, and of one line along the feed, m.
     lines : int
-        Lines used.
+        Number of lines used.
     """
 
     values: Array
@@ -111,12 +110,7 @@ class ProfilerPose:
 
 
 def calibrate(
-    x: ArrayLike,
-    height: ArrayLike,
-    stage: ArrayLike,
-    pocket: Pocket,
-    *,
-    angle_prior: float | None = None,
+    x: ArrayLike, height: ArrayLike, stage: ArrayLike, pocket: Pocket, *, angle_prior: float | None = None
 ) -> ProfilerPose:
     """Return the pose of the profiler from scans of a pocket.
 
@@ -125,29 +119,28 @@ def calibrate(
     x : (point,)
         Positions along the profile, m.
     height : (scan, line, point)
-        m; NaN = no reading. One scan leaves ``a`` open unless there is a prior; two at heights apart determine it.
+        m; NaN = no reading. One scan does not determine ``a`` without a prior; two scans at different heights do.
     stage : (scan, line, 3)
-        Where the tool frame is at each line, off its position over the pocket, m, in machine directions; one height per
-        scan.
+        Displacement of the tool frame at each line from its position over the pocket, m, in machine directions; one
+        height per scan.
     pocket : Pocket
-        What is scanned.
     angle_prior : float, optional
         Standard uncertainty of the angles a, b, g about 0 when the profiler was set up, rad.
 
     Raises
     ------
     MethodError
-        Shapes that do not fit, no pocket to be seen, or parameters that the scans do not determine, by name.
+        Shapes that do not match, no pocket in the scans, or parameters that the scans do not determine.
     """
     points, z, s = (np.asarray(value, dtype=float) for value in (x, height, stage))
     if z.ndim != 3 or points.shape != z.shape[2:] or s.shape != (*z.shape[:2], 3):
         raise MethodError(
-            "The calibration needs x (point), height (scan, line, point) and stage (scan, line, 3); found "
+            "Expected x (point), height (scan, line, point) and stage (scan, line, 3); found "
             f"{points.shape}, {z.shape} and {s.shape}."
         )
     if np.ptp(s[..., 2], axis=1).max() > 1e-6:
         raise MethodError(
-            "Each scan of the pocket needs one height of the spindle; the stage's Z changes within a scan."
+            "Expected one height of the spindle for each scan of the pocket; Z of the stage changes within a scan."
         )
     fit = _Fit([_scan(points, *pair) for pair in zip(z, s, strict=True)], pocket, angle_prior)
     return fit.solve()
@@ -168,24 +161,24 @@ def calibrate_dataset(raw: xr.Dataset, *, angle_prior: float | None = None) -> P
     DatasetError
         The dataset breaks its schema.
     MethodError
-        It holds no scans of a pocket, or as in `calibrate`.
+        It contains no scans of a pocket, or as in `calibrate`.
     """
     validate(raw)
     if "pocket_radius" not in raw:
         raise MethodError(
-            "The calibration needs scans of a pocket (a raw dataset of crossbeam_scan with pocket_radius); found "
+            "Expected scans of a pocket (a raw dataset of crossbeam_scan with pocket_radius); found "
             f"{raw.attrs['schema']} with {', '.join(map(str, raw.data_vars))}."
         )
     names = ("radius", "radius_uncertainty", "centre", "centre_uncertainty")
     known: dict[str, Any] = {name: raw[f"pocket_{name}"].values for name in names if f"pocket_{name}" in raw}
-    place = ("scan", "profile")
-    height, stage = raw.height.transpose(*place, "point"), raw.stage.transpose(*place, "direction")
+    line = ("scan", "profile")
+    height, stage = raw.height.transpose(*line, "point"), raw.stage.transpose(*line, "direction")
     return calibrate(raw.x.values, height.values, stage.values, Pocket(**known), angle_prior=angle_prior)
 
 
 @dataclass(frozen=True)
 class _Scan:
-    """What the fit takes of one scan: edges (n, 2, 3) in the profiler's frame, and the plate."""
+    """Input of the fit from one scan: edges (n, 2, 3) in the profiler's frame, and the plate."""
 
     edges: Array
     stage: Array  # (n, 3) of the lines of the edges
@@ -197,7 +190,7 @@ class _Scan:
 def _scan(x: Array, height: Array, stage: Array) -> _Scan:
     plate, rim = edges.pocket(x, height)
     heights = plate.height[np.isfinite(plate.height)]
-    # the carriage goes straight and the plate is level: all lines see the rim at one height, best known by their mean
+    # The carriage moves straight and the plate is level: the height of the rim is the mean over all lines.
     z = heights.mean() + plate.slope * rim.x
     positions = np.stack([rim.x, np.zeros_like(z), z], axis=-1)
     return _Scan(positions, stage[rim.line], heights, float(stage[0, 2]), plate)
@@ -206,7 +199,7 @@ def _scan(x: Array, height: Array, stage: Array) -> _Scan:
 class _Fit:
     """Least squares over half sums and half differences of the radii of both edges of a line, the plate and the priors.
 
-    Jitter of a line along the feed moves both its edges together: only the half sum has it.
+    Jitter of a line along the feed moves both its edges equally: it affects the half sum only.
     """
 
     def __init__(self, scans: Sequence[_Scan], pocket: Pocket, angle_prior: float | None) -> None:
@@ -246,7 +239,7 @@ class _Fit:
         return R.mean(axis=1) - p[6], (R[:, 1] - R[:, 0]) / 2, cos, sin
 
     def _residuals(self, scaled: Array, used: NDArray[np.bool_]) -> Array:
-        """Return everything over its standard deviation."""
+        """Return all residuals divided by their standard deviations."""
         p = scaled * _UNIT
         half_sum, half_difference, cos, sin = self._rim(p)
         size = cos * self.size_x / np.sqrt(2)
@@ -265,7 +258,7 @@ class _Fit:
         return np.concatenate(rows)
 
     def _weigh(self, p: Array, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Estimate both scatters from the residuals; return the lines that fit."""
+        """Estimate both scatters from the residuals; return the lines within `CLIP`."""
         half_sum, half_difference, cos, sin = self._rim(p)
         right = np.sqrt(2) * half_difference / cos
         rough = max(NORMAL_MAD * float(np.median(np.abs(right[used]))), 1e-9)
@@ -279,10 +272,10 @@ class _Fit:
         return np.asarray(fits)
 
     def _covariance(self, J: Array, misses: Array, edges_end: int) -> Array:
-        """Return the covariance (6, 6) of the pose, or refuse what is not determined.
+        """Return the covariance (6, 6) of the pose; raise MethodError where it is not determined.
 
-        The first ``edges_end`` residuals are the edges'. What they scatter depends on how obliquely a line crosses the
-        rim, so they enter with their own squares (White 1980), the others with the variance that they have.
+        The first ``edges_end`` residuals are those of the edges. Their scatter depends on how obliquely a line crosses
+        the rim; their squares are used instead of a common variance (White 1980). The others have variance 1.
         """
         _, s, V = np.linalg.svd(J, full_matrices=False)
         inverse = V.T / np.maximum(s, 1e-12 * s[0])
@@ -291,12 +284,13 @@ class _Fit:
         gain = (inverse @ inverse.T) @ J.T
         covariance = np.asarray((gain * squares) @ gain.T * np.outer(_UNIT, _UNIT))[:6, :6]
         size = np.sqrt(np.diag(covariance))
-        worst = np.repeat([WORST_ANGLE, WORST_PLACE], 3)
+        worst = np.repeat([WORST_ANGLE, WORST_POSITION], 3)
         unknown = [name for name, too_much in zip(PARAMETERS, size > worst, strict=True) if too_much]
         if unknown:
             raise MethodError(
                 f"The scans of the pocket do not determine {', '.join(unknown)} of the profiler's pose. The angle a "
-                "needs scans at two heights of the spindle, some millimetres apart, or an angle_prior, as 0.005 rad."
+                "needs scans at two heights of the spindle, some millimetres apart, or an angle_prior, such as "
+                "0.005 rad."
             )
         covariance[3:, 3:] += np.diag(np.asarray(self.pocket.centre_uncertainty, dtype=float) ** 2)
         return covariance

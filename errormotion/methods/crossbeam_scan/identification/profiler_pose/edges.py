@@ -1,8 +1,8 @@
-"""What a scan of a level plate with a circular pocket shows: tilt and height of each line, and the edges of the pocket.
+"""Tilt and height of each line of a scan of a level plate with a circular pocket, and the edges of the pocket.
 
-An edge is found to a fraction of the point pitch from the area under the step: with the height g between floor (0) and
-plate (1), the edge of a step that falls at the right of the window lies where the sum of g times the pitch ends. That
-holds for any symmetrical spot, at any sampling phase.
+An edge is determined to a fraction of the point pitch from the area under the step: with the height g normalised to 0
+(floor) and 1 (plate), the distance of a falling edge from the start of a window is the sum of g times the pitch. This
+is true for any symmetrical spot at any sampling phase.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from errormotion.errors import MethodError
 
 Mask = NDArray[np.bool_]
 
-#: what stray light may spoil beside an edge, and how far the floor is looked at from there, m
+#: Width beside an edge that stray light may disturb, and width of the floor that is used next to it, m.
 TRIM, FLOOR = 250e-6, 1.5e-3
-#: a point farther off its line than this many standard deviations is left out
+#: Points farther from their line than this many standard deviations are excluded.
 CLIP = 4.5
-#: an edge is given up where more of its window is missing
+#: Largest accepted share of missing points in the window of an edge.
 GAPS = 0.4
 
 
@@ -32,7 +32,7 @@ class Tilt:
     Attributes
     ----------
     slope, uncertainty : float
-        dz/dx and its standard uncertainty, from the scatter of the lines, so whatever is correlated along a line is in.
+        dz/dx and its standard uncertainty, from the scatter of the lines: effects correlated along a line are included.
     height : ndarray, (line,)
         z of each line at x = 0 under the common slope, m; NaN without points.
     """
@@ -49,7 +49,7 @@ class Edges:
     Attributes
     ----------
     line : ndarray of int, (n,)
-        Which line.
+        Index of the line.
     x : ndarray, (n, 2)
         Left and right edge, m.
     z : ndarray, (n, 2)
@@ -69,7 +69,7 @@ def tilt(x: Array, height: Array) -> Tilt:
     x : (point,)
         m.
     height : (line, point)
-        m; NaN = no reading, or no part of the plane.
+        m; NaN = no reading, or not on the plane.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def tilt(x: Array, height: Array) -> Tilt:
         size = NORMAL_MAD * np.nanmedian(np.abs(residual[used]))
         used &= np.abs(np.where(np.isfinite(residual), residual, np.inf)) <= CLIP * max(size, 1e-12)
     count = slopes.size
-    # the variance of a weighted mean, from the scatter about it
+    # variance of a weighted mean, from the scatter about it
     variance = float(weights**2 @ (slopes - slope) ** 2) * count / (count - 1)
     return Tilt(slope, float(np.sqrt(variance)), np.where(full, mean_z - slope * mean_x, np.nan))
 
@@ -121,7 +121,7 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
     inside = _spans(deep)
     if high - low < 0.2e-3 or inside.sum() < 10:
         raise MethodError(
-            f"A circular pocket at least 0.2 mm deep is needed, with ten lines across it; found levels {low * 1e3:.4g} "
+            f"Expected a circular pocket at least 0.2 mm deep, with ten lines across it; found levels {low * 1e3:.4g} "
             f"and {high * 1e3:.4g} mm, and {int(inside.sum())} lines. Check the unit and that the pocket was scanned."
         )
     trim = max(round(TRIM / pitch), 3)
@@ -141,15 +141,15 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
             positions.append(ends)
     if len(lines) < 10:
         raise MethodError(
-            f"Ten lines with both edges of the pocket are needed; found {len(lines)}. Too many readings are missing at "
-            "the edges, or the pocket is not wholly in the scan."
+            f"Expected ten lines with both edges of the pocket; found {len(lines)}. Too many readings are missing at "
+            "the edges, or the pocket is not completely in the scan."
         )
     line, at = np.array(lines, dtype=np.int64), np.array(positions)
     return plate, Edges(line, at, plate.height[line, None] + plate.slope * at)
 
 
 def _spans(deep: Mask) -> Mask:
-    """Return the lines that are deep over a good part of their width, and not at its ends."""
+    """Return the lines that cross the pocket: deep over some of their points, but not at their ends."""
     many = deep.sum(axis=1) >= max(0.02 * deep.shape[1], 8)
     return np.asarray(many & ~deep[:, :4].any(axis=1) & ~deep[:, -4:].any(axis=1))
 

@@ -16,16 +16,16 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose import cali
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
 
-ROUND = 0.01
-"""Where no nominal pose is given: square to the machine, at a position in whole centimetres."""
+NOMINAL_STEP = 0.01
+"""Without a stated nominal pose, the nominal position is the one found, rounded to this, m; its angles are 0."""
 
 
-def given(pose: PoseSettings) -> RigidTransform:
+def stated_pose(pose: PoseSettings) -> RigidTransform:
     """Return the pose that settings state."""
     return calibration.pose(pose.a, pose.b, pose.g, pose.dx, pose.dy, pose.dz)
 
 
-def given_covariance(pose: PoseSettings) -> np.ndarray:
+def stated_covariance(pose: PoseSettings) -> np.ndarray:
     """Return the covariance (6, 6) of (a, b, g, dx, dy, dz) that settings state."""
     return np.diag([pose.angle_uncertainty] * 3 + [pose.place_uncertainty] * 3) ** 2
 
@@ -39,20 +39,20 @@ def identify_pose(raw: xr.Dataset, settings: Settings, method: str, version: str
     Raises
     ------
     MethodError
-        As `calibration.calibrate`.
+        As for `calibration.calibrate`.
     """
     found = calibration.calibrate_dataset(raw, angle_prior=settings.angle_prior)
     H = found.transform
     nominal = (
-        given(settings.profiler_pose)
+        stated_pose(settings.profiler_pose)
         if settings.profiler_pose is not None
-        else RigidTransform.from_translation(ROUND * np.round(H.translation / ROUND))
+        else RigidTransform.from_translation(NOMINAL_STEP * np.round(H.translation / NOMINAL_STEP))
     )
     point = np.asarray(nominal.translation)
     J = _sensitivity(calibration.parameters(H), nominal)
     square = (("row", "column"), ("p", "p_"))
     return build_errors(
-        _off(H, nominal)[None],
+        _deviation(H, nominal)[None],
         (J.T @ found.covariance @ J)[None],
         dims=("beam",),
         coords={"beam": ["profiler"]},
@@ -81,17 +81,17 @@ def identify_pose(raw: xr.Dataset, settings: Settings, method: str, version: str
     ).assign_attrs(notes=[""], lines_used=found.lines)
 
 
-def _off(pose: RigidTransform, nominal: RigidTransform) -> np.ndarray:
+def _deviation(pose: RigidTransform, nominal: RigidTransform) -> np.ndarray:
     """Return the twist (6,) from the nominal pose to another, at the nominal position."""
     return displacement(pose * nominal.inv(), nominal.translation)
 
 
 def _sensitivity(p: np.ndarray, nominal: RigidTransform) -> np.ndarray:
-    """Return how that twist changes with each parameter of the pose, (parameter, 6).
+    """Return the derivative of that twist with respect to each parameter of the pose, (parameter, 6).
 
-    Not the small motions of `chain.pose_twists`: some milliradians off the nominal pose turn the rotation vector, and
-    what is known to 20 urad then counts in what is known to 0.1 urad.
+    `chain.pose_twists` is not accurate enough: a deviation of some milliradians from the nominal pose rotates the
+    rotation vector, so that an angle known to 20 urad affects one that is known to 0.1 urad.
     """
     steps = 1e-6 * np.eye(6)
-    ends = [[_off(calibration.pose(*(p + sign * step)), nominal) for sign in (1, -1)] for step in steps]
+    ends = [[_deviation(calibration.pose(*(p + sign * step)), nominal) for sign in (1, -1)] for step in steps]
     return np.array([(up - down) / 2e-6 for up, down in ends])
