@@ -106,7 +106,7 @@ class DatasetHasher:
 
     def __init__(self, ds: xr.Dataset, form: str = "blake3-tree") -> None:
         self._ds, self._form, self._new = ds, form, _TREES[form]
-        self._pool = ThreadPoolExecutor(_cores(), thread_name_prefix="hash")
+        self._pool = ThreadPoolExecutor(cores(), thread_name_prefix="hash")
         self._queue: deque[tuple[Future[None], int]] = deque()
         self._pending = 0
         self._leaves: dict[str, _Leaves] = {}
@@ -280,7 +280,8 @@ def _tiles(variable: xr.Variable, axis: int) -> Iterator[tuple[slice, ...]]:
     yield from divided(whole)
 
 
-def _cores() -> int:
+def cores() -> int:
+    """Return how many processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

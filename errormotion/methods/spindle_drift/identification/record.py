@@ -17,7 +17,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.identification.averaging import Averager, Averages, join, slices
+from errormotion.methods.spindle_drift.identification.averaging import COMPILED_SIZE, Averager, Averages, join, slices
 from errormotion.methods.spindle_drift.identification.times import Times, first_and_last, increases, values_of
 from errormotion.methods.spindle_drift.schema import CHANNELS
 
@@ -64,8 +64,8 @@ def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -
     slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
     # The order is changed after reading: a lazy selection would read the store sample by sample.
     order = [list(raw["channel"].values).index(name) for name in CHANNELS]
-    # One thread: the hasher uses the other cores.
-    averager = Averager(len(CHANNELS), settings.average, settings.min_valid, threads=1)
+    compiled = raw["distance"].size >= COMPILED_SIZE
+    averager = Averager(len(CHANNELS), settings.average, settings.min_valid, compiled=compiled)
     slow_averagers = {name: Averager(raw[name].sizes.get("sensor", 1), settings.average, minimum=0.0) for name in slow}
     parts: list[Averages] = []
     slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
