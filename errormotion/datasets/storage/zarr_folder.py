@@ -28,8 +28,8 @@ from errormotion.errors import DatasetError
 
 _COMPRESSORS = ("blosc", "zstd")
 _FILLS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
-_SHORT = 2**14
-"""Bytes; shorter runs of a chunk are taken from its whole content."""
+_RUN = 2**14
+"""Bytes that are read in the time that another run takes to begin: a chunk with more runs is read as a whole."""
 
 
 def open_zarr(path: Path) -> xr.Dataset | None:
@@ -211,12 +211,12 @@ class _Array(BackendArray):
             ) from error
 
     def _runs_into(self, file: Any, window: Sequence[slice], target: np.ndarray) -> bool:
-        """Read a window of a plain chunk run by run; False, and nothing is read, where the runs are short."""
+        """Read a window of a plain chunk run by run; False, and nothing is read, where there are too many."""
         axis = len(self.chunk) - 1  # of the runs; the axes behind it are whole, in the chunk and in the box
         while axis > 0 and target.shape[axis] == self.chunk[axis] and target[(0,) * (axis - 1)].flags.c_contiguous:
             axis -= 1
         inner = math.prod(self.chunk[axis + 1 :])
-        if axis < 0 or target.shape[axis] * inner * self.dtype.itemsize < _SHORT:
+        if axis < 0 or math.prod(target.shape[:axis]) * _RUN > math.prod(self.chunk) * self.dtype.itemsize:
             return False
         self._check_size(file.seek(0, 2))
         for row in np.ndindex(*target.shape[:axis]):

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 _SLICE_BYTES = 32 << 20
 """Size of the slices in which a record is read."""
-_BLOCK = 1 << 16
-"""Values that numpy adds up at a time, as numbers of double precision: half a megabyte, in the cache of a core."""
+_BLOCK = 1 << 17
+"""Samples of windows of several lengths that are added up at a time, as numbers of double precision: a megabyte."""
 COMPILED_SIZE = 1 << 32
 """Values from which on the compiled sums are faster, the time to load them included."""
 _LEAST_WINDOW = 0.5
@@ -66,30 +66,42 @@ def window_sums(
         from errormotion.methods.spindle_drift.identification import averaging_kernels
 
         return averaging_kernels.sums(values, edges, threads)
-    sums, counts = np.zeros((len(values), edges.size - 1)), np.zeros((len(values), edges.size - 1), np.int64)
-    full = np.flatnonzero(np.diff(edges) > 0)
-    starts, ends = edges[full], edges[full + 1]
-    first = 0
-    while first < full.size:
-        # As many whole windows as fit, one at least.
-        last = max(int(np.searchsorted(ends, starts[first] + _BLOCK, side="right")), first + 1)
-        part, inside = full[first:last], slice(starts[first], ends[last - 1])
+    samples = np.diff(edges)
+    sums, counts = np.empty((len(values), samples.size)), np.empty((len(values), samples.size), np.int64)
+    for part in _groups(samples):
+        inside = slice(edges[part.start], edges[part.stop])
         for channel, row in enumerate(values):
-            block = row[inside]
-            sums[channel, part], counts[channel, part] = _row_sums(block, starts[first:last] - starts[first])
-        first = last
+            sums[channel, part], counts[channel, part] = _totals(row[inside], samples[part]), samples[part]
+            if np.isnan(sums[channel, part]).any():
+                valid = ~np.isnan(row[inside])
+                sums[channel, part] = _totals(np.where(valid, row[inside], values.dtype.type(0.0)), samples[part])
+                counts[channel, part] = _totals(valid, samples[part])
     return sums, counts
 
 
-def _row_sums(values: NDArray[np.floating[Any]], starts: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64] | Array]:
-    """Return sums and numbers of the values that are not NaN, from each start to before the next one or the end."""
-    # Numpy adds contiguous rows pairwise, which keeps the rounding error small.
-    sums = np.add.reduceat(np.ascontiguousarray(values, np.float64), starts)
-    if not np.isnan(sums).any():
-        return sums, np.diff(starts, append=values.size)
-    valid = ~np.isnan(values)
-    filled = np.where(valid, values, 0.0).astype(np.float64)
-    return np.add.reduceat(filled, starts), np.add.reduceat(valid, starts, dtype=np.int64)
+def _groups(samples: NDArray[np.int64]) -> Iterator[slice]:
+    """Yield slices of the windows: all but the first and the last one where these are of one length, else blocks."""
+    middle = samples[1:-1]
+    if middle.size and middle[0] > 0 and (middle == middle[0]).all():
+        yield from (slice(0, 1), slice(1, samples.size - 1), slice(samples.size - 1, samples.size))
+        return
+    ends = np.cumsum(samples)
+    first = 0
+    while first < samples.size:
+        last = int(np.searchsorted(ends, ends[first] - samples[first] + _BLOCK, side="right"))
+        yield slice(first, max(last, first + 1))
+        first = max(last, first + 1)
+
+
+def _totals(row: NDArray[Any], samples: NDArray[np.int64]) -> Array:
+    """Return the sums of consecutive values; numpy adds them pairwise, which keeps the rounding error small."""
+    if samples[0] > 0 and (samples == samples[0]).all():
+        return np.asarray(row.reshape(samples.size, -1).sum(axis=1, dtype=np.float64))
+    full = np.flatnonzero(samples)
+    total = np.zeros(samples.size)
+    if full.size:
+        total[full] = np.add.reduceat(row.astype(np.float64), (np.cumsum(samples) - samples)[full])
+    return total
 
 
 @dataclass(frozen=True)
@@ -114,6 +126,23 @@ class Averages:
     expected: NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class Windows:
+    """Which windows some samples are in.
+
+    Attributes
+    ----------
+    first, last : int
+        Numbers of the windows of the first and the last sample.
+    edges : ndarray, int64, (window + 1,)
+        Indices of their first samples, and the number of samples.
+    """
+
+    first: int
+    last: int
+    edges: NDArray[np.int64]
+
+
 class Averager:
     """Averages of a stream of blocks in windows of fixed length; at most one unfinished window is in memory.
 
@@ -121,8 +150,7 @@ class Averager:
     of the samples is longer than half a window, every sample is its own window.
     """
 
-    def __init__(self, channels: int, length: float, minimum: float = 0.5, *, compiled: bool = False) -> None:
-        self._compiled = compiled
+    def __init__(self, channels: int, length: float, minimum: float = 0.5) -> None:
         self._length, self._minimum = length, minimum
         self._start = np.nan
         self._single: bool | None = None
@@ -141,28 +169,39 @@ class Averager:
         if self._first is not None:
             time, values = np.append(self._first[0], values_of(time)), np.concatenate([self._first[1], values], axis=1)
             self._first = None
+        if self._single is None and time.size == 1:  # the interval of the samples is not known yet
+            self._first = values_of(time).copy(), values.copy()
+            return self._none()
+        windows = self.windows(time)
+        if windows is None:
+            return _samples_as_windows(values_of(time), values)
+        return self.add(time, windows, *window_sums(values, windows.edges, 1))
+
+    def windows(self, time: Times) -> Windows | None:
+        """Return the windows of the samples at ``time``, the next ones; None where `update` has to have the values."""
+        if self._first is not None or time.size == 0 or (self._single is None and time.size == 1):
+            return None
         if self._single is None:
-            if time.size == 1:  # the interval of the samples is not known yet
-                self._first = values_of(time).copy(), values.copy()
-                return self._none()
             self._start = first_and_last(time)[0]
             interval = usual_interval(time)
             self._single = interval > 0.5 * self._length
             self._tolerance = 0.5 * interval / self._length
             self._full = self._length / interval
         if self._single:
-            return _samples_as_windows(values_of(time), values)
+            return None
         # The tolerance of half a sample covers the rounding of times that were written as decimals.
         start, end = first_and_last(time)
         first = int(np.floor((start - self._start) / self._length + self._tolerance))
         last = int(np.floor((end - self._start) / self._length + self._tolerance))
         bounds = np.asarray(self._start + (np.arange(first + 1, last + 1) - self._tolerance) * self._length, np.float64)
-        edges = np.concatenate([[0], first_samples(time, bounds), [time.size]]).astype(np.int64)
-        sums, counts = window_sums(values, edges, 1, compiled=self._compiled)
-        samples = np.diff(edges)
-        times = time_sums(time, edges) + samples * start
+        return Windows(first, last, np.concatenate([[0], first_samples(time, bounds), [time.size]]).astype(np.int64))
+
+    def add(self, time: Times, windows: Windows, sums: Array, counts: NDArray[np.int64]) -> Averages:
+        """Add the sums and numbers (channel, window) of values at ``time``; return the windows that are now complete."""
+        samples = np.diff(windows.edges)
+        times = time_sums(time, windows.edges) + samples * first_and_last(time)[0]
         if self._samples:  # the window that the blocks before have left open goes on, or was their last one
-            if first == self._index:
+            if windows.first == self._index:
                 sums[:, 0] += self._sum
                 counts[:, 0] += self._count
                 times[0] += self._time
@@ -170,7 +209,7 @@ class Averager:
             else:
                 sums, counts = np.column_stack([self._sum, sums]), np.column_stack([self._count, counts])
                 times, samples = np.append(self._time, times), np.append(self._samples, samples)
-        self._index = last
+        self._index = windows.last
         self._sum, self._count = sums[:, -1].copy(), counts[:, -1].copy()
         self._time, self._samples = float(times[-1]), int(samples[-1])
         done = np.flatnonzero(samples[:-1])
@@ -218,7 +257,7 @@ def join(parts: list[Averages]) -> Averages:
 
 
 def slices(raw: xr.Dataset) -> Iterator[tuple[Times, xr.Dataset]]:
-    """Yield (time, slice of the dataset) of a record along ``time``, a few tens of megabytes at a time.
+    """Yield (time, slice of the dataset) of a record along ``time``, `_SLICE_BYTES` at a time, in whole chunks.
 
     The time comes from the variable ``time``, or from the attributes ``sample_rate`` (Hz) and ``time_start`` (s).
     """
