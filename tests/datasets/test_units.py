@@ -162,3 +162,19 @@ def test_an_invalid_quantity_is_refused_with_an_example(text: str) -> None:
     for quantity in units.KINDS:
         with pytest.raises(ValueError, match=f"expected {quantity.kind} with its unit"):
             quantity.parse(text)
+
+
+def test_the_table_of_usual_units_states_exactly_what_pint_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs = [(a, b) for a, (one, _) in units._EXACT.items() for b, (other, _) in units._EXACT.items() if one == other]
+    ours = [units._linear.__wrapped__(*pair) for pair in pairs]
+    monkeypatch.setattr(units, "_EXACT", {})
+    assert ours == [units._linear.__wrapped__(*pair) for pair in pairs]
+
+
+def test_the_table_of_usual_units_refuses_another_kind_like_pint(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(DatasetError) as ours:
+        units._linear.__wrapped__("arcsec", "m")
+    monkeypatch.setattr(units, "_EXACT", {})
+    with pytest.raises(DatasetError) as others:
+        units._linear.__wrapped__("arcsec", "m")
+    assert str(ours.value) == str(others.value)

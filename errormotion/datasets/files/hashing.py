@@ -24,6 +24,7 @@ import os
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from threading import Lock
 from typing import Any, Self
 
 import numpy as np
@@ -102,12 +103,12 @@ def has_hash(ds: xr.Dataset, stored: str) -> bool:
 class DatasetHasher:
     """The hash of a dataset in the form of a tree, from parts that are read for another purpose.
 
-    `value` reads parts that were not passed, or not in order. To be used as a context manager.
+    `value` reads parts that were not passed. To be used as a context manager.
     """
 
     def __init__(self, ds: xr.Dataset, form: str = "blake3-tree") -> None:
         self._ds, self._form, self._new = ds, form, _TREES[form]
-        self._pool = ThreadPoolExecutor(_cores(), thread_name_prefix="hash")
+        self._pool = ThreadPoolExecutor(cores(), thread_name_prefix="hash")
         self._queue: deque[tuple[Future[None], int]] = deque()
         self._pending = 0
         self._leaves: dict[str, _Leaves] = {}
@@ -119,7 +120,7 @@ class DatasetHasher:
         self._pool.shutdown(cancel_futures=True)
 
     def update(self, name: str, values: np.ndarray, **window: slice) -> None:
-        """Hash a part of a variable.
+        """Hash a part of a variable in this thread; several threads may hand over parts, in any order.
 
         Parameters
         ----------
@@ -127,13 +128,14 @@ class DatasetHasher:
         values : ndarray
             With the axes of the variable; must not be changed afterwards.
         **window : slice
-            Indices of the part along the dimensions that are not complete, in increasing order.
+            Indices of the part along the dimensions that are not complete.
         """
         variable = self._ds.variables[name]
-        leaves = self._leaves.setdefault(name, _Leaves(variable))
+        leaves = self._leaves.get(name) or self._leaves.setdefault(name, _Leaves(variable))
         starts = [(window[str(dim)].start if str(dim) in window else 0) for dim in variable.dims]
-        if leaves.accepts(starts, values.shape):
-            self._hash(leaves, starts, values)
+        if leaves.accepts(values.shape):
+            for runs, out in leaves.take(starts, values):
+                _hash_leaves(runs, leaves.piece, out, self._new)
 
     def value(self) -> str:
         """Return ``form:digest``; reads parts that were not passed."""
@@ -202,48 +204,54 @@ class _Leaves:
         self._length = self.shape[axis] if inner else 0
         self._rows = np.arange(math.prod(self.shape[:axis])).reshape(self.shape[:axis])
         self.digests = np.empty((self._rows.size, -(-self._length // self.piece), 32), np.uint8)
-        self._done = np.zeros(self._rows.size, np.int64)
-        self._open: dict[int, list[np.ndarray]] = {}
+        self._done = np.zeros(self.digests.shape[:2], bool)
+        self._open: dict[tuple[int, int], dict[int, np.ndarray]] = {}
+        self._lock = Lock()
 
     @property
     def complete(self) -> bool:
-        return bool(np.all(self._done == self._length))
+        return bool(self._done.all())
 
-    def accepts(self, starts: Sequence[int], shape: Sequence[int]) -> bool:
-        """Return whether a part has complete inner axes and continues its rows."""
-        starts, shape = (0, *starts), (1, *shape)
-        whole = self.shape[self._axis + 1 :] == tuple(shape[self._axis + 1 :])
-        return whole and bool(np.all(self._done[self._within(starts, shape)] == starts[self._axis]))
+    def accepts(self, shape: Sequence[int]) -> bool:
+        """Return whether a part has complete inner axes."""
+        return self.shape[self._axis + 1 :] == (1, *shape)[self._axis + 1 :]
 
     def take(self, starts: Sequence[int], values: np.ndarray) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
-        """Yield the values of complete leaves with the digests to fill; keep an incomplete leaf for the next part.
+        """Yield the values of complete leaves with the digests to fill; keep an incomplete leaf until the rest arrives.
 
         The values are one run of several leaves, or several runs of one leaf.
         """
         starts, shape = (0, *starts), (1, *values.shape)
         start, count = starts[self._axis], shape[self._axis]
         block = values.reshape(-1, count, *values.shape[self._axis :])
-        for row, run in zip(self._within(starts, shape).ravel(), block, strict=True):
+        for row, run in zip(self._within(starts, shape).ravel().tolist(), block, strict=True):
             first = min(-start % self.piece, count)
             last = first + (count - first) // self.piece * self.piece
             yield from self._part(row, start, run[:first])
             step = max(1, _TASK // (self.piece * self._inner * values.itemsize)) * self.piece
             for k in range(first, last, step):
-                leaf = (start + k) // self.piece
                 task = run[k : min(k + step, last)]
-                yield [task], self.digests[row, leaf : leaf + len(task) // self.piece]
+                leaves = slice((start + k) // self.piece, (start + k + len(task)) // self.piece)
+                self._done[row, leaves] = True
+                yield [task], self.digests[row, leaves]
             yield from self._part(row, start + last, run[last:])
-            self._done[row] = start + count
 
     def _part(self, row: int, start: int, values: np.ndarray) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+        """Yield the runs of a leaf when they are all there."""
         if not len(values):
             return
-        runs, end = [*self._open.pop(row, []), values], start + len(values)
-        if end % self.piece == 0 or end == self._length:
-            leaf = start // self.piece
-            yield runs, self.digests[row, leaf : leaf + 1]
-        else:
-            self._open[row] = runs
+        leaf = start // self.piece
+        with self._lock:
+            parts = self._open.setdefault((row, leaf), {})
+            parts[start] = values
+            end = leaf * self.piece
+            for begin in sorted(parts):
+                end = end + len(parts[begin]) if begin == end else -1
+            if end != min((leaf + 1) * self.piece, self._length):
+                return
+            del self._open[row, leaf]
+        self._done[row, leaf] = True
+        yield [parts[begin] for begin in sorted(parts)], self.digests[row, leaf : leaf + 1]
 
     def _within(self, starts: Sequence[int], shape: Sequence[int]) -> np.ndarray:
         """Return the numbers of the rows of a part."""
@@ -252,11 +260,15 @@ class _Leaves:
 
 
 def _hash_leaves(runs: list[np.ndarray], piece: int, out: np.ndarray, new: Any) -> None:
-    for k in range(len(out)):
-        digest = new()
-        for run in runs:
-            digest.update(_bytes(run[k * piece : (k + 1) * piece]))
-        out[k] = np.frombuffer(digest.digest(), np.uint8)
+    if len(runs) == 1:
+        content, size = _bytes(runs[0]), piece * runs[0][:1].nbytes
+        digests = [new(content[k * size : (k + 1) * size]).digest() for k in range(len(out))]
+        out[...] = np.frombuffer(b"".join(digests), np.uint8).reshape(out.shape)
+        return
+    digest = new()
+    for run in runs:
+        digest.update(_bytes(run))
+    out[0] = np.frombuffer(digest.digest(), np.uint8)
 
 
 def _tiles(variable: xr.Variable, axis: int) -> Iterator[tuple[slice, ...]]:
@@ -282,7 +294,8 @@ def _tiles(variable: xr.Variable, axis: int) -> Iterator[tuple[slice, ...]]:
     yield from divided(whole)
 
 
-def _cores() -> int:
+def cores() -> int:
+    """Return how many processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

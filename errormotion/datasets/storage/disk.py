@@ -23,6 +23,7 @@ from errormotion.datasets.files.writing import reason, remove, sync, writing
 from errormotion.datasets.schemas import SCHEMA
 from errormotion.datasets.storage.compression import as_stored, encoding
 from errormotion.datasets.storage.netcdf import compose_netcdf, open_netcdf
+from errormotion.datasets.storage.zarr_folder import open_zarr
 from errormotion.errors import DatasetError, ErrormotionError
 
 _NETCDF = (".nc", ".nc4", ".h5")
@@ -66,17 +67,12 @@ def load(path: str | Path) -> xr.Dataset:
         if engine == "h5netcdf":
             check_netcdf(path)
             ds = open_netcdf(path)
+        elif engine == "zarr":
+            check_zarr(path)
+            known = open_zarr(path)
+            ds = _opened(path, engine, consolidated=_is_consolidated(path)) if known is None else known
         else:
-            if engine == "zarr":
-                check_zarr(path)
-            ds = xr.open_dataset(
-                path,
-                engine=engine,
-                backend_kwargs={"consolidated": _is_consolidated(path)} if engine == "zarr" else {},
-                decode_times=False,
-                decode_timedelta=False,
-                create_default_indexes=False,
-            )
+            ds = _opened(path, engine)
         ds = _tidy(ds)
         if ds.attrs.get("schema") == SCHEMA:
             with ds:
@@ -172,6 +168,18 @@ def _engine_of(path: Path) -> str:
     raise DatasetError(
         f"{path}: is not a dataset; expected a NetCDF file, a Zarr folder or a .csv file of readings. For a text log "
         "use 'errormotion import'"
+    )
+
+
+def _opened(path: Path, engine: str, **options: bool) -> xr.Dataset:
+    """Open a file or folder by an engine of xarray; times are numbers."""
+    return xr.open_dataset(
+        path,
+        engine=engine,
+        backend_kwargs=options,
+        decode_times=False,
+        decode_timedelta=False,
+        create_default_indexes=False,
     )
 
 

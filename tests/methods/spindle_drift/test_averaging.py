@@ -17,15 +17,16 @@ from errormotion.methods.spindle_drift.identification.times import EvenTimes, in
 @pytest.mark.parametrize("layout", ["channel first", "time first"])
 @pytest.mark.parametrize("lost", [0.0, 0.02, 1.0])
 @pytest.mark.parametrize("compiled", [False, True])
-def test_sums_are_those_of_numpy_in_both_layouts(dtype, layout, lost, compiled, monkeypatch):
-    monkeypatch.setattr(averaging, "_COMPILED_SIZE", 0 if compiled else 1 << 30)
+@pytest.mark.parametrize("block", [64, 1 << 16])
+def test_sums_are_those_of_numpy_in_both_layouts(dtype, layout, lost, compiled, block, monkeypatch):
+    monkeypatch.setattr(averaging, "_BLOCK", block)
     rng = np.random.default_rng(0)
     values = rng.normal(1e-3, 1e-6, (5, 3001)).astype(dtype)
     values[rng.random(values.shape) < lost] = np.nan
     if layout == "time first":
         values = np.ascontiguousarray(values.T).T
     edges = np.array([0, 1, 1, 700, 1403, 3001])
-    sums, counts = window_sums(values, edges)
+    sums, counts = window_sums(values, edges, compiled=compiled)
     for k, (a, b) in enumerate(pairwise(edges)):
         part = values[:, a:b].astype(np.float64)
         np.testing.assert_allclose(sums[:, k], np.nansum(part, axis=1), rtol=1e-13)

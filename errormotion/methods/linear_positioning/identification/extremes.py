@@ -23,7 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.methods.linear_positioning.identification import standard
@@ -172,7 +172,7 @@ def _drifts(spread: Scatter, trials: int, generator: np.random.Generator) -> tup
         if spread.freedom > 0:
             with np.errstate(invalid="ignore", divide="ignore"):
                 ratio = (variance + spread.noise) / spread.noise
-            significant = stats.chi2.sf(spread.freedom * ratio, spread.freedom) < SIGNIFICANT
+            significant = special.chdtrc(spread.freedom, spread.freedom * ratio) < SIGNIFICANT
             scale = spread.freedom / generator.chisquare(spread.freedom, (trials, 2))
             with_noise = np.maximum(scale * (variance + spread.noise) - spread.noise, 0.0)
             variances = np.where(significant, with_noise, variances)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -213,7 +213,7 @@ def _differ(square: Array, n: Array) -> bool:
         return False
     statistic = v.sum() * np.log(pooled) - v @ np.log(variance)
     correction = 1.0 + ((1.0 / v).sum() - 1.0 / v.sum()) / (3.0 * (k - 1))
-    return bool(stats.chi2.sf(statistic / correction, k - 1) < SIGNIFICANT)
+    return bool(special.chdtrc(k - 1, statistic / correction) < SIGNIFICANT)
 
 
 def _mean_square(part: Array) -> Array:

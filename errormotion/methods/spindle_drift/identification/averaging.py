@@ -1,7 +1,8 @@
 """Averages of fixed length over records of any length.
 
 A drift record of billions of samples is reduced to one mean every half second. It is read in slices, so that it needs
-constant memory. Large slices are added up by `averaging_kernels`, small ones by numpy.
+constant memory. Numpy adds up what fits into the cache of a core at a time; `averaging_kernels` is twice as fast from
+memory, but takes most of a second to load, which pays off for records of a working day.
 """
 
 from __future__ import annotations
@@ -31,14 +32,16 @@ if TYPE_CHECKING:
 
 _SLICE_BYTES = 32 << 20
 """Size of the slices in which a record is read."""
-_COMPILED_SIZE = 1 << 22
+_BLOCK = 1 << 17
+"""Samples of windows of several lengths that are added up at a time, as numbers of double precision: a megabyte."""
+COMPILED_SIZE = 1 << 32
 """Values from which on the compiled sums are faster, the time to load them included."""
 _LEAST_WINDOW = 0.5
 """Share of the last window below which it is ignored: run-out does not average away in a part of it."""
 
 
 def window_sums(
-    values: NDArray[np.floating[Any]], edges: NDArray[np.int64], threads: int | None = None
+    values: NDArray[np.floating[Any]], edges: NDArray[np.int64], threads: int | None = None, *, compiled: bool = False
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return sums and numbers of the values that are not NaN, between consecutive edges.
 
@@ -50,6 +53,8 @@ def window_sums(
         Sample indices, not decreasing.
     threads : int, optional
         Number of threads of the compiled sums; default all cores.
+    compiled : bool
+        Use the compiled sums.
 
     Returns
     -------
@@ -57,25 +62,46 @@ def window_sums(
     """
     if values.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
         values = values.astype(np.float64)
-    if values.size < _COMPILED_SIZE:
-        return _small_window_sums(values, edges)
-    from errormotion.methods.spindle_drift.identification import averaging_kernels
+    if compiled:
+        from errormotion.methods.spindle_drift.identification import averaging_kernels
 
-    return averaging_kernels.sums(values, edges, threads)
-
-
-def _small_window_sums(values: NDArray[Any], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    valid = ~np.isnan(values)
-    # Numpy adds contiguous rows pairwise, which keeps the rounding error small; it has no empty windows.
-    filled = np.where(valid, values, 0.0).astype(np.float64, order="C")
-    full = np.flatnonzero(np.diff(edges) > 0)
-    sums, counts = np.zeros((len(values), edges.size - 1)), np.zeros((len(values), edges.size - 1), np.int64)
-    if full.size:
-        inside = slice(edges[full[0]], edges[full[-1] + 1])
-        starts = edges[full] - edges[full[0]]
-        sums[:, full] = np.add.reduceat(filled[:, inside], starts, axis=1)
-        counts[:, full] = np.add.reduceat(valid[:, inside], starts, axis=1, dtype=np.int64)
+        return averaging_kernels.sums(values, edges, threads)
+    samples = np.diff(edges)
+    sums, counts = np.empty((len(values), samples.size)), np.empty((len(values), samples.size), np.int64)
+    for part in _groups(samples):
+        inside = slice(edges[part.start], edges[part.stop])
+        for channel, row in enumerate(values):
+            sums[channel, part], counts[channel, part] = _totals(row[inside], samples[part]), samples[part]
+            if np.isnan(sums[channel, part]).any():
+                valid = ~np.isnan(row[inside])
+                sums[channel, part] = _totals(np.where(valid, row[inside], values.dtype.type(0.0)), samples[part])
+                counts[channel, part] = _totals(valid, samples[part])
     return sums, counts
+
+
+def _groups(samples: NDArray[np.int64]) -> Iterator[slice]:
+    """Yield slices of the windows: all but the first and the last one where these are of one length, else blocks."""
+    middle = samples[1:-1]
+    if middle.size and middle[0] > 0 and (middle == middle[0]).all():
+        yield from (slice(0, 1), slice(1, samples.size - 1), slice(samples.size - 1, samples.size))
+        return
+    ends = np.cumsum(samples)
+    first = 0
+    while first < samples.size:
+        last = int(np.searchsorted(ends, ends[first] - samples[first] + _BLOCK, side="right"))
+        yield slice(first, max(last, first + 1))
+        first = max(last, first + 1)
+
+
+def _totals(row: NDArray[Any], samples: NDArray[np.int64]) -> Array:
+    """Return the sums of consecutive values; numpy adds them pairwise, which keeps the rounding error small."""
+    if samples[0] > 0 and (samples == samples[0]).all():
+        return np.asarray(row.reshape(samples.size, -1).sum(axis=1, dtype=np.float64))
+    full = np.flatnonzero(samples)
+    total = np.zeros(samples.size)
+    if full.size:
+        total[full] = np.add.reduceat(row.astype(np.float64), (np.cumsum(samples) - samples)[full])
+    return total
 
 
 @dataclass(frozen=True)
@@ -100,6 +126,23 @@ class Averages:
     expected: NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class Windows:
+    """Which windows some samples are in.
+
+    Attributes
+    ----------
+    first, last : int
+        Numbers of the windows of the first and the last sample.
+    edges : ndarray, int64, (window + 1,)
+        Indices of their first samples, and the number of samples.
+    """
+
+    first: int
+    last: int
+    edges: NDArray[np.int64]
+
+
 class Averager:
     """Averages of a stream of blocks in windows of fixed length; at most one unfinished window is in memory.
 
@@ -107,8 +150,7 @@ class Averager:
     of the samples is longer than half a window, every sample is its own window.
     """
 
-    def __init__(self, channels: int, length: float, minimum: float = 0.5, threads: int | None = None) -> None:
-        self._threads = threads
+    def __init__(self, channels: int, length: float, minimum: float = 0.5) -> None:
         self._length, self._minimum = length, minimum
         self._start = np.nan
         self._single: bool | None = None
@@ -123,66 +165,79 @@ class Averager:
     def update(self, time: Times, values: NDArray[np.floating[Any]]) -> Averages:
         """Add ``values`` (channel, sample) at ``time`` (sample,); return the windows that are now complete."""
         if time.size == 0:
-            return self._averages([], [], [], [])
+            return self._none()
         if self._first is not None:
             time, values = np.append(self._first[0], values_of(time)), np.concatenate([self._first[1], values], axis=1)
             self._first = None
+        if self._single is None and time.size == 1:  # the interval of the samples is not known yet
+            self._first = values_of(time).copy(), values.copy()
+            return self._none()
+        windows = self.windows(time)
+        if windows is None:
+            return _samples_as_windows(values_of(time), values)
+        return self.add(time, windows, *window_sums(values, windows.edges, 1))
+
+    def windows(self, time: Times) -> Windows | None:
+        """Return the windows of the samples at ``time``, the next ones; None where `update` has to have the values."""
+        if self._first is not None or time.size == 0 or (self._single is None and time.size == 1):
+            return None
         if self._single is None:
-            if time.size == 1:  # the interval of the samples is not known yet
-                self._first = values_of(time).copy(), values.copy()
-                return self._averages([], [], [], [])
             self._start = first_and_last(time)[0]
             interval = usual_interval(time)
             self._single = interval > 0.5 * self._length
             self._tolerance = 0.5 * interval / self._length
             self._full = self._length / interval
         if self._single:
-            return _samples_as_windows(values_of(time), values)
+            return None
         # The tolerance of half a sample covers the rounding of times that were written as decimals.
         start, end = first_and_last(time)
         first = int(np.floor((start - self._start) / self._length + self._tolerance))
         last = int(np.floor((end - self._start) / self._length + self._tolerance))
         bounds = np.asarray(self._start + (np.arange(first + 1, last + 1) - self._tolerance) * self._length, np.float64)
-        edges = np.concatenate([[0], first_samples(time, bounds), [time.size]]).astype(np.int64)
-        sums, counts = window_sums(values, edges, self._threads)
-        samples = np.diff(edges)
-        times = time_sums(time, edges) + samples * start
-        done_sum, done_count, done_time, done_samples = [], [], [], []
-        for k in range(samples.size):
-            if first + k != self._index:
-                if self._samples:
-                    done_sum.append(self._sum)
-                    done_count.append(self._count)
-                    done_time.append(self._time)
-                    done_samples.append(self._samples)
-                self._index = first + k
-                self._sum, self._count = sums[:, k].copy(), counts[:, k].copy()
-                self._time, self._samples = float(times[k]), int(samples[k])
+        return Windows(first, last, np.concatenate([[0], first_samples(time, bounds), [time.size]]).astype(np.int64))
+
+    def add(self, time: Times, windows: Windows, sums: Array, counts: NDArray[np.int64]) -> Averages:
+        """Add the sums and numbers (channel, window) of values at ``time``; return the windows that are now complete."""
+        samples = np.diff(windows.edges)
+        times = time_sums(time, windows.edges) + samples * first_and_last(time)[0]
+        if self._samples:  # the window that the blocks before have left open goes on, or was their last one
+            if windows.first == self._index:
+                sums[:, 0] += self._sum
+                counts[:, 0] += self._count
+                times[0] += self._time
+                samples[0] += self._samples
             else:
-                self._sum += sums[:, k]
-                self._count += counts[:, k]
-                self._time += float(times[k])
-                self._samples += int(samples[k])
-        return self._averages(done_sum, done_count, done_time, done_samples)
+                sums, counts = np.column_stack([self._sum, sums]), np.column_stack([self._count, counts])
+                times, samples = np.append(self._time, times), np.append(self._samples, samples)
+        self._index = windows.last
+        self._sum, self._count = sums[:, -1].copy(), counts[:, -1].copy()
+        self._time, self._samples = float(times[-1]), int(samples[-1])
+        done = np.flatnonzero(samples[:-1])
+        return self._averages(sums[:, done], counts[:, done], times[done], samples[done])
 
     def finish(self) -> Averages:
         """Return the last window, if it is long enough to average out the run-out."""
         if self._first is not None:
             return _samples_as_windows(*self._first)
         if not self._samples or self._samples < _LEAST_WINDOW * self._full:
-            return self._averages([], [], [], [])
-        last = self._averages([self._sum], [self._count], [self._time], [self._samples])
+            return self._none()
+        last = self._averages(
+            self._sum[:, None], self._count[:, None], np.array([self._time]), np.array([self._samples])
+        )
         self._samples = 0
         return last
 
-    def _averages(self, sums: list[Any], counts: list[Any], times: list[float], samples: list[int]) -> Averages:
+    def _none(self) -> Averages:
         channels = self._sum.size
-        count = np.array(counts, np.int64).reshape(-1, channels).T
-        total = np.array(sums, np.float64).reshape(-1, channels).T
-        expected = np.array(samples, np.int64)
+        nothing = np.zeros(0, np.int64)
+        return self._averages(np.zeros((channels, 0)), np.zeros((channels, 0), np.int64), np.zeros(0), nothing)
+
+    def _averages(
+        self, total: Array, count: NDArray[np.int64], times: Array, expected: NDArray[np.int64]
+    ) -> Averages:
         enough = count >= np.maximum(1, self._minimum * np.maximum(expected, 0.99 * self._full))
         mean = np.where(enough, total / np.maximum(count, 1), np.nan)
-        return Averages(np.array(times) / np.maximum(expected, 1), mean, count, expected)
+        return Averages(times / np.maximum(expected, 1), mean, count, expected)
 
 
 def _samples_as_windows(time: Array, values: NDArray[np.floating[Any]]) -> Averages:
@@ -202,7 +257,7 @@ def join(parts: list[Averages]) -> Averages:
 
 
 def slices(raw: xr.Dataset) -> Iterator[tuple[Times, xr.Dataset]]:
-    """Yield (time, slice of the dataset) of a record along ``time``, a few tens of megabytes at a time.
+    """Yield (time, slice of the dataset) of a record along ``time``, `_SLICE_BYTES` at a time, in whole chunks.
 
     The time comes from the variable ``time``, or from the attributes ``sample_rate`` (Hz) and ``time_start`` (s).
     """

@@ -5,6 +5,7 @@ The loops add up in double precision. Only where the sum of a window is NaN they
 
 from __future__ import annotations
 
+from threading import Lock
 from typing import Any
 
 import numba
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
+_ONE = Lock()
+"""Not all of numba's ways to run threads allow calls from several of ours."""
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_FAST)
@@ -81,13 +84,14 @@ def sums(
     """Return sums and numbers of the values that are not NaN, see `averaging.window_sums`."""
     total = np.empty((len(values), edges.size - 1))
     counts = np.empty(total.shape, np.int64)
-    before = numba.get_num_threads()
-    numba.set_num_threads(threads or before)
-    try:
-        if values.T.flags.c_contiguous and not values.flags.c_contiguous:
-            _sum_columns(values.T, edges, total, counts)
-        else:
-            _sum_rows(np.ascontiguousarray(values), edges, total, counts)
-    finally:
-        numba.set_num_threads(before)
+    with _ONE:
+        before = numba.get_num_threads()
+        numba.set_num_threads(threads or before)
+        try:
+            if values.T.flags.c_contiguous and not values.flags.c_contiguous:
+                _sum_columns(values.T, edges, total, counts)
+            else:
+                _sum_rows(np.ascontiguousarray(values), edges, total, counts)
+        finally:
+            numba.set_num_threads(before)
     return total, counts

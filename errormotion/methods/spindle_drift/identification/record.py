@@ -7,7 +7,8 @@ scatter of the readings at steady speed beyond their noise.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,15 +17,23 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets.files.hashing import DatasetHasher, cores
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.identification.averaging import Averager, Averages, join, slices
+from errormotion.methods.spindle_drift.identification.averaging import (
+    COMPILED_SIZE,
+    Averager,
+    Averages,
+    Windows,
+    join,
+    slices,
+    window_sums,
+)
 from errormotion.methods.spindle_drift.identification.times import Times, first_and_last, increases, values_of
 from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from errormotion.datasets.files.hashing import DatasetHasher
     from errormotion.methods.spindle_drift.settings import Settings
 
 
@@ -64,52 +73,76 @@ def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -
     slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
     # The order is changed after reading: a lazy selection would read the store sample by sample.
     order = [list(raw["channel"].values).index(name) for name in CHANNELS]
-    # One thread: the hasher uses the other cores.
-    averager = Averager(len(CHANNELS), settings.average, settings.min_valid, threads=1)
+    averager = Averager(len(CHANNELS), settings.average, settings.min_valid)
     slow_averagers = {name: Averager(raw[name].sizes.get("sensor", 1), settings.average, minimum=0.0) for name in slow}
     parts: list[Averages] = []
     slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
     scatter: Array | None = None
-    last, done = -np.inf, 0
-    for time, part in _read_ahead(raw, ("distance", *slow)):
-        first, end = first_and_last(time)
-        if not (last < first and increases(time) and np.isfinite([first, end]).all()):
-            raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
-        last = end
-        read: dict[str, NDArray[Any]] = {}
-        for name, values in part.items():
-            hasher.update(name, values, time=slice(done, done + time.size))
-            # The axis is moved after reading: a lazy transposition reads sample by sample.
-            read[name] = np.moveaxis(values, raw[name].get_axis_num("time"), -1)
-        done += time.size
-        readings = read["distance"] if order == [0, 1, 2, 3, 4] else read["distance"][order]
-        parts.append(averager.update(time, readings))
+    for piece in _pieces(raw, {"distance": averager, **slow_averagers}, order, hasher):
+        parts.append(piece.added_to(averager, "distance"))
         for name in slow:
-            values = read[name].astype(np.float64)
-            slow_parts[name].append(slow_averagers[name].update(time, values.reshape(-1, time.size)))
-            if name == "spindle_speed" and scatter is None:
-                scatter = _scatter(values_of(time), readings, values, settings)
+            slow_parts[name].append(piece.added_to(slow_averagers[name], name))
+        if "spindle_speed" in slow and scatter is None:
+            speed = piece.values["spindle_speed"].astype(np.float64)
+            scatter = _scatter(values_of(piece.time), piece.values["distance"], speed[0], settings)
     parts.append(averager.finish())
     means = {name: join([*complete, slow_averagers[name].finish()]).mean for name, complete in slow_parts.items()}
     speed = means.get("spindle_speed")
     return Record(join(parts), means.get("temperature"), None if speed is None else speed[0], scatter)
 
 
-def _read_ahead(raw: xr.Dataset, names: tuple[str, ...]) -> Iterator[tuple[Times, dict[str, NDArray[Any]]]]:
-    """Yield (time, values of the variables) slice by slice, while the next slice is read."""
+@dataclass(frozen=True)
+class _Piece:
+    """A slice of a record: its times, values (row, sample), and their sums, None where each sample is a window."""
 
-    def read(part: xr.Dataset) -> dict[str, NDArray[Any]]:
-        return {name: np.asarray(part[name].values) for name in names}
+    time: Times
+    windows: Windows | None
+    values: dict[str, NDArray[Any]]
+    sums: dict[str, tuple[Array, NDArray[np.int64]]]
 
-    with ThreadPoolExecutor(1, thread_name_prefix="read") as pool:
-        before: tuple[Times, Future[dict[str, NDArray[Any]]]] | None = None
+    def added_to(self, averager: Averager, name: str) -> Averages:
+        """Return the windows that are complete with this slice."""
+        if self.windows is None:
+            return averager.update(self.time, self.values[name])
+        return averager.add(self.time, self.windows, *self.sums[name])
+
+
+def _pieces(
+    raw: xr.Dataset, averagers: Mapping[str, Averager], order: list[int], hasher: DatasetHasher
+) -> Iterator[_Piece]:
+    """Yield a record slice by slice. Each is read, hashed and added up by one thread while it is in its cache."""
+    # Numpy is four times slower where the channels of a sample are neighbours.
+    weight = 1 if raw["distance"].dims[-1] == "time" else 4
+    compiled = weight * raw["distance"].size >= COMPILED_SIZE
+
+    def work(time: Times, part: xr.Dataset, done: int, windows: Windows | None) -> _Piece:
+        values, sums = {}, {}
+        for name in averagers:
+            read = np.asarray(part[name].values)
+            hasher.update(name, read, time=slice(done, done + time.size))
+            # The axis is moved after reading: a lazy transposition reads sample by sample.
+            rows = np.moveaxis(read, raw[name].get_axis_num("time"), -1).reshape(-1, time.size)
+            if name == "distance" and order != [0, 1, 2, 3, 4]:
+                rows = rows[order]
+            values[name] = rows
+            if windows is not None:
+                sums[name] = window_sums(rows, windows.edges, 1, compiled=compiled)
+        return _Piece(time, windows, values, sums)
+
+    last, done = -np.inf, 0
+    with ThreadPoolExecutor(cores(), thread_name_prefix="slice") as pool:
+        running: deque[Future[_Piece]] = deque()
         for time, part in slices(raw):
-            coming = time, pool.submit(read, part)
-            if before is not None:
-                yield before[0], before[1].result()
-            before = coming
-        if before is not None:
-            yield before[0], before[1].result()
+            first, end = first_and_last(time)
+            if not (last < first and increases(time) and np.isfinite([first, end]).all()):
+                raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
+            _, *_, windows = (None, *(each.windows(time) for each in averagers.values()))  # the same for all
+            running.append(pool.submit(work, time, part, done, windows))
+            last, done = end, done + time.size
+            while len(running) > (cores() if windows is not None else 0):
+                yield running.popleft().result()
+        while running:
+            yield running.popleft().result()
 
 
 def _scatter(time: Array, readings: NDArray[np.floating[Any]], speed: Array, settings: Settings) -> Array | None:
