@@ -106,7 +106,7 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
     y = np.asarray(positions, dtype=float)
     cycles, artefacts = found.cold_share.shape
     W, A = strain.from_maps(rig.pose), chain.carriage_adjoint(rig.pose, rig.lever)
-    changed = rig.changed()
+    changed = [[_to_carriage(*rig_) for rig_ in pair] for pair in rig.changed()]
     e = np.full((cycles, artefacts, 6), np.nan)
     C = np.full((cycles, artefacts, 6, 6), np.nan)
     drift = np.full((cycles, artefacts, 3), np.nan)
@@ -126,8 +126,8 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
         e[c, used], C[c, used], gain = settled.twist, settled.covariance, settled.gain
         assumed[:, used[:, None], c, used] = transform(settled.assumed.reshape(2, used.size, used.size, 6), A)
         drift[c, used] = seen[:, 6:]
-        for s, (up, down) in enumerate(changed):
-            there, back = (_errors(maps, gain, *rig_) for rig_ in (up, down))
+        for s, pair in enumerate(changed):
+            there, back = (_errors(maps, gain, *matrices) for matrices in pair)
             influence[s, c, used] = (there - back) / 2
     covariance = transform_covariance(C, A)
     cold = _cold_influence(covariance, found)
@@ -156,10 +156,14 @@ def _settled(
     return strain.guided(twist, covariance, positions, to_carriage, guide)
 
 
-def _errors(maps: Array, gain: Array, pose: RigidTransform, lever: Array) -> Array:
+def _to_carriage(pose: RigidTransform, lever: Array) -> tuple[Array, Array]:
+    """Return what takes registrations to twists (6, 9), and these to twists of the carriage (6, 6)."""
+    return strain.from_maps(pose)[:6], chain.carriage_adjoint(pose, lever)
+
+
+def _errors(maps: Array, gain: Array, to_twist: Array, to_carriage: Array) -> Array:
     """Return the errors (n, 6) that registrations (n, 9) mean with another pose and lever, the same gain."""
-    motion = (gain @ (maps @ strain.from_maps(pose)[:6].T).ravel()).reshape(-1, 6)
-    return transform(motion, chain.carriage_adjoint(pose, lever))
+    return transform((gain @ (maps @ to_twist.T).ravel()).reshape(-1, 6), to_carriage)
 
 
 def _cold_influence(covariance: Array, found: Registrations) -> Array:
