@@ -122,7 +122,7 @@ def _relax(height: Array, filled: NDArray[np.int64], sweeps: int) -> None:
     third, which = np.divmod(i + j - int(np.min(i + j)), 3)
     turn = which * (int(third.max()) + 1) + third
     order = np.argsort(turn, kind="stable")
-    order = order[inside.any(axis=0)[order]]
+    order = order[np.asarray(inside.any(axis=0))[order]]
     turn, inside, node = turn[order], inside[:, order].astype(float), (bx * i + j)[order]
     # Where there are no two neighbours on both sides, what is found along that direction counts 0 times.
     reach = np.array([-2, -1, 1, 2])[:, None]
