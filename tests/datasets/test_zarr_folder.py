@@ -118,7 +118,11 @@ def test_what_this_reader_does_not_know_is_left_to_the_library(tmp_path, options
 def test_consolidated_metadata_count_before_those_of_the_arrays(tmp_path) -> None:
     path, array = folder(tmp_path / "x.zarr", np.arange(10.0), (4,))
     root = json.loads((path / "zarr.json").read_text())
-    held = {"kind": "inline", "must_understand": False, "metadata": {"x": json.loads((path / "x/zarr.json").read_text())}}
+    held = {
+        "kind": "inline",
+        "must_understand": False,
+        "metadata": {"x": json.loads((path / "x/zarr.json").read_text())},
+    }
     (path / "zarr.json").write_text(json.dumps(root | {"consolidated_metadata": held}))
     array.resize(12)
     ds = open_zarr(path)
@@ -150,7 +154,13 @@ def test_texts_come_back_and_damaged_ones_are_refused(tmp_path) -> None:
     assert found["name"].values.tolist() == ds["name"].values.tolist()
     chunk = path / "name" / "c" / "0"
     content = chunk.read_bytes()
-    for damaged in (b"", content[:-3], b"\x05" + content[1:], content[:4] + b"\xff" + content[5:], content[:9] + b"\xff"):
+    for damaged in (
+        b"",
+        content[:-3],
+        b"\x05" + content[1:],
+        content[:4] + b"\xff" + content[5:],
+        content[:9] + b"\xff",
+    ):
         chunk.write_bytes(damaged)
         with pytest.raises(DatasetError, match=r"is damaged or incomplete"):
             load(path)

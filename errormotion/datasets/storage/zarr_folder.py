@@ -176,8 +176,7 @@ class _Array(BackendArray):
             """Read what one chunk has of the box."""
             begin = [k * size for k, size in zip(place, self.chunk, strict=True)]
             spans = [
-                (max(a, o), min(b + 1, o + size))
-                for a, b, o, size in zip(first, last, begin, self.chunk, strict=True)
+                (max(a, o), min(b + 1, o + size)) for a, b, o, size in zip(first, last, begin, self.chunk, strict=True)
             ]
             target = box[(*(slice(a - o, b - o) for (a, b), o in zip(spans, first, strict=True)), ...)]
             self._chunk_into(place, [slice(a - o, b - o) for (a, b), o in zip(spans, begin, strict=True)], target)

@@ -1,5 +1,6 @@
 """The pose between two scans: its sign, its precision against the bound, its honesty, and what is refused."""
 
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -11,7 +12,8 @@ from scipy.spatial.transform import RigidTransform
 from errormotion import compiling
 from errormotion.errors import MethodError
 from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.identification.registration import comparison, prepare, register
+from errormotion.methods.crossbeam_scan.identification.registration import kernels, prepare, register
+from errormotion.methods.crossbeam_scan.identification.registration.comparison import lag_sums
 from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem, State
 
@@ -313,17 +315,35 @@ def test_what_an_artefact_tells_is_the_sum_over_its_blocks(scanner):
     assert of_noise[6, 6] == pytest.approx(np.sum(Y**2))
 
 
-def test_one_thread_and_several_add_up_the_same(scanner, motion, monkeypatch):
+def test_one_thread_and_several_and_array_operations_add_up_the_same(scanner, motion, monkeypatch):
     rng = np.random.default_rng(14)
     problem = Problem.of(prepare(*scanner.scan(rng)), prepare(*scanner.scan(rng, motion)))
     plain = problem.evaluate(State.of(motion))  # by array operations
-    monkeypatch.setattr(comparison, "COMPILED_FROM", 0)
+    problem = replace(problem, cold=replace(problem.cold, compiled=True))
     alone = problem.evaluate(State.of(motion))
     np.testing.assert_allclose(plain.residual, alone.residual, rtol=0, atol=1e-15)
     np.testing.assert_allclose(plain.weight, alone.weight, rtol=1e-9)
     np.testing.assert_allclose(plain.A.sum(axis=0), alone.A.sum(axis=0), rtol=1e-9)
-    monkeypatch.setattr(comparison, "MANY", 0)
+    monkeypatch.setattr(kernels, "MANY", 0)
     monkeypatch.setattr(compiling, "threads", lambda: 3)
     shared = problem.evaluate(State.of(motion))
     np.testing.assert_array_equal(shared.residual, alone.residual)
     np.testing.assert_allclose(shared.A, alone.A, rtol=1e-12)
+
+
+def test_neighbours_are_multiplied_within_the_map():
+    rng = np.random.default_rng(15)
+    residual, weight = rng.standard_normal((2, 7, 9))
+    weight = np.where(rng.random(weight.shape) < 0.2, 0.0, weight**2)
+    residual[weight == 0] = np.nan
+    r, known = np.sqrt(weight) * np.nan_to_num(residual), weight > 0
+    sums, pairs = lag_sums(residual, weight, 2)
+    for i in range(3):
+        for j in range(-2, 3):
+            there = [
+                (r[p, q] * r[p + i, q + j], known[p, q] and known[p + i, q + j])
+                for p in range(7 - i)
+                for q in range(max(-j, 0), min(9 - j, 9))
+            ]
+            assert sums[i, j + 2] == pytest.approx(sum(product for product, _ in there), rel=1e-12, abs=1e-12)
+            assert pairs[i, j + 2] == sum(both for _, both in there)

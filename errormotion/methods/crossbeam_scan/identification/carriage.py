@@ -107,7 +107,7 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
     y = np.asarray(positions, dtype=float)
     cycles, artefacts = found.cold_share.shape
     W, A = strain.from_maps(rig.pose), chain.carriage_adjoint(rig.pose, rig.lever)
-    changed = rig.changed()
+    changed = [[_to_carriage(*rig_) for rig_ in pair] for pair in rig.changed()]
     e = np.full((cycles, artefacts, 6), np.nan)
     C = np.full((cycles, artefacts, 6, 6), np.nan)
     drift = np.full((cycles, artefacts, 3), np.nan)
@@ -127,8 +127,8 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
         e[c, used], C[c, used], gain = guided.twist, guided.covariance, guided.gain
         assumed[:, used[:, None], c, used] = transform(guided.assumed.reshape(2, used.size, used.size, 6), A)
         drift[c, used] = seen[:, 6:]
-        for s, (up, down) in enumerate(changed):
-            plus, minus = (_errors(maps, gain, *changed_rig) for changed_rig in (up, down))
+        for s, pair in enumerate(changed):
+            plus, minus = (_errors(maps, gain, *matrices) for matrices in pair)
             influence[s, c, used] = (plus - minus) / 2
     covariance = transform_covariance(C, A)
     cold = _cold_influence(covariance, found)
@@ -157,10 +157,14 @@ def _guided(
     return strain.guided(twist, covariance, positions, to_carriage, guide)
 
 
-def _errors(maps: Array, gain: Array, pose: RigidTransform, lever: Array) -> Array:
+def _to_carriage(pose: RigidTransform, lever: Array) -> tuple[Array, Array]:
+    """Return the matrices from registrations to twists (6, 9), and from these to twists of the carriage (6, 6)."""
+    return strain.from_maps(pose)[:6], chain.carriage_adjoint(pose, lever)
+
+
+def _errors(maps: Array, gain: Array, to_twist: Array, to_carriage: Array) -> Array:
     """Return the errors (n, 6) of registrations (n, 9) for another pose and lever, with the same gain."""
-    motion = (gain @ (maps @ strain.from_maps(pose)[:6].T).ravel()).reshape(-1, 6)
-    return transform(motion, chain.carriage_adjoint(pose, lever))
+    return transform((gain @ (maps @ to_twist.T).ravel()).reshape(-1, 6), to_carriage)
 
 
 def _cold_influence(covariance: Array, found: Registrations) -> Array:

@@ -1,7 +1,7 @@
 """Registrations of all warm scans of a campaign onto their cold scans.
 
-Scans are read one at a time, artefact by artefact, each while the previous one is registered: the campaign may be
-larger than memory.
+Scans are read and reduced to blocks one at a time, artefact by artefact, each while the previous one is registered:
+the campaign may be larger than memory.
 """
 
 from __future__ import annotations
@@ -149,10 +149,9 @@ def _artefact(
             found.reason[cycle, k] = "there is no cold scan to register it onto"
             continue
         try:
-            if isinstance(scan, MethodError):
-                raise scan
-            height, x, y, found.time[cycle, k] = scan
-            warm = prepare(height, x, y)
+            found.time[cycle, k], warm = scan
+            if isinstance(warm, MethodError):
+                raise warm
             if cold is None:
                 cold, maps = warm, _maps(warm)
                 found.cold[k] = cycle
@@ -185,14 +184,16 @@ def _coarse(cold: BlockMap, artefact: int) -> list[str]:
     ]
 
 
-def _prefetched(scans: Scans, cycles: Sequence[int], artefact: int) -> Iterator[Scan | MethodError]:
-    """Yield scans; the next one is loaded in a thread."""
+def _prefetched(scans: Scans, cycles: Sequence[int], artefact: int) -> Iterator[tuple[float, BlockMap | MethodError]]:
+    """Yield time and blocks of scans; the next one is loaded and reduced to blocks in a thread."""
 
-    def load(cycle: int) -> Scan | MethodError:
+    def load(cycle: int) -> tuple[float, BlockMap | MethodError]:
+        time = np.nan
         try:
-            return scans.scan(cycle, artefact)
+            height, x, y, time = scans.scan(cycle, artefact)
+            return time, prepare(height, x, y, scans.cycles * scans.artefacts)
         except MethodError as error:
-            return error
+            return time, error
 
     with ThreadPoolExecutor(1) as pool:
         future = pool.submit(load, cycles[0])
@@ -282,7 +283,6 @@ def _store_maps(maps: Maps | None, cold: BlockMap, warm: BlockMap, result: Regis
     rows, columns = _thin(warm)
     if (rows.size, columns.size) != maps.surface.shape:
         return
-    problem = Problem.of(cold, warm)
-    before = problem.evaluate(problem.rest).residual
-    maps.before[cycle] = before[rows][:, columns]
+    problem = Problem.of(cold, warm).at(rows, columns)
+    maps.before[cycle] = problem.evaluate(problem.rest).residual
     maps.after[cycle] = result.residual[rows][:, columns]

@@ -232,9 +232,7 @@ class Averager:
         nothing = np.zeros(0, np.int64)
         return self._averages(np.zeros((channels, 0)), np.zeros((channels, 0), np.int64), np.zeros(0), nothing)
 
-    def _averages(
-        self, total: Array, count: NDArray[np.int64], times: Array, expected: NDArray[np.int64]
-    ) -> Averages:
+    def _averages(self, total: Array, count: NDArray[np.int64], times: Array, expected: NDArray[np.int64]) -> Averages:
         enough = count >= np.maximum(1, self._minimum * np.maximum(expected, 0.99 * self._full))
         mean = np.where(enough, total / np.maximum(count, 1), np.nan)
         return Averages(times / np.maximum(expected, 1), mean, count, expected)

@@ -16,13 +16,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.identification.registration import kernels
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Moments
-from errormotion.methods.crossbeam_scan.identification.registration.kernels import COLUMNS, POINTS, ROWS
+from errormotion.methods.crossbeam_scan.identification.registration.kernels.planes import COLUMNS, FEWEST, POINTS, ROWS
+from errormotion.methods.crossbeam_scan.identification.registration.reduction import (
+    blocks_of,
+    reduce_blocks,
+    robust_planes,
+)
 from errormotion.methods.crossbeam_scan.identification.registration.surface import Surface, repaired
 
 LARGEST = 1.0
 """Largest size of an artefact, m; larger numbers are taken for millimetres."""
+COMPILED_FROM = 60_000_000
+"""Points of a campaign from which loops are compiled: less than these take less time than to compile them."""
 FEWEST_BLOCKS = 8
 BESIDE_HOLE = 3.0
 """Factor on the variance of blocks next to a hole, because the filled heights are not measured."""
@@ -53,6 +59,8 @@ class BlockMap:
         Standard deviation of the blocks' slopes, the larger of both directions.
     scan : tuple of ndarray
         The height map, its x and its y, as given.
+    compiled : bool
+        Whether compiled loops work on it and on what is registered onto it.
     """
 
     x: Array
@@ -65,6 +73,7 @@ class BlockMap:
     noise: float
     slope_noise: float
     scan: tuple[NDArray[np.float32], Array, Array] = field(repr=False)
+    compiled: bool = False
 
     @property
     def pitch(self) -> tuple[float, float]:
@@ -116,7 +125,7 @@ class BlockMap:
         return Moments(q @ q.T, q[8:] @ q[8:].T, q.shape[1])
 
 
-def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
+def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike, scans: int = 1) -> BlockMap:
     """Reduce a scan to blocks.
 
     Parameters
@@ -127,6 +136,9 @@ def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
         Positions of the points along the profile, m, evenly spaced and rising.
     y : array_like (row,)
         Positions of the profiles along the feed, m, rising; uneven by less than their pitch.
+    scans : int
+        How many scans the campaign has: loops are compiled for large campaigns only. The result is the same but for
+        rounding.
 
     Returns
     -------
@@ -156,12 +168,13 @@ def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
     if scales.size < FEWEST_BLOCKS:
         raise MethodError(
             f"expected a surface, found heights in {np.isfinite(z).mean():.1%} of the points and nowhere "
-            f"{kernels.FEWEST} of {POINTS} neighbours together; check the sensor's range and exposure"
+            f"{FEWEST} of {POINTS} neighbours together; check the sensor's range and exposure"
         )
     # A scan without any noise still has the last bit of its numbers; some of them give its size.
     least = float(np.spacing(np.nanmax(np.abs(z[:: 4 * ROWS - 1, :: COLUMNS - 1]))))
-    out = kernels.reduce_blocks(z, dx[0], dy, max(float(np.median(scales)), least))
-    return _deblurred(out, xc, yc, dx[0], dy[0], least, (z, x, y))
+    compiled = scans * z.size >= COMPILED_FROM
+    out = reduce_blocks(z, dx[0], dy, max(float(np.median(scales)), least), compiled)
+    return _deblurred(out, xc, yc, dx[0], dy[0], least, (z, x, y), compiled)
 
 
 def _centres(name: str, positions: Array, blocks: int, size: int, tolerance: float) -> tuple[Array, Array]:
@@ -194,8 +207,9 @@ def _centres(name: str, positions: Array, blocks: int, size: int, tolerance: flo
 
 
 def _deblurred(
-    out: Array, x: Array, y: Array, dx: Array, dy: Array, least: float, scan: tuple[NDArray[np.float32], Array, Array]
-) -> BlockMap:
+    out: Array, x: Array, y: Array, dx: Array, dy: Array, least: float, scan: tuple[NDArray[np.float32], Array, Array],
+    compiled: bool,
+) -> BlockMap:  # fmt: skip
     """Return the block map of the kernel's columns: filled, sharpened, its noise estimated."""
     mean, sx, sy, gain = out[0], out[1], out[2], out[5]
     pitch_x, pitch_y = x[1] - x[0], y[1] - y[0]
@@ -217,7 +231,7 @@ def _deblurred(
         variance = np.where(known, np.where(_beside(~known), BESIDE_HOLE, 1.0) * variance, np.inf)
     slope_noise = max(_slope_noise(out[1], height, pitch_x, 1), _slope_noise(out[2], height, pitch_y, 0))
     points = out[4].astype(np.int64)
-    return BlockMap(x, y, height, out[1], out[2], variance, points, float(noise), slope_noise, scan)
+    return BlockMap(x, y, height, out[1], out[2], variance, points, float(noise), slope_noise, scan, compiled)
 
 
 def _beside(lost: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -257,31 +271,11 @@ def upper_median(values: Array) -> float:
 
 
 def _block_scales(z: NDArray[np.float32], dx: Array, dy: Array, step: int) -> Array:
-    """Return the robust scatter (m) of every ``step``-th block about its plane, without those of too few points.
-
-    The plane is that of `kernels._robust_plane`.
-    """
-    columns = z.shape[1] // COLUMNS
-    chosen = np.arange(0, len(dy) * columns, step)
-    row, column = chosen // columns, chosen % columns
-    lines, points = (ROWS * row)[:, None] + np.arange(ROWS), (COLUMNS * column)[:, None] + np.arange(COLUMNS)
-    block, y = z[lines[:, :, None], points[:, None, :]].astype(float), dy[row]
-    half_r, half_c = ROWS // 2, COLUMNS // 2
-    sx = _medians(block[:, :, half_c:] - block[:, :, :half_c], kernels.FEWEST // 4) / (dx[half_c] - dx[0])
-    run = (y[:, half_r:] - y[:, :half_r])[:, :, None]
-    sy = _medians((block[:, half_r:] - block[:, :half_r]) / run, kernels.FEWEST // 4)
-    rest = block - sx[:, None, None] * dx - sy[:, None, None] * y[:, :, None]
-    height = _medians(rest, kernels.FEWEST)
-    scales = NORMAL_MAD * _medians(np.abs(rest - height[:, None, None]), kernels.FEWEST)
+    """Return the robust scatter (m) of every ``step``-th block about its plane, without those of too few points."""
+    blocks = blocks_of(z, len(dy))
+    row, column = np.divmod(np.arange(0, len(dy) * blocks.shape[2], step), blocks.shape[2])
+    scales = robust_planes(blocks[row, :, column], dx, dy[row])[3]
     return np.asarray(scales[np.isfinite(scales)])
-
-
-def _medians(values: Array, fewest: int) -> Array:
-    """Return the upper median of each block's finite values (block, ...); NaN where there are fewer than this."""
-    ordered = np.sort(values.reshape(len(values), -1), axis=1)  # NaN come last
-    count = np.isfinite(ordered).sum(axis=1)
-    middle = ordered[np.arange(len(ordered)), np.minimum(count // 2, ordered.shape[1] - 1)]
-    return np.where(count < max(fewest, 1), np.nan, middle)
 
 
 def _sharpened(maps: Array, pitch_x: float, pitch_y: float, bends: Array) -> tuple[Array, Array]:

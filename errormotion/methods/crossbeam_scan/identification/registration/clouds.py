@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform
@@ -40,6 +39,8 @@ def open3d() -> Any:
     MethodError
         Open3D is not installed.
     """
+    import numba
+
     numba.get_num_threads()  # its threads start before Open3D loads a TBB of its own, which numba would warn of
     try:
         import open3d as module

@@ -15,7 +15,7 @@ from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.registration.blocks import THIN, BlockMap
 from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Freedoms, freedoms, refuse, scales
-from errormotion.methods.crossbeam_scan.identification.registration.kernels import ROWS
+from errormotion.methods.crossbeam_scan.identification.registration.kernels.planes import ROWS
 from errormotion.methods.crossbeam_scan.identification.registration.result import Registration
 from errormotion.methods.crossbeam_scan.identification.registration.solver import (
     Noise,

@@ -22,6 +22,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.arrays import NORMAL_MAD, Array
@@ -60,6 +61,11 @@ class Problem:
         x, y = warm.x[some].copy(), warm.y[some].copy()
         return cls(np.stack([z[some, some] for z in maps]), x, y, cold, cold.centre, extra)
 
+    def at(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Problem:
+        """Return the problem with the warm blocks of some rows and columns."""
+        stack = np.ascontiguousarray(self.stack[:, rows[:, None], columns])
+        return replace(self, stack=stack, x=self.x[columns], y=self.y[rows])
+
     @property
     def rest(self) -> State:
         """No motion."""
@@ -71,7 +77,7 @@ class Problem:
         n = 6 + len(self.extra.bases)
         residual, weight, rows = compare(
             self.stack, self.x, self.y, matrix, normal, self.centre, self.extra.bases, self.cold.surface.coefficients,
-            self.cold.variance, self.cold.surface.grid, gate,
+            self.cold.variance, self.cold.surface.grid, gate, self.cold.compiled,
         )  # fmt: skip
         A, g = rows[:, : n * n].reshape(-1, n, n), rows[:, n * n : n * n + n]
         return Sums(residual, weight, A, g, *rows[:, n * n + n :].T)
@@ -261,8 +267,8 @@ def _maximised(C: Array, u: Array, k: float, tau: Array) -> Array:
     """Return the standard deviations of the line effects after some steps of expectation and maximisation."""
     for _ in range(_EM_STEPS):
         K00, K01, K11 = line_gain(C, k, *tau)
-        effects = np.stack([K00 * u[:, 0] + K01 * u[:, 1], K01 * u[:, 0] + K11 * u[:, 1]])
-        tau = np.sqrt(np.mean(effects**2 + k * np.stack([K00, K11]), axis=1))
+        of_z, of_y = K00 * u[:, 0] + K01 * u[:, 1], K01 * u[:, 0] + K11 * u[:, 1]
+        tau = np.sqrt([(of_z**2 + k * K00).mean(), (of_y**2 + k * K11).mean()])
     return tau
 
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from errormotion.arrays import Array
-from errormotion.methods.crossbeam_scan.identification.registration import kernels
 
 SWEEPS = 40
 _BAND = 4
@@ -89,63 +88,50 @@ def repaired(height: Array, slope_x: Array, slope_y: Array, pitch_x: float, pitc
     return height, slope_x, slope_y
 
 
-@kernels.compiled()
-def _spread(height: Array, sx: Array, sy: Array, pitch_x: float, pitch_y: float) -> int:  # pragma: no cover - compiled
-    """Fill blocks without height (NaN) from their neighbours' planes, outwards from the known, then smooth the filled.
+def _spread(height: Array, sx: Array, sy: Array, pitch_x: float, pitch_y: float) -> None:
+    """Fill blocks without height (NaN) by the mean of their neighbours' planes, outwards from the known ones."""
+    inner = np.asarray(np.isfinite(height))
+    if not inner.any():
+        return
+    maps = np.stack([np.where(inner, values, 0.0) for values in (height, sx, sy, 1.0)])
+    maps = np.pad(maps, ((0, 0), (1, 1), (1, 1)))  # the fourth is 1 where a block is known
+    i, j = 1 + np.argwhere(~inner).T
+    while len(i):
+        total = np.zeros((4, len(i)))
+        for p in (-1, 0, 1):
+            for q in (-1, 0, 1):
+                h, gx, gy, known = maps[:, i + p, j + q]
+                total += np.stack([h - gx * q * pitch_x - gy * p * pitch_y, gx, gy, known])
+        beside = np.asarray(total[3] > 0)
+        maps[:, i[beside], j[beside]] = total[:, beside] / total[3, beside]
+        i, j = i[~beside], j[~beside]
+    for values, found in zip((height, sx, sy), maps[:3, 1:-1, 1:-1], strict=True):
+        values[~inner] = found[~inner]
 
-    Returns
-    -------
-    int
-        How many were filled.
+
+def _relax(height: Array, filled: NDArray[np.int64], sweeps: int) -> None:
+    """Bend the filled blocks (n, 2) so that fourth differences vanish along rows and columns (Gauss-Seidel).
+
+    Each depends on the blocks up to two away along its row and column: not on others of its diagonal, and on those of
+    the next two as the sweep before has left them. So every third diagonal is changed at once, each a sweep behind the
+    one on its left, and the result is that of one block after the other.
     """
     by, bx = height.shape
-    lost = np.argwhere(np.isnan(height))
-    if len(lost) == 0 or len(lost) == by * bx:
-        return len(lost)
-    known = ~np.isnan(height)
-    waiting, left = lost, len(lost)
-    while left > 0:
-        order = np.empty((left, 2), np.int64)
-        filled = np.empty((left, 3))
-        n, rest = 0, 0
-        for k in range(left):
-            i, j = waiting[k, 0], waiting[k, 1]
-            count, h, gx, gy = 0, 0.0, 0.0, 0.0
-            for p in range(max(i - 1, 0), min(i + 2, by)):
-                for q in range(max(j - 1, 0), min(j + 2, bx)):
-                    if known[p, q]:
-                        h += height[p, q] + sx[p, q] * (j - q) * pitch_x + sy[p, q] * (i - p) * pitch_y
-                        gx += sx[p, q]
-                        gy += sy[p, q]
-                        count += 1
-            if count:
-                order[n, 0], order[n, 1] = i, j
-                filled[n, 0], filled[n, 1], filled[n, 2] = h / count, gx / count, gy / count
-                n += 1
-            else:
-                waiting[rest, 0], waiting[rest, 1] = i, j
-                rest += 1
-        for k in range(n):
-            i, j = order[k, 0], order[k, 1]
-            height[i, j], sx[i, j], sy[i, j] = filled[k, 0], filled[k, 1], filled[k, 2]
-            known[i, j] = True
-        left = rest
-    return len(lost)
-
-
-@kernels.compiled()
-def _relax(height: Array, filled: NDArray[np.int64], sweeps: int) -> None:  # pragma: no cover - compiled
-    """Bend the filled blocks so that fourth differences vanish along rows and columns (Gauss-Seidel)."""
-    by, bx = height.shape
-    for _ in range(sweeps):
-        for k in range(len(filled)):
-            i, j = filled[k, 0], filled[k, 1]
-            total, count = 0.0, 0
-            if 2 <= i < by - 2:
-                total += 4.0 * (height[i - 1, j] + height[i + 1, j]) - height[i - 2, j] - height[i + 2, j]
-                count += 6
-            if 2 <= j < bx - 2:
-                total += 4.0 * (height[i, j - 1] + height[i, j + 1]) - height[i, j - 2] - height[i, j + 2]
-                count += 6
-            if count:
-                height[i, j] = total / count
+    i, j = filled.T
+    inside = np.stack([(i >= 2) & (i < by - 2), (j >= 2) & (j < bx - 2)])
+    third, which = np.divmod(i + j - int(np.min(i + j)), 3)
+    turn = which * (int(third.max()) + 1) + third
+    order = np.argsort(turn, kind="stable")
+    order = order[np.asarray(inside.any(axis=0))[order]]
+    turn, inside, node = turn[order], inside[:, order].astype(float), (bx * i + j)[order]
+    # Where there are no two neighbours on both sides, what is found along that direction counts 0 times.
+    reach = np.array([-2, -1, 1, 2])[:, None]
+    around = np.stack([node + (reach * step * use).astype(int) for step, use in zip((bx, 1), inside, strict=True)])
+    count, flat, last = 6.0 * inside.sum(axis=0), height.reshape(-1), int(third.max())
+    for stage in range(3 * (last + sweeps)):
+        first = (stage % 3) * (last + 1)
+        lowest, highest = max(stage // 3 - sweeps + 1, 0), min(stage // 3, last)
+        part = slice(*np.searchsorted(turn, [first + lowest, first + highest + 1]))
+        far, near, near_too, far_too = flat[around[:, :, part]].swapaxes(0, 1)
+        bent = inside[:, part] * (4.0 * (near + near_too) - far - far_too)
+        flat[node[part]] = (bent[0] + bent[1]) / count[part]
