@@ -176,5 +176,5 @@ def test_damaged_lists_of_recordings_and_scans(tmp_path: Path) -> None:
 
     good = (tmp_path / "scans.rec").read_bytes()
     mutants.check(replay, good, seed=8, number=mutants.count(500))
-    with pytest.raises(InstrumentError, match="no name of a file"):
+    with pytest.raises(InstrumentError, match="is not a file name"):
         replay(good.replace(b"scan.csv", b"scan.csv\0"))

@@ -460,7 +460,7 @@ def test_an_invalid_address_is_refused(params: str, message: str) -> None:
 
 
 def test_only_the_gantry_has_a_table() -> None:
-    with pytest.raises(InstrumentError, match="only on sim://gantry"):
+    with pytest.raises(InstrumentError, match="only sim://gantry has a crossbeam"):
         KeyenceLJX("sim://cframe/profiler?artefact=twin").open()
 
 
@@ -489,7 +489,7 @@ def test_one_clock_is_controlled_by_one_kind_of_device() -> None:
         controller.run_program(forwards(0, 100))
         stream = device.stream(10)
         next(stream)
-        with pytest.raises(InstrumentError, match="Another device drives the clock"):
+        with pytest.raises(InstrumentError, match="Another device controls the clock"):
             sensor.read()
         next(stream)
         stream.close()

@@ -53,7 +53,7 @@ def test_moves_without_travel_take_no_time_and_nothing_is_read_after_the_end() -
 @pytest.mark.parametrize(
     ("line", "why"),
     [
-        ("G91", "write G90"),
+        ("G91", "use G90"),
         ("G20 G1 Y1", "inches"),
         ("M0", "remove the stop"),
         ("M01", "remove the stop"),
@@ -61,9 +61,9 @@ def test_moves_without_travel_take_no_time_and_nothing_is_read_after_the_end() -
         ("G1.5 Y10", "'G1.5' is not supported"),
         ("M8", "'M8' is not supported"),
         ("M3 S1000", "a spindle is not available here"),
-        ("M3", "expected the spindle's speed"),
+        ("M3", "expected the spindle speed"),
         ("M3 M5 S1000", "M3 and M5 in one line"),
-        ("S1000", "M3 belongs to it"),
+        ("S1000", "expected M3 with it"),
         ("G31 Y10 F100", "a probe is not available here"),
         ("DPRNT[Y#5062[53]]", "a printer is not available here"),
         ("T1", "'T' is not supported"),
@@ -78,7 +78,7 @@ def test_moves_without_travel_take_no_time_and_nothing_is_read_after_the_end() -
         ("G0 Z-0.5", r"Z travels from 0 to 1000 mm; found -0\.5"),
         ("G1 Y10 F0", r"at most 20000 mm/min; found 0"),
         ("G1 Y10 F20001", r"at most 20000 mm/min; found 20001"),
-        ("G4", "expected a dwell as G4 P2.5"),
+        ("G4", "expected a dwell such as G4 P2.5"),
         ("G4 X2.0", "expected a dwell"),
         ("G4 P-1", "expected a dwell"),
         ("G1 Y10 P5", "only with a dwell"),
@@ -92,7 +92,7 @@ def test_unknown_text_is_refused_with_its_line(line: str, why: str) -> None:
 def test_a_move_needs_its_kind_and_its_feed() -> None:
     with pytest.raises(InstrumentError, match=r"Line 1 'Y10': a position before G0 or G1"):
         run("Y10", "M30")
-    with pytest.raises(InstrumentError, match=r"Line 2 'G1 Y20': .* no feed F"):
+    with pytest.raises(InstrumentError, match=r"Line 2 'G1 Y20': .* before a feed F"):
         run("G0 Y10", "G1 Y20", "M30")
 
 

@@ -77,7 +77,7 @@ def test_the_state_names_the_target_only_while_there_is_one() -> None:
         (("cube",), "Expected the target 'plane', 'bar' or None"),
         (("plane",), "inclination and rotation"),
         (("plane", 0.1), "inclination and rotation"),
-        (("bar", 0.1, 0.2), "for a plane only"),
+        (("bar", 0.1, 0.2), "only with a plane"),
         (("plane", 1.2, 0.0), "inclination from 0 to 60 deg; found 68.7"),
     ],
 )

@@ -123,7 +123,7 @@ def test_a_jump_is_refused(compensator: LinuxCNCOffset) -> None:
 def test_without_arming_or_a_write_nothing_is_requested(machine: Machine) -> None:
     until(lambda: machine.pins("errormotion-alive.out") == [0.0])
     with machine.compensator() as unarmed, machine.compensator() as other:
-        with pytest.raises(InstrumentError, match="is not armed; it reads only"):
+        with pytest.raises(InstrumentError, match="is not armed; it only reads"):
             unarmed.write([1e-6, 0.0, 0.0])
         other.arm(LIMIT * 1e-6)  # the right is released
         for _ in range(5):

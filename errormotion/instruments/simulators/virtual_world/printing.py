@@ -2,7 +2,7 @@
 
 Sources: Haas 96-8000 rev. AC, May 2010, p. 116 (text, formats, rounding, leading spaces, growing fields); NCT 2000M/99M
 Programmer's Manual, p. 193 (digits before and after the point, ISO code with even parity, line feed). The format of
-FANUC is from memory; the documentation of the driver ``dprnt`` lists the assumptions.
+FANUC is from memory; the page of the touch probe that reads these lines lists the assumptions.
 """
 
 from __future__ import annotations

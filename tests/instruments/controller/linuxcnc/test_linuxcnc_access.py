@@ -165,7 +165,7 @@ def test_a_token_that_others_can_read_is_not_used(start: Start, tmp_path: Path) 
             LinuxCNC(f"tcp://127.0.0.1:{port}", LinuxCNCSettings(token_file=token)).open()
     again = subprocess.run([sys.executable, BRIDGE], env={"HOME": str(tmp_path)}, capture_output=True, check=False)
     assert again.returncode == 1
-    assert b"nobody else can read" in again.stderr
+    assert b"no other user can read" in again.stderr
 
 
 def test_without_a_token_the_message_states_the_remedy(start: Start, tmp_path: Path) -> None:

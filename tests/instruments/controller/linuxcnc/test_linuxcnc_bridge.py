@@ -535,7 +535,7 @@ def test_many_stop_requests_are_one_stop(play: Callable[[Test], None]) -> None:
         ("move_to", {"position": [0, 0, True]}, "expected a coordinate"),
         ("move_to", {"position": [0, 0, 0.11]}, "Z travels from -0.1 to 0.1 m; found 0.11"),
         ("move_to", {"position": [0, 0, 0], "feed": -1}, "feed above 0"),
-        ("probe", {"target": [0, 0, 0], "feed": 0.1}, "is at the target"),
+        ("probe", {"target": [0, 0, 0], "feed": 0.1}, "is already at the target"),
         ("probe", {"target": [0, 0, 0.01], "feed": None}, "expected a feed"),
         ("move_to", {"position": [0, 0, 0], "feed": 1e308}, "at most 10 m/s"),
         ("move_to", {"position": [0, 0, 0], "feed": 10**400}, "expected a feed"),
@@ -880,7 +880,7 @@ def test_a_token_that_others_can_read_is_refused(tmp_path: Path, mode: int) -> N
     path = tmp_path / "own" / "token"
     module.own_token(path)
     path.chmod(mode)
-    with pytest.raises(PermissionError, match="nobody else can read"):
+    with pytest.raises(PermissionError, match="no other user can read"):
         module.own_token(path)
 
 

@@ -500,7 +500,7 @@ def test_a_ball_is_touched_through_linuxcnc() -> None:
 
 
 def test_another_machine_is_refused_while_one_runs(machine: LinuxCNC) -> None:
-    with pytest.raises(InstrumentError, match=r"can run one LinuxCNC.*close that driver first"):
+    with pytest.raises(InstrumentError, match=r"can only run one LinuxCNC.*close that driver first"):
         LinuxCNC("sim://cframe/linuxcnc?seed=4").open()
     assert machine.state()["enabled"]
 

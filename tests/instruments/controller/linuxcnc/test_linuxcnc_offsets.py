@@ -101,7 +101,7 @@ def test_two_heartbeats_within_one_servo_cycle_would_be_lost(pins: Pins) -> None
     [
         ({"motion.motion-enabled": False}, "the machine is off or in e-stop"),
         ({"motion.is-all-homed": False}, "the machine is not homed"),
-        ({"axis.y.eoffset-request": 0.0105}, "LinuxCNC has an external offset that is 10.5 um off"),
+        ({"axis.y.eoffset-request": 0.0105}, "LinuxCNC has an external offset that differs by 10.5 um"),
     ],
 )
 def test_a_machine_that_accepts_no_offset_has_a_reason(pins: Pins, changed: dict[str, Any], fault: str) -> None:

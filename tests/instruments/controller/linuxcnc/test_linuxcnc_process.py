@@ -33,7 +33,9 @@ def test_a_second_one_waits_and_then_states_the_reason(own_lock: Path) -> None:
     first = os.open(own_lock, os.O_RDONLY)
     fcntl.flock(first, fcntl.LOCK_EX)
     try:
-        with pytest.raises(InstrumentError, match="can run one LinuxCNC; another simulated one did not end in time"):
+        with pytest.raises(
+            InstrumentError, match="can only run one LinuxCNC; another simulated one did not end in time"
+        ):
             LinuxCNCProcess({}, BRIDGE, wait=0.2)
     finally:
         os.close(first)
