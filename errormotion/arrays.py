@@ -22,7 +22,7 @@ def filled(values: Array) -> Array:
 
 
 def products(influence: Array) -> Array:
-    """Return the sums over sources of products of their effects: (source, ..., d) gives covariances (..., d, d).
+    """Return the sums over sources of products of their effects: from (source, ..., d) to covariances (..., d, d).
 
     NaN counts as 0.
     """

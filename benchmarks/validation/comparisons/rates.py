@@ -168,11 +168,16 @@ def section(seeds: int, pool: Pool) -> list[str]:
         "independent (left out). Of datasets that agree 95.4 % of the |En| are below 1 (k = 2), p is uniform, and 95 "
         "% of the 95 % intervals of the consensus contain the true errors. After ±: standard error of the mean over "
         "machines, because the instants of one machine share their sources.",
-        "",
-        "| datasets | correlation | abs(En) <= 1 | p uniform (Kolmogorov-Smirnov) | p < 0.05 | consensus: coverage |",
-        "|---|---|---|---|---|---|",
+        *HEAD,
         *rows,
     ]
+
+
+HEAD = (
+    "",
+    "| datasets | correlation | abs(En) <= 1 | p uniform (Kolmogorov-Smirnov) | p < 0.05 | consensus: coverage |",
+    "|---|---|---|---|---|---|",
+)
 
 
 def row(name: str, how: str, runs: list[dict]) -> str:

@@ -10,7 +10,7 @@ from errormotion.datasets import DOF
 from errormotion.methods.multilateration import Multilateration, Settings, simulation
 from errormotion.twin import VirtualMachine
 from validation.comparisons.pool import Pool
-from validation.comparisons.rates import against, row
+from validation.comparisons.rates import HEAD, against, row
 
 COUNT, POSITIONS = (6, 6, 5), 9
 SCALE = 0.3e-6
@@ -74,8 +74,6 @@ def section(seeds: int, pool: Pool) -> list[str]:
         f"compared with {np.prod(COUNT)} targets through the kinematic chain. The error motions of the virtual "
         "machine are waves, not draws of the prior with which the errors of the targets are extended to the "
         "positions of the axis, so that these rates need not be exact.",
-        "",
-        "| datasets | correlation | abs(En) <= 1 | p uniform (Kolmogorov-Smirnov) | p < 0.05 | consensus: coverage |",
-        "|---|---|---|---|---|---|",
+        *HEAD,
         *rows,
     ]

@@ -216,14 +216,12 @@ def _nominal(errors: xr.Dataset) -> list[Block]:
                 estimate(angle / ARCSEC, 2 * sigma / ARCSEC, reason=_UNKNOWN, signed=False),
             ]
         )
-    return [
-        Table(
-            "Detected minus nominal. After ±: expanded uncertainty, k = 2.",
-            ["beam", "Δx / µm", "Δy / µm", "Δz / µm", "distance / µm", "angle / arcsec"],
-            rows,
-            [("", 1), ("origin", 4), ("direction", 1)],
-        )
-    ]
+    return [_difference_table("Detected minus nominal. After ±: expanded uncertainty, k = 2.", rows)]
+
+
+def _difference_table(caption: str, rows: list[list[Cell | str]]) -> Table:
+    head = ["beam", "Δx / µm", "Δy / µm", "Δz / µm", "distance / µm", "angle / arcsec"]
+    return Table(caption, head, rows, [("", 1), ("origin", 4), ("direction", 1)])
 
 
 def _construction_differences(errors: xr.Dataset) -> list[tuple[float, float]]:
@@ -254,15 +252,11 @@ def _constructions(errors: xr.Dataset) -> list[Block]:
                 or_dash(fixed(both[i][1] / ARCSEC, 1), _UNKNOWN),
             ]
         )
-    return [
-        Table(
-            "Construction from circles and a line, minus the maximum-likelihood fit of all readings to the "
-            "intersection of ray and sphere. The result is that of the likelihood fit.",
-            ["beam", "Δx / µm", "Δy / µm", "Δz / µm", "distance / µm", "angle / arcsec"],
-            rows,
-            [("", 1), ("origin", 4), ("direction", 1)],
-        )
-    ]
+    caption = (
+        "Construction from circles and a line, minus the maximum-likelihood fit of all readings to the "
+        "intersection of ray and sphere. The result is that of the likelihood fit."
+    )
+    return [_difference_table(caption, rows)]
 
 
 def _residuals(errors: xr.Dataset, key: str) -> list[Block]:

@@ -4,27 +4,16 @@
 from __future__ import annotations
 
 import inspect
-import json
 import math
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
-from dataclasses import asdict
-from typing import Any, get_args
+from typing import Any
 
-from errormotion.errors import ErrormotionError, InstrumentError
-from errormotion.plugins import (
-    Applied,
-    Compensator,
-    CompensatorSubject,
-    Identity,
-    InstrumentInfo,
-    Status,
-    kind_registry,
-    load_object,
-)
+from errormotion.errors import InstrumentError
+from errormotion.plugins import Applied, Compensator, CompensatorSubject, InstrumentInfo, kind_registry
 from errormotion.testing.checks import fuzz as fuzz_checks
-from errormotion.testing.checks.instrument import check_settings
+from errormotion.testing.checks import shared
 from errormotion.testing.compensator_sessions import (
     POLL,
     armed,
@@ -81,15 +70,8 @@ def _no_states(subject: CompensatorSubject) -> str:
 def info_complete(subject: CompensatorSubject) -> str:
     """Class attribute `info` states id, the kind "compensator", summary, status, version; its simulator loads."""
     info = subject.plugin.info
-    require(isinstance(info, InstrumentInfo), f"expected an InstrumentInfo, found {type(info).__name__}")
-    good = isinstance(info.id, str) and info.id.isidentifier() and info.id == info.id.lower()
-    require(good, f"info.id: expected lower case letters, digits and _, found {info.id!r}")
+    shared.check_info(info, InstrumentInfo, "id")
     require(info.kind == "compensator", f"info.kind: expected 'compensator', found {info.kind!r}")
-    require(len(info.summary.strip()) >= 10, f"info.summary: expected a sentence, found {info.summary!r}")
-    require(info.status in get_args(Status), f"info.status: expected one of {get_args(Status)}, found {info.status!r}")
-    require(bool(info.version), "info.version is empty")
-    if info.simulator is not None:
-        load_object(info.simulator)
     return f"{info.id}, {info.status}"
 
 
@@ -106,7 +88,7 @@ def members(subject: CompensatorSubject) -> str:
 def settings_strict(subject: CompensatorSubject) -> str:
     """Settings are a PluginSettings, refuse unknown keys, and are unchanged after a round trip through JSON."""
     with started(subject) as device:
-        return check_settings(subject.plugin.Settings, made(subject, device).settings)
+        return shared.check_settings(subject.plugin.Settings, made(subject, device).settings)
 
 
 @COMPENSATOR_CHECKS.add()
@@ -114,13 +96,7 @@ def identify(subject: CompensatorSubject) -> str:
     """The compensator states manufacturer, model and serial number of the machine, the same each time."""
     with started(subject) as device, closing(made(subject, device)) as compensator:
         compensator.open()
-        first, second = compensator.identify(), compensator.identify()
-    require(isinstance(first, Identity), f"expected an Identity, found {type(first).__name__}")
-    for name in ("manufacturer", "model", "serial_number"):
-        require(bool(str(getattr(first, name)).strip()), f"identity.{name} is empty")
-    require(first == second, f"two answers differ: {first} and {second}")
-    json.dumps(asdict(first))
-    return f"{first.manufacturer} {first.model} {first.serial_number}"
+        return shared.check_identity(compensator.identify(), compensator.identify())
 
 
 @COMPENSATOR_CHECKS.add()
@@ -146,20 +122,10 @@ def use_before_open(subject: CompensatorSubject) -> str:
             if subject.simulated:
                 uses["write"] = lambda: compensator.write((0.0, 0.0, 0.0))
             for name, use in uses.items():
-                _require_refusal(use, f"{name}() {when}")
+                shared.require_refusal(use, f"{name}() {when}")
             compensator.open()
             compensator.close()
     return "refused before open and after close"
-
-
-def _require_refusal(use: Callable[[], Any], what: str) -> None:
-    try:
-        use()
-    except InstrumentError:
-        return
-    except Exception as error:  # noqa: BLE001 - named in the verdict
-        require(False, f"{what}: expected an InstrumentError, found {type(error).__name__}: {error}")
-    require(False, f"{what}: expected an InstrumentError, found none")
 
 
 @COMPENSATOR_CHECKS.add()
@@ -168,15 +134,7 @@ def no_device(subject: CompensatorSubject) -> str:
     with started(subject) as device:
         settings = getattr(device, "driver_settings", None)
     with closing(subject.build(subject.dead_address, settings)) as compensator:
-        start = time.perf_counter()
-        try:
-            compensator.open()
-        except ErrormotionError as error:
-            seconds = time.perf_counter() - start
-            require(seconds <= subject.time_limit, f"the error took {seconds:.1f} s, limit {subject.time_limit:g} s")
-            return f"{type(error).__name__} after {seconds:.2f} s"
-    require(False, f"a machine answered at {subject.dead_address}")
-    return ""
+        return shared.check_absent(compensator.open, subject.dead_address, subject.time_limit)
 
 
 @COMPENSATOR_CHECKS.add()
@@ -229,15 +187,15 @@ def refused_orders(subject: CompensatorSubject) -> str:
     with started(subject) as device, closing(made(subject, device)) as compensator:
         compensator.open()
         for limit in (0.0, -1e-6, math.nan, math.inf):
-            _require_refusal(lambda limit=limit: compensator.arm(limit), f"arm({limit})")  # type: ignore[misc]
+            shared.require_refusal(lambda limit=limit: compensator.arm(limit), f"arm({limit})")  # type: ignore[misc]
         zero = (0.0, 0.0, 0.0)
-        _require_refusal(lambda: compensator.write(zero), "write() unarmed")
+        shared.require_refusal(lambda: compensator.write(zero), "write() unarmed")
         compensator.arm(subject.limit)
         for offset in wrong:
-            _require_refusal(lambda offset=offset: compensator.write(offset), f"write({offset})")  # type: ignore[misc]
+            shared.require_refusal(lambda offset=offset: compensator.write(offset), f"write({offset})")  # type: ignore[misc]
         compensator.close()
         compensator.open()
-        _require_refusal(lambda: compensator.write(zero), "write() after it was closed and opened again")
+        shared.require_refusal(lambda: compensator.write(zero), "write() after it was closed and opened again")
         time.sleep(10 * POLL)
         require(device.machine.orders == 0, f"the machine received {device.machine.orders} commands")
     return f"{len(wrong) + 6} commands refused"
@@ -408,8 +366,4 @@ def nothing_left(subject: CompensatorSubject) -> str:
         ):
             compensator.open()
             compensator.read()
-    end = time.monotonic() + 2.0  # a simulator may detect the end of the connection later
-    while (left := open_things() - before) and time.monotonic() < end:
-        time.sleep(POLL)
-    require(not left, f"still open: {', '.join(sorted(left))}")
-    return "no thread, no socket"
+    return shared.check_nothing_open(before)

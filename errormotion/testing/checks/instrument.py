@@ -3,32 +3,21 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
-from errormotion.errors import ErrormotionError, InstrumentError
-from errormotion.plugins import (
-    Identity,
-    InstrumentInfo,
-    InstrumentSubject,
-    PluginSettings,
-    Samples,
-    Status,
-    kind_registry,
-    load_object,
-)
+from errormotion.errors import InstrumentError
+from errormotion.plugins import InstrumentInfo, InstrumentSubject, Samples, kind_registry
 from errormotion.testing.checks import fuzz as fuzz_checks
+from errormotion.testing.checks import shared
 from errormotion.testing.checks import wire as wire_checks
 from errormotion.testing.kit import CheckFailedError, Checks, require
 from errormotion.testing.sessions import Session, first_blocks, leaves, numbers, open_things, require_same, run_session
@@ -70,18 +59,7 @@ ATTEMPTS = 3
 def info_complete(subject: InstrumentSubject) -> str:
     """Class attribute ``info`` states id, kind, summary, status and version, and its simulator loads."""
     info = subject.plugin.info
-    require(isinstance(info, InstrumentInfo), f"expected an InstrumentInfo, found {type(info).__name__}")
-    for name in ("id", "kind"):
-        value = getattr(info, name)
-        require(
-            isinstance(value, str) and value.isidentifier() and value == value.lower(),
-            f"info.{name}: expected lower case letters, digits and _, found {value!r}",
-        )
-    require(len(info.summary.strip()) >= 10, f"info.summary: expected a sentence, found {info.summary!r}")
-    require(info.status in get_args(Status), f"info.status: expected one of {get_args(Status)}, found {info.status!r}")
-    require(bool(info.version), "info.version is empty")
-    if info.simulator is not None:
-        load_object(info.simulator)
+    shared.check_info(info, InstrumentInfo, "id", "kind")
     return f"{info.id} ({info.kind}), {info.status}"
 
 
@@ -97,35 +75,17 @@ def kind_contract(subject: InstrumentSubject) -> str:
 @INSTRUMENT_CHECKS.add()
 def settings_strict(subject: InstrumentSubject) -> str:
     """Settings are a PluginSettings, refuse unknown keys, and are unchanged after a round trip through JSON."""
-    return check_settings(subject.plugin.Settings, subject.build().settings)
-
-
-def check_settings(cls: Any, settings: Any) -> str:
-    """Check a class of settings with one instance; also for methods."""
-    require(issubclass(cls, PluginSettings), f"expected a subclass of PluginSettings, found {cls.__name__}")
-    require(isinstance(settings, cls), f"expected the Settings of the plugin, found a {type(settings).__name__}")
-    stored = json.loads(settings.model_dump_json())
-    require(cls.model_validate(stored) == settings, f"settings are changed after a round trip through JSON: {stored}")
-    try:
-        cls.model_validate(stored | {"no_such_setting": 1})
-    except ValidationError:
-        return f"{len(cls.model_fields)} settings"
-    require(False, "an unknown key 'no_such_setting' was accepted")
-    return ""
+    return shared.check_settings(subject.plugin.Settings, subject.build().settings)
 
 
 @INSTRUMENT_CHECKS.add()
 def identify(subject: InstrumentSubject) -> str:
     """The instrument states manufacturer, model and serial number, the same each time, and whether it is simulated."""
     with subject.build() as instrument:
-        first, second = instrument.identify(), instrument.identify()
-    require(isinstance(first, Identity), f"expected an Identity, found {type(first).__name__}")
-    for name in ("manufacturer", "model", "serial_number"):
-        require(bool(str(getattr(first, name)).strip()), f"identity.{name} is empty")
-    require(first == second, f"two answers differ: {first} and {second}")
+        first = instrument.identify()
+        found = shared.check_identity(first, instrument.identify())
     require(first.simulated == subject.simulated, f"identity.simulated is {first.simulated} at {subject.address}")
-    json.dumps(asdict(first))
-    return f"{first.manufacturer} {first.model} {first.serial_number}"
+    return found
 
 
 @INSTRUMENT_CHECKS.add()
@@ -151,43 +111,34 @@ def open_and_close_twice(subject: InstrumentSubject) -> str:
 def use_before_open(subject: InstrumentSubject) -> str:
     """Before opening and after closing, the instrument raises an InstrumentError."""
     instrument = subject.build()
-    _require_refusal(instrument, "before open", subject.streams)
+    _require_refusals(instrument, "before open", subject.streams)
     with instrument:
         pass
-    _require_refusal(instrument, "after close", subject.streams)
+    _require_refusals(instrument, "after close", subject.streams)
     return "refused before open and after close"
 
 
-def _require_refusal(instrument: Any, when: str, streams: bool) -> None:
+def _require_refusals(instrument: Any, when: str, streams: bool) -> None:
     uses = {"identify": instrument.identify, "read": instrument.read}
     if streams:
         uses["stream"] = lambda: next(iter(instrument.stream()))
     for name, use in uses.items():
-        try:
-            use()
-        except InstrumentError:
-            continue
-        except Exception as error:  # noqa: BLE001 - named in the verdict
-            require(False, f"{name}() {when}: expected an InstrumentError, found {type(error).__name__}: {error}")
-        require(False, f"{name}() {when}: expected an InstrumentError, found a result")
+        shared.require_refusal(use, f"{name}() {when}")
 
 
 @INSTRUMENT_CHECKS.add()
 def no_device(subject: InstrumentSubject) -> str:
     """Without a device, an instance can be created, and opening it raises a typed error within the time limit."""
     instrument = subject.build(address=subject.dead_address)
-    start = time.perf_counter()
-    try:
+
+    def use() -> None:
         with instrument:
             instrument.identify()
-    except ErrormotionError as error:
-        seconds = time.perf_counter() - start
-        require(seconds <= subject.time_limit, f"the error took {seconds:.1f} s, limit {subject.time_limit:g} s")
-        return f"{type(error).__name__} after {seconds:.2f} s"
+
+    try:
+        return shared.check_absent(use, subject.dead_address, subject.time_limit)
     finally:
         instrument.close()
-    require(False, f"a device answered at {subject.dead_address}")
-    return ""
 
 
 @INSTRUMENT_CHECKS.add()
@@ -371,10 +322,4 @@ def nothing_left(subject: InstrumentSubject) -> str:
         del stream
     for fault in subject.menu[-1:]:
         run_session(subject, fault=fault)
-    left = open_things() - before
-    deadline = time.monotonic() + 2.0  # a simulator may detect the end of the connection later
-    while left and time.monotonic() < deadline:
-        time.sleep(0.01)
-        left = open_things() - before
-    require(not left, f"still open: {', '.join(sorted(left))}")
-    return "no thread, no socket"
+    return shared.check_nothing_open(before)

@@ -10,7 +10,7 @@ from collections.abc import Hashable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -21,9 +21,9 @@ from errormotion.datasets.schemas import variants
 from errormotion.errors import ErrormotionError
 from errormotion.kinematics import twists
 from errormotion.kinematics.iso import DOF
-from errormotion.plugins import MethodInfo, MethodSubject, Needs, Status, kind_registry
+from errormotion.plugins import MethodInfo, MethodSubject, Needs, kind_registry
+from errormotion.testing.checks import shared
 from errormotion.testing.checks.coverage import coverage, differences, recovers_truth
-from errormotion.testing.checks.instrument import check_settings
 from errormotion.testing.checks.redraw import sources_as_stated, sources_drawn, why_no_redrawing
 from errormotion.testing.checks.text import chapters_translated, why_no_texts
 from errormotion.testing.kit import Checks, require
@@ -42,11 +42,7 @@ SAME_SINGLE = 0.1
 def info_complete(subject: MethodSubject) -> str:
     """``info`` states id, summary, status, version and what the method cannot determine; ``needs`` has a raw schema."""
     info, needs = subject.plugin.info, subject.plugin.needs
-    require(isinstance(info, MethodInfo), f"info: expected a MethodInfo, found {type(info).__name__}")
-    require(info.id.isidentifier() and info.id == info.id.lower(), f"info.id: expected lower case, found {info.id!r}")
-    require(len(info.summary.strip()) >= 10, f"info.summary: expected a sentence, found {info.summary!r}")
-    require(info.status in get_args(Status), f"info.status: expected one of {get_args(Status)}, found {info.status!r}")
-    require(bool(info.version), "info.version is empty")
+    shared.check_info(info, MethodInfo, "id")
     blind = isinstance(info.cannot_see, tuple) and all(isinstance(text, str) and text for text in info.cannot_see)
     require(blind, f"info.cannot_see: expected a tuple of sentences, found {info.cannot_see!r}")
     require(isinstance(needs, Needs), f"needs: expected a Needs, found {type(needs).__name__}")
@@ -58,7 +54,7 @@ def info_complete(subject: MethodSubject) -> str:
 @METHOD_CHECKS.add()
 def settings_strict(subject: MethodSubject) -> str:
     """Settings are a PluginSettings, refuse unknown keys, and are unchanged after a round trip through JSON."""
-    return check_settings(subject.plugin.Settings, subject.effective_settings())
+    return shared.check_settings(subject.plugin.Settings, subject.effective_settings())
 
 
 @METHOD_CHECKS.add()
