@@ -215,7 +215,7 @@ class _Leaves:
         return self.shape[self._axis + 1 :] == (1, *shape)[self._axis + 1 :]
 
     def take(self, starts: Sequence[int], values: np.ndarray) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
-        """Yield the values of whole leaves with the digests to fill; keep what is less than a leaf until the rest comes.
+        """Yield the values of whole leaves with the digests to fill; keep parts of a leaf until it is complete.
 
         The values are one run of several leaves, or several runs that make one leaf.
         """
