@@ -194,12 +194,12 @@ def record(hours: float) -> None:
         size = result["bytes"] / 1e9
         print(
             f"  {samples / 1e9:.2f}e9 samples ({size:.1f} GB) to {result['instants']} instants in "
-            f"{result['seconds']:.1f} s ({size / result['seconds']:.2f} GB/s, hash included; processor {result['used']:.1f} s); "
-            f"peak memory "
-            f"{result['peak'] / 2**20:.0f} MiB, of which {result['before'] / 2**20:.0f} MiB before the first sample\n"
-            f"  the same file afterwards: read and added up {size / result['read']:.2f} GB/s, "
-            f"hash alone {size / result['hash']:.2f} GB/s; identification "
-            f"takes {result['seconds'] / result['read']:.1f} times the plain read"
+            f"{result['seconds']:.1f} s ({size / result['seconds']:.2f} GB/s, hash included; processor "
+            f"{result['used']:.1f} s); peak memory {result['peak'] / 2**20:.0f} MiB, of which "
+            f"{result['before'] / 2**20:.0f} MiB before the first sample\n"
+            f"  the same file afterwards: read and added up {size / result['read']:.2f} GB/s, hash alone "
+            f"{size / result['hash']:.2f} GB/s; identification takes {result['seconds'] / result['read']:.1f} times "
+            "the plain read"
         )
 
 
