@@ -38,6 +38,20 @@ def test_help_loads_nothing_heavy(words: list[str]) -> None:
     assert result.stdout.splitlines()[-1] == "loaded:"
 
 
+def test_what_scipy_asks_numpy_for_is_loaded_when_it_is_used() -> None:
+    script = (
+        "import sys\nfrom errormotion.cli import main\n"
+        "try:\n    main(['--version'])\nexcept SystemExit as end:\n    assert not end.code\n"
+        "import scipy.special, numpy\n"
+        "print('numpy.f2py.crackfortran' in sys.modules, 'numpy.testing._private' in sys.modules)\n"
+        "numpy.testing.assert_equal(1, 1)\nfrom numpy.testing import assert_allclose\nassert_allclose(1.0, 1.0)\n"
+        "print(callable(numpy.f2py.run_main), numpy.f2py.crackfortran.__name__)\n"
+    )
+    result = python("-c", script)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.splitlines()[1:] == ["False False", "True numpy.f2py.crackfortran"]
+
+
 def test_module_is_the_command() -> None:
     result = python("-m", "errormotion", "--help")
     for name in ("demo", "plugins", "bench", "run", "identify", "import", "report", "validate", "doctor"):

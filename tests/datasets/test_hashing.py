@@ -1,6 +1,7 @@
 import hashlib
 import json
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -83,11 +84,28 @@ def test_supplied_parts_result_in_the_same_hash_and_are_not_read_again(step) -> 
         assert hasher.value() == hash_dataset(ds)
 
 
-def test_parts_that_are_missing_or_not_in_order_are_read() -> None:
+@pytest.mark.parametrize("step", [LEAF, 1000, LEAF + 1, 40_001])
+def test_parts_may_come_in_any_order_from_several_threads(step) -> None:
+    ds = record()
+    unreadable = ds.map(lambda each: xr.zeros_like(each) if "time" in each.dims else each, keep_attrs=True)
+    starts = np.random.default_rng(0).permutation(np.arange(0, ds.sizes["time"], step))
+    with DatasetHasher(unreadable) as hasher, ThreadPoolExecutor(4) as pool:
+
+        def hand_over(start: int) -> None:
+            window = slice(start, start + step)
+            for name in ("distance", "temperature"):
+                hasher.update(name, ds.isel(time=window)[name].values, time=window)
+
+        list(pool.map(hand_over, starts.tolist()))
+        assert hasher.value() == hash_dataset(ds)
+
+
+def test_what_is_not_handed_over_is_read() -> None:
     ds = record()
     with DatasetHasher(ds) as hasher:
         hasher.update("distance", ds["distance"].values[:, :1000], time=slice(0, 1000))
         hasher.update("distance", ds["distance"].values[:, 5000:], time=slice(5000, None))
+        hasher.update("distance", ds["distance"].values[:, 800:1200], time=slice(800, 1200))  # a part of it twice
         hasher.update("temperature", ds["temperature"].values[:, :1], sensor=slice(0, 1))
         assert hasher.value() == hash_dataset(ds)
 

@@ -33,8 +33,8 @@ def folder(path, values, chunks, **options):
     ("shape", "chunks"),
     [
         ((), ()), ((7,), (3,)), ((50_000,), (20_000,)), ((5, 60_000), (5, 25_000)), ((5, 60_000), (2, 60_000)),
-        ((60_000, 5), (25_000, 5)), ((60_000, 5), (25_000, 2)), ((4, 3, 20_000), (3, 3, 20_000)), ((6, 7, 8), (2, 3, 8)),
-        ((3, 40, 900), (1, 40, 900)),
+        ((60_000, 5), (25_000, 5)), ((60_000, 5), (25_000, 2)), ((4, 3, 20_000), (3, 3, 20_000)),
+        ((6, 7, 8), (2, 3, 8)), ((3, 40, 900), (1, 40, 900)),
     ],
 )  # fmt: skip
 def test_every_window_of_every_layout_is_what_the_library_reads(tmp_path, shape, chunks, compressor) -> None:
@@ -118,11 +118,8 @@ def test_what_this_reader_does_not_know_is_left_to_the_library(tmp_path, options
 def test_consolidated_metadata_count_before_those_of_the_arrays(tmp_path) -> None:
     path, array = folder(tmp_path / "x.zarr", np.arange(10.0), (4,))
     root = json.loads((path / "zarr.json").read_text())
-    held = {
-        "kind": "inline",
-        "must_understand": False,
-        "metadata": {"x": json.loads((path / "x/zarr.json").read_text())},
-    }
+    metadata = {"x": json.loads((path / "x" / "zarr.json").read_text())}
+    held = {"kind": "inline", "must_understand": False, "metadata": metadata}
     (path / "zarr.json").write_text(json.dumps(root | {"consolidated_metadata": held}))
     array.resize(12)
     ds = open_zarr(path)
@@ -154,13 +151,8 @@ def test_texts_come_back_and_damaged_ones_are_refused(tmp_path) -> None:
     assert found["name"].values.tolist() == ds["name"].values.tolist()
     chunk = path / "name" / "c" / "0"
     content = chunk.read_bytes()
-    for damaged in (
-        b"",
-        content[:-3],
-        b"\x05" + content[1:],
-        content[:4] + b"\xff" + content[5:],
-        content[:9] + b"\xff",
-    ):
+    longer, other = content[:4] + b"\xff" + content[5:], content[:9] + b"\xff" + content[10:]
+    for damaged in (b"", content[:-3], b"\x05" + content[1:], longer, other):
         chunk.write_bytes(damaged)
         with pytest.raises(DatasetError, match=r"is damaged or incomplete"):
             load(path)

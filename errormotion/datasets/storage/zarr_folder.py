@@ -178,7 +178,8 @@ class _Array(BackendArray):
             spans = [
                 (max(a, o), min(b + 1, o + size)) for a, b, o, size in zip(first, last, begin, self.chunk, strict=True)
             ]
-            target = box[(*(slice(a - o, b - o) for (a, b), o in zip(spans, first, strict=True)), ...)]
+            part: tuple[Any, ...] = tuple(slice(a - o, b - o) for (a, b), o in zip(spans, first, strict=True))
+            target = box[(*part, ...)]
             self._chunk_into(place, [slice(a - o, b - o) for (a, b), o in zip(spans, begin, strict=True)], target)
 
         places = list(
@@ -223,7 +224,7 @@ class _Array(BackendArray):
             for k, within in enumerate(window[: axis + 1]):
                 start = start * self.chunk[k] + within.start + (row[k] if k < axis else 0)
             file.seek(start * inner * self.dtype.itemsize)
-            into = memoryview(target[row].reshape(-1)).cast("B")
+            into = target[row].reshape(-1).view(np.uint8).data
             while into:
                 read = file.readinto(into)
                 if not read:

@@ -8,9 +8,14 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from errormotion.methods.spindle_drift.identification import averaging
+from errormotion.datasets import hash_dataset
+from errormotion.datasets.files.hashing import DatasetHasher
+from errormotion.methods.spindle_drift import simulation
+from errormotion.methods.spindle_drift.identification import averaging, record
 from errormotion.methods.spindle_drift.identification.averaging import Averager, join, slices, window_sums
 from errormotion.methods.spindle_drift.identification.times import EvenTimes, increases, values_of
+from errormotion.methods.spindle_drift.settings import Settings
+from errormotion.twin import VirtualMachine
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -115,3 +120,27 @@ def test_slices_take_the_time_from_a_rate_where_there_is_no_variable():
     )
     times = np.concatenate([values_of(time) for time, _ in slices(raw)])
     np.testing.assert_allclose(times, 2.0 + np.arange(7) / 10)
+
+
+@pytest.mark.parametrize("dims", [("channel", "time"), ("time", "channel")])
+@pytest.mark.parametrize("slice_bytes", [1 << 14, 1 << 17])
+def test_a_record_is_averaged_the_same_by_compiled_sums_in_any_slices_and_by_any_number_of_threads(
+    dims, slice_bytes, monkeypatch
+):
+    raw = simulation.raw_drift(VirtualMachine("cframe", seed=1), np.arange(0.0, 40.0, 0.002), seed=0)
+    raw = raw.assign(distance=raw["distance"].transpose(*dims).copy())
+    whole_hash = hash_dataset(raw)
+    found = []
+    for compiled_from, cores, size in ((1 << 40, 1, 1 << 30), (1 << 40, 3, slice_bytes), (0, 3, slice_bytes)):
+        monkeypatch.setattr(record, "COMPILED_SIZE", compiled_from)
+        monkeypatch.setattr(record, "cores", lambda cores=cores: cores)
+        monkeypatch.setattr(averaging, "_SLICE_BYTES", size)
+        with DatasetHasher(raw) as hasher:
+            found.append(record.average_record(raw, Settings(), hasher))
+            assert hasher.value() == whole_hash
+    for other in found[1:]:
+        np.testing.assert_array_equal(other.averages.count, found[0].averages.count)
+        # Means of 1 mm to 1e-13: sums of 250 numbers of double precision in another order.
+        np.testing.assert_allclose(other.averages.mean, found[0].averages.mean, rtol=1e-13)
+        np.testing.assert_allclose(other.averages.time, found[0].averages.time, rtol=1e-13)
+        np.testing.assert_allclose(other.temperature, found[0].temperature, rtol=1e-13)

@@ -197,7 +197,7 @@ class Averager:
         return Windows(first, last, np.concatenate([[0], first_samples(time, bounds), [time.size]]).astype(np.int64))
 
     def add(self, time: Times, windows: Windows, sums: Array, counts: NDArray[np.int64]) -> Averages:
-        """Add the sums and numbers (channel, window) of values at ``time``; return the windows that are now complete."""
+        """Add the sums and numbers (channel, window) of values at ``time``; return the complete windows."""
         samples = np.diff(windows.edges)
         times = time_sums(time, windows.edges) + samples * first_and_last(time)[0]
         if self._samples:  # the window that the blocks before have left open goes on, or was their last one

@@ -83,8 +83,8 @@ def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -
         for name in slow:
             slow_parts[name].append(piece.added_to(slow_averagers[name], name))
         if "spindle_speed" in slow and scatter is None:
-            speed = piece.values["spindle_speed"].astype(np.float64)
-            scatter = _scatter(values_of(piece.time), piece.values["distance"], speed[0], settings)
+            turning = piece.values["spindle_speed"][0].astype(np.float64)
+            scatter = _scatter(values_of(piece.time), piece.values["distance"], turning, settings)
     parts.append(averager.finish())
     means = {name: join([*complete, slow_averagers[name].finish()]).mean for name, complete in slow_parts.items()}
     speed = means.get("spindle_speed")
