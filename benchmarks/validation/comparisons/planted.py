@@ -195,9 +195,9 @@ def section(seeds: int, pool: Pool) -> list[str]:
         f"level {LEVEL:g}. Sizes are those of this power on the first machine; for a mistake without size, all "
         "uncertainties are multiplied by the factor instead. `margin`: difference of the scores (twice the logarithm "
         "of the likelihood ratio, minus the penalties) of the planted cause and of the next one, without noise; "
-        f"below {SCORE_MARGIN:g} the two cannot be distinguished at this size. `right first`: of the detected mistakes, "
-        "the planted cause has the first rank; `or alike`: it has, or the first one is reported as indistinguishable "
-        "from it.",
+        f"below {SCORE_MARGIN:g} the two cannot be distinguished at this size. `right first`: of the detected "
+        "mistakes, the planted cause has the first rank; `or alike`: it has, or the first one is reported as "
+        "indistinguishable from it.",
         "",
         "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike | first "
         "instead | named as alike |",

@@ -9,9 +9,9 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
-from errormotion.methods.linear_positioning.diagonals.simulation import MACHINE, instruments_of
 from errormotion.methods.linear_positioning.moving import cycles, ends, moving_of
 from errormotion.methods.linear_positioning.schema import SCHEMA
+from errormotion.methods.linear_positioning.virtual import MACHINE, instruments_of
 from errormotion.twin import VirtualMachine, truth
 
 if TYPE_CHECKING:
