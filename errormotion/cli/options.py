@@ -1,7 +1,8 @@
-"""Options of several commands, and their values: points, dates, quantities with units, lists."""
+"""Options of several commands, and their values: points, dates, quantities with units, lists, settings."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -105,3 +106,42 @@ def duration(option: str, text: str, longest: float = float("inf")) -> float:
         bound = "" if longest == float("inf") else f" and at most {longest:g} s"
         raise BenchError(f"{option}: expected more than 0 s{bound}; found '{text}'")
     return value
+
+
+def read_settings(model: Any, file: Path | None, assignments: Sequence[str]) -> Any:
+    """Return checked settings of a plugin: a TOML file, overridden by ``--set key=value``.
+
+    Parameters
+    ----------
+    model : type of PluginSettings
+        The settings class.
+    file : Path, optional
+        A TOML file with the settings at its top level.
+    assignments : sequence of str
+        ``key=value``, dotted keys for tables; the value in TOML, else text.
+
+    Raises
+    ------
+    MethodError
+        The settings are invalid; the message states all mistakes.
+    """
+    from errormotion.datasets.files import tomlfile
+    from errormotion.datasets.files.tomltext import value_of
+    from errormotion.errors import MethodError
+
+    data = tomlfile.read_toml(file, error=MethodError) if file else {}
+    for assignment in assignments:
+        key, sign, text = assignment.partition("=")
+        if not sign or not key.strip():
+            raise MethodError(f"--set {assignment}: expected key=value, such as --set average='0.5 s'")
+        *tables, name = key.strip().split(".")
+        target = data
+        for table in tables:
+            target = target.setdefault(table, {})
+            if not isinstance(target, dict):
+                raise MethodError(f"--set {assignment}: '{table}' is a value, not a table")
+        target[name] = value_of(text.strip())
+    settings, mistakes = tomlfile.check(data, model)
+    if settings is None:
+        raise MethodError(tomlfile.report(file or "--set", mistakes))
+    return settings

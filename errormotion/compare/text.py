@@ -107,7 +107,7 @@ def verdict(ds: xr.Dataset) -> list[str]:
             lines.append(f"{pair}: no single cause explains the difference; the nearest is {first.name} {first.size}.")
         else:
             more = f" Indistinguishable from: {first.alike}." if first.alike else ""
-            lines.append(f"{pair}: most likely {first.name}{' ' + first.size if first.size else ''}.{more}")
+            lines.append(f"{pair}: most likely cause: {first.name}{' ' + first.size if first.size else ''}.{more}")
     if shared := _shared(ds):
         more = f" and {len(shared) - MAX_SHARED} more" if len(shared) > MAX_SHARED else ""
         lines.append(f"Treated as fully correlated between datasets: {'; '.join(shared[:MAX_SHARED])}{more}.")

@@ -25,7 +25,7 @@ def test_no_fault_moves_the_offset_beyond_its_limits(tmp_path: Path) -> None:
 
 
 def test_a_jump_after_a_suspension_would_be_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(follower, "LONGEST_STEP", 100.0)
+    monkeypatch.setattr(follower, "MAX_STEP", 100.0)
     monkeypatch.setattr("compensated_hours.FAULTS", ("suspended",))
     found = follow(tmp_path, 0.1, INTERVAL, seed=2)
     assert [text for text in limits_kept(found) if text.startswith("change of")]

@@ -394,7 +394,7 @@ def test_contradictions_are_reported_before_any_connection(plan: BenchPlan, mode
         made(replace(plan, compensator=None), arm=MACHINE)
     with pytest.raises(CompensationError, match="The model is for the machine 'Mill 6'"):
         made(machine="Mill 6")
-    with pytest.raises(CompensationError, match="offsets need 'machine'"):
+    with pytest.raises(CompensationError, match="offsets need the frame 'machine'"):
         made(frame="tool")
     wrong = type("Wrong", (Thermometer,), {"channels": ("spindel",)})
     with pytest.raises(BenchError, match="needs the temperatures spindle; found spindel"):

@@ -93,7 +93,7 @@ def test_a_long_curve_keeps_its_shape_in_bounded_memory() -> None:
     (line,) = curves.lines(80)
     assert len(line.plain) <= 80
     assert re.search(r"▁▁?▂.*▇▇*█", line.plain)
-    assert len(curves._courses["EX"].points) < MAX_POINTS
+    assert len(curves._curves["EX"].points) < MAX_POINTS
     for k in range(100):
         curves.add(f"name{k} +1 um")
     assert len(list(curves.lines(80))) == MAX_CURVES

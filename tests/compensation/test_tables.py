@@ -323,7 +323,7 @@ def test_a_format_of_another_distribution_is_used(monkeypatch: pytest.MonkeyPatc
     assert exported.rounding > 1e-6  # it states offsets of 0, and so is found out
     for name, message in (
         ("wrong", "has the id 'foreign'"), ("bare", "lacks id, title"), ("broken", "cannot be loaded: ModuleNotFound"),
-        ("twice", "Several distributions claim"), ("foreing", "Did you mean 'foreign'"),
+        ("twice", "Several distributions provide"), ("foreing", "Did you mean 'foreign'"),
     ):  # fmt: skip
         with pytest.raises(PluginError, match=message):
             get(name)

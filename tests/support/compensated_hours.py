@@ -18,7 +18,7 @@ from simulated_clock import SimulatedClock
 
 from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, parse_bench
-from errormotion.compensation.online.follower import LONGEST_STEP, State
+from errormotion.compensation.online.follower import MAX_STEP, State
 from errormotion.compensation.online.settings import Limits
 from errormotion.compensation.thermal_model import ThermalModel
 from errormotion.compensation.thermal_model.features import Feature
@@ -228,7 +228,7 @@ def limits_kept(found: Found) -> list[str]:
         f"offset in effect {found.largest * 1e6:.3f} um": found.largest <= LIMITS.limit * rounding,
         f"change in effect {found.fastest * 1e6:.3f} um/s": found.fastest <= SLEW * rounding,
         f"ordered offset {found.largest_order * 1e6:.3f} um": found.largest_order <= LIMITS.limit * rounding,
-        f"change of {found.longest_step:.3f} periods": found.longest_step <= LONGEST_STEP * rounding + 2 * count,
+        f"change of {found.longest_step:.3f} periods": found.longest_step <= MAX_STEP * rounding + 2 * count,
     }
     return [text for text, kept in checks.items() if not kept]
 

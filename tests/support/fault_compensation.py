@@ -22,7 +22,7 @@ from errormotion.campaign.files import load_bench
 from errormotion.campaign.folder import list_runs
 from errormotion.campaign.monitor.watch import Monitor
 from errormotion.compensation.online.audit import verify
-from errormotion.compensation.online.follower import LONGEST_STEP
+from errormotion.compensation.online.follower import MAX_STEP
 from errormotion.compensation.thermal_model import ThermalModel
 from errormotion.compensation.thermal_model.features import Feature
 from errormotion.compensation.thermal_model.model import Parts
@@ -141,7 +141,7 @@ def _course(orders: Sequence[Order], start: Order) -> list[str]:
     """Return what is wrong with the orders of one program: beyond the limit, or a step that the slew limit forbids."""
     course = np.array([start, *orders])
     steps = np.abs(np.diff(course, axis=0)).max(initial=0.0)
-    most = LONGEST_STEP * SLEW * PERIOD + 2 * ROUNDING
+    most = MAX_STEP * SLEW * PERIOD + 2 * ROUNDING
     found = [f"a step of {1e6 * steps:.3f} um, limit {1e6 * most:.3f} um"] if steps > most else []
     largest = np.abs(course).max(initial=0.0)
     return found + ([f"an order of {1e6 * largest:.3f} um"] if largest > LIMIT + ROUNDING else [])

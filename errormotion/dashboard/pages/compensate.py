@@ -50,7 +50,7 @@ class _Compensating(Guarded):
             models=models,
             states=STATES,
             spans=SPANS,
-            asked={name: self.get_argument(name, "")[:400] for name in ("bench", "model", "mode")},
+            requested={name: self.get_argument(name, "")[:400] for name in ("bench", "model", "mode")},
             chosen=self.value("run"),
             wrong=wrong[:MAX_MESSAGE],
         )

@@ -10,10 +10,10 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
+from errormotion.cli.options import read_settings
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.page import Page, new_dataset
 from errormotion.cli.progress import Bars
-from errormotion.cli.settings import read_settings
 from errormotion.compensation.thermal_model import SCHEMA as MODEL_SCHEMA
 from errormotion.compensation.thermal_model import Check, Settings, ThermalModel, check, fit
 from errormotion.datasets.schemas import DOF, SCHEMA

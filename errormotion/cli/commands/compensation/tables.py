@@ -7,9 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from errormotion.cli.commands.compensation.model import errors_of
-from errormotion.cli.options import quantity
+from errormotion.cli.options import quantity, read_settings
 from errormotion.cli.output import show, show_json
-from errormotion.cli.settings import read_settings
 from errormotion.compensation.tables import axis_table, export, get
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.units import Length, Time

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from errormotion import datasets, plugins
+from errormotion.cli.options import read_settings
 from errormotion.cli.output import show, show_json
 from errormotion.cli.page import new_dataset
 from errormotion.cli.progress import Bars
-from errormotion.cli.settings import read_settings
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError

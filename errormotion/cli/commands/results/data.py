@@ -13,10 +13,10 @@ import typer
 from errormotion import datasets, plugins
 from errormotion.campaign.storage.raw_paths import is_runs_folder, raw_of
 from errormotion.cli.guard import ERROR, INTERNAL, log_file
+from errormotion.cli.options import read_settings
 from errormotion.cli.output import show, show_json, working
 from errormotion.cli.page import new_files
 from errormotion.cli.progress import Bars
-from errormotion.cli.settings import read_settings
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.cli.tolerances import end_with, lines_of, remarks
 from errormotion.datasets.clock import noted
