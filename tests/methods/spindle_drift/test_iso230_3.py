@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
 
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.identification import iso230_3
 from errormotion.methods.spindle_drift.identification.iso230_3 import MEASURES, QUANTITIES, evaluate, quantities
 
 U = 1e-8
@@ -166,17 +164,3 @@ def test_unknown_instants_are_skipped():
     assert value(results(t, errors), "Z", "range_60min") == pytest.approx(
         value(results(t), "Z", "range_60min"), rel=1e-12
     )
-
-
-@pytest.mark.parametrize("seed", range(40))
-def test_the_minimum_is_that_of_scipy_to_the_last_bit(seed):
-    rng = np.random.default_rng(seed)
-    a, b, c, d = rng.normal(size=4)
-    functions = [
-        lambda x: (x - a) ** 2 + 0.3 * np.sin(5 * x + b), lambda x: abs(x - a) + d, lambda x: np.exp(c * x) + 0.0 * x,
-        lambda x: 1.0,
-    ]  # fmt: skip
-    low, high = np.sort(rng.normal(scale=3, size=2))
-    for function in functions:
-        peer = minimize_scalar(function, bounds=(low, high), method="bounded")
-        assert iso230_3._minimum(function, low, high) == (peer.x, peer.fun)

@@ -19,7 +19,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from errormotion.arrays import Array
+from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.datasets import provenance
 from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.pretravel import HIGHEST, PretravelMap, assemble, harmonics, terms_up_to, unit
@@ -31,7 +31,6 @@ REDUNDANCY = 4
 """Smallest number of touches beyond the number of unknowns."""
 _ITERATIONS = 20
 _OUTLIER = 5.0  # distance from the other touches, in robust standard deviations
-_NORMAL = 0.6744897501960817  # median of the distances from the mean of a normal distribution, in standard deviations
 _MOST_OUTLIERS = 0.1  # fraction of the touches
 _OVAL = 0.27  # rms of the surface of an ellipsoid over the sphere for one peak to valley
 _SINGULAR = 1e-6  # smallest singular value of the design relative to the largest one
@@ -220,7 +219,7 @@ def _worst(residual: Array) -> int | None:
     """Return the index of the largest outlier; None if there is none."""
     off = np.abs(residual - np.median(residual))
     worst = int(np.argmax(off))
-    return worst if off[worst] > _OUTLIER * float(np.median(off)) / _NORMAL else None
+    return worst if off[worst] > _OUTLIER * NORMAL_MAD * float(np.median(off)) else None
 
 
 def _covariance(fit: _Fit, normals: Array, contact: float, settings: PretravelSettings) -> tuple[float, Array]:

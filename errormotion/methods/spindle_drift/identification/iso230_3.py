@@ -19,7 +19,7 @@ from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification.record import turns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -236,50 +236,7 @@ def _time_constant(time: Array, y: Array) -> float:
     best = int(np.argmin([rest(g) for g in grid]))
     if best in (0, grid.size - 1) or total == 0:
         return np.nan
-    log_tau, least = _minimum(rest, float(grid[best - 1]), float(grid[best + 1]))
-    return float(np.exp(log_tau)) if least < 0.1 * total else np.nan
+    from scipy.optimize import minimize_scalar
 
-
-def _minimum(function: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
-    """Return where a function of one variable is smallest within an interval, to 1e-5, and its value there.
-
-    Source: Brent, Algorithms for Minimization without Derivatives (1973), chapter 5, with the constants and in the
-    order of ``scipy.optimize.minimize_scalar``, which takes 0.2 s to load.
-    """
-    golden = 0.5 * (3.0 - np.sqrt(5.0))
-    x = second = third = low + golden * (high - low)  # the best places so far
-    fx = f_second = f_third = function(x)
-    step = before = 0.0
-    for _ in range(500):
-        middle = 0.5 * (low + high)
-        near = np.sqrt(2.2e-16) * abs(x) + 1e-5 / 3.0
-        if abs(x - middle) <= 2.0 * near - 0.5 * (high - low):
-            break
-        parabolic = False
-        if abs(before) > near:
-            r = (x - second) * (fx - f_third)
-            q = (x - third) * (fx - f_second)
-            p = (x - third) * q - (x - second) * r
-            q = 2.0 * (q - r)
-            p, q = -p if q > 0.0 else p, abs(q)
-            r, before = before, step
-            parabolic = abs(p) < abs(0.5 * q * r) and q * (low - x) < p < q * (high - x)
-        if parabolic:
-            step = p / q
-            if x + step - low < 2.0 * near or high - (x + step) < 2.0 * near:
-                step = near if middle >= x else -near
-        else:
-            before = (low if x >= middle else high) - x
-            step = golden * before
-        new = x + (1.0 if step >= 0 else -1.0) * max(abs(step), near)
-        f_new = function(new)
-        if f_new <= fx:
-            low, high = (x, high) if new >= x else (low, x)
-            third, f_third, second, f_second, x, fx = second, f_second, x, fx, new, f_new
-        else:
-            low, high = (new, high) if new < x else (low, new)
-            if f_new <= f_second or second == x:
-                third, f_third, second, f_second = second, f_second, new, f_new
-            elif f_new <= f_third or third in (x, second):
-                third, f_third = new, f_new
-    return x, fx
+    found = minimize_scalar(rest, bounds=(grid[best - 1], grid[best + 1]), method="bounded")
+    return float(np.exp(found.x)) if found.fun < 0.1 * total else np.nan
