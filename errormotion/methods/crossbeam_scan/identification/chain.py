@@ -144,30 +144,6 @@ def commutator(error: ArrayLike, twist: ArrayLike) -> Array:
     return transform(np.asarray(twist, dtype=float), bracket)
 
 
-def calibration_effect(errors: ArrayLike, profiler_pose: RigidTransform, lever: ArrayLike, change: ArrayLike) -> Array:
-    """Return the change of the errors of the carriage with the pose of the profiler, to first order (eq. 14).
-
-    Parameters
-    ----------
-    errors : (..., 6)
-        Errors of the carriage for this pose, m and rad.
-    profiler_pose : RigidTransform
-        Pose with which they were determined.
-    lever : (3,)
-        m.
-    change : (6,)
-        Changes of (a, b, g, dx, dy, dz), rad and m.
-
-    Returns
-    -------
-    ndarray, (..., 6)
-        To be added to the errors; of the order of change times error. It does not include that scans were assembled
-        along the `feed_direction` of the wrong pose: an effect of the same order that depends on artefact and
-        registration.
-    """
-    return commutator(np.asarray(change, dtype=float) @ pose_twists(profiler_pose, lever), errors)
-
-
 def pose_identities(profiler_pose: RigidTransform, covariance: ArrayLike | None) -> dict[str, str]:
     """Return the identity of each source of a calibrated pose by its name; none for a pose that is taken as exact."""
     if covariance is None:

@@ -81,11 +81,6 @@ class Points:
     iterations: int = 0
     notes: tuple[str, ...] = ()
 
-    @property
-    def total_covariance(self) -> Array:
-        """Covariance (n, 3, 3) of each point, including the common sources."""
-        return np.asarray(self.covariance + np.einsum("sni,snj->nij", self.influence, self.influence))
-
 
 def points(
     reading: ArrayLike,
