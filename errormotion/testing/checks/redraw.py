@@ -63,7 +63,7 @@ def sources_as_stated(subject: MethodSubject) -> str:
             total = np.sqrt(np.nan_to_num(np.diagonal(covariance(errors)[place])))
             off[:, ~(moving > SMALL * total)] = np.nan
             repeated = np.repeat(stated[place][None], TRIALS, axis=0)
-            verdict = require_honest(off, repeated, names(errors), f"{what}, place {place}", share=len(places))
+            verdict = require_honest(off, repeated, names(errors), f"{what}, point {place}", share=len(places))
             verdicts.append(verdict)
     return f"{TRIALS} trials; " + "; ".join(verdicts)
 
