@@ -14,7 +14,7 @@ from errormotion.datasets import provenance
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
-from errormotion.methods.crossbeam_scan.identification.registration import comparison
+from errormotion.methods.crossbeam_scan.identification.registration import blocks, kernels
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.montecarlo.trials import redrawing_of
 from errormotion.twin import VirtualMachine
@@ -316,8 +316,8 @@ def test_repeated_identification_gives_the_same_bits(campaigns, found):
 
 def test_one_thread_and_two_give_the_same_bits(campaigns, monkeypatch):
     runs = []
-    monkeypatch.setattr(comparison, "COMPILED_FROM", 0)
-    monkeypatch.setattr(comparison, "MANY", 0)
+    monkeypatch.setattr(blocks, "COMPILED_FROM", 0)
+    monkeypatch.setattr(kernels, "MANY", 0)
     for threads in (1, 2):
         monkeypatch.setattr(compiling, "threads", lambda threads=threads: threads)
         runs.append(identify(campaigns[2]))
