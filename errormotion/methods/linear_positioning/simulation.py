@@ -14,10 +14,10 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
-from errormotion.methods.linear_positioning.diagonals.simulation import MACHINE, instruments_of, simulate_diagonals
+from errormotion.methods.linear_positioning.diagonals.simulation import simulate_diagonals
 from errormotion.methods.linear_positioning.planning.targets import positions
 from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, SCHEMA, SENSORS
-from errormotion.methods.linear_positioning.warming import simulate_moving
+from errormotion.methods.linear_positioning.warming import MACHINE, instruments_of, simulate_moving
 from errormotion.twin import VirtualMachine, truth
 
 if TYPE_CHECKING:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,6 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
-from errormotion.methods.linear_positioning.diagonals.simulation import MACHINE, instruments_of
 from errormotion.methods.linear_positioning.moving import cycles, ends, moving_of
 from errormotion.methods.linear_positioning.schema import SCHEMA
 from errormotion.twin import VirtualMachine, truth
@@ -17,6 +17,8 @@ from errormotion.twin import VirtualMachine, truth
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
 
+MACHINE = "gantry"
+"""Kind of the virtual machine of all simulations."""
 GROWTH, SHIFT = 30e-6, 8e-6
 """Final relative expansion of the screw, 1, and displacement of its bearing, m (rad for rotations)."""
 TIME_CONSTANT = 2400.0
@@ -25,6 +27,12 @@ NOISE = 0.3e-6
 """Standard deviation of a reading; m, rad."""
 COLD_INTERVAL = 30.0
 """Interval of the cold readings, s."""
+
+
+def instruments_of(machine: VirtualMachine) -> str:
+    """Return the attribute ``instruments`` of a simulated raw dataset."""
+    address = f"twin://{machine.kind}?seed={machine.seed}"
+    return json.dumps([{"id": "virtual interferometer", "address": address, "simulated": True}])
 
 
 def simulate_moving(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:

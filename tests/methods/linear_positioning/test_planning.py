@@ -63,9 +63,7 @@ def test_motions_are_those_of_the_program_within_the_limits():
 
 def test_a_test_beyond_the_limits_is_refused():
     settings = Settings(travel=(0.0, 0.4), limits=(0.0, 0.4), overrun=0.1)
-    with pytest.raises(
-        MethodError, match=r"expected X from 0\.000 to 400\.000 mm; .*, with an overrun of 100 mm"
-    ):
+    with pytest.raises(MethodError, match=r"expected X from 0\.000 to 400\.000 mm; .*, with an overrun of 100 mm"):
         motions.steps(settings)
     machine = MachineDescription("C-frame", "workpiece-X-Y-bed-Z-spindle-tool", dict.fromkeys("XYZ", (0.0, 0.3)))
     assert "travel" in METHOD.check_machine(settings, machine)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +13,12 @@ from errormotion.datasets import build_deviations, provenance
 from errormotion.methods.linear_positioning.diagonals.identification import DIMS
 from errormotion.methods.linear_positioning.diagonals.lines import Line, distances, lines, squareness_of
 from errormotion.methods.linear_positioning.schema import APPROACHES, SCHEMA, STOPS
+from errormotion.methods.linear_positioning.warming import MACHINE, instruments_of
 from errormotion.twin import VirtualMachine
 
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
 
-MACHINE = "gantry"
 _M = {"units": "m"}
 
 
@@ -77,12 +76,6 @@ def simulate_diagonals(
     coords = {"diagonal": names, "approach": list(APPROACHES), "direction": list("xyz")}
     attrs = {"schema": SCHEMA, "machine": machine.name, "instruments": instruments_of(machine)}
     return xr.Dataset(variables, coords, attrs), _truth(machine, diagonals, distance, np.array(true))
-
-
-def instruments_of(machine: VirtualMachine) -> str:
-    """Return the attribute ``instruments`` of a simulated raw dataset."""
-    address = f"twin://{machine.kind}?seed={machine.seed}"
-    return json.dumps([{"id": "virtual interferometer", "address": address, "simulated": True}])
 
 
 def _truth(machine: VirtualMachine, diagonals: list[Line], distance: Array, true: Array) -> xr.Dataset:
