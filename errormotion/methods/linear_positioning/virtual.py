@@ -7,6 +7,7 @@ import json
 from errormotion.twin import VirtualMachine
 
 MACHINE = "gantry"
+"""Kind of the virtual machine of all simulations."""
 
 
 def instruments_of(machine: VirtualMachine) -> str:

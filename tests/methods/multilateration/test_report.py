@@ -169,7 +169,7 @@ def test_missing_variables_are_accepted(tmp_path, lost):
 
 def test_a_chapter_of_only_errors_states_what_is_missing(tmp_path):
     text = words(page(bare(), tmp_path))
-    for sentence in ("There are no error vectors to draw", "The result holds no stations", "holds no residuals"):
+    for sentence in ("No error vectors are drawn", "The result contains no stations", "contains no residuals"):
         assert sentence in text
 
 

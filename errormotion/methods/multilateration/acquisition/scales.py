@@ -33,7 +33,7 @@ class Scales:
         if not bench.has_kind("thermometer"):
             raise MethodError(
                 f"measuring.scale_sensors: expected an instrument of kind 'thermometer' on the bench for "
-                f"{', '.join(sensors)}; found none. Add it, or leave the sensors out."
+                f"{', '.join(sensors)}; found none. Add it, or remove the setting."
             )
         self._thermometer: Any = bench.of_kind("thermometer")
         known = [str(name) for name in self._thermometer.read()]
