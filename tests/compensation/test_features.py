@@ -43,9 +43,9 @@ def test_friction_grows_with_the_speed_and_its_square() -> None:
 
 def test_a_missing_input_is_named() -> None:
     inputs = Inputs(np.zeros(1), {"bed": np.zeros(1)}, {})
-    with pytest.raises(DatasetError, match="needs the temperature 'head'; the data have bed"):
+    with pytest.raises(DatasetError, match="requires the temperature 'head'; found bed"):
         matrix(inputs, [Feature("head")])
-    with pytest.raises(DatasetError, match="needs the working parameter 'spindle_speed'; the data have none"):
+    with pytest.raises(DatasetError, match="requires the working parameter 'spindle_speed'; found none"):
         matrix(inputs, [Feature("spindle_speed", True)])
 
 

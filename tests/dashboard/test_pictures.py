@@ -210,7 +210,7 @@ def test_now_shows_a_warming_machine_and_a_missing_instrument(
         _apart(drawn["found"])
         assert values == 2 * len(sensors) or len(sensors) == CROWD
         assert named == 2 * len(sensors) or len(sensors) > 10
-        assert (named < 2 * len(sensors)) == ("Not every sensor" in drawn["note"])
+        assert (named < 2 * len(sensors)) == ("Names without enough space" in drawn["note"])
 
 
 def test_results_of_the_demonstration(

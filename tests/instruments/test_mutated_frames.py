@@ -113,11 +113,11 @@ def test_an_answer_of_a_sensor_has_a_limited_number_of_lines() -> None:
 @pytest.mark.parametrize("text", ["s", r"\s", r"\\"])
 def test_an_incomplete_text_of_a_station_takes_no_more_memory_than_its_length(text: str) -> None:
     line = b'%R1P,0,1:0,"' + (1000 // len(text) * text).encode()
-    with pytest.raises(ProtocolError, match="unfinished"):
+    with pytest.raises(ProtocolError, match="incomplete"):
         geocom.reply(line)
     tracemalloc.start()
     try:
-        with pytest.raises(ProtocolError, match="unfinished"):
+        with pytest.raises(ProtocolError, match="incomplete"):
             geocom.reply(line)
         assert tracemalloc.get_traced_memory()[1] < 32 << 10
     finally:

@@ -151,7 +151,7 @@ def test_a_file_that_is_too_large_is_not_read_and_not_extended(tmp_path: Path) -
     line = json.dumps({"text": "x" * 900, "noted": "2026-03-01T08:00:00"}) + "\n"
     (tmp_path / "events.jsonl").write_text(line * (events.LARGEST_FILE // len(line)))
     assert len(events.read(tmp_path)[0]) > 1000
-    with pytest.raises(RunError, match="takes no more"):
+    with pytest.raises(RunError, match="the note does not fit"):
         events.append(tmp_path, events.event("x" * 1000))
     (tmp_path / "events.jsonl").write_text(line * (events.LARGEST_FILE // len(line) + 1))
     assert "it is larger" in events.read(tmp_path)[1][0]

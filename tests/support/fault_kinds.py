@@ -38,7 +38,7 @@ CODES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 """Errors of a disk: full, beyond the quota, read-only, defective."""
 HOUR, DAY = 3600.0, 86400.0
 SHIFTS = {"an hour": HOUR, "a day": DAY, "50 years": 50 * 365.25 * DAY}
-REFUSALS = ("another process is working", "Nothing to resume", "has its result")
+REFUSALS = ("another process is using", "Nothing to resume", "has its result")
 
 
 @dataclass
