@@ -80,6 +80,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
 LEFT_OUT = {
     "provenance.software.*": "versions of Python and of packages; the version of errormotion changes",
     "@start": "time stamp of a campaign with simulated devices",
+    "@clock.*": "clocks of a campaign with simulated devices",
     "provenance.steps.*.campaigns.*": "hash of an error dataset, versions included; the dataset itself is compared",
     "provenance.steps.*.model": "hash of a thermal model, versions included; the model itself is compared",
 }
@@ -90,7 +91,7 @@ NOT_REPRODUCIBLE = {
 """Datasets that one version does not reproduce bit for bit, and the fraction of a standard uncertainty for their
 comparison: Open3D registers with several threads, and the order of its sums varies. Two runs differ by up to 2e-8."""
 PROSE = (
-    *("notes", "notes.*", "reference", "comment", "description", "title"),
+    *("notes", "notes.*", "reference", "comment", "description", "title", "*.unseen", "*.unseen.*"),
     *("*.long_name", "*.description", "*.comment", "provenance.steps.*"),
 )
 DOF = ("EX", "EY", "EZ", "EA", "EB", "EC")
