@@ -2,7 +2,7 @@
 
 A task receives paths and settings and writes a file; no dataset is transferred. The same tasks therefore run on any
 machine that sees the same paths, a run that fails does not affect the others, and an interrupted batch is continued:
-results that exist already are skipped.
+existing results are skipped.
 """
 
 from __future__ import annotations
@@ -286,7 +286,7 @@ def _identify_or_raise(task: Task) -> bool:
             if found.get("settings") == settings_mark and has_hash(dataset, str(found.get("raw"))):
                 return True
             raise DatasetError(
-                f"{path}: exists already, from other raw data, other settings or another version of the method, and "
+                f"{path}: already exists, from other raw data, other settings or another version of the method, and "
                 "a result is never overwritten; specify another folder with --out"
             )
         with _lock if one_thread_at_a_time() else nullcontext(), explained(task.raw, dataset):

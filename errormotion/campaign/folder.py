@@ -131,7 +131,7 @@ class RunFolder:
         name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{test}-{run_id}"
         path, part = runs / name, runs / f".{name}.part"
         if path.exists():
-            raise RunError(f"{path}: exists already; a run is never overwritten")
+            raise RunError(f"{path}: already exists; a run is never overwritten")
         try:
             part.mkdir(parents=True)
             folder = cls(part, {"schema": SCHEMA, "id": run_id, "test": test, "created": now(), **data})

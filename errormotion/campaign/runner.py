@@ -54,7 +54,7 @@ class Progress(Protocol):
     """Receives the progress of a campaign."""
 
     def announce(self, text: str) -> None:
-        """State how a test will move the machine, before the bench is opened."""
+        """State what motions and spindle speeds a test will command, before the bench is opened."""
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
         """Start a test, or skip a finished one."""
@@ -277,9 +277,8 @@ class _Session:
                     folder = folders[test.name] = self._new_folder(test)
                 self.records(folder.path)
                 self.progress.test(test.name, folder.path, number, len(self.campaign.tests))
-                opened.enter_context(
-                    folder.locked()
-                )  # until the end: no other process continues the campaign between two tests
+                # Locked until the end: no other process continues the campaign between two tests.
+                opened.enter_context(folder.locked())
                 with journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
                     self._test(folder, test, folders)
         return [folders[test.name] for test in self.campaign.tests]
@@ -337,10 +336,8 @@ class _Session:
     def _acquire(self, folder: RunFolder, test: TestPlan, inputs: Mapping[str, xr.Dataset]) -> None:
         method, bench = test.method(), self.bench.chosen(test.instruments)
         dim, expected = method.append_dim(test.settings), float(method.progress(test.settings))
-        if (
-            folder.raw.exists() and committed_length(folder.raw, dim) == 0
-        ):  # created, but interrupted before its first samples
-            shutil.rmtree(folder.raw)
+        if folder.raw.exists() and committed_length(folder.raw, dim) == 0:
+            shutil.rmtree(folder.raw)  # created, but interrupted before its first samples
         done = datasets.load(folder.raw) if folder.raw.exists() else None
         before = int(done.sizes[dim]) if done is not None else 0
         folder.data["instruments"] = [answer.record() for answer in bench.answers]

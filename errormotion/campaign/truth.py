@@ -34,7 +34,7 @@ def truth_of(folder: RunFolder) -> xr.Dataset:
     """
     machine, clock = machine_of(folder), folder.data["clock"]
     if folder.errors is None:
-        raise RunError(f"{folder.path}: the run has no errors yet; identify its raw data first")
+        raise RunError(f"{folder.path}: the run has no error dataset yet; identify its raw data first")
     method = plugins.get("methods", str(folder.data["method"]["id"]))
     truth = getattr(method, "truth", None)
     with datasets.load(folder.errors) as errors:
@@ -49,7 +49,7 @@ def truth_of(folder: RunFolder) -> xr.Dataset:
     try:
         datasets.validate(found)
     except DatasetError as error:
-        raise RunError(f"{folder.path}: the true errors are no valid error dataset: {error}") from error
+        raise RunError(f"{folder.path}: the true errors are not a valid error dataset: {error}") from error
     return found
 
 

@@ -51,12 +51,12 @@ def new_files(page: Page | None, *others: Path | None) -> list[Path]:
     Raises
     ------
     DatasetError
-        One of them exists already.
+        One of them already exists.
     """
     files = [*(each for each in others if each is not None), *(page.files if page is not None else ())]
     for path in files:
         if path.exists():
-            raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
+            raise DatasetError(f"{path}: already exists, and a result is never overwritten; give another name")
     return files
 
 
@@ -66,7 +66,7 @@ def new_dataset(out: Path) -> None:
     Raises
     ------
     DatasetError
-        The name does not end in .nc, or the file exists already.
+        The name does not end in .nc, or the file already exists.
     """
     if out.suffix != ".nc":
         raise DatasetError(f"{out}: expected a name that ends in .nc (NetCDF-4 file)")

@@ -31,7 +31,7 @@ def load(
     Raises
     ------
     DatasetError, RunError
-        A path does not exist or is no error dataset, or a run has no errors.
+        A path does not exist or is not an error dataset, or a run has no error dataset.
     """
     found: dict[str, xr.Dataset] = {}
     omitted: list[str] = []
@@ -84,5 +84,5 @@ def _files(path: Path, omitted: list[str], every: bool = False) -> list[tuple[st
 
 def _errors(folder: RunFolder) -> Path:
     if folder.errors is None or not folder.errors.is_file():
-        raise RunError(f"{folder.path}: the run has no errors yet; identify its raw data first")
+        raise RunError(f"{folder.path}: the run has no error dataset yet; identify its raw data first")
     return folder.errors

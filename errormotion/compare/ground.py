@@ -178,7 +178,7 @@ def common_ground(
 def _check(name: str, ds: xr.Dataset) -> None:
     try:
         validate(ds)
-        ds.em.names  # noqa: B018 - raises if it is no error dataset
+        ds.em.names  # noqa: B018 - raises if it is not an error dataset
     except DatasetError as error:
         raise DatasetError(f"'{name}': {error}") from None
     if ds.em.names != DOF:

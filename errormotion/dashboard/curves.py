@@ -77,7 +77,7 @@ def curves_of(
     Raises
     ------
     DatasetError
-        The dataset is no error dataset, an index is beyond its dimension, or the functional point cannot be changed.
+        The dataset is not an error dataset, an index is beyond its dimension, or the functional point is fixed.
     """
     moved = ds if point is None else ds.em.at(point)
     dims = moved.em.dims

@@ -12,7 +12,7 @@ from errormotion.errors import InstrumentError
 from errormotion.plugins import MachineLimits, PluginSettings
 
 _ROUNDING = 1e-9
-"""Tolerance of positions, m, and share of feeds and speeds."""
+"""Tolerance of positions, m, and relative tolerance of feeds and speeds."""
 
 log = logging.getLogger(__name__)
 

@@ -1,10 +1,10 @@
 """Check of an NC program (ISO 6983) against the limits, line by line; a block that may exceed them is refused.
 
-The check understands straight moves in absolute machine coordinates and mm: G0, G1, G31, G38.2 to G38.5 with X, Y, Z
+The check accepts straight moves in absolute machine coordinates and mm: G0, G1, G31, G38.2 to G38.5 with X, Y, Z
 and F, G4 alone on a line, G17, G21, G40, G49, G53, G80, G90, G94, M0 to M9, M30, S, T, comments, and the printing of
 positions. A program must state its units, G1 and its feed before it depends on them; the modes that a control keeps
 from earlier programs are unknown. Arcs, incremental moves, inches, offsets, variables, macros and subprograms are
-refused: only the control knows their path.
+refused: their path depends on the state of the control.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _check_line(plain: str, door: Door, stated: set[str]) -> None:
             raise _unknown(f"{letter}{value}")
     if dwell:  # a control may also move if a dwell has other words beside it
         if sorted(letter for letter, _ in words if letter != "N") not in (["G", "P"], ["G", "X"]):
-            raise InstrumentError("a dwell with other words beside it; write G4 P alone on a line")
+            raise InstrumentError("a dwell with other words on its line; write G4 P alone on a line")
         return
     if door.limits.feed is not None and "G0" in codes:
         raise InstrumentError("a rapid move at the feed of the machine; write G1 with a feed within the limit")

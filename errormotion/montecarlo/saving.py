@@ -39,7 +39,7 @@ def evaluate_and_save(
     Raises
     ------
     MethodError, RunError, DatasetError
-        As for `errormotion.montecarlo.evaluate`; or the file of the evaluation exists already.
+        As for `errormotion.montecarlo.evaluate`; or the file of the evaluation already exists.
     KeyboardInterrupt
         The operator stopped the evaluation; the message states the folder of the trials.
     """

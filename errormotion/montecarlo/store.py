@@ -56,9 +56,8 @@ class Store:
                         f"{self.folder}: contains trials of another evaluation ({', '.join(differ)} differ). Remove "
                         "the folder, or give another name to --out"
                     )
-            elif any(
-                each != _part(file) for each in self.folder.iterdir()
-            ):  # left by a process that ended during its start
+            # A process that ended during its start leaves such a part.
+            elif any(each != _part(file) for each in self.folder.iterdir()):
                 raise RunError(
                     f"{self.folder}: expected an empty folder or trials of this evaluation; found other files"
                 )

@@ -350,7 +350,7 @@ class Compensator(Protocol):
     settings: Any
 
     def open(self) -> None:
-        """Connect; idempotent. Raises InstrumentError without answer."""
+        """Connect; idempotent. Raises InstrumentError if there is no answer."""
 
     def close(self) -> None:
         """Disconnect and disarm; idempotent. The watchdog of the machine ramps written offsets to zero."""
@@ -365,7 +365,7 @@ class Compensator(Protocol):
         """
 
     def read(self) -> Applied:
-        """Return the active offsets, and whether they may change."""
+        """Return the offsets in effect, and whether they may change."""
 
     def write(self, offset: Sequence[float]) -> None:
         """Write the offset of X, Y, Z, m, and reset the watchdog of the machine.

@@ -162,7 +162,7 @@ class CompensatorSubject(_Simulated):
     limit : float
         The limit of ``arm``, m.
     resolution : float
-        Largest difference of the active offset from the written one, m.
+        Largest difference of the offset in effect from the written one, m.
     states : tuple of str
         States that the compensator can report: ``busy``, ``fault``.
     faults : tuple of str, optional

@@ -212,7 +212,7 @@ def _of_freedom(path: Path, entry: Entry, freedom: re.Match[str], at: Sequence[f
     from errormotion import datasets
 
     if not entry.errors:
-        raise RunError("the run has no errors yet")
+        raise RunError("the run has no error dataset yet")
     errors = datasets.load(path / entry.errors)
     name, minutes = freedom[1], freedom[2]
     origin = _origin(errors)

@@ -92,7 +92,7 @@ def follow(subject: CompensatorSubject, compensator: Any, device: Any) -> None:
     for _ in range(math.ceil(ramp / (0.4 * machine.watchdog)) + 1):
         write(compensator, device, subject.offset)
         machine.elapse(0.4 * machine.watchdog)
-    require_offset(subject, machine.offset, subject.offset, "the active offset after it was written")
+    require_offset(subject, machine.offset, subject.offset, "the offset in effect after it was written")
 
 
 def require_ramp(device: Any, what: str) -> None:

@@ -71,7 +71,7 @@ def test_settings_are_checked(run, answer, data):
 
 def test_nothing_is_overwritten(run, data, tmp_path):
     (tmp_path / "a.nc").write_text("mine")
-    assert "exists already" in run("calibrate", data, "-o", "a.nc", code=1).stderr
+    assert "already exists" in run("calibrate", data, "-o", "a.nc", code=1).stderr
     assert (tmp_path / "a.nc").read_text() == "mine"
     assert "expected a name that ends in .nc" in run("calibrate", data, "-o", "a.txt", code=1).stderr
 

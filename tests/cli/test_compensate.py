@@ -95,4 +95,4 @@ def test_a_file_that_exists_is_kept(run, folder: Path) -> None:
     assert run(*arguments).exit_code == 0
     reported = run(*arguments)
     assert reported.exit_code == 1
-    assert "C-frame-610-Y.csv exists already" in reported.stderr
+    assert "C-frame-610-Y.csv already exists" in reported.stderr

@@ -96,7 +96,7 @@ def test_an_impossible_request_is_an_error_and_nothing_is_written(
 def test_an_existing_program_is_not_replaced(part: Path, volume: Path) -> None:
     code, text = run(part, "--with", volume, "--offset", "G54=0,0,0", "--out", part)
     assert code == 1
-    assert "exists already" in text
+    assert "already exists" in text
     assert part.read_text() == PROGRAM
 
 

@@ -32,7 +32,7 @@ def test_path_duration_and_limits_are_reported_and_drawn(folder: Path) -> None:
     assert not (folder / "runs").exists()
     again = CliRunner().invoke(app, ["run", "virtual_probing/monday.toml", "--dry-run", "--out", "pictures"])
     assert again.exit_code == 1
-    assert "exists already" in again.stderr
+    assert "already exists" in again.stderr
 
 
 def test_the_json_output_has_the_same_content(folder: Path) -> None:

@@ -32,7 +32,7 @@ def test_a_bench_and_a_campaign_are_written_by_options_alone(run: Run, tmp_path:
     assert (campaign.tests[0].name, campaign.tests[0].settings.duration) == ("a", 120.0)
     assert "errormotion bench probe new/bench.toml" in said
     before = (tmp_path / "new" / "bench.toml").read_bytes()
-    assert "exists already" in run("init", "new", *options, code=1).stderr
+    assert "already exists" in run("init", "new", *options, code=1).stderr
     assert (tmp_path / "new" / "bench.toml").read_bytes() == before
     run("init", "new", "--machine", "Other", *FRAME, "--force")
     assert load_bench(tmp_path / "new" / "bench.toml").machine == "Other"

@@ -51,7 +51,7 @@ def test_a_model_is_made_used_and_checked(run, folder: Path) -> None:
     ("arguments", "message"),
     [
         (("fit", "{0}/0.nc", "-o", "m.txt"), "m.txt: expected a name that ends in .nc"),
-        (("fit", "{0}/0.nc", "-o", "{0}/1.nc"), "exists already"),
+        (("fit", "{0}/0.nc", "-o", "{0}/1.nc"), "already exists"),
         (("fit", "{0}/0.nc", "-o", "m.nc", "--set", "variant=nice"), "variant"),
         (("fit", "{0}/0.nc", "-o", "m.nc", "--set", "lags=[5]"), "expected a time with its unit"),
         (("check", "{0}/0.nc", "{0}/1.nc"), "expected schema errormotion.model.thermal/1"),

@@ -35,7 +35,7 @@ def test_a_single_test_is_written_into_the_folder_itself(run, tmp_path):
 def test_no_file_is_replaced(run, tmp_path):
     (tmp_path / "pocket_2.nc").write_text("mine")
     found = run("program", GANTRY, "--test", "pose", "--out", tmp_path, code=1)
-    assert "pocket_2.nc exists already" in found.stderr
+    assert "pocket_2.nc already exists" in found.stderr
     assert (tmp_path / "pocket_2.nc").read_text() == "mine"
     assert not (tmp_path / "pocket_1.nc").exists()
 

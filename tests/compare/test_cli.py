@@ -108,14 +108,14 @@ def test_the_page_is_in_the_language_and_has_a_pdf(run, files, monkeypatch):
     assert "size: letter" in page
     Path("d.pdf").write_text("mine")
     again = run("compare", "drift.nc", "probing.nc", *FEW, "--report", "d.html", "--pdf", code=1)
-    assert "d.pdf: exists already" in again.stderr
+    assert "d.pdf: already exists" in again.stderr
     assert "--pdf: allowed with a page only" in run("compare", "drift.nc", "probing.nc", *FEW, "--pdf", code=1).stderr
 
 
 def test_a_result_is_never_overwritten(run, files):
     for option, name in (("--out", "c.nc"), ("--report", "c.html")):
         Path(name).write_text("mine")
-        assert "exists already" in run("compare", "drift.nc", "probing.nc", *FEW, option, name, code=1).stderr
+        assert "already exists" in run("compare", "drift.nc", "probing.nc", *FEW, option, name, code=1).stderr
         assert Path(name).read_text() == "mine"
 
 

@@ -279,7 +279,7 @@ def test_positions_without_errors_are_interpolated_and_reported() -> None:
     ds = machine.volumetric_truth(grid(machine, 5))
     lost = ds.assign({name: ds[name].where(ds["target_index"] % 31 != 5) for name in DOF})
     made = correction(lost)
-    assert any("4 of 125 positions lack errors" in note for note in made.notes)
+    assert any("4 of 125 positions have no known errors" in note for note in made.notes)
     asked = places(machine, 50) * 0.8
     assert np.isfinite(made.at(asked).offset).all()
     assert np.abs(made.at(asked).offset - correction(ds).at(asked).offset).max() < 3e-6

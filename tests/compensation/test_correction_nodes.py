@@ -69,8 +69,8 @@ def test_positions_without_errors_at_any_time_are_omitted() -> None:
     gone = errors.assign({name: errors[name].where(~lost) for name in ("EX", "EY", "EZ", "EA", "EB", "EC")})
     made = correction(gone)
     assert [note.split(": ")[1] for note in made.notes] == [
-        "1 of 3 times have no errors; interpolated from their neighbours.",
-        "1 of 5 positions lack errors; interpolated from their neighbours.",
+        "1 of 3 times have no known errors; interpolated from their neighbours.",
+        "1 of 5 positions have no known errors; interpolated from their neighbours.",
     ]
     here = np.array([[0.0, 0.02, 0.0]])
     assert np.abs(made.at(here, 700.0).offset - correction(errors).at(here, 700.0).offset).max() < 1e-9

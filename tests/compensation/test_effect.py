@@ -187,7 +187,7 @@ def test_the_command_prints_and_writes_the_effect(files: Path) -> None:
     assert "90 % less" in shown
     assert "EB after 120.0 min" in shown
     assert "Errors before and after" in Path("page.html").read_text()
-    assert "exists already" in run("before.nc", "after.nc", "--report", "page.html", code=1)
+    assert "already exists" in run("before.nc", "after.nc", "--report", "page.html", code=1)
     plain = json.loads(run("before.nc", "after.nc", "--json"))
     part = next(each for each in plain["parts"] if each["name"] == "EZ")
     assert part["reduction"]["low"] < 0.9 < part["reduction"]["high"]

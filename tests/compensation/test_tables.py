@@ -274,7 +274,7 @@ def test_files_that_exist_are_kept(machine: VirtualMachine, tmp_path: Path) -> N
     first = exported.save(tmp_path / "tables")
     first[1].unlink()
     before = first[0].read_bytes()
-    with pytest.raises(DatasetError, match="exists already"):
+    with pytest.raises(DatasetError, match="already exists"):
         exported.save(tmp_path / "tables")
     assert first[0].read_bytes() == before
     assert not first[1].exists()

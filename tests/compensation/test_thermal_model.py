@@ -128,7 +128,7 @@ def test_a_saved_model_predicts_the_same(model: ThermalModel, pair: list[xr.Data
     again = ThermalModel.load(tmp_path / "m.nc")
     assert again.features == model.features
     xr.testing.assert_identical(again.predict(pair[1]), model.predict(pair[1]))
-    with pytest.raises(DatasetError, match="exists already"):
+    with pytest.raises(DatasetError, match="already exists"):
         model.save(tmp_path / "m.nc")
 
 

@@ -161,7 +161,7 @@ def test_metadata_in_the_root_have_priority_over_those_of_the_arrays(tmp_path) -
 @both
 def test_a_file_is_overwritten_only_on_request(errors, tmp_path, suffix) -> None:
     path = save(errors(seed=1), tmp_path / f"errors{suffix}")
-    with pytest.raises(DatasetError, match="exists already"):
+    with pytest.raises(DatasetError, match="already exists"):
         save(errors(seed=2), path)
     xr.testing.assert_identical(load(path), errors(seed=1))
     save(errors(seed=2), path, overwrite=True)

@@ -280,7 +280,7 @@ def test_the_command_prints_and_stores_the_verdicts(measured, tmp_path):
     assert "Monte Carlo evaluation of tool" in page.read_text(encoding="utf-8")
     repeated = CliRunner().invoke(app, command)
     assert repeated.exit_code == 1
-    assert "exists already" in repeated.output
+    assert "already exists" in repeated.output
 
 
 def test_several_results_are_evaluated_in_sequence_and_a_second_call_adds_nothing(measured, tmp_path):

@@ -174,7 +174,7 @@ def test_dataset_and_page(lab: Path, call: Callable[..., Any], tmp_path: Path) -
     assert not re.search(r"(?:src|href)=\"(?!#)|https?://(?!www\.w3\.org)", text)
     for words in ("hit the vice", "coolant off", "Moving ranges", "run-25"):
         assert words in text
-    assert "exists already" in call(lab, "--figure", "EZ", "--out", out, code=1)
+    assert "already exists" in call(lab, "--figure", "EZ", "--out", out, code=1)
     assert CliRunner().invoke(app, ["validate", str(out)]).exit_code == 0
     again = CliRunner().invoke(app, ["report", str(out), "--out", str(tmp_path / "again.html")])
     assert again.exit_code == 0, again.output

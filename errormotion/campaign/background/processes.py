@@ -151,7 +151,7 @@ def answer(runs: Path, name: str, number: int) -> None:
     """
     process = _one(runs, name)
     if not process.alive or process.request is None or process.request.number != number:
-        raise RunError(f"{process.campaign}: request {number} is not open any more")
+        raise RunError(f"{process.campaign}: request {number} is no longer open")
     replace_text(runs / FOLDER / name / ANSWER, f"{number}\n")
 
 
@@ -167,7 +167,7 @@ def stop(runs: Path, name: str) -> None:
     folder = runs / FOLDER / name
     pid = _state(folder / "process.json").get("pid")
     if not process.alive or not isinstance(pid, int):
-        raise RunError(f"{process.campaign}: the process has ended already")
+        raise RunError(f"{process.campaign}: the process has already ended")
     requested = folder / "stop"
     if requested.exists() and time.time() - requested.stat().st_mtime < STOP_INTERVAL:
         return  # a second signal would end it while it closes its instruments

@@ -54,7 +54,7 @@ class Published:
         )
 
     def announce(self, text: str) -> None:
-        """State how a test will move the machine."""
+        """State what motions and spindle speeds a test will command."""
         self._set(announcements=[*self._state["announcements"], text[:MAX_TEXT]][:MAX_TESTS])
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:

@@ -436,7 +436,7 @@ def _only_one(machine: str) -> Iterator[None]:
         except BlockingIOError:
             holder = os.read(descriptor, 100).decode("utf-8", "replace").strip()
             raise CompensationError(
-                f"The machine '{machine}' is compensated already{f' by process {holder}' if holder else ''}; stop that "
+                f"The machine '{machine}' is already compensated{f' by process {holder}' if holder else ''}; stop that "
                 "compensation first."
             ) from None
         os.ftruncate(descriptor, 0)

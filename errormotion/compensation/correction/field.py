@@ -158,9 +158,11 @@ def field_of(ds: xr.Dataset, name: str, chain: str) -> tuple[Field, list[str]]:
         raise DatasetError(f"{name}: no position has known errors at all times; select one time (--select time=NUMBER)")
     notes = []
     if gaps := int((~times).sum()):
-        notes.append(f"{name}: {gaps} of {shape[0]} times have no errors; interpolated from their neighbours.")
+        notes.append(f"{name}: {gaps} of {shape[0]} times have no known errors; interpolated from their neighbours.")
     if gaps := int((~kept).sum()):
-        notes.append(f"{name}: {gaps} of {shape[1]} positions lack errors; interpolated from their neighbours.")
+        notes.append(
+            f"{name}: {gaps} of {shape[1]} positions have no known errors; interpolated from their neighbours."
+        )
     instants = _line(ds, "time", times, name) if "time" in dims else None
     nodes, columns, rows = _nodes(ds, place, np.flatnonzero(kept), name)
     E, total, F = (
@@ -263,8 +265,7 @@ def _lever(ds: xr.Dataset, point: Array, chain: str, place: str, name: str) -> t
     if component not in carries_tool:
         raise DatasetError(f"{name}: the chain {chain} has no axis {component}")
     behind = list(carries_tool)[list(carries_tool).index(component) + 1 :]
-    if not carries_tool[
-        component
-    ]:  # its point is fixed to the body on the workpiece side, so its own travel is a lever
+    # The point of such an axis is fixed to the body on the workpiece side: its own travel changes the lever.
+    if not carries_tool[component]:
         behind.append(component)
     return np.zeros(3), np.array([float(axis in behind) for axis in _AXES]), []

@@ -197,7 +197,7 @@ def _along(
 
 
 def _reversal(errors: xr.Dataset, axis: str, component: str, x: Array) -> Array:
-    """Return mean forward less mean backward error at positions, m; 0 if the errors state none."""
+    """Return mean forward minus mean backward error at positions, m; 0 if the errors state none."""
     if "reversal" not in errors.variables or set(errors["reversal"].dims) != {"freedom", "position"}:
         return np.zeros(x.size)
     name = iso_names(axis)[f"E{component}"]

@@ -158,7 +158,7 @@ def loaded(path: Path) -> xr.Dataset:
     Raises
     ------
     DatasetError
-        The file cannot be read, or is no error dataset.
+        The file cannot be read, or is not an error dataset.
     """
 
     def load() -> xr.Dataset:

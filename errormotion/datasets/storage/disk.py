@@ -231,7 +231,7 @@ def reading(path: str | Path) -> Iterator[None]:
 
 def _refuse_existing(path: Path, overwrite: bool) -> None:
     if not overwrite and (path.exists() or path.is_symlink()):
-        raise DatasetError(f"{path}: exists already; choose another name, or allow overwriting")
+        raise DatasetError(f"{path}: already exists; choose another name, or allow overwriting")
 
 
 def _replace(part: Path, path: Path) -> None:

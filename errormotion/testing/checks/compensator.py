@@ -170,7 +170,7 @@ def nothing_on_connecting(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add(why_not=_no_machine)
 def arrives(subject: CompensatorSubject) -> str:
-    """A written offset becomes active on each axis with its sign, and is read back."""
+    """A written offset comes into effect on each axis with its sign, and is read back."""
     with started(subject) as device, armed(subject, device) as compensator:
         follow(subject, compensator, device)
         _reads_what_is_in_effect(subject, compensator, device, "read()")
@@ -230,7 +230,7 @@ def closed(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add(why_not=_no_machine)
 def restart(subject: CompensatorSubject) -> str:
-    """A new connection reads the active offset and continues from it; its first write resets the watchdog."""
+    """A new connection reads the offset in effect and continues from it; its first write resets the watchdog."""
     with started(subject) as device:
         with armed(subject, device) as compensator:
             follow(subject, compensator, device)
@@ -266,7 +266,7 @@ def two_connections(subject: CompensatorSubject) -> str:
 
 
 def _reads_what_is_in_effect(subject: CompensatorSubject, compensator: Any, device: Any, who: str) -> None:
-    """Wait until a compensator reads the active offset."""
+    """Wait until a compensator reads the offset in effect."""
     wait_for(
         lambda: near(compensator.read().offset, device.machine.offset, subject.resolution),
         lambda: f"{who}: expected {um(device.machine.offset)}, found {um(compensator.read().offset)}",
@@ -300,7 +300,7 @@ def lost_connection(subject: CompensatorSubject) -> str:
 
 @COMPENSATOR_CHECKS.add(limit=90.0, why_not=_no_faults)
 def faults(subject: CompensatorSubject) -> str:
-    """Each fault causes a typed error within the time limit, and no offset beyond the limit becomes active."""
+    """Each fault causes a typed error within the time limit, and no offset beyond the limit comes into effect."""
     seen: list[str] = []
     wrong: list[str] = []
     for fault in subject.menu:

@@ -146,7 +146,7 @@ METHOD_CHECKS.add(why_not=why_no_texts)(chapters_translated)
 
 @METHOD_CHECKS.add()
 def frame_invariance(subject: MethodSubject) -> str:
-    """Raw data in another frame result in the same errors and covariance in this frame."""
+    """Raw data transformed to another frame result in the same errors and covariance, transformed to that frame."""
     rotation, shift = (np.array(part) for part in subject.motion)
     pose = RigidTransform.from_components(shift, Rotation.from_rotvec(rotation))
     raw, _ = subject.make(0)

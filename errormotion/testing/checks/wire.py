@@ -149,7 +149,7 @@ def _same(reading: Reading, other: Reading) -> bool:
 
 
 def time_limit(subject: InstrumentSubject) -> str:
-    """Without answer, an error is raised after the ``timeout`` of the settings, not earlier or much later."""
+    """Without an answer, an error is raised after the ``timeout`` of the settings, neither earlier nor much later."""
     for wire, forms in (("tcp", TCP_FORMS), ("pty", SERIAL_FORMS)):
         for form in forms:
             if _seconds_to_timeout(subject, wire, form, QUICK) is None:
@@ -167,7 +167,7 @@ def time_limit(subject: InstrumentSubject) -> str:
 
 
 def _seconds_to_timeout(subject: InstrumentSubject, wire: str, form: str, limit: float) -> float | None:
-    """Return the time until the error without answer of the device, s; None for other errors."""
+    """Return the time until the error if the device does not answer, s; None for other errors."""
     with _silent(wire) as server:
         subject = _with_settings(subject, timeout=limit)
         instrument = subject.build(address=form.format(_place(server)))

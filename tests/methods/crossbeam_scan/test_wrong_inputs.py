@@ -73,7 +73,9 @@ def assert_lost_alone(found, errors, reason, cycles=(CYCLE,), artefact=ARTEFACT)
         assert np.isnan(there[lost]).all()
         np.testing.assert_array_equal(there[~lost], clean[~lost])
     assert not found["points_used"].values[lost].any()
-    assert any(note.startswith(f"{lost[1:].sum()} of 6 warm scans have no errors (at 0 m)") for note in notes(found))
+    assert any(
+        note.startswith(f"{lost[1:].sum()} of 6 warm scans have no known errors (at 0 m)") for note in notes(found)
+    )
 
 
 def notes(found):

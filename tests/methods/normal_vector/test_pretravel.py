@@ -168,7 +168,7 @@ def test_a_map_is_saved_and_loaded(tmp_path: Path) -> None:
     path = made.save(tmp_path / "probe.nc")
     loaded = PretravelMap.load(path)
     np.testing.assert_array_equal(loaded.length(upper(0)), made.length(upper(0)))
-    with pytest.raises(DatasetError, match="exists already"):
+    with pytest.raises(DatasetError, match="already exists"):
         made.save(path)
     with pytest.raises(DatasetError, match="no such file"):
         PretravelMap.load(tmp_path / "other.nc")

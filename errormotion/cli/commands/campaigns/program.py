@@ -24,7 +24,7 @@ def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
     Raises
     ------
         BenchError
-            The test does not exist, its method has no programs, or a file exists already. Nothing is written.
+            The test does not exist, its method has no programs, or a file already exists. Nothing is written.
     """
     plan = load_campaign(campaign)
     chosen = [entry for entry in plan.tests if test is None or entry.name == test]
@@ -48,7 +48,7 @@ def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
         files += [(entry.name, folder / name, text) for name, text in texts.items()]
     if existing := [str(path) for _, path, _ in files if path.exists()]:
         raise BenchError(
-            f"{existing[0]} exists already; choose another folder, or remove the file. Nothing was written."
+            f"{existing[0]} already exists; choose another folder, or remove the file. Nothing was written."
         )
     for line in announced:
         typer.echo(line, err=True)

@@ -36,7 +36,7 @@ def run(
     Raises
     ------
     DatasetError
-        The results cannot be read or compared, or a file exists already.
+        The results cannot be read or compared, or a file already exists.
     BenchError
         The file of tolerances is invalid.
     """

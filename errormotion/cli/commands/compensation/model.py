@@ -30,7 +30,7 @@ def make(campaigns: list[Path], out: Path, assignments: list[str], settings_file
     Raises
     ------
     DatasetError
-        The errors cannot be read or do not determine a model, or the file exists already.
+        The errors cannot be read or do not determine a model, or the file already exists.
     """
     new_dataset(out)
     settings = read_settings(Settings, settings_file, assignments)
@@ -64,7 +64,7 @@ def predict(model: Path, data: Path, out: Path, as_json: bool) -> None:
     Raises
     ------
     DatasetError
-        The model or the data cannot be read, an input is missing, or the file exists already.
+        The model or the data cannot be read, an input is missing, or the file already exists.
     """
     new_dataset(out)
     used, inputs = ThermalModel.load(model), dataset_of(data)
@@ -148,7 +148,7 @@ def source_of(path: Path) -> xr.Dataset | ThermalModel:
 
 
 def dataset_of(path: Path) -> xr.Dataset:
-    """Return the dataset of a file; of a run folder, its errors, or its raw data if it has no errors."""
+    """Return the dataset of a file; of a run folder, its errors, or its raw data if it has no error dataset."""
     if (path / "run.json").exists():
         folder = RunFolder.open(path)
         path = folder.errors or folder.raw

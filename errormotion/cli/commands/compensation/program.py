@@ -59,7 +59,7 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
     """
     target = out or part.with_name(f"{part.stem}.corrected{part.suffix}")
     if target.exists():
-        raise ProgramError(f"{target}: exists already, and is not replaced; give another name")
+        raise ProgramError(f"{target}: already exists, and is not replaced; give another name")
     settings = Settings(
         tolerance=quantity("--tolerance", choice.tolerance, Length),
         step=quantity("--sampling", choice.sampling, Length),

@@ -36,7 +36,7 @@ def table(errors: Path, form: str, choice: Choice, out: Path, assignments: list[
         No such format.
     DatasetError
         The errors cannot be read or do not determine a table, the table exceeds a limit of the control, or a file
-        exists already. Nothing is written.
+        already exists. Nothing is written.
     """
     chosen = get(form)
     settings = read_settings(chosen.Settings, None, assignments)

@@ -21,7 +21,7 @@ def run(data: Path, out: Path, assignments: list[str], settings_file: Path | Non
     Raises
     ------
     DatasetError
-        The data cannot be read or have no schema of a calibration, or the file exists already.
+        The data cannot be read or have no schema of a calibration, or the file already exists.
     MethodError
         The settings are invalid, or the readings do not determine a calibration.
     """

@@ -34,7 +34,7 @@ def record(bench: Path, name: str, duration: str, out: Path | None, mask_serial:
     instrument = _instrument(bench, name)
     path = out or Path(f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}.rec")
     if path.exists():
-        raise InstrumentError(f"The recording {path} exists already; choose another file or remove it")
+        raise InstrumentError(f"The recording {path} already exists; choose another file or remove it")
     early: dict[Path, int] = {}  # number of frames before the identity was known
     session = run_live(
         instrument.driver(instrument.address, instrument.settings, record=path),

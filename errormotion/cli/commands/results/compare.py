@@ -50,7 +50,7 @@ def compare(
     Raises
     ------
     DatasetError
-        The datasets cannot be read or compared, or a file exists already.
+        The datasets cannot be read or compared, or a file already exists.
     """
     files = new_files(page, out)
     results, left_out = load(paths, _named(stated.names), every=stated.by is not None)

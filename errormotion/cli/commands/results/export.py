@@ -43,12 +43,12 @@ def export(
     Raises
     ------
     DatasetError
-        The path is not exactly one result, the ending or a freedom is unknown, or the file exists already.
+        The path is not exactly one result, the ending or a freedom is unknown, or the file already exists.
     """
     if out.suffix.lower() not in FORMS:
         raise DatasetError(f"{out}: expected a name that ends in {', '.join(FORMS)}")
     if out.exists():
-        raise DatasetError(f"{out}: exists already, and is not replaced; give another name")
+        raise DatasetError(f"{out}: already exists, and is not replaced; give another name")
     found, _ = load([result], {})
     if len(found) != 1:
         names = ", ".join(found) or "none"

@@ -26,7 +26,7 @@ def trials_of(text: str) -> int | None:
 
 
 def beside(out: Path) -> Path:
-    """Return the file of the evaluation of a result; DatasetError if it exists already or has no folder."""
+    """Return the file of the evaluation of a result; DatasetError if it already exists or has no folder."""
     file = evaluation_file(out)
     if not out.parent.is_dir():
         raise DatasetError(f"{out.parent}: no such folder, which --out states for the result")

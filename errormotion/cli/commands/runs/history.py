@@ -38,7 +38,7 @@ def history(
     RunError
         No run of the machine states the figure.
     DatasetError
-        A file exists already, or cannot be written.
+        A file already exists, or cannot be written.
     """
     files = new_files(page, out)
     runs = list_runs(paths or [Path("runs")], machine=machine, method=method, test=test)

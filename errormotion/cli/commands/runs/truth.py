@@ -19,7 +19,7 @@ def truth(run: Path, out: Path) -> None:
     RunError
         The run was not made on a virtual machine, so that the truth is unknown.
     DatasetError
-        The file exists already.
+        The file already exists.
     """
     new_files(None, out)
     datasets.save(truth_of(RunFolder.open(run)), out)

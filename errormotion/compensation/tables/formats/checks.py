@@ -31,6 +31,6 @@ def one_direction(table: AxisTable, control: str) -> tuple[str, ...]:
     if table.reversal < 1e-9:
         return ()
     return (
-        f"{control} does not distinguish directions: it has the mean of both. Half of the reversal, up to "
+        f"{control} does not distinguish directions: the table contains the mean of both. Half of the reversal, up to "
         f"{0.5e6 * table.reversal:.2f} um, remains for the backlash compensation of the control.",
     )

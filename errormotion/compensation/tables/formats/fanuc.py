@@ -70,9 +70,9 @@ class FanucTable:
         zero = int(np.abs(table.positions).argmin())
         if abs(table.positions[zero]) > 1e-9:
             raise DatasetError(
-                "FANUC counts the compensation from the reference point at position 0, which is none of the points of "
+                "FANUC counts the compensation from the reference point at position 0, which is not a point of "
                 f"the table ({1e3 * table.positions[0]:g} to {1e3 * table.positions[-1]:g} mm in steps of "
-                f"{1e3 * table.step:g} mm). State a step whose multiples they are (--step)"
+                f"{1e3 * table.step:g} mm). State a step of which all points are multiples (--step)"
             )
         count = table.positions.size
         if count - 1 > settings.most_points or settings.first_number + count > NUMBERS:

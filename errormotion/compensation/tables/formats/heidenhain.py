@@ -1,8 +1,8 @@
 """HEIDENHAIN: a compensation value table (.COM), and the assignment of tables to axes (.CMA).
 
 The columns are those of the newer controls: AXISPOS, BACKLASH, and the key of the axis that is corrected. A value is
-the error with its own sign, the actual less the nominal position, which the control subtracts, according to the manuals
-of the TNC 306, 360 and 407 and to a published converter from laser measurements. No manual of a newer control that
+the error with its own sign, the actual minus the nominal position, which the control subtracts, according to the
+manuals of the TNC 306, 360 and 407 and to a published converter from laser measurements. No manual of a newer control that
 states the sign was found. The first line of the text (``BEGIN``) is that of the same converter; the last
 (``[END]``) is from memory.
 """
@@ -70,7 +70,7 @@ class HeidenhainTable:
         columns[corrected] = _cells(turn * values[0])
         name = table.name.lower()
         sign = (
-            f"sign: value = {'-' if settings.inverted else ''}error, actual less nominal (manuals of TNC 306 and 407; "
+            f"sign: value = {'-' if settings.inverted else ''}error, actual minus nominal (manuals of TNC 306 and 407; "
             "not stated for newer controls)"
         )
         comments = [*table.comments, sign, "unit: mm, positions from the machine datum"]

@@ -2,7 +2,7 @@
 
 Each line has three numbers: nominal position, forward, reverse, in the unit of length of the machine. With
 ``COMP_FILE_TYPE = 1`` the last two are trims, which the motion controller adds to the command of the motor; with 0 they
-are the positions that the axis reaches, and the trim is the nominal position less these. The first line without three
+are the positions that the axis reaches, and the trim is the nominal minus these positions. The first line without three
 numbers ends the table; comments therefore follow it. Before the first and after the last point the trim is constant; at
 standstill the last one remains.
 """

@@ -227,9 +227,8 @@ class KeyenceLK(Driver):
         for _ in range(MAX_LATE_LINES):
             line = self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES)
             text = line.removesuffix(LINE_END).decode("ascii", errors="replace")
-            if text.endswith(
-                (mode, *(f"{ERROR},{mode},{code}" for code in STATE_ERRORS))
-            ):  # the controller was already in this mode
+            # The error means that the controller was already in this mode.
+            if text.endswith((mode, *(f"{ERROR},{mode},{code}" for code in STATE_ERRORS))):
                 self._synchronised = True
                 return
             if error_code(mode, text) is not None:

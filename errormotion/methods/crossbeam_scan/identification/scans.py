@@ -226,7 +226,7 @@ def _notes(reason: NDArray[np.object_], position: Array, rig: Rig) -> list[str]:
     if len(lost):
         where = sorted({f"{position[k]:g} m" for _, k in lost}, key=lambda text: float(text.split()[0]))
         notes.append(
-            f"{len(lost)} of {reason[1:].size} warm scans have no errors (at {', '.join(where)}); the variable "
+            f"{len(lost)} of {reason[1:].size} warm scans have no known errors (at {', '.join(where)}); the variable "
             "`reason` states why."
         )
     if rig.pose_covariance is None:

@@ -43,7 +43,7 @@ def _residual(seen: Campaign, cycle: int, artefact: int) -> list[Block]:
     if math.isfinite(noise):
         words += f"; noise of a point {_length(noise)}"
     turned = _wrong_pose(seen, cycle, artefact)
-    words += ". The residual shows noise and jitter of two scans; it is no measure of the accuracy of the pose"
+    words += ". The residual shows noise and jitter of two scans; it is not a measure of the accuracy of the pose"
     if turned is not None:
         name, sigma, added = turned
         words += (

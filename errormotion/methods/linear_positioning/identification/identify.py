@@ -241,7 +241,7 @@ def _extras(evaluated: Evaluated, settings: Settings) -> dict[str, xr.DataArray]
         "deviations": (("freedom", "approach", "run", "position"), readings.x, "readings, corrected; m, rad"),
         "unidirectional_mean": (dims, statistics.mean, "mean unidirectional deviation; m, rad"),
         "unidirectional_s": (dims, statistics.s, "estimator of the unidirectional standard deviation; m, rad"),
-        "reversal": (("freedom", "position"), statistics.reversal, "mean forward less mean backward; m, rad"),
+        "reversal": (("freedom", "position"), statistics.reversal, "mean forward minus mean backward; m, rad"),
         "reversal_u": (("freedom", "position"), _reversal_u(evaluated), "standard uncertainty of reversal; m, rad"),
         "figure_value": (("freedom", "figure"), np.array([each.value for each in figures]), "ISO 230-2; m, rad"),
         "figure_bias": (

@@ -53,7 +53,7 @@ class Statistics:
 
     @property
     def reversal(self) -> Array:
-        """Reversal error at each target: mean forward less mean backward, (..., target)."""
+        """Reversal error at each target: mean forward minus mean backward, (..., target)."""
         return np.asarray(self.mean[..., 0, :] - self.mean[..., 1, :])
 
     @property

@@ -166,10 +166,8 @@ class Warming:
         recorded_origin, cold = float(done.attrs["clock_origin"]), float(done.attrs["cold_cycle_seconds"])
         if not self.control.identify().simulated:
             self.origin = clock - age(done)
-        elif (
-            clock - recorded_origin >= _ends(done)[-1] - cycle.SHORTEST_STEP
-        ):  # the same virtual machine, still running
-            self.origin = recorded_origin
+        elif clock - recorded_origin >= _ends(done)[-1] - cycle.SHORTEST_STEP:
+            self.origin = recorded_origin  # the same virtual machine, still running
         else:
             log.info("the virtual machine repeats %d cycles", done.sizes["time"])
             self.repeats = True

@@ -58,7 +58,7 @@ def init(
     answers = _stated(machine, chain, travel, instruments, tests, assignments)
     targets = [folder / BENCH, folder / CAMPAIGN]
     if not force and (there := [str(path) for path in targets if path.exists()]):
-        raise BenchError(f"{' and '.join(there)}: exists already; give another folder, or --force to replace it")
+        raise BenchError(f"{' and '.join(there)}: already exists; give another folder, or --force to replace it")
     if ask is None and sys.stdin.isatty() and sys.stderr.isatty() and not as_json:
         ask = _prompt
     if ask is not None:

@@ -70,7 +70,7 @@ class Extra:
         Raises
         ------
         MethodError
-            A name is unknown, or a standard deviation is no positive number.
+            A name is unknown, or a standard deviation is not a positive number.
         """
         requested = dict(requested or {})
         if unknown := sorted(set(requested) - set(BASES)):

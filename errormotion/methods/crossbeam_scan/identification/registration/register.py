@@ -96,7 +96,7 @@ def register(
     if terms.names and registration != "height_map":
         raise MethodError(
             f"expected registration 'height_map' for the extra parameters {', '.join(terms.names)}, found "
-            f"{registration!r}, which knows the rigid motion only; choose one of both"
+            f"{registration!r}, which determines only the rigid motion; choose one or the other"
         )
     free = _determined(cold, warm, loose, terms)
     started = _start(cold, warm, free)
