@@ -2,8 +2,8 @@
 
 The columns are those of the newer controls: AXISPOS, BACKLASH, and the key of the axis that is corrected. A value is
 the error with its own sign, the actual minus the nominal position, which the control subtracts, according to the
-manuals of the TNC 306, 360 and 407 and to a published converter from laser measurements. No manual of a newer control that
-states the sign was found. The first line of the text (``BEGIN``) is that of the same converter; the last
+manuals of the TNC 306, 360 and 407 and to a published converter from laser measurements. No manual of a newer control
+that states the sign was found. The first line of the text (``BEGIN``) is that of the same converter; the last
 (``[END]``) is from memory.
 """
 
