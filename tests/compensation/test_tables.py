@@ -217,7 +217,7 @@ def test_fanuc_rejects_values_out_of_range(machine: VirtualMachine) -> None:
         DatasetError, match=r"changes by 1[45]\d\d\.\d um between two points; FANUC accepts at most 700 um"
     ):
         export(axis_table(steep(machine), "Y", step=0.05), get("fanuc"))
-    with pytest.raises(DatasetError, match="reference point at position 0, which is none of the points"):
+    with pytest.raises(DatasetError, match="reference point at position 0, which is not a point"):
         export(axis_table(measured(machine, count=32), "Y"), get("fanuc"))
 
 
