@@ -375,7 +375,7 @@ def test_earlier_readings_at_an_unknown_time_are_refused(plan: BenchPlan, model:
 def test_one_machine_has_one_compensation(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     with Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()):
         with (
-            pytest.raises(CompensationError, match=r"compensated already by process \d+"),
+            pytest.raises(CompensationError, match=r"already compensated by process \d+"),
             Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()),
         ):
             pass

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +39,11 @@ def installed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ballbar")
     source, site, work = folder / "source", folder / "site", folder / "work"
     shutil.copytree(EXAMPLE, source, ignore=shutil.ignore_patterns("__pycache__", "build", "*.egg-info"))
-    options = ["--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
-    run("-m", "pip", "install", "-q", *options, "--target", site, source, folder=folder, site=folder)
+    # An environment that uv has made has no pip.
+    pip = ["uv", "pip"] if find_spec("pip") is None else [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+    here = ["--python", sys.executable] if pip[0] == "uv" else []
+    options = [*here, "--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--target", site]
+    subprocess.run([*pip, "install", *options, source], check=True)
     work.mkdir()
     for name in ("bench.toml", "campaign.toml", "import.toml"):
         shutil.copy(EXAMPLE / name, work)
