@@ -63,7 +63,7 @@ def test_a_request_waits_for_its_answer(tmp_path: Path) -> None:
             processes.Request(1, "Mount <b>the bar</b>."),
             60.0,
         )
-        with pytest.raises(RunError, match="is not open"):
+        with pytest.raises(RunError, match="is no longer open"):
             processes.answer(tmp_path, NAME, 2)
         assert asking.is_alive()
         listed = CliRunner().invoke(app, ["background", "list", str(tmp_path)])
