@@ -36,8 +36,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Use three workers for each processor: many tests wait for a device that is late, silent or slow on purpose."""
-    return 3 * (os.cpu_count() or 1)
+    """Use two workers for each processor: many tests wait for a device that is late, silent or slow on purpose."""
+    return 2 * (os.cpu_count() or 1)
 
 
 class _ByFile(LoadFileScheduling):  # type: ignore[misc]
