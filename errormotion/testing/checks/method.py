@@ -93,7 +93,7 @@ def schema(subject: MethodSubject) -> str:
         datasets.validate(raw, tables)
     expected = subject.plugin.needs.raw_schema
     require(raw.attrs["schema"] == expected, f"raw data: expected schema {expected}, found {raw.attrs.get('schema')}")
-    errors = subject.identify(raw)
+    errors, _ = subject.outcome(0)
     datasets.validate(errors)
     info = subject.plugin.info
     for key, value in {"schema": datasets.SCHEMA, "method": info.id, "method_version": info.version}.items():
@@ -150,10 +150,8 @@ def frame_invariance(subject: MethodSubject) -> str:
     rotation, shift = (np.array(part) for part in subject.motion)
     pose = RigidTransform.from_components(shift, Rotation.from_rotvec(rotation))
     raw, _ = subject.make(0)
-    here, there = (
-        subject.identify(raw),
-        _moved_subject(subject, pose).identify(moved_raw(raw, subject.raw_vectors, pose)),
-    )
+    here, _ = subject.outcome(0)
+    there = _moved_subject(subject, pose).identify(moved_raw(raw, subject.raw_vectors, pose))
     if names(here) != DOF:
         return _deviation_invariance(here, there, pose)
     back = np.round(pose.apply(functional_point(here)) - functional_point(there), 12)  # else NaN times rounding is NaN
@@ -219,7 +217,7 @@ def number_format(subject: MethodSubject) -> str:
     for name in measured_variables(subject, raw):
         single[name] = raw[name].astype(np.float32)
         single[name].attrs = dict(raw[name].attrs)
-    one, other = subject.identify(raw), subject.identify(single)
+    one, other = subject.outcome(0)[0], subject.identify(single)
     _require_close(values(one), covariance(one), values(other), covariance(other), fraction=SAME_SINGLE)
     return f"{', '.join(measured_variables(subject, raw))} in single precision"
 
@@ -230,7 +228,7 @@ def units(subject: MethodSubject) -> str:
     raw, _ = subject.make(0)
     lengths = [name for name in measured_variables(subject, raw) if raw[name].attrs.get("units") == "m"]
     require(bool(lengths), "no measured variable has the attribute units = 'm'")
-    straight, verdicts = subject.identify(raw), []
+    straight, verdicts = subject.outcome(0)[0], []
     for name in lengths:
         field = raw.copy()
         field[name] = (raw[name] * 1e3).assign_attrs(units="mm")
@@ -242,7 +240,7 @@ def units(subject: MethodSubject) -> str:
 def layout(subject: MethodSubject) -> str:
     """The order of dimensions and of their labels has no effect, or is refused with a typed error."""
     raw, _ = subject.make(0)
-    straight = subject.identify(raw)
+    straight, _ = subject.outcome(0)
     turned = raw.copy()
     for name in map(str, raw.data_vars):
         turned[name] = raw[name].transpose(*reversed(raw[name].dims))
@@ -317,7 +315,7 @@ def leaves_inputs_alone(subject: MethodSubject) -> str:
 def round_trip(subject: MethodSubject) -> str:
     """A result is unchanged after storage; raw data from a file (NetCDF, Zarr) have the same result."""
     raw, _ = subject.make(0)
-    errors = subject.identify(raw)
+    errors, _ = subject.outcome(0)
     with TemporaryDirectory() as folder:
         datasets.save(errors, Path(folder) / "errors.nc")
         loaded = datasets.load(Path(folder) / "errors.nc")

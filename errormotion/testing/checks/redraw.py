@@ -71,7 +71,7 @@ def sources_as_stated(subject: MethodSubject) -> str:
 def _drawn(subject: MethodSubject) -> tuple[xr.Dataset, xr.Dataset, Redrawing]:
     """Return raw data, result, and the draws of the sources."""
     raw, _ = subject.make(0)
-    errors = subject.identify(raw)
+    errors, _ = subject.outcome(0)
     with _quiet():
         return raw, errors, redrawing_of(subject.plugin(), raw, subject.effective_settings(), errors)
 
