@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -89,6 +90,7 @@ def freeform(z: Surface, half_size: tuple[float, float] = (22e-3, 30e-3), *, nam
     return Artefact(name, surfaces.FREEFORM, np.array([*half_size, x[0], y[0], 1 / KNOTS]), table)
 
 
+@lru_cache(maxsize=4)
 def swept(half_size: tuple[float, float] = (22e-3, 30e-3)) -> Artefact:
     """Return a section curve in X-Z, swept along a guide curve in Y-Z: z = f(x) + g(y), slopes up to 0.5.
 

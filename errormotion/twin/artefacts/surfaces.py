@@ -7,12 +7,14 @@ Python evaluates all shapes. All lengths are in metres, in the frame of the arte
 from __future__ import annotations
 
 import math
+from typing import cast
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.twin.kernels import compiled, mixed, normal
+from errormotion.twin.kernels import Function, compiled, mixed, normal
 
 #: Shapes.
 FREEFORM, PLANE, SPHERE, POCKET = 0, 1, 2, 3
@@ -26,7 +28,12 @@ _ROOT_2 = math.sqrt(2.0)
 _GOLDEN, _S11 = np.uint64(0x9E3779B97F4A7C15), np.uint64(11)
 
 
-@compiled
+def inlined(function: Function) -> Function:
+    """Make a function a part of the compiled functions that call it; a call would take as long as the function."""
+    return cast(Function, numba.njit(inline="always")(function))
+
+
+@inlined
 def weights(f: float) -> tuple[float, float, float, float, float, float, float, float]:
     """Return the four cubic B-splines at a position 0 <= f < 1 between two knots, and their derivatives."""
     g = 1.0 - f
@@ -42,7 +49,7 @@ def weights(f: float) -> tuple[float, float, float, float, float, float, float, 
     )
 
 
-@compiled
+@inlined
 def freeform(p: Array, table: Array, x: float, y: float) -> tuple[float, float, float]:
     """Return height and both slopes of a bicubic spline; the outermost cell is continued beyond the table."""
     u = (x - p[2]) * p[4]
@@ -64,7 +71,7 @@ def freeform(p: Array, table: Array, x: float, y: float) -> tuple[float, float, 
     return z, zx * p[4], zy * p[4]
 
 
-@compiled
+@inlined
 def surface(shape: int, p: Array, table: Array, x: float, y: float) -> tuple[float, float, float]:
     """Return height and both slopes of a smooth surface; NaN off the surface."""
     if shape == FREEFORM:
