@@ -42,6 +42,10 @@ _MAX_EVALUATIONS = 1000
 """Largest number of evaluations of each search, per plane."""
 _TOLERANCE = 1e-7
 _ROUNDING = 1e-9
+_TINY = np.finfo(float).tiny
+_AXES = np.eye(3)
+_REGULAR = 1e-12 * np.eye(2)
+"""Relative information that is added, so that planes that do not determine the direction have a large uncertainty."""
 _RESTARTS = 2
 _STARTS = 3
 """Sets of planes, distributed evenly about the beam, from which the search starts in addition to the given one."""
@@ -152,7 +156,9 @@ class Design:
 def plane_normals(planes: Array) -> Array:
     """Return the normals (k, 3) of a gauge on a turntable about Z, from inclinations and rotations (k, 2), rad."""
     a, b = np.asarray(planes, np.float64).T
-    return np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], axis=-1)
+    sine, normals = np.sin(a), np.empty((len(a), 3))
+    normals[:, 0], normals[:, 1], normals[:, 2] = sine * np.cos(b), sine * np.sin(b), np.cos(a)
+    return normals
 
 
 def stroke_points(lengths: Array, counts: NDArray[np.int64]) -> Array:
@@ -185,7 +191,7 @@ def longest_strokes(normals: Array, limits: Limits) -> Array:
     """Return the longest strokes (k, 3), m, within the range, the travel and the plate."""
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # a plane along the beam has no strokes
         gradient = -normals / (normals @ limits.beam)[:, None]
-        spot = np.linalg.norm(np.eye(3) + gradient[:, :, None] * limits.beam, axis=-1)
+        spot = np.sqrt(((_AXES + gradient[:, :, None] * limits.beam) ** 2).sum(axis=-1))
         longest = np.minimum(limits.reach / np.abs(gradient), limits.plate / spot)
     return np.asarray(np.minimum(longest, limits.travel))
 
@@ -200,7 +206,11 @@ def shares_of_strokes(strokes: Array, limits: Limits) -> tuple[Array, Array]:
 
 def angle_covariance(planes: Array, shares: Array, limits: Limits) -> Array:
     """Return the covariance (2, 2) of the beam's two angles, rad^2, for planes with shares (k,) of the readings."""
-    normals = plane_normals(planes)
+    return _covariance_of(plane_normals(planes), shares, limits)
+
+
+def _covariance_of(normals: Array, shares: Array, limits: Limits) -> Array:
+    """Return the covariance (2, 2) of the beam's two angles, rad^2, for planes of these normals (k, 3)."""
     t = tilts(normals, limits.beam)
     _, c = shares_of_strokes(longest_strokes(normals, limits), limits)
     own = 12 * limits.noise**2 * c**2 / (limits.readings * shares)
@@ -208,7 +218,7 @@ def angle_covariance(planes: Array, shares: Array, limits: Limits) -> Array:
         own = own + limits.slope_uncertainty(t) ** 2
     weighted = t / own[:, None]
     information = t.T @ weighted
-    information += 1e-12 * np.trace(information) * np.eye(2) + np.finfo(float).tiny
+    information += (information[0, 0] + information[1, 1]) * _REGULAR + _TINY
     covariance = np.asarray(np.linalg.inv(information), np.float64)
     return np.asarray(covariance + common_scale(covariance, weighted, limits))
 
@@ -249,12 +259,12 @@ def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
     upper = np.array([limits.max_inclination, 3 * np.pi] * number + [1.0] * number)
 
     def cost(x: Array, gradient: Array) -> float:  # noqa: ARG001 - the signature of nlopt
-        planes = _planes(x[: 2 * number], limits)
-        beyond = np.maximum(inclinations(plane_normals(planes), limits.beam) - limits.max_inclination, 0.0).sum()
+        normals = plane_normals(_planes(x[: 2 * number], limits))
+        beyond = np.maximum(inclinations(normals, limits.beam) - limits.max_inclination, 0.0).sum()
         if beyond > _ROUNDING:
             return _PENALTY * (1.0 + float(beyond))
         shares = x[2 * number :]
-        return float(np.log(worst_angle(angle_covariance(planes, shares / shares.sum(), limits))))
+        return float(np.log(worst_angle(_covariance_of(normals, shares / shares.sum(), limits))))
 
     nlopt.srand(seed)
 
@@ -299,10 +309,13 @@ def _planes(about_beam: Array, limits: Limits) -> Array:
     for a beam within these limits.
     """
     inclination, azimuth = about_beam.reshape(-1, 2).T
-    sideways = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) @ _basis(tuple(limits.beam))
+    turned = np.empty((len(azimuth), 2))
+    turned[:, 0], turned[:, 1] = np.cos(azimuth), np.sin(azimuth)
+    sideways = turned @ _basis(tuple(limits.beam))
     normals = np.sin(inclination)[:, None] * sideways - np.cos(inclination)[:, None] * limits.beam
-    rotation = np.mod(np.arctan2(normals[:, 1], normals[:, 0]), 2 * np.pi)
-    planes = np.stack([np.arccos(np.clip(normals[:, 2], -1.0, 1.0)), rotation], axis=-1)
+    planes = np.empty((len(normals), 2))
+    planes[:, 0] = np.arccos(np.clip(normals[:, 2], -1.0, 1.0))
+    planes[:, 1] = np.mod(np.arctan2(normals[:, 1], normals[:, 0]), 2 * np.pi)
     lower, upper = zip(limits.inclination, limits.rotation, strict=True)
     return np.asarray(np.clip(planes, lower, upper))
 
@@ -335,7 +348,7 @@ def with_readings(planes: Array, shares: Array, limits: Limits) -> Design:
     fractions = (shares[:, None] * shares_of_strokes(strokes, limits)[0]).ravel()
     spare = limits.readings - MIN_READINGS * fractions.size
     wanted = np.maximum(fractions * limits.readings - MIN_READINGS, 0.0)
-    wanted *= spare / max(wanted.sum(), np.finfo(float).tiny)
+    wanted *= spare / max(wanted.sum(), _TINY)
     counts = np.floor(wanted).astype(np.int64)
     counts[np.argsort(counts - wanted, kind="stable")[: spare - counts.sum()]] += 1
     return Design(planes, strokes, (counts + MIN_READINGS).reshape(-1, 3))
