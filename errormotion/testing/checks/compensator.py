@@ -202,7 +202,7 @@ def refused_orders(subject: CompensatorSubject) -> str:
 
 
 @COMPENSATOR_CHECKS.add(why_not=_no_machine)
-def sign_of_life(subject: CompensatorSubject) -> str:
+def heartbeat(subject: CompensatorSubject) -> str:
     """Repeated writing keeps an offset active; without writing, the machine ramps to zero."""
     with started(subject) as device, armed(subject, device) as compensator:
         follow(subject, compensator, device)

@@ -13,7 +13,7 @@ if reason := linuxcnc_process.why_not():
 
 pytestmark = pytest.mark.slow
 
-WRITING = {"nothing_on_connecting", "arrives", "refused_orders", "sign_of_life", "closed", "restart", "two_connections"}
+WRITING = {"nothing_on_connecting", "arrives", "refused_orders", "heartbeat", "closed", "restart", "two_connections"}
 WRITING |= {"states", "lost_connection", "faults", "mutants"}
 OTHER_ROUTE = {"arrives", "closed", "restart", "states"}
 """The rest of the code is the same on both."""
