@@ -12,6 +12,7 @@ from errormotion.datasets import DOF, build_errors, provenance
 from errormotion.methods.beam_direction import simulation
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.methods.beam_direction.method import BeamDirection
+from errormotion.methods.beam_direction.report import surface
 from errormotion.methods.beam_direction.settings import Settings
 from errormotion.report import write_report
 from errormotion.twin import VirtualMachine
@@ -22,6 +23,14 @@ ARCSEC = np.pi / 180 / 3600
 DEGREE = np.pi / 180
 PLANES = ((20, 0), (20, 90), (25, 180), (30, 270))
 NOISE = 0.4e-6
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse_maps():
+    """Draw the maps of the calibration with fewer cells."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surface, "_STEPS", 21)
+        yield
 
 
 @cache
@@ -293,6 +302,7 @@ def test_the_direction_is_stated_before_and_after_compensation(html):
         assert [number(cell) for cell in row[3:5]] == pytest.approx([spans.min(), spans.max()], abs=5.1e-3)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_tilt_that_the_calibration_does_not_cover_is_reported(page):
     supported, bare = (
         page(result(planes)) for planes in (((20, 0), (20, 90), (25, 180)), ((20, 0), (30, 45), (25, 180)))
@@ -313,6 +323,7 @@ def test_the_calibration_is_reported_with_its_remaining_error(html):
     np.testing.assert_allclose([float(number) for number in reported.groups()], expected, rtol=0.06)  # two digits
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_missing_calibration_is_stated(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     html = write_report(result(), tmp_path / "report.html").read_text(encoding="utf-8")
@@ -320,6 +331,7 @@ def test_a_missing_calibration_is_stated(tmp_path, monkeypatch):
     assert len(drawings(html)) == 5
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_calibration_of_the_same_name_and_another_content_is_not_shown(page):
     errors = result()
     errors["compensation"] = 1.1 * errors["compensation"]
@@ -327,6 +339,7 @@ def test_a_calibration_of_the_same_name_and_another_content_is_not_shown(page):
     assert "No map: the content of the calibration 'lk-h050' is not that used for the correction" in words_of(html)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_calibration_beside_the_campaign_is_found_from_elsewhere(tmp_path, monkeypatch):
     there = tmp_path / "there"
     (there / "calibrations").mkdir(parents=True)
@@ -378,6 +391,7 @@ def test_extras_of_only_nan_are_treated_as_missing(page):
     assert "nan" not in words_of(html).lower().split()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_strokes_are_read_from_the_raw_dataset(page):
     errors = result()
     raw = xr.Dataset({"stage": errors["stage"]})
@@ -390,6 +404,7 @@ def test_two_planes_have_no_closure(page):
     assert "Two planes always fit a beam exactly: their closures are 0 by definition" in words_of(html)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_contradicting_planes_are_a_warning(page):
     errors = result()
     errors["closure"][2] = 20 * errors["closure_uncertainty"][2]
@@ -409,6 +424,7 @@ def test_the_rotation_about_the_beam_is_reported_as_unknown(page):
     assert "Not determined: EC." in words_of(html)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_remarks_of_the_method_are_warnings(page):
     errors = result().assign_attrs(notes=["The compensation took 4 iterations."])
     assert '<p class="warning">The compensation took 4 iterations.</p>' in page(errors)
@@ -451,6 +467,7 @@ def test_a_result_of_the_method_is_reported_completely(page, measured):
     ]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_result_without_compensation_is_reported_with_contradicting_planes(page, measured):
     html = page(BeamDirection().identify(measured, Settings(ordered=False)), raw=measured)
     assert "The readings were not compensated for the tilt of the planes" in words_of(html)
@@ -458,6 +475,7 @@ def test_a_result_without_compensation_is_reported_with_contradicting_planes(pag
     assert "the triangulation plane is unknown" in words_of(html)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_plan_has_no_chapter_of_results(page):
     errors = result()
     planned = errors.drop_vars(extras_of(errors))  # only the uncertainty, without results

@@ -102,6 +102,7 @@ def test_ignored_reading_is_listed_with_its_residual(html):
     assert float(found[1]) == pytest.approx(WRONG / UM, abs=30)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_ignored_reading_is_listed_without_raw_data(tmp_path):
     assert "Outliers, ignored: S2 to T021" in words(page(measured()[0], tmp_path))
 
@@ -173,6 +174,7 @@ def test_a_chapter_of_only_errors_states_what_is_missing(tmp_path):
         assert sentence in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_alternating_scheme_is_reported_if_it_was_applied(tmp_path):
     html = words(
         page(bare(alternating_iterations=((), 715), alternating_left=((), 0.25e-6), iterations=((), 4)), tmp_path)
@@ -195,6 +197,7 @@ def test_result_without_known_targets_is_reported(tmp_path):
     assert "the uncertainties of the targets are unknown" in words(page(errors, tmp_path))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_excluded_target_is_listed(tmp_path):
     errors = measured()[0].copy(deep=True)
     errors["left_out"][{"target": 5}] = 2
@@ -208,6 +211,7 @@ def test_names_with_markup_are_escaped(tmp_path):
     assert "<b>&'" not in html
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_plan_states_the_expected_uncertainty_and_no_errors(tmp_path):
     planned = bare(target_uncertainty=(("target",), np.full(12, UM)))
     html = page(planned, tmp_path)
@@ -216,6 +220,7 @@ def test_plan_states_the_expected_uncertainty_and_no_errors(tmp_path):
     assert "Errors of the volume" not in html
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_plan_lists_best_and_set_positions(tmp_path):
     places = (("station", "direction"), 0.1 * np.arange(12.0).reshape(4, 3))
     best = (("station", "direction"), 0.1 * np.arange(12.0).reshape(4, 3) + 0.005)
@@ -285,6 +290,7 @@ def test_a_plan_draws_its_map_and_lists_the_targets_to_measure(tmp_path):
     assert "Predicted uncertainty" not in page(bare(), tmp_path / "other")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_repeatability_of_the_machine_is_a_line_of_the_budget(tmp_path):
     machine = VirtualMachine("cframe", seed=3)
     raw = simulation.raw(machine, simulation.target_grid(machine, (4, 4, 3)), seed=1, repeatability=2 * UM)

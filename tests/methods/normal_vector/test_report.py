@@ -249,6 +249,7 @@ def test_unknown_temperature_is_not_a_number(tmp_path):
     assert f"Without a valid reading: {first[0]}" in words(html)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_result_by_the_normals_is_labelled(tmp_path):
     raw = warm_up()
     errors = NormalVector().identify(raw, NormalVector.Settings(procedure="normals"))
