@@ -148,7 +148,8 @@ def fuzz(codec: Codec, numbers: range, *, seed: int = 1, sampled: int = SAMPLED)
     if not accepted:
         raise AssertionError(f"{codec.name}: none of its good frames is accepted")
     found = Found()
-    gc.freeze()  # the objects of other tests are not searched
+    gc.collect()
+    gc.freeze()  # also for later tests: what was loaded is not searched again
     gc.disable()
     try:
         for number in numbers:
@@ -164,7 +165,6 @@ def fuzz(codec: Codec, numbers: range, *, seed: int = 1, sampled: int = SAMPLED)
                 gc.collect()
     finally:
         gc.enable()
-        gc.unfreeze()
     return found
 
 
