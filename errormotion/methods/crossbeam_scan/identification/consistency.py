@@ -227,18 +227,17 @@ class _Scans:
         after, before, change, noise = self.changes(k, used)
         others = used != k
         s = cycles.size
-        deviation, model_variance = np.zeros((s, 6)), np.zeros((s, 6))
+        points = np.where(others[:, None], change, np.nan).swapaxes(1, 2)  # (s, 6, used)
+        variance = np.diagonal(noise, axis1=-2, axis2=-1).swapaxes(1, 2)
+        curve = smooth(self.position[used], points, variance, self.position[[k]], order=PREDICTION_ORDER)
+        W = curve.weights[..., 0, :]
+        deviation = change[:, ~others][:, 0] - curve.values[..., 0]
+        model_variance = curve.variance[..., 0] - (W**2 * np.nan_to_num(variance)).sum(axis=-1)
         share = np.zeros((s, 6, self.errors.shape[0] + 1, self.errors.shape[1]))  # of the noise of each scan
-        row = np.arange(s)
-        for d in range(6):
-            known = np.where(others, change[..., d], np.nan)
-            curve = smooth(self.position[used], known, noise[..., d, d], self.position[[k]], order=PREDICTION_ORDER)
-            W = curve.weights[:, 0]
-            deviation[:, d] = change[:, ~others, d][:, 0] - curve.values[:, 0]
-            model_variance[:, d] = curve.variance[:, 0] - (W**2 * np.nan_to_num(noise[..., d, d])).sum(axis=-1)
-            for sign, which in ((1.0, after), (-1.0, before)):
-                share[row, d, which, k] = sign
-                share[row[:, None], d, which[:, None], used[others]] = -sign * W[:, others]
+        row, freedom = np.arange(s)[:, None], np.arange(6)
+        for sign, which in ((1.0, after), (-1.0, before)):
+            share[row, freedom, which[:, None], k] = sign
+            share[row[..., None], freedom[:, None], which[:, None, None], used[others]] = -sign * W[..., others]
         usable = np.isfinite(deviation).all(axis=-1)
         if not usable.any():
             return None

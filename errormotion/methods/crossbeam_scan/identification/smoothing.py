@@ -21,7 +21,7 @@ variance only, and propagate the other errors with the same weights by ``carry``
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import comb, factorial, prod
 from typing import Any
 
@@ -164,28 +164,36 @@ def smooth(
     known = np.isfinite(y) & np.isfinite(v)
     if (v[known] <= 0).any():
         raise MethodError("Expected variances above 0 of all points; leave out what is exact (the cold cycle).")
-    fixed = int(exact_zero)
-    different = np.array([np.unique(x[k]).size + fixed for k in known], dtype=int)
+    _, place = np.unique(x, return_inverse=True)
+    at_place = place[:, None] == np.arange(place.max(initial=-1) + 1)
+    different = (known @ at_place).sum(axis=1) + int(exact_zero)
     if order is None:
         order = int(np.clip(different.max(initial=0) - 1, 1, ORDER))
     if order not in (1, 2, 3):
         raise MethodError(f"Expected order 1, 2 or 3 of the curves; found {order}.")
     rows = np.flatnonzero(different >= order)
     orders = (order, order - 1) if rougher and order > 1 else (order,)
-    by_order = [_series(_Basis.of(x, to, order, q, exact_zero), y, v, known, rows) for q in orders]
 
     curves, spread = np.full((2, len(y), to.size), np.nan)
     W = np.full((len(y), to.size, n), np.nan)
     amplitude, evidence, likelihood, rough = np.full((4, len(y)), np.nan)
-    for some in [range(rows.size)] if together else [[k] for k in range(rows.size)]:
-        share = _weigh_all([[series[k] for k in some] for series in by_order])
-        for k in some if share.size else ():
-            each = [series[k] for series in by_order]
-            best = max(each, key=lambda one: one.best_likelihood)
-            row = rows[k]
-            curves[row], spread[row], W[row] = _mixed(share, [one.mixture() for one in each])
-            amplitude[row], evidence[row], likelihood[row] = best.amplitude, best.evidence, best.best_likelihood
-            rough[row] = share[1:].sum()
+    contrasts = known[rows].sum(axis=1) - (order - int(exact_zero))
+    if not together:
+        rows = rows[contrasts > 0]
+    if contrasts.any():
+        by_order = [_Series.of(_Basis.of(x, to, order, q, exact_zero), y[rows], v[rows], known[rows]) for q in orders]
+        weighed = [_weigh(*series.groups(together)) for series in by_order]
+        log = np.array([one.log_evidence for one in weighed])
+        share = np.exp(log - log.max(axis=0))
+        share /= share.sum(axis=0)  # of each order, (order, group)
+        parts = [series.mixture(one) for series, one in zip(by_order, weighed, strict=True)]
+        curves[rows], spread[rows], W[rows] = _mixed(share, parts)
+        best = np.argmax([one.best_likelihood for one in weighed], axis=0)[None]
+        units = np.array([series.amplitude_unit for series in by_order])[:, None]
+        amplitude[rows] = np.take_along_axis(np.array([one.amplitude for one in weighed]) * units, best, axis=0)[0]
+        evidence[rows] = np.take_along_axis(np.array([one.evidence for one in weighed]), best, axis=0)[0]
+        likelihood[rows] = np.take_along_axis(np.array([one.best_likelihood for one in weighed]), best, axis=0)[0]
+        rough[rows] = share[1:].sum(axis=0)
     return Smooth(
         curves.reshape(*batch, to.size),
         spread.reshape(*batch, to.size),
@@ -295,130 +303,149 @@ def _integrated(s: Array, t: Array, order: int) -> Array:
 
 
 @dataclass(frozen=True)
-class _Design:
-    """Information of points at known positions with known noise about a curve, independent of their values.
+class _Series:
+    """The points of several curves, and what they tell about these.
 
     In units of the noise, a set of points consists of a fitted polynomial and of contrasts that no polynomial affects:
     uncorrelated combinations of the points, of variance 1 + amplitude * gain. A curve is the fitted polynomial plus the
     effect of the contrasts at the requested positions. (The separation is accurate even where the noise is tiny.)
+    Curves with fewer points than others have zeros in place of the missing points and contrasts.
     """
 
-    known: NDArray[np.bool_]
-    gain: Array  # (c,)
-    reach: Array  # effect of the contrasts, (m, c), per amplitude
-    own: Array  # variance of the curve about the fitted polynomial, per amplitude, (m,)
-    fit: Array  # weights of the points in the fitted polynomial, (m, n)
-    to_contrast: Array  # weights of the points in each contrast, (c, n)
-    noise: Array  # variance of the polynomial due to the noise of the points, (m,)
-    unit: float  # log of the density of the contrasts over that of the points
+    y: Array  # points, (r, n)
+    amplitude_unit: float
+    gain: Array  # (r, c)
+    contrast: Array  # (r, c)
+    reach: Array  # effect of the contrasts, (r, m, c), per amplitude
+    own: Array  # variance of the curve about the fitted polynomial, per amplitude, (r, m)
+    fit: Array  # weights of the points in the fitted polynomial, (r, m, n)
+    to_contrast: Array  # weights of the points in each contrast, (r, c, n)
+    noise: Array  # variance of the polynomial due to the noise of the points, (r, m)
+    unit: Array  # log of the density of the contrasts over that of the points, (r,)
 
     @classmethod
-    def of(cls, basis: _Basis, v: Array, known: NDArray[np.bool_]) -> _Design:
-        sigma = np.sqrt(v[known])
-        K, K_at = basis.K[np.ix_(known, known)] / np.outer(sigma, sigma), basis.K_at[:, known] / sigma
-        T = basis.T[known] / sigma[:, None]
-        Q, R = np.linalg.qr(T, mode="complete")
-        inside, rest = Q[:, : T.shape[1]], Q[:, T.shape[1] :]
-        gain, axes = np.linalg.eigh(rest.T @ K @ rest)
-        gain = np.maximum(gain, 1e-14 * gain.max(initial=0.0))
-        rest = rest @ axes
-        H = np.linalg.solve(R[: T.shape[1]].T, basis.T_at.T).T  # of the fitted polynomial, (m, p)
-        off = K_at - H @ inside.T @ K
-        own = basis.own - np.einsum("mn,mn->m", K_at + off, H @ inside.T)
-        unit = -float(np.log(sigma).sum() + np.log(np.abs(np.diag(R))).sum()) - gain.size * np.log(2 * np.pi) / 2
-        return cls(known, gain, off @ rest, own, H @ inside.T / sigma, rest.T / sigma, (H**2).sum(axis=1), unit)
+    def of(cls, basis: _Basis, y: Array, v: Array, known: NDArray[np.bool_]) -> _Series:
+        """Return the points of some curves; those with the same points known share the computation."""
+        (r, n), (m, p) = y.shape, basis.T_at.shape
+        c = int(known.sum(axis=1).max()) - p
+        gain, contrast, unit = np.zeros((r, c)), np.zeros((r, c)), np.zeros(r)
+        reach, own, noise = np.zeros((r, m, c)), np.zeros((r, m)), np.zeros((r, m))
+        fit, to_contrast = np.zeros((r, m, n)), np.zeros((r, c, n))
+        patterns, of_pattern = np.unique(known, axis=0, return_inverse=True)
+        for k, some in enumerate(patterns):
+            rows, points = np.flatnonzero(of_pattern == k), np.flatnonzero(some)
+            variances, of_variance = np.unique(v[np.ix_(rows, points)], axis=0, return_inverse=True)
+            parts = _separated(basis, np.sqrt(variances), points)
+            inner = slice(parts[0].shape[-1])  # contrasts
+            gain[rows, inner], reach[rows, :, inner], own[rows], noise[rows], unit[rows] = (
+                part[of_variance] for part in parts[:5]
+            )
+            fit[rows[:, None], :, points], to_contrast[rows[:, None], inner, points] = (
+                part[of_variance].swapaxes(1, 2) for part in parts[5:]
+            )
+        y = np.where(known, y, 0.0)
+        contrast = (to_contrast @ y[..., None])[..., 0]
+        return cls(y, basis.unit, gain, contrast, reach, own, fit, to_contrast, noise, unit)
+
+    def groups(self, together: bool) -> tuple[Array, Array, Array]:
+        """Return gains and contrasts of each group with one amplitude, (group, c), and its log of the density."""
+        shape = (1, -1) if together else self.gain.shape
+        unit = self.unit.sum(keepdims=True) if together else self.unit
+        return self.gain.reshape(shape), self.contrast.reshape(shape), unit
+
+    def mixture(self, weighed: _Weighed) -> tuple[Array, Array, Array]:
+        """Return values (r, m), variance (r, m) and weights (r, m, n) over all amplitudes."""
+        A, share = weighed.amplitudes[..., None], weighed.share[:, None]
+        held = A / (1 + A * self.gain[:, None])  # of each contrast by each amplitude
+        curves = (self.fit @ self.y[..., None]).mT + (held * self.contrast[:, None]) @ self.reach.mT
+        values = share @ curves
+        strength = np.divide(
+            self.reach**2, self.gain[:, None], out=np.zeros_like(self.reach), where=self.gain[:, None] > 0
+        )
+        between = np.maximum(self.own - strength.sum(axis=-1), 0.0)  # of a curve through all points, per amplitude
+        variance = self.noise[:, None] + A * between[:, None] + held @ strength.mT
+        weights = self.fit + (self.reach * (share @ held)) @ self.to_contrast
+        return values[:, 0], (share @ (variance + (curves - values) ** 2))[:, 0], weights
 
 
-@dataclass
-class _Series:
-    """The points of one curve, and the likelihood of each amplitude (squared)."""
+def _separated(basis: _Basis, sigma: Array, points: NDArray[np.intp]) -> tuple[Array, ...]:
+    """Return the separation of some points into polynomial and contrasts, for several sets of their noise (d, point).
 
-    design: _Design
-    y: Array
-    amplitude_unit: float
-    contrast: Array = field(init=False)  # (c,)
-    amplitudes: Array = field(default_factory=lambda: np.empty(0))  # squared
-    share: Array = field(default_factory=lambda: np.empty(0))  # of each amplitude
-    amplitude: float = np.nan
-    evidence: float = np.nan
-    best_likelihood: float = np.nan
-
-    def __post_init__(self) -> None:
-        self.y = self.y[self.design.known]
-        self.contrast = self.design.to_contrast @ self.y
-
-    def log_likelihood(self, amplitudes: Array) -> Array:
-        """Return the log likelihood of each amplitude, for any polynomial."""
-        grown = 1 + amplitudes[:, None] * self.design.gain
-        return np.asarray(self.design.unit - (self.contrast**2 / grown + np.log(grown)).sum(axis=1) / 2)
-
-    def mixture(self) -> tuple[Array, Array, Array]:
-        """Return values (m,), variance (m,) and weights (m, n) over all amplitudes."""
-        d, A = self.design, self.amplitudes[:, None]
-        held = A / (1 + A * d.gain)  # of each contrast by each amplitude
-        curves = d.fit @ self.y + (held * self.contrast) @ d.reach.T
-        values = self.share @ curves
-        strength = d.reach**2 / d.gain
-        between = np.maximum(d.own - strength.sum(axis=1), 0.0)  # of a curve through all points, per amplitude
-        variance = d.noise + A * between + held @ strength.T
-        weights = np.zeros((values.size, d.known.size))
-        weights[:, d.known] = d.fit + (d.reach * (self.share @ held)) @ d.to_contrast
-        return values, self.share @ (variance + (curves - values) ** 2), weights
+    Returns
+    -------
+    tuple
+        gain, reach, own, noise, unit, fit and to_contrast of `_Series`, for each of the sets and these points only.
+    """
+    p, each = basis.T.shape[1], sigma[:, None]
+    K, K_at = basis.K[np.ix_(points, points)] / (each.mT * each), basis.K_at[:, points] / each
+    Q, R = np.linalg.qr(basis.T[points] / each.mT, mode="complete")
+    inside, rest, R = Q[..., :p], Q[..., p:], R[:, :p]
+    gain, axes = np.linalg.eigh(rest.mT @ K @ rest)
+    gain = np.maximum(gain, 1e-14 * gain.max(axis=-1, initial=0.0, keepdims=True))
+    rest = rest @ axes
+    H = np.linalg.solve(R.mT, basis.T_at.T).mT  # of the fitted polynomial, (d, m, p)
+    off = K_at - H @ inside.mT @ K
+    own = basis.own - ((K_at + off) * (H @ inside.mT)).sum(axis=-1)
+    density = np.log(sigma).sum(axis=-1) + np.log(np.abs(np.diagonal(R, axis1=1, axis2=2))).sum(axis=-1)
+    unit = -density - gain.shape[-1] * np.log(2 * np.pi) / 2
+    return gain, off @ rest, own, (H**2).sum(axis=-1), unit, H @ inside.mT / each, rest.mT / each
 
 
-def _series(basis: _Basis, y: Array, v: Array, known: NDArray[np.bool_], rows: NDArray[np.intp]) -> list[_Series]:
-    """Return the points of the curves of some rows; curves with equal variances of their points share a design."""
-    designs: dict[bytes, _Design] = {}
-    series = []
-    for row in rows:
-        key = known[row].tobytes() + v[row].tobytes()
-        if key not in designs:
-            designs[key] = _Design.of(basis, v[row], known[row])
-        series.append(_Series(designs[key], y[row], basis.unit))
-    return series
+@dataclass(frozen=True)
+class _Weighed:
+    """What the contrasts of some groups of curves tell about the amplitude (squared) of each group."""
+
+    log_evidence: Array  # of the order, (group,)
+    amplitudes: Array  # relevant ones, (group, amplitude)
+    share: Array  # of each of these
+    amplitude: Array  # with the best evidence, not squared, (group,)
+    best_likelihood: Array  # (group,)
+    evidence: Array  # (group,)
 
 
-def _weigh_all(by_order: list[list[_Series]]) -> Array:
-    """Return the probability of each order for the curves of a group, (order,); empty without contrasts."""
-    if not sum(one.contrast.size for one in by_order[0]):
-        return np.empty(0)
-    log = np.array([_weigh(group) for group in by_order])
-    share = np.exp(log - log.max())
-    return np.asarray(share / share.sum())
-
-
-def _weigh(group: list[_Series]) -> float:
-    """Set the relevant amplitudes and their shares for each curve of a group; return the log evidence of all."""
-    gains = np.concatenate([one.design.gain for one in group])
-    contrasts = np.concatenate([one.contrast for one in group])
-    low, high = _LOWEST / gains.max(), _HIGHEST * (np.maximum(contrasts**2, 1.0) / gains).max()
+def _weigh(gain: Array, contrast: Array, unit: Array) -> _Weighed:
+    """Return the amplitudes of groups of curves with these gains and contrasts (group, c)."""
+    gains, squares = gain.T[..., None], contrast.T[..., None] ** 2  # (c, group, 1): sums over the first axis are fast
 
     def likelihood(amplitudes: Array) -> Array:
-        return np.asarray(sum(one.log_likelihood(amplitudes) for one in group))
+        """Return the log likelihood of amplitudes (group, amplitude), for any polynomial."""
+        grown = 1 + amplitudes * gains
+        terms = squares / grown
+        terms += np.log(grown, out=grown)
+        return np.asarray(unit[:, None] - terms.sum(axis=0) / 2)
 
-    amplitudes = _log_spaced(low, high, _EXAMINED)
+    some = gains > 0
+    needed = np.divide(np.maximum(squares, 1.0), gains, out=np.zeros_like(gains), where=some).max(axis=0)[:, 0]
+    amplitudes = _log_spaced(_LOWEST / gains.max(axis=0)[:, 0], _HIGHEST * needed, _EXAMINED)
     log = likelihood(amplitudes)
-    top = int(log.argmax())
-    relevant = np.flatnonzero(log >= log[top] + np.log(_NEGLIGIBLE))
-    first, last = max(relevant[0] - 1, 0), min(relevant[-1] + 1, _EXAMINED - 1)
-    chosen = _log_spaced(amplitudes[first], amplitudes[last], _AVERAGED)
-    share = np.exp(likelihood(chosen) - log[top])
-    none = float(likelihood(np.zeros(1))[0])
-    for one in group:
-        one.amplitudes, one.share = chosen, share / share.sum()
-        one.amplitude = np.sqrt(amplitudes[top]) * one.amplitude_unit if top else 0.0
-        one.best_likelihood = log[top] if top else none
-        one.evidence = one.best_likelihood - none
-    return float(log[top] + np.log(np.exp(log - log[top]).mean()))
+    group, top = np.arange(len(log)), log.argmax(axis=1)
+    best = log[group, top]
+    relevant = log >= best[:, None] + np.log(_NEGLIGIBLE)
+    first = np.maximum(relevant.argmax(axis=1) - 1, 0)
+    last = np.minimum(_EXAMINED - relevant[:, ::-1].argmax(axis=1), _EXAMINED - 1)
+    chosen = _log_spaced(amplitudes[group, first], amplitudes[group, last], _AVERAGED)
+    share = np.exp(likelihood(chosen) - best[:, None])
+    none = likelihood(np.zeros((len(log), 1)))[:, 0]
+    likeliest = np.where(top > 0, best, none)
+    return _Weighed(
+        best + np.log(np.exp(log - best[:, None]).mean(axis=1)),
+        chosen,
+        share / share.sum(axis=1, keepdims=True),
+        np.where(top > 0, np.sqrt(amplitudes[group, top]), 0.0),
+        likeliest,
+        likeliest - none,
+    )
 
 
 def _mixed(share: Array, parts: list[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
-    """Return values, variance and weights of a mixture of curves."""
+    """Return values, variance and weights of mixtures of curves; ``share`` of each part, (part, group)."""
     curves, spread, weights = (np.stack(part) for part in zip(*parts, strict=True))
-    values = share @ curves
-    return values, share @ (spread + (curves - values) ** 2), np.einsum("q,qmn->mn", share, weights)
+    share = share[..., None]
+    values = (share * curves).sum(axis=0)
+    variance = (share * (spread + (curves - values) ** 2)).sum(axis=0)
+    return values, variance, (share[..., None] * weights).sum(axis=0)
 
 
-def _log_spaced(low: float, high: float, n: int) -> Array:
-    """Return n numbers from low to high with a constant ratio."""
-    return np.asarray(np.exp(np.linspace(np.log(low), np.log(high), n)))
+def _log_spaced(low: Array, high: Array, n: int) -> Array:
+    """Return n numbers from low to high with a constant ratio, for each of several (group,): (group, n)."""
+    return np.asarray(np.exp(np.linspace(np.log(low), np.log(high), n, axis=-1)))
