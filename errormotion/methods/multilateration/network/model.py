@@ -59,7 +59,7 @@ def motions(positions: Array, centre: Array) -> Array:
     """Return G (n, 3, 6): the displacement of positions (n, 3) by a rigid motion t + r x (position - ``centre``)."""
     x, y, z = (positions - centre).T
     G = np.zeros((len(positions), 3, 6))
-    G[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    G[:, 0, 0] = G[:, 1, 1] = G[:, 2, 2] = 1.0
     G[:, 0, 4], G[:, 0, 5], G[:, 1, 5] = z, -y, x
     G[:, 1, 3], G[:, 2, 3], G[:, 2, 4] = -z, y, -x
     return G
