@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from operator import mul
@@ -18,6 +18,7 @@ from errormotion.kinematics.machines import Machine
 
 WAVES = 4
 """Number of waves over the travel of a linear axis, or over a turn of a rotary one."""
+_WAVE_NUMBERS = np.pi * np.arange(1, WAVES + 1)
 STRAIGHTNESS = 3e-6
 """Displacement of the first wave on 1 m of travel (proportional to its root), or on a turn, m, 1 sigma."""
 ANGLE = 8e-6
@@ -32,7 +33,7 @@ LINE_OFFSET = 10e-6
 
 @dataclass(frozen=True)
 class AxisErrors:
-    """Six error motions of one axis as functions of its position.
+    """Six error motions of one axis as functions of its position, or those of several axes (see `stacked`).
 
     Attributes
     ----------
@@ -44,7 +45,7 @@ class AxisErrors:
         Linear part, m/m and rad/m.
     """
 
-    travel: float
+    travel: float | Array
     sine: Array
     cosine: Array
     slope: Array
@@ -52,9 +53,16 @@ class AxisErrors:
     def __call__(self, position: ArrayLike) -> Array:
         """Return the error twists (..., 6), m and rad, at positions (...), m or rad."""
         q = np.asarray(position, dtype=float)[..., None, None]
-        phase = np.pi * np.arange(1, WAVES + 1) * (q / self.travel)
+        phase = _WAVE_NUMBERS * (q / self.travel)
         waves = self.sine * np.sin(phase) + self.cosine * (np.cos(phase) - 1)
-        return np.asarray(np.sum(waves, axis=-1) + self.slope * q[..., 0])
+        return np.asarray(waves.sum(axis=-1) + self.slope * q[..., 0])
+
+    @classmethod
+    def stacked(cls, axes: Sequence[AxisErrors]) -> AxisErrors:
+        """Return the errors of several axes: twists (..., axis, 6) at positions (..., axis)."""
+        travel = np.array([axis.travel for axis in axes])[:, None, None]
+        sine, cosine, slope = (np.array([getattr(axis, of) for axis in axes]) for of in ("sine", "cosine", "slope"))
+        return cls(travel, sine, cosine, slope)
 
 
 @dataclass(frozen=True)
@@ -121,29 +129,49 @@ class GeometricErrors:
         return reduce(mul, table, still), reduce(mul, head, still)
 
     def displacement(self, points: ArrayLike) -> Array:
-        """Return EX, EY, EZ of `twist`, (..., 3), m; fifty times faster for the axes X, Y and Z."""
+        """Return EX, EY, EZ of `twist`, (..., 3), m; hundreds of times faster for the axes X, Y and Z."""
         if self.machine.axis_names != ("X", "Y", "Z"):
             return self.twist(points)[..., :3]
+        order, motions, levers, tilts = self._linear_axes
         q = np.asarray(points, dtype=float)
-        total, before = np.zeros(q.shape), np.zeros(q.shape)
-        for joint in self.machine.joints:
-            motion = q[..., self.machine.axis_names.index(joint.name), None] * joint.direction
-            error = self.motions[joint.name](np.sum(motion, axis=-1))
-            at = before + motion if joint.error_follows_motion else before
-            total += error[..., :3] + np.cross(error[..., 3:], q - at)
-            total += np.cross(self._orientations[joint.name], motion)
-            before = before + motion
-        return total
+        along = q[..., order]
+        error = motions(along)
+        parts = np.empty((*along.shape, 2, 3))
+        np.add(error[..., :3], cross(error[..., 3:], levers * q[..., None, :]), out=parts[..., 0, :])
+        np.multiply(tilts, along[..., None], out=parts[..., 1, :])
+        return np.asarray(parts.reshape(*q.shape[:-1], 6, 3).sum(axis=-2))
 
     @cached_property
-    def _orientations(self) -> Mapping[str, Array]:
-        """Errors of orientation of each axis, (3,), rad."""
+    def _linear_axes(self) -> tuple[list[int], AxisErrors, Array, Array]:
+        """Of X, Y and Z in the order of the joints: index, error motions, levers, and displacements by squareness.
+
+        A lever is 1 for each coordinate of the tool's position relative to the point of the error, else 0. The
+        displacements by errors of orientation are those per metre of motion.
+        """
         axes = self.machine.axis_names
-        named = {axis: location_names(axis, axes) for axis in axes}
-        return {
-            axis: np.array([self.locations.get(names.get(dof, ""), 0.0) for dof in DOF[3:]])
-            for axis, names in named.items()
-        }
+        names = [joint.name for joint in self.machine.joints]
+        directions = np.array([joint.direction for joint in self.machine.joints])
+        moved = np.cumsum(directions, axis=0)
+        follows = np.array([joint.error_follows_motion for joint in self.machine.joints])[:, None]
+        orientations = [
+            [self.locations.get(location_names(axis, axes).get(dof, ""), 0.0) for dof in DOF[3:]] for axis in names
+        ]
+        return (
+            [axes.index(axis) for axis in names],
+            AxisErrors.stacked([self.motions[axis] for axis in names]),
+            1 - np.where(follows, moved, moved - directions),
+            cross(np.array(orientations), directions),
+        )
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return the vector products of (..., 3) and (..., 3), as `np.cross`; several times faster for few vectors."""
+    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
+    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
+    x = a1 * b2 - a2 * b1
+    out = np.empty((*x.shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = x, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    return out
 
 
 def seeded_errors(rng: np.random.Generator, description: MachineDescription) -> GeometricErrors:

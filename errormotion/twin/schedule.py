@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -194,14 +195,20 @@ class Schedule:
         """Return the effective share of the compensation of X, Y, Z at times t, 0 to 1, shape (n, 3)."""
         t = np.asarray(t, dtype=float)
         share = np.ones((*t.shape, 3))
-        for axis, name in enumerate("XYZ"):
-            state = 1.0
-            for event in self.events:
-                target = (event.compensation or {}).get(name)
-                if target is not None and float(target) != state:
-                    share[..., axis] += (float(target) - state) * np.clip((t - event.time) / SLEW, 0, 1)
-                    state = float(target)
+        for axis, time, change in self._switches:
+            share[..., axis] += change * np.clip((t - time) / SLEW, 0, 1)
         return share
+
+    @cached_property
+    def _switches(self) -> list[tuple[int, float, float]]:
+        """Axis, time and change of the share of each change of the compensation."""
+        state, switches = {"X": 1.0, "Y": 1.0, "Z": 1.0}, []
+        for event in self.events:
+            for name, target in (event.compensation or {}).items():
+                if float(target) != state[name]:
+                    switches.append(("XYZ".index(name), event.time, float(target) - state[name]))
+                    state[name] = float(target)
+        return switches
 
     @property
     def cuts(self) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from errormotion.twin.heat.network import Ambient, ThermalNetwork, lag_response
+from errormotion.twin.heat.network import Ambient, LagResponse, ThermalNetwork
 from errormotion.twin.kinds import KINDS
 from errormotion.twin.schedule import Event
 
@@ -42,13 +42,13 @@ def test_temperatures_obey_the_heat_balance(kind):
         step = solve_ivp(derivative, (a, b), state, args=(power(a),), rtol=1e-10, atol=1e-10)
         state = step.y[:, -1]
         pieces.append(state)
-    exact = net.air_response(t, AIR) + net.heating(t, TIMES, POWER)
+    exact = net.air_response(t, AIR) + net.heating(t, net.heated(TIMES, POWER))
     assert np.max(np.abs(exact - np.array(pieces))) < 1e-7  # of the stepping: 24 steps at 1e-10 of 20 to 40 degC
 
 
 def test_all_the_heat_goes_into_the_air_in_the_end():
     net = network()
-    rise = net.heating(np.array([1e7]), np.zeros(1), np.array([360.0]))[0]
+    rise = net.heating(np.array([1e7]), net.heated(np.zeros(1), np.array([360.0])))[0]
     assert net.to_air @ rise == pytest.approx(360.0 * net.heat_share.sum(), rel=1e-9)
 
 
@@ -70,19 +70,21 @@ def test_bodies_follow_the_air_delayed_and_attenuated():
 
 
 def test_no_temperature_rise_before_the_heat():
-    assert not network().heating(np.array([0.0, 99.0]), np.array([100.0]), np.array([300.0])).any()
+    net = network()
+    assert not net.heating(np.array([0.0, 99.0]), net.heated(np.array([100.0]), np.array([300.0]))).any()
 
 
 def test_result_does_not_depend_on_other_requested_times():
     net = network()
     t = np.linspace(0, 5000, 137)
-    together = net.heating(t, TIMES, POWER) + net.air_response(t, AIR)
-    alone = [net.heating(t[i : i + 1], TIMES, POWER) + net.air_response(t[i : i + 1], AIR) for i in range(t.size)]
+    heated = net.heated(TIMES, POWER)
+    together = net.heating(t, heated) + net.air_response(t, AIR)
+    alone = [net.heating(t[i : i + 1], heated) + net.air_response(t[i : i + 1], AIR) for i in range(t.size)]
     assert np.array_equal(together, np.concatenate(alone))
 
 
 def test_lag_reaches_one_minus_one_over_e_after_its_time_constant():
-    z = lag_response(np.array([50.0]), np.array([1 / 50.0]), np.zeros(1), np.ones(1))
+    z = LagResponse(np.array([1 / 50.0]), np.zeros(1), np.ones(1))(np.array([50.0]))
     assert z[0, 0] / 50 == pytest.approx(1 - np.exp(-1), rel=1e-14)
 
 

@@ -17,33 +17,39 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 
 
-def lag_response(t: ArrayLike, rates: Array, times: Array, inputs: Array) -> Array:
-    """Return z(t) of dz/dt = -rate z + u, at rest before times[0], for a piecewise constant input u.
+@dataclass(frozen=True)
+class LagResponse:
+    """z(t) of dz/dt = -rate z + u, at rest before times[0], for a piecewise constant input u.
 
-    Parameters
+    Attributes
     ----------
-    t : (n,)
-        Times, s.
     rates : (mode,)
         Reciprocal time constants, 1/s.
     times, inputs : (piece,)
         The input is inputs[i] from times[i] on.
-
-    Returns
-    -------
-    ndarray, (n, mode)
     """
-    t = np.asarray(t, dtype=float)
-    begin = np.zeros((times.size, rates.size))
-    for i in range(1, times.size):
-        decay = np.exp(-rates * (times[i] - times[i - 1]))
-        begin[i] = begin[i - 1] * decay + inputs[i - 1] * (1 - decay) / rates
-    at = np.searchsorted(times, t, side="right") - 1
-    early = at < 0
-    at = np.maximum(at, 0)
-    exponent = -rates * np.where(early, 0.0, t - times[at])[:, None]
-    z = begin[at] * np.exp(exponent) - inputs[at][:, None] * np.expm1(exponent) / rates
-    return np.asarray(np.where(early[:, None], 0.0, z))
+
+    rates: Array
+    times: Array
+    inputs: Array
+    _begin: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        begin = np.zeros((self.times.size, self.rates.size))
+        for i in range(1, self.times.size):
+            decay = np.exp(-self.rates * (self.times[i] - self.times[i - 1]))
+            begin[i] = begin[i - 1] * decay + self.inputs[i - 1] * (1 - decay) / self.rates
+        object.__setattr__(self, "_begin", begin)
+
+    def __call__(self, t: ArrayLike) -> Array:
+        """Return z at times t (n,), s, shape (n, mode)."""
+        t = np.asarray(t, dtype=float)
+        at = np.searchsorted(self.times, t, side="right") - 1
+        early = at < 0
+        at = np.maximum(at, 0)
+        exponent = -self.rates * np.where(early, 0.0, t - self.times[at])[:, None]
+        z = self._begin[at] * np.exp(exponent) - self.inputs[at][:, None] * np.expm1(exponent) / self.rates
+        return np.asarray(np.where(early[:, None], 0.0, z))
 
 
 @dataclass(frozen=True)
@@ -125,9 +131,13 @@ class ThermalNetwork:
         c, g, h = vectors
         return cls(names, c, conductance, g, h)
 
-    def heating(self, t: ArrayLike, times: Array, power: Array) -> Array:
-        """Return the temperature rise due to the spindle's heat ``power`` (W, from ``times`` on), K, (n, body)."""
-        return _combine(lag_response(t, self.rates, times, power) * self._heat, self._modes)
+    def heated(self, times: Array, power: Array) -> LagResponse:
+        """Return the response of the modes to the spindle's heat ``power`` (W, from ``times`` on)."""
+        return LagResponse(self.rates, times, power)
+
+    def heating(self, t: ArrayLike, heated: LagResponse) -> Array:
+        """Return the temperature rise due to the spindle's heat at times t (n,), s; K, shape (n, body)."""
+        return _combine(heated(t) * self._heat, self._modes)
 
     def air_response(self, t: ArrayLike, ambient: Ambient) -> Array:
         """Return each body's temperature in the steady state of a machine at standstill, degC, shape (n, body)."""
@@ -140,6 +150,6 @@ class ThermalNetwork:
 def _combine(values: Array, weights: Array) -> Array:
     """Return values @ weights.T, (n, k) and (m, k), in an order of summation that does not depend on n."""
     out = np.zeros((values.shape[0], weights.shape[0]))
-    for k in range(values.shape[1]):
-        out += values[:, k, None] * weights[:, k]
+    for value, weight in zip(values.T[:, :, None], weights.T, strict=True):
+        out += value * weight
     return out

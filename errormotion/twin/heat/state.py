@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
-from errormotion.twin.heat.network import Ambient, ThermalNetwork, lag_response
+from errormotion.twin.heat.network import Ambient, LagResponse, ThermalNetwork
 from errormotion.twin.kinds import MachineKind
 from errormotion.twin.schedule import Schedule
 
@@ -62,8 +63,12 @@ class ThermalState:
 
     def bodies(self, t: ArrayLike) -> Array:
         """Return the bodies' temperatures at times t, degC, shape (n, body)."""
-        heated = self.network.heating(t, self.schedule.speed_times, self.power(self.schedule.speeds))
-        return self.network.air_response(t, self.ambient) + heated
+        return self.network.air_response(t, self.ambient) + self.network.heating(t, self._heated)
+
+    @cached_property
+    def _heated(self) -> LagResponse:
+        """Response of the network to the spindle."""
+        return self.network.heated(self.schedule.speed_times, self.power(self.schedule.speeds))
 
     def temperatures(self, t: ArrayLike) -> Array:
         """Return the temperatures at times t, degC, shape (n, sensor)."""
@@ -79,9 +84,19 @@ class ThermalState:
 
     def correction_at(self, t: ArrayLike) -> Array:
         """Return the full correction of X, Y, Z by the control's model, m, shape (n, 3)."""
+        return np.asarray(self._loaded(t) * self._loaded.rates * self.correction)
+
+    @cached_property
+    def _loaded(self) -> LagResponse:
+        """Response of the control's model of X, Y, Z to the share of the heat at top speed."""
         load = self.power(self.schedule.speeds) / self.power(self.kind.top_speed)
         rates = np.array([1 / self.kind.compensation[axis][1] for axis in "XYZ"])
-        return np.asarray(lag_response(t, rates, self.schedule.speed_times, load) * rates * self.correction)
+        return LagResponse(rates, self.schedule.speed_times, load)
+
+    @cached_property
+    def _before_the_spindle(self) -> list[int]:
+        """Numbers of the bodies that rotate the frame of the axes."""
+        return [body for body, name in enumerate(self.network.names) if name not in self.kind.behind]
 
     def twist(self, t: ArrayLike) -> Array:
         """Return the spindle's thermal error at the end of the bar, m and rad, shape (n, 6); 0 in the cold state."""
@@ -90,12 +105,9 @@ class ThermalState:
     def twist_and_turn(self, t: ArrayLike) -> tuple[Array, Array]:
         """Return `twist`, and the part of its rotation that rotates the frame of the axes, rad, shape (n, 3)."""
         warming = self.bodies(t) - self._cold
-        twist, turn = np.zeros((warming.shape[0], 6)), np.zeros((warming.shape[0], 3))
-        for body, name in enumerate(self.network.names):
-            grown = warming[:, body, None] * self.growth[:, body]
-            twist += grown
-            if name not in self.kind.behind:
-                turn += grown[:, 3:]
+        grown = np.multiply(warming.T[:, :, None], self.growth.T[:, None], order="C")  # body, time, freedom
+        twist = grown.sum(axis=0)
+        turn = grown[self._before_the_spindle, :, 3:].sum(axis=0)
         twist[:, :3] -= self.correction_at(t) * self.schedule.compensation(t)
         if self.offset is not None:
             times, offsets = self.offset

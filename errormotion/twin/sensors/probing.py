@@ -12,6 +12,7 @@ error.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cached_property
 
 import numpy as np
 import xarray as xr
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from errormotion.arrays import Array
 from errormotion.twin import kernels, truth
 from errormotion.twin.artefacts.balls import Balls, Probe, seeded_balls, seeded_probe
-from errormotion.twin.geometry import GeometricErrors
+from errormotion.twin.geometry import GeometricErrors, cross
 from errormotion.twin.heat.state import ThermalState
 
 ErrorAt = Callable[[Array], Array]
@@ -132,7 +133,7 @@ class ProbeMeasurements:
         times = np.atleast_1d(np.asarray(t, dtype=float))
         point = self.probing_functional_point if functional_point is None else np.asarray(functional_point, dtype=float)
         twist, turn = self.state.twist_and_turn(times)
-        displacement = twist[:, :3] + np.cross(turn, self._carried(point))
+        displacement = twist[:, :3] + cross(turn, self._lever(point))
         coords = {
             "time": ("time", times, {"units": "s"}),
             "sensor": list(self.temperature_sensors),
@@ -155,21 +156,25 @@ class ProbeMeasurements:
             s.
         """
         twist, turn = self.state.twist_and_turn(np.atleast_1d(np.asarray(t, dtype=float)))
-        lever = self._carried(np.atleast_2d(np.asarray(p, dtype=float)))
-        displacement = twist[:, :3] + np.cross(turn, lever)
+        lever = self._lever(np.atleast_2d(np.asarray(p, dtype=float)))
+        displacement = twist[:, :3] + cross(turn, lever)
         return np.hstack([displacement, np.broadcast_to(twist[:, 3:], displacement.shape)])
 
-    def _carried(self, position: Array) -> Array:
+    @cached_property
+    def _carried(self) -> Array:
+        """The diagonal of M, (3,)."""
+        return np.array([axis in self.tool_axes for axis in "XYZ"], dtype=float)
+
+    def _lever(self, position: Array) -> Array:
         """Return M (p - f), the lever that rotates with the frame of the axes, m."""
-        carried = np.array([axis in self.tool_axes for axis in "XYZ"], dtype=float)
-        return np.asarray(carried * (position - self.probing_functional_point))
+        return np.asarray(self._carried * (position - self.probing_functional_point))
 
     def _error_at(self, times: Array) -> ErrorAt:
         """Return the error of the tip at given times as a function of its commanded positions (n, 3)."""
         twist, turn = self.state.twist_and_turn(times)
 
         def error(p: Array) -> Array:
-            return np.asarray(twist[:, :3] + np.cross(turn, self._carried(p)) + self.geometry.displacement(p))
+            return np.asarray(twist[:, :3] + cross(turn, self._lever(p)) + self.geometry.displacement(p))
 
         return error
 
@@ -191,13 +196,11 @@ class ProbeMeasurements:
         """
         balls = self.balls if balls is None else balls
         tip = np.atleast_2d(np.asarray(p, dtype=float)) + self.probe_error(p, t)
-        gaps = []
-        for ball in range(len(balls)):
-            offset = tip - balls.centre[ball]
-            distance = np.linalg.norm(offset, axis=1)
-            normal = offset / np.maximum(distance, _SETTLED)[:, None]
-            gaps.append(distance - self._reach(balls, np.full(len(offset), ball), normal))
-        return np.asarray(np.min(gaps, axis=0))
+        offset = (tip[:, None] - balls.centre).reshape(-1, 3)
+        distance = np.sqrt((offset**2).sum(axis=1))
+        normal = offset / np.maximum(distance, _SETTLED)[:, None]
+        gaps = distance - self._reach(balls, np.tile(np.arange(len(balls)), len(tip)), normal)
+        return np.asarray(gaps.reshape(len(tip), -1).min(axis=1))
 
     def released(self, p: ArrayLike, t: float, *, balls: Balls | None = None) -> bool:
         """Return whether a tripped probe is released with the tip at a commanded position p (3,), m."""
@@ -251,9 +254,11 @@ class ProbeMeasurements:
         scatter = np.full(count, self.probe.noise * self._trigger(first, last, t) if noise else 0.0)
         times = np.full(count, float(t))
         path = np.full(count, np.nan)
-        for _ in range(1 if feed is None else 3):  # with a feed, the time of the contact depends on its position
+        for _ in range(3):  # with a feed, the time of the contact depends on its position
             path = self._path_to_trip(first, direction, np.arange(count), balls, self._error_at(times), scatter)
-            times = t + np.where(np.isfinite(path), path, 0.0) / feed if feed else times
+            if not feed or not np.isfinite(path).any():
+                break
+            times = t + np.where(np.isfinite(path), path, 0.0) / feed
         path = path[path <= length]
         if path.size == 0:
             return None, length
@@ -323,10 +328,10 @@ class ProbeMeasurements:
             found = np.where((inside >= 0) & (along < 0), -along - np.sqrt(np.maximum(inside, 0.0)), np.nan)
             change = np.abs(found - path)
             path = found
-            normal = offset + np.where(np.isfinite(path), path, -along)[:, None] * direction
-            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-            if not np.any(change > _SETTLED):
+            if not (change > _SETTLED).any():
                 break
+            normal = offset + np.where(np.isfinite(path), path, -along)[:, None] * direction
+            normal /= np.sqrt((normal**2).sum(axis=1, keepdims=True))
         return np.asarray(np.maximum(path, 0.0))
 
     def _trigger(self, start: Array, target: Array, t: float) -> float:

@@ -166,7 +166,7 @@ class Motion(SampleClock):
             ):
                 raise InstrumentError("The probe is tripped before it moves; remove the contact or repair the probe")
             self.tool = "probe"
-            contact = self.trip(start, goal, begin, feed)
+            contact = self.trip(start, goal, begin, feed, released=True)
             self._go(start, goal if contact is None else contact, begin, feed)
             return {
                 "tripped": contact is not None,
@@ -174,11 +174,14 @@ class Motion(SampleClock):
                 "time": self.time,
             }
 
-    def trip(self, start: Array, goal: Array, time: float, feed: float) -> Array | None:
-        """Return where the probe trips on a straight path, m; None: never; the start if it is already tripped."""
+    def trip(self, start: Array, goal: Array, time: float, feed: float, *, released: bool = False) -> Array | None:
+        """Return where the probe trips on a straight path, m; None: never; the start if it is already tripped.
+
+        With ``released``, it is known that the probe has not tripped at the start.
+        """
         if self.stuck:
             return start if self.stuck == "closed" else None
-        return self.machine.contact(start, goal, time, feed, balls=self.balls)[0]
+        return self.machine.contact(start, goal, time, feed, balls=self.balls, leaving=released)[0]
 
     def obstacle(self, start: Array, goal: Array, time: float, feed: float) -> Array | None:
         """Return where a probe in the spindle collides with a ball, m, unless it moves away from it; None: nowhere."""
