@@ -181,18 +181,20 @@ def smooth(
     if not together:
         rows = rows[contrasts > 0]
     if contrasts.any():
-        by_order = [_Series.of(_Basis.of(x, to, order, q, exact_zero), y[rows], v[rows], known[rows]) for q in orders]
+        alike = _alike(v[rows], known[rows])
+        y = np.where(known, y, 0.0)[rows]
+        by_order = [_Series.of(_Basis.of(x, to, order, q, exact_zero), y, alike) for q in orders]
         weighed = [_weigh(*series.groups(together)) for series in by_order]
         log = np.array([one.log_evidence for one in weighed])
         share = np.exp(log - log.max(axis=0))
         share /= share.sum(axis=0)  # of each order, (order, group)
         parts = [series.mixture(one) for series, one in zip(by_order, weighed, strict=True)]
         curves[rows], spread[rows], W[rows] = _mixed(share, parts)
-        best = np.argmax([one.best_likelihood for one in weighed], axis=0)[None]
-        units = np.array([series.amplitude_unit for series in by_order])[:, None]
-        amplitude[rows] = np.take_along_axis(np.array([one.amplitude for one in weighed]) * units, best, axis=0)[0]
-        evidence[rows] = np.take_along_axis(np.array([one.evidence for one in weighed]), best, axis=0)[0]
-        likelihood[rows] = np.take_along_axis(np.array([one.best_likelihood for one in weighed]), best, axis=0)[0]
+        best = np.argmax([one.best_likelihood for one in weighed], axis=0), np.arange(share.shape[1])
+        sizes = [series.amplitude_unit * one.amplitude for series, one in zip(by_order, weighed, strict=True)]
+        amplitude[rows] = np.array(sizes)[best]
+        evidence[rows] = np.array([one.evidence for one in weighed])[best]
+        likelihood[rows] = np.array([one.best_likelihood for one in weighed])[best]
         rough[rows] = share[1:].sum(axis=0)
     return Smooth(
         curves.reshape(*batch, to.size),
@@ -303,6 +305,27 @@ def _integrated(s: Array, t: Array, order: int) -> Array:
 
 
 @dataclass(frozen=True)
+class _Alike:
+    """Curves with the same points known."""
+
+    rows: NDArray[np.intp]  # of these curves
+    points: NDArray[np.intp]  # that are known
+    sigma: Array  # different sets of standard deviations of the points, (d, point)
+    of_sigma: NDArray[np.intp]  # set of each curve
+
+
+def _alike(v: Array, known: NDArray[np.bool_]) -> list[_Alike]:
+    """Return the curves with variances v (r, n), grouped by the points that are known."""
+    groups = []
+    patterns, of_pattern = np.unique(known, axis=0, return_inverse=True)
+    for k, some in enumerate(patterns):
+        rows, points = np.flatnonzero(of_pattern == k), np.flatnonzero(some)
+        variances, of_sigma = np.unique(v[np.ix_(rows, points)], axis=0, return_inverse=True)
+        groups.append(_Alike(rows, points, np.sqrt(variances), of_sigma))
+    return groups
+
+
+@dataclass(frozen=True)
 class _Series:
     """The points of several curves, and what they tell about these.
 
@@ -324,26 +347,19 @@ class _Series:
     unit: Array  # log of the density of the contrasts over that of the points, (r,)
 
     @classmethod
-    def of(cls, basis: _Basis, y: Array, v: Array, known: NDArray[np.bool_]) -> _Series:
-        """Return the points of some curves; those with the same points known share the computation."""
+    def of(cls, basis: _Basis, y: Array, alike: list[_Alike]) -> _Series:
+        """Return the points (r, n) of some curves, 0 where they are missing."""
         (r, n), (m, p) = y.shape, basis.T_at.shape
-        c = int(known.sum(axis=1).max()) - p
-        gain, contrast, unit = np.zeros((r, c)), np.zeros((r, c)), np.zeros(r)
-        reach, own, noise = np.zeros((r, m, c)), np.zeros((r, m)), np.zeros((r, m))
-        fit, to_contrast = np.zeros((r, m, n)), np.zeros((r, c, n))
-        patterns, of_pattern = np.unique(known, axis=0, return_inverse=True)
-        for k, some in enumerate(patterns):
-            rows, points = np.flatnonzero(of_pattern == k), np.flatnonzero(some)
-            variances, of_variance = np.unique(v[np.ix_(rows, points)], axis=0, return_inverse=True)
-            parts = _separated(basis, np.sqrt(variances), points)
-            inner = slice(parts[0].shape[-1])  # contrasts
-            gain[rows, inner], reach[rows, :, inner], own[rows], noise[rows], unit[rows] = (
-                part[of_variance] for part in parts[:5]
-            )
+        c = max(some.points.size for some in alike) - p
+        gain, reach, to_contrast = np.zeros((r, c)), np.zeros((r, m, c)), np.zeros((r, c, n))
+        own, noise, fit, unit = np.zeros((r, m)), np.zeros((r, m)), np.zeros((r, m, n)), np.zeros(r)
+        for some in alike:
+            rows, points, inner = some.rows, some.points, slice(some.points.size - p)
+            parts = [part[some.of_sigma] for part in _separated(basis, some.sigma, points)]
+            gain[rows, inner], reach[rows, :, inner], own[rows], noise[rows], unit[rows] = parts[:5]
             fit[rows[:, None], :, points], to_contrast[rows[:, None], inner, points] = (
-                part[of_variance].swapaxes(1, 2) for part in parts[5:]
+                part.swapaxes(1, 2) for part in parts[5:]
             )
-        y = np.where(known, y, 0.0)
         contrast = (to_contrast @ y[..., None])[..., 0]
         return cls(y, basis.unit, gain, contrast, reach, own, fit, to_contrast, noise, unit)
 
