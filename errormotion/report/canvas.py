@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -44,6 +45,7 @@ _STYLE: Any = {
     "axes.titlesize": 8.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.linewidth": 0.6,
@@ -81,6 +83,7 @@ def draw(paint: Callable[[Figure], None], key: str, height: float, width: float 
         paint(figure)
         _translate_legends(figure)
         _spread_ticks(figure)
+        _fix_places(figure)
         name_parts(figure)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
@@ -112,6 +115,16 @@ def _spread_ticks(figure: Figure) -> None:
 
 _LETTER = 4.6
 """Width of a digit of a tick, points."""
+
+
+def _fix_places(figure: Figure) -> None:
+    """Fix the places of titles and empty labels: matplotlib would lay out all ticks again to find places for them."""
+    for axes in figure.axes:
+        if axes.get_title(loc="left"):
+            axes.yaxis.set_offset_position("right")  # a power of ten is not written into the title
+        for axis in (axes.xaxis, axes.yaxis):
+            if not axis.get_label_text():
+                axis.set_label_coords(0.0, 0.0)
 
 
 def stack(figure: Figure, heights: Sequence[float], right: float = RIGHT) -> list[Axes]:
@@ -152,14 +165,16 @@ def _picks(values: np.ndarray, bins: int) -> np.ndarray | None:
     """Return the indices of the points of a curve that are drawn; None for all."""
     if values.size <= 2 * bins:
         return None
-    found = []
-    for part in np.array_split(np.arange(values.size), bins):
-        known = part[np.isfinite(values[part])]
-        if known.size == 0:
-            found.append(part[:1])
-        else:
-            found.append(np.unique([known[np.argmin(values[known])], known[np.argmax(values[known])]]))
-    return np.concatenate(found)
+    bin_of = np.arange(bins).repeat([part.size for part in np.array_split(values, bins)])
+    starts = np.flatnonzero(np.diff(bin_of, prepend=-1))
+    known = np.isfinite(values)
+    lowest = np.minimum.reduceat(np.where(known, values, np.inf), starts)
+    highest = np.maximum.reduceat(np.where(known, values, -np.inf), starts)
+    found = [starts[np.isinf(lowest)]]
+    for extreme in (lowest, highest):
+        places = np.flatnonzero(known & (values == extreme[bin_of]))
+        found.append(places[np.unique(bin_of[places], return_index=True)[1]])
+    return np.unique(np.concatenate(found))
 
 
 def envelope(
@@ -278,8 +293,7 @@ def inline(svg: str, key: str, named: Marks | None = None) -> Markup:
         for child in [child for child in parent if child.tag in ("metadata", "style")]:
             parent.remove(child)
     _resolve(root)
-    text = ElementTree.tostring(root, encoding="unicode")
-    wanted = set(re.findall(r"url\(#([^)]+)\)", text)) | set(re.findall(r'href="#([^"]+)"', text))
+    wanted = set(_REFERENCE.findall("\n".join(value for each in root.iter() for value in each.attrib.values())))
     for element in root.iter():
         attributes = element.attrib
         if "id" in attributes:
@@ -306,14 +320,14 @@ def inline(svg: str, key: str, named: Marks | None = None) -> Markup:
 
 def _resolve(root: ElementTree.Element) -> None:
     """Replace the use of an area, which matplotlib defines once and uses once, by its definition."""
-    text = ElementTree.tostring(root, encoding="unicode")
+    uses = Counter(each.attrib.get("href") for each in root.iter())
     defined = {each.attrib["id"]: each for each in root.iter("path") if "id" in each.attrib}
     for parent in list(root.iter()):
         for i, child in enumerate(list(parent)):
             name = child.attrib.get("href", "").lstrip("#")
             if child.tag != "use" or name not in defined or float(child.attrib.get("x", 1)) != 0:
                 continue
-            if text.count(f'"#{name}"') == 1:
+            if uses[f"#{name}"] == 1:
                 d = _lowered(defined[name].attrib["d"], float(child.attrib.get("y", 0)))
                 style = f"{defined[name].attrib.get('style', '')}; {child.attrib.get('style', '')}".strip("; ")
                 parent[i] = ElementTree.Element("path", {"d": d, "style": style})
@@ -328,13 +342,13 @@ def _lowered(path: str, down: float) -> str:
     return re.sub(_PAIR, lambda found: f"{found[1]} {float(found[2]) + down:.6f}", path)
 
 
+_REFERENCE = re.compile(r"(?:^|url\()#([^)\n]+)", re.MULTILINE)
 _PAIR = re.compile(r"(-?[\d.]+(?:e-?\d+)?)\s+(-?[\d.]+(?:e-?\d+)?)")
 
 
 def _short(path: str) -> str:
     """Return path data with a resolution of 0.01 points."""
-    numbers = re.sub(r"-?\d+\.\d+", lambda found: f"{float(found[0]):.2f}".rstrip("0").rstrip("."), path)
-    return re.sub(r"\s+", " ", numbers).strip()
+    return " ".join(f"{float(each):.2f}".rstrip("0").rstrip(".") if "." in each else each for each in path.split())
 
 
 def _font(text: str) -> str:

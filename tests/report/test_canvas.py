@@ -57,6 +57,16 @@ def test_names_that_look_like_mathematics_or_markup_are_drawn_as_written():
     assert "主軸" in svg
 
 
+def test_a_power_of_ten_is_at_the_other_end_of_the_title():
+    def paint(figure):
+        axes = figure.subplots()
+        axes.plot([0, 1], [0, 1e-9])
+        axes.set_title("Position")
+
+    svg = str(canvas.draw(paint, "k", 2.0))
+    assert re.search(r"text-anchor: end[^>]*>1e−9<", svg)
+
+
 def test_svg_has_no_address_and_no_unused_identifier():
     def paint(figure):
         axes = figure.subplots()

@@ -202,6 +202,7 @@ class Catalogue:
         )
 
 
+@cache
 def _pattern(key: str) -> re.Pattern[str]:
     parts = key.split("{}")
     made = re.escape(parts[0])
