@@ -214,7 +214,7 @@ class _Fit:
         from scipy.optimize import least_squares  # takes time to import
 
         p = self._start()
-        used = self._rim(p)[2] > OBLIQUE
+        used = self._rim(p, pose(*p[:6]))[2] > OBLIQUE
         fitted = used
         for _ in range(4):
             if (lines := int(used.sum())) < _FEWEST_LINES:
@@ -231,9 +231,9 @@ class _Fit:
         b = np.mean([-np.arctan(scan.tilt.slope) for scan in self.scans])
         return np.array([0.0, b, 0.0, *-middle, self.pocket.radius])
 
-    def _rim(self, p: Array) -> tuple[Array, Array, Array, Array]:
+    def _rim(self, p: Array, H: RigidTransform) -> tuple[Array, Array, Array, Array]:
         """Return half sum and half difference of the radii less r, m, and |cos|, |sin| of the edges, (n,) each."""
-        P = pose(*p[:6]).apply(self.edges.reshape(-1, 3)).reshape(self.edges.shape) + self.shift
+        P = H.apply(self.edges.reshape(-1, 3)).reshape(self.edges.shape) + self.shift
         R = np.hypot(P[..., 0], P[..., 1])
         cos, sin = np.abs(P[..., 0] / R).min(axis=1), np.abs((P[..., 1] / R).mean(axis=1))
         return R.mean(axis=1) - p[6], (R[:, 1] - R[:, 0]) / 2, cos, sin
@@ -241,11 +241,11 @@ class _Fit:
     def _residuals(self, scaled: Array, used: NDArray[np.bool_]) -> Array:
         """Return all residuals divided by their standard deviations."""
         p = scaled * _UNIT
-        half_sum, half_difference, cos, sin = self._rim(p)
+        H = pose(*p[:6])
+        half_sum, half_difference, cos, sin = self._rim(p, H)
         size = cos * self.size_x / np.sqrt(2)
         rows = [(half_sum / np.hypot(size, sin * self.size_y))[used], (half_difference / size)[used]]
         rows.append(np.array([(p[6] - self.pocket.radius) / max(self.pocket.radius_uncertainty, 1e-9)]))
-        H = pose(*p[:6])
         R = H.rotation.as_matrix()
         for scan in self.scans:
             Z = R[2, 2] * scan.plate.mean() + H.translation[2] + scan.lift - self.centre[2]  # at x = 0
@@ -259,7 +259,7 @@ class _Fit:
 
     def _weigh(self, p: Array, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Estimate both scatters from the residuals; return the lines within `CLIP`."""
-        half_sum, half_difference, cos, sin = self._rim(p)
+        half_sum, half_difference, cos, sin = self._rim(p, pose(*p[:6]))
         right = np.sqrt(2) * half_difference / cos
         rough = max(NORMAL_MAD * float(np.median(np.abs(right[used]))), 1e-9)
         fits = (cos > OBLIQUE) & (np.abs(right) < CLIP * rough)

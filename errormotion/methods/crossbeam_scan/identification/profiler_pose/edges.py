@@ -132,19 +132,17 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
     start, end = np.argmax(seen, axis=1), x.size - 1 - np.argmax(seen[:, ::-1], axis=1)
     within = (index >= start[:, None] + trim) & (index <= end[:, None] - trim)
     plate = tilt(x, np.where(beside & within, height, np.nan))
-    lines, positions = [], []
-    for k in np.flatnonzero(inside & np.isfinite(plate.height)):
-        top = plate.height[k] + plate.slope * x
-        ends = [_edge(x, height[k], top, i, side * trim) for i, side in ((first[k], 1), (last[k], -1))]
-        if np.isfinite(ends).all():
-            lines.append(k)
-            positions.append(ends)
-    if len(lines) < 10:
+    lines = np.flatnonzero(inside & np.isfinite(plate.height))
+    step = height[lines] - (plate.height[lines, None] + plate.slope * x)
+    ends = [_edges(x, step, index[lines], trim, side) for index, side in ((first, 1), (last, -1))]
+    positions = np.stack(ends, axis=-1)
+    found = np.isfinite(positions).all(axis=1)
+    line, at = lines[found], positions[found]
+    if line.size < 10:
         raise MethodError(
-            f"Expected ten lines with both edges of the pocket; found {len(lines)}. Too many readings are missing at "
+            f"Expected ten lines with both edges of the pocket; found {line.size}. Too many readings are missing at "
             "the edges, or the pocket is not completely in the scan."
         )
-    line, at = np.array(lines, dtype=np.int64), np.array(positions)
     return plate, Edges(line, at, plate.height[line, None] + plate.slope * at)
 
 
@@ -154,19 +152,41 @@ def _spans(deep: Mask) -> Mask:
     return np.asarray(many & ~deep[:, :4].any(axis=1) & ~deep[:, -4:].any(axis=1))
 
 
-def _edge(x: Array, z: Array, top: Array, index: int, trim: int) -> float:
-    """Return the position of an edge near a point, m; ``trim`` is positive where the floor is at the right."""
-    pitch, reach, side = float(x[1] - x[0]), abs(trim), int(np.sign(trim))
-    start, end = index - reach, index + reach
-    far = sorted((index + trim, index + side * (reach + round(FLOOR / pitch))))
-    if start < 0 or end >= x.size or far[0] < 0 or far[1] >= x.size:
-        return np.nan
-    floor = z[far[0] : far[1]] - top[far[0] : far[1]]
-    if np.isfinite(floor).sum() < reach:
-        return np.nan
-    g = 1 - (z - top)[start : end + 1] / np.nanmedian(floor)
+def _edges(x: Array, step: Array, index: NDArray[np.int64], trim: int, side: int) -> Array:
+    """Return the position of the edge near a point of each line, m; NaN without one.
+
+    Parameters
+    ----------
+    x : (point,)
+        m.
+    step : (line, point)
+        Height above the plate, m.
+    index : (line,)
+        The point.
+    trim : int
+        Number of points beside an edge that stray light may disturb.
+    side : {1, -1}
+        1 where the floor is at the right.
+    """
+    pitch = float(x[1] - x[0])
+    width = round(FLOOR / pitch)
+    window = np.arange(-trim, trim + 1)
+    beyond = trim + np.arange(width) if side > 0 else np.arange(-trim - width, -trim)
+    at = np.full(index.size, np.nan)
+    first, end = min(window[0], beyond[0]), max(window[-1], beyond[-1] + 1)
+    rows = np.flatnonzero((index + first >= 0) & (index + end < x.size))
+    floor = np.sort(step[rows[:, None], index[rows, None] + beyond], axis=1)  # NaN last
+    count = np.isfinite(floor).sum(axis=1)
+    seen = count >= trim
+    rows, floor, count = rows[seen], floor[seen], count[seen]
+    row = np.arange(rows.size)
+    level = (floor[row, (count - 1) // 2] + floor[row, count // 2]) / 2
+    g = 1 - step[rows[:, None], index[rows, None] + window] / level[:, None]
     known = np.isfinite(g)
-    if np.mean(~known) > GAPS or not (known[0] and known[-1]):
-        return np.nan
-    share = np.interp(np.arange(g.size), np.flatnonzero(known), np.clip(g[known], 0.0, 1.0)).sum() * pitch
-    return float(x[start] - pitch / 2 + share if side > 0 else x[end] + pitch / 2 - share)
+    usable = ~(np.mean(~known, axis=1) > GAPS) & known[:, 0] & known[:, -1]
+    rows, g, known = rows[usable], np.clip(g[usable], 0.0, 1.0), known[usable]
+    for k in np.flatnonzero(~known.all(axis=1)):
+        g[k] = np.interp(window, window[known[k]], g[k, known[k]])
+    share = g.sum(axis=1) * pitch
+    at[rows] = x[index[rows] - side * trim] - side * pitch / 2 + side * share
+    return at
