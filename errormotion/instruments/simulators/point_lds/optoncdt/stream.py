@@ -169,7 +169,8 @@ class SensorStream:
     def _raws(self, distances: Array, first: int) -> Array:
         output = self._output
         raws = raw_distances(self._averaged(distances), output.measuring_range, output.largest)
-        raws[self._fault.affects("out_of_range", first + np.arange(raws.size))] = NO_PEAK
+        if self._fault.kind == "out_of_range":
+            raws[self._fault.affects("out_of_range", first + np.arange(raws.size))] = NO_PEAK
         if not output.laser:
             raws[:] = LASER_OFF
         if output.overflow:
@@ -255,9 +256,11 @@ class SensorStream:
         value = {"MIN": low, "MAX": high, "PEAK2PEAK": high - low}[name]
         return np.where(high < 0, NO_PEAK, value)
 
-    def _lost(self, first: int, size: int) -> Array:
-        """Return for each measurement whether it is omitted: by a fault or by the reduction."""
+    def _lost(self, first: int, size: int) -> Array | None:
+        """Return for each measurement whether it is omitted: by a fault or by the reduction; None: none is."""
         fault = self._fault
+        if self._output.every == 1 and fault.kind not in ("silence", "disconnect", "drop"):
+            return None
         numbers = first + np.arange(size)
         active = numbers >= fault.at
         lost = np.zeros(size, dtype=bool)
@@ -268,8 +271,8 @@ class SensorStream:
         lost |= numbers % self._output.every != 0
         return lost
 
-    def _bytes(self, blocks: Array, lost: Array, first: int) -> bytes:
-        sent = blocks[~lost]
+    def _bytes(self, blocks: Array, lost: Array | None, first: int) -> bytes:
+        sent = blocks if lost is None else blocks[~lost]
         gate = self._counters.gate
         if gate is not None:
             sent = sent[:gate]
@@ -277,7 +280,7 @@ class SensorStream:
         data = encode(sent) if sent.size else b""
         fault = self._fault
         if fault.kind == "garbage":
-            numbers = first + np.arange(lost.size)
+            numbers = first + np.arange(len(blocks))
             due = int(((numbers >= fault.at) & ((numbers - fault.at) % fault.every == 0)).sum())
             for position in sorted(self._rng.integers(0, len(data) + 1, due), reverse=True):
                 data = data[:position] + stray_bytes(self._rng) + data[position:]

@@ -35,6 +35,8 @@ def raw_distances(distances: Array, measuring_range: float, largest: int) -> Arr
     parts = np.asarray(distances) / measuring_range
     with np.errstate(invalid="ignore"):
         raws = np.rint((parts + RESERVE) * STEPS)
+        if ((raws >= 0) & (raws <= largest)).all():
+            return raws.astype(np.int64)
         raws = np.where(raws < 0, BEFORE_RANGE, np.where(raws > largest, BEHIND_RANGE, raws))
     return np.where(np.isnan(parts), NO_PEAK, raws).astype(np.int64)
 
