@@ -114,6 +114,7 @@ def test_failed_scan_is_unknown_and_reported(machine, method, recorded):
     assert np.abs(misses(machine, beams)).max() < 4.0
 
 
+@pytest.mark.usefixtures("without_paper")
 def test_correlation_of_shift_and_rotation_has_its_sign(machine, method):
     """Joint test of all five freedoms: no single interval shows a wrong sign of a covariance."""
     seeds, scores = 40, []
