@@ -23,13 +23,8 @@ TOOLS = ("hypothesis", "packaging", "pytest", "pytest-timeout", "pytest-xdist")
 PEERS = ("canopen", "cesapi", "geocompy", "metrolopy", "minimalmodbus", "mtconnect", "pyvisa", "pyvisa-py")
 CORE = (
     *("test_compiling.py", "datasets/test_storage.py", "datasets/test_bounded_reading.py", "datasets/test_units.py"),
-    *(
-        "datasets/test_golden_datasets.py",
-        "datasets/test_zarr_folder.py",
-        "campaign/test_store.py",
-        "datasets/test_tomlfile.py",
-    ),
-    *("campaign/test_batch.py", "campaign/test_files.py", "campaign/test_beam_campaign.py"),
+    *("datasets/test_golden_datasets.py", "datasets/test_zarr_folder.py", "datasets/test_tomlfile.py"),
+    *("campaign/test_batch.py", "campaign/test_files.py", "campaign/test_store.py", "campaign/test_beam_campaign.py"),
     *("compensation/test_thermal_model.py", "kinematics/test_fits.py", "methods/beam_direction/test_planning.py"),
     *("methods/multilateration/test_layout.py", "methods/multilateration/test_solver.py"),
     *("methods/crossbeam_registration/test_registration.py", "methods/spindle_drift"),
