@@ -181,9 +181,9 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
     def _events(self) -> tuple[Event, ...]:
         return self.state.schedule.events
 
-    def spindle_load(self, t: ArrayLike) -> Array:
-        """Return the heat of the spindle at times t as a share of that at top speed, shape (n,)."""
-        return np.asarray(self.state.power(self.spindle_speed(t)) / self.state.power(self.top_speed))
+    def spindle_load(self, speed: ArrayLike) -> Array:
+        """Return the heat of the spindle at speeds in 1/min as a share of that at top speed."""
+        return np.asarray(self.state.power(speed) / self.state.power(self.top_speed))
 
     def spindle_speed(self, t: ArrayLike) -> Array:
         """Return the speed of the spindle at times t, 1/min, shape (n,)."""

@@ -59,7 +59,10 @@ class Path:
     def place(self, t: ArrayLike) -> Array:
         """Return the positions at times t (...), s; m, shape (..., 3)."""
         t = np.asarray(t, dtype=float)
-        return np.stack([np.interp(t, self.times, axis) for axis in self.places.T], axis=-1)
+        places = np.empty((*t.shape, 3))
+        for axis in range(3):
+            places[..., axis] = np.interp(t, self.times, self.places[:, axis])
+        return places
 
     def cut(self, time: float) -> Path:
         """Return the same path up to a time, s, at which the machine stops."""

@@ -181,15 +181,20 @@ class Schedule:
 
     def turning(self, t: ArrayLike) -> Array:
         """Return (turns, turns/s, half the acceleration) at times t, shape (n, 3)."""
-        t = np.asarray(t, dtype=float)
-        at = np.maximum(np.searchsorted(self.phase_times, t, side="right") - 1, 0)
-        turns, rate, half = self.phases[at].T
-        dt = t - self.phase_times[at]
+        turns, rate, half, dt = self._phase(t)
         return np.stack([turns + dt * (rate + dt * half), rate + 2 * dt * half, half], axis=-1)
+
+    def _phase(self, t: ArrayLike) -> tuple[Array, Array, Array, Array]:
+        """Return (turns, turns/s, half the acceleration) at the start of the phase at times t, and the time since."""
+        t = np.asarray(t, dtype=float)
+        at = np.maximum(self.phase_times.searchsorted(t, side="right") - 1, 0)
+        turns, rate, half = self.phases[at].T
+        return turns, rate, half, np.asarray(t - self.phase_times[at])
 
     def speed(self, t: ArrayLike) -> Array:
         """Return the spindle's true speed at times t, 1/min, shape (n,)."""
-        return self.turning(t)[..., 1] * 60
+        _, rate, half, dt = self._phase(t)
+        return np.asarray((rate + 2 * dt * half) * 60)
 
     def compensation(self, t: ArrayLike) -> Array:
         """Return the effective share of the compensation of X, Y, Z at times t, 0 to 1, shape (n, 3)."""

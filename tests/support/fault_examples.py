@@ -29,7 +29,7 @@ SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
             (r'(?s)\[\[test\]\]\nname = "pose".*?(?=\[\[test\]\])', ""),
             (r'inputs = \{ pose = "pose" \}\n', ""),
             (r"scan_z = .*", 'profiler_pose = { dz = "-170 mm" }'),
-            (r"positions = .*", 'positions = ["-600 mm", "600 mm"]\nline_pitch = "140 um"'),
+            (r"positions = .*", 'positions = ["-200 mm", "200 mm"]\nline_pitch = "140 um"'),
             (r"warm_up = .*", 'warm_up = ["7 min", "15 min", "30 min"]'),
         ],
     ),
@@ -50,7 +50,7 @@ SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
     ),
 }
 """By method and procedure: the example, its campaign, and what is replaced in it (regular expression, text)."""
-BENCH = [(r"points=800&pitch=25e-6&artefacts=-0.6,-0.2,0.2,0.6", "points=400&pitch=50e-6&artefacts=-0.6,0.6")]
+BENCH = [(r"points=800&pitch=25e-6&artefacts=-0.6,-0.2,0.2,0.6", "points=400&pitch=50e-6&artefacts=-0.2,0.2")]
 """The same of all benches: half of the profile points, and of the artefacts."""
 
 

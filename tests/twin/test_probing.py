@@ -266,6 +266,6 @@ def test_stop_of_the_spindle_removes_its_scheduled_speeds():
     machine.stop_spindle(100.0)
     np.testing.assert_allclose(machine.spindle_speed([99.0, 110.0, 300.0]), [8000, 0, 0], atol=1e-9)
     assert machine.state.schedule.compensation(np.array([300.0]))[0, 2] == 0
-    assert machine.spindle_load(50.0)[0] == pytest.approx(
+    assert machine.spindle_load(machine.spindle_speed(50.0))[0] == pytest.approx(
         machine.state.power(8000.0) / machine.state.power(15000.0), rel=1e-12
     )

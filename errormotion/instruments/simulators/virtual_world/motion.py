@@ -279,7 +279,10 @@ class Motion(SampleClock):
     @property
     def stepping(self) -> bool:
         """Whether a step program waits or runs."""
-        return self.motion is not None and self.time < self.motion.end
+        return self._stepping_at(self.time)
+
+    def _stepping_at(self, time: float) -> bool:
+        return self.motion is not None and time < self.motion.end
 
     @property
     def running(self) -> bool:
@@ -288,8 +291,10 @@ class Motion(SampleClock):
 
     def position(self) -> list[float]:
         """Return the commanded position of the tool, m."""
-        now = self.time
-        place = self.path.place(now) if self.motion is None else self._sphere(now)
+        return self._position_at(self.time)
+
+    def _position_at(self, time: float) -> list[float]:
+        place = self.path.place(time) if self.motion is None else self._sphere(time)
         return [float(x) for x in place]
 
     def _sphere(self, time: float) -> Array:
@@ -306,9 +311,9 @@ class Motion(SampleClock):
             (time, command.text("fanuc", "none")) for time, command in self.port_output if isinstance(command, Block)
         ]
 
-    def feed(self) -> float:
-        """Return the present feed, m/s; NaN while the sphere is stepped."""
-        return float("nan") if self.stepping else self.path.feed(self.time)
+    def _feed_at(self, time: float) -> float:
+        """Return the feed at a time, m/s; NaN while the sphere is stepped."""
+        return float("nan") if self._stepping_at(time) else self.path.feed(time)
 
     def warm_time(self, times: ArrayLike) -> Array:
         """Return the duration of the warm-up of the axes at times of the world's clock, s; 0 before its start.

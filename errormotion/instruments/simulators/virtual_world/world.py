@@ -203,24 +203,25 @@ class VirtualWorld(Motion):
     def commanded(self) -> dict[str, Any]:
         """Return the state that a controller displays."""
         with self._change:
-            now, moving = self.time, self.stepping or self.running
+            now = self.time
+            stepping, running = self._stepping_at(now), now < self.path.end
             compensation = {"X": True, "Y": True, "Z": True}
             for event in self._events(now):
                 compensation.update(event.compensation or {})
-            speed = float(self.machine.spindle_speed(now)[0]) if self._commanded is None else self._commanded
-            position = self.position()
+            true_speed = float(self.machine.spindle_speed(now)[0])
+            position = self._position_at(now)
             return {
                 "time": now,
                 "position": position,
                 "commanded_position": list(position),
-                "spindle_speed": speed,
+                "spindle_speed": true_speed if self._commanded is None else self._commanded,
                 "commanded_spindle_speed": self.commanded_speed(now),
-                "spindle_load": float(self.machine.spindle_load(now)[0]),
-                "feed": self.feed(),
-                "mode": "automatic" if moving else "mdi",
-                "program": self.program if moving else "",
-                "stepping": self.stepping,
-                "running": self.running,
+                "spindle_load": float(self.machine.spindle_load(true_speed)),
+                "feed": self._feed_at(now),
+                "mode": "automatic" if stepping or running else "mdi",
+                "program": self.program if stepping or running else "",
+                "stepping": stepping,
+                "running": running,
                 "homed": True,
                 "enabled": not self.estop and not self.alarms,
                 "estop": self.estop,
