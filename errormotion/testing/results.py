@@ -12,7 +12,7 @@ from errormotion.testing.kit import require
 
 def place_dims(errors: xr.Dataset) -> tuple[str, ...]:
     """Return the dimensions of the errors."""
-    return tuple(str(dim) for dim in errors["EX"].dims)
+    return tuple(str(dim) for dim in errors.variables["EX"].dims)
 
 
 def names(errors: xr.Dataset) -> tuple[str, ...]:
@@ -22,14 +22,17 @@ def names(errors: xr.Dataset) -> tuple[str, ...]:
 
 def values(errors: xr.Dataset) -> np.ndarray:
     """Return the estimates, (place, n), SI; NaN is unknown."""
-    full = errors.em.estimates().transpose(*place_dims(errors), "dof").values
-    return np.reshape(full, (-1, full.shape[-1]))
+    dims = place_dims(errors)
+    full = np.stack([errors.variables[name].transpose(*dims).values for name in names(errors)], axis=-1)
+    return full.reshape(-1, full.shape[-1])
 
 
 def covariance(errors: xr.Dataset) -> np.ndarray:
     """Return the covariance of the estimates at each point, (place, n, n), SI."""
-    full = errors.em.covariance().transpose(*place_dims(errors), "dof", "dof_").values
-    return np.reshape(full, (-1, *full.shape[-2:]))
+    n, dims = len(names(errors)), place_dims(errors)
+    if n == 1:
+        return errors.variables["deviation_variance"].transpose(*dims).values.reshape(-1, 1, 1)
+    return errors.variables["covariance"].transpose(*dims, "dof", "dof_").values.reshape(-1, n, n)
 
 
 def sigma(errors: xr.Dataset) -> np.ndarray:
@@ -59,18 +62,18 @@ def truth_at_places(errors: xr.Dataset, truth: xr.Dataset) -> np.ndarray:
     require(place_dims(truth) == dims, f"the truth has the dimensions {place_dims(truth)}, the result {dims}")
     seen = ("deviation",) if "deviation" in truth else DOF
     require(seen == DOF or names(errors) == seen, "the truth is a deviation, but the result is not")
-    known = truth[list(seen)]
-    for dim in dims:
-        if errors[dim].dtype.kind in "fiu":
-            low, high = float(truth[dim].min()), float(truth[dim].max())
-            inside = bool(((errors[dim] >= low) & (errors[dim] <= high)).all())
-            require(inside, f"the truth covers {dim} from {low:g} to {high:g} only")
-        else:
-            known = known.sel({dim: errors[dim].values})
-    array = np.stack([known[name].transpose(*dims).values for name in seen], axis=-1)
+    array = np.stack([truth.variables[name].transpose(*dims).values for name in seen], axis=-1)
     for axis, dim in enumerate(dims):
-        if errors[dim].dtype.kind in "fiu":
-            array = _interpolated(array, axis, truth[dim].values, errors[dim].values)
+        given, wanted = truth[dim].values, errors[dim].values
+        if wanted.dtype.kind in "fiu":
+            low, high = float(given.min()), float(given.max())
+            inside = bool(((wanted >= low) & (wanted <= high)).all())
+            require(inside, f"the truth covers {dim} from {low:g} to {high:g} only")
+            array = _interpolated(array, axis, given, wanted)
+        elif not np.array_equal(given, wanted):
+            places = truth.get_index(dim).get_indexer(wanted)
+            require(bool((places >= 0).all()), f"the truth lacks values of {dim} that the result has")
+            array = np.take(array, places, axis)
     true = array.reshape(-1, len(seen))
     if seen != DOF:
         return true

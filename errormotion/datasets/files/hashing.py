@@ -43,6 +43,7 @@ _FORMS = (*_TREES, "sha256")
 _TILE = 2**25  # bytes read at a time
 _PENDING = 2**26  # largest number of bytes in the queue
 _TASK = 2**21  # bytes of one task of a thread
+_SMALL = 2**16  # bytes that are hashed sooner than another thread takes them over
 _FIRST_FORM_BLOCK = 2**21  # values; part of the definition of the form "sha256"
 
 
@@ -166,6 +167,9 @@ class DatasetHasher:
         self._wait(_PENDING - values.nbytes)
         for runs, out in leaves.take(starts, values):
             size = sum(run.nbytes for run in runs)
+            if size <= _SMALL:
+                _hash_leaves(runs, leaves.piece, out, self._new)
+                continue
             self._queue.append((self._pool.submit(_hash_leaves, runs, leaves.piece, out, self._new), size))
             self._pending += size
 

@@ -144,12 +144,16 @@ def build_errors(
     if lever_axes:
         attrs["lever_axes"] = lever_axes
     try:
-        ds = xr.Dataset(variables, coords=own_coords, attrs=attrs)
-        clash = sorted(set(extras or {}) & set(ds.variables))
+        more = dict(extras or {})
+        clash = sorted(set(more) & {*variables, *own_coords})
         if clash:
             raise DatasetError(f"extras: expected names that are not used by the schema; found {', '.join(clash)}")
         # Arrays without coordinates need no alignment, which would take most of the time.
-        ds = ds.assign({name: each if len(each.coords) else each.variable for name, each in (extras or {}).items()})
+        bare = {name: each.variable for name, each in more.items() if not len(each.coords)}
+        aligned = len(bare) < len(more)
+        ds = xr.Dataset(variables if aligned else variables | bare, coords=own_coords, attrs=attrs)
+        if aligned:
+            ds = ds.assign(more | bare)
     except ValueError as error:
         raise DatasetError(f"Values, coordinates and extra results do not fit together: {error}") from error
     found = error_violations(ds)
