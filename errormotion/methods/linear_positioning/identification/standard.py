@@ -116,9 +116,7 @@ def figures(found: Statistics) -> Array:
 
 
 def _largest(values: Array) -> Array:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # all values unknown: NaN
-        return np.asarray(np.nanmax(values, axis=-1))
+    return np.asarray(np.fmax.reduce(values, axis=-1))  # NaN if all values are unknown
 
 
 def _smallest(values: Array) -> Array:

@@ -367,35 +367,32 @@ def _estimate(terms: list[Term], N: Array, b: Array, sources: int, square: float
     """Maximise the evidence over tau of every error motion, by expectation and maximisation."""
     n = len(terms)
     order = np.array([term.order for term in terms], dtype=float)
-    flat = np.array([term.order < 0 or (term.order == 1 and term.error[1] == term.error[2]) for term in terms])
-    names = [term.error for term in terms]
-    groups = {name: np.flatnonzero([(e == name) and not f for e, f in zip(names, flat, strict=True)]) for name in names}
-    groups = {name: group for name, group in groups.items() if len(group)}
-    shape = np.where(flat, np.inf, np.maximum(order, 1.0) ** -p)
-    kinds = {name: "EA EB EC".find(name[:2]) >= 0 for name in groups}
+    free = np.array([term.order >= 0 and (term.order > 1 or term.error[1] != term.error[2]) for term in terms])
+    penalised = np.flatnonzero(free)  # terms with a prior
+    names = list(dict.fromkeys(terms[k].error for k in penalised))
+    group = np.array([names.index(terms[k].error) for k in penalised], dtype=np.intp)
+    count = np.bincount(group, minlength=len(names))
+    kind = np.array([int(name[:2] in ("EA", "EB", "EC")) for name in names], dtype=np.intp)
+    shape = np.maximum(order[penalised], 1.0) ** -p
     # columns scaled to the same size, independent of the units m and rad
     unit = 1 / np.sqrt(np.diag(N))
-    scaled, right = N * np.outer(unit, unit), b * unit
-    guess = {kind: float(np.median([unit[i] for name, g in groups.items() if kinds[name] == kind for i in g] or [1.0]))
-             for kind in (False, True)}  # fmt: skip
-    tau = {name: 30 * guess[kinds[name]] for name in groups}
+    sizes, right, identity = np.outer(unit, unit), b * unit, np.eye(len(N))
+    scaled = N * sizes
+    guess = np.array([np.median(unit[penalised[kind[group] == k]]) if (kind == k).any() else 1.0 for k in (0, 1)])
+    tau = 30 * guess[kind]
     for _ in range(_MAX_ITERATIONS):
         prior = np.zeros(len(N))
-        for name, group in groups.items():
-            prior[group] = 1 / (tau[name] * shape[group]) ** 2
+        prior[penalised] = 1 / (tau[group] * shape) ** 2
         factor = linalg.cho_factor(scaled + np.diag(prior * unit**2))
-        C = linalg.cho_solve(factor, np.eye(len(N))) * np.outer(unit, unit)
+        C = linalg.cho_solve(factor, identity, check_finite=False) * sizes
         x = unit * linalg.cho_solve(factor, right)
         variance = np.diag(C)
-        second = {name: float(np.sum((x[g] ** 2 + variance[g]) / shape[g] ** 2)) for name, g in groups.items()}
-        typical = {
-            kind: float(np.exp(np.mean([np.log(tau[name] ** 2) for name in groups if kinds[name] == kind] or [0.0])))
-            for kind in (False, True)
-        }
-        before = dict(tau)
-        for name, group in groups.items():
-            tau[name] = float(np.sqrt((second[name] + _POOLED * typical[kinds[name]]) / (len(group) + _POOLED)))
-        if max(abs(np.log(tau[name] / before[name])) for name in groups) < _TOLERANCE:
+        second = np.bincount(group, (x[penalised] ** 2 + variance[penalised]) / shape**2, len(names))
+        logs = 2 * np.log(tau)
+        typical = np.exp([logs[kind == k].mean() if (kind == k).any() else 0.0 for k in (0, 1)])
+        before = tau
+        tau = np.sqrt((second + _POOLED * typical[kind]) / (count + _POOLED))
+        if np.abs(np.log(tau / before)).max(initial=0.0) < _TOLERANCE:
             break
     determined = 1 - variance[:n] * prior[:n]
     # Twice the logarithm of the marginal likelihood, minus a constant.

@@ -36,7 +36,7 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     for k, axis in enumerate(AXES):
         dim = f"{axis}_position"
         q = np.linspace(chain.low[k], chain.high[k], CURVE_POINTS)
-        coords = {dim: (dim, q, {"units": "m"})}
+        coords = xr.Coordinates({dim: (dim, q, {"units": "m"})})
         for error in chain.machine.error_names[6 * k : 6 * k + 6]:
             unit = _unit(error)
             attrs = {
