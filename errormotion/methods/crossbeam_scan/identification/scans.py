@@ -286,9 +286,8 @@ def _extras(
         out["cold_repeat_u"] = (("repeat", "position", "dof"), u)
     out |= _map_extras(found.maps, rows) | further
     coords = {"jitter": ["z", "y"], "direction": list("xyz"), "pose_parameter": ["a", "b", "g", "dx", "dy", "dz"]}
-    ds = xr.Dataset(out).assign_coords(
-        {name: labels for name, labels in coords.items() if name in xr.Dataset(out).dims}
-    )
+    ds = xr.Dataset(out)
+    ds = ds.assign_coords({name: labels for name, labels in coords.items() if name in ds.dims})
     return {str(name): ds[name] for name in ds.data_vars}
 
 
