@@ -79,6 +79,7 @@ class TrackerScene:
         self._repeatability = address.number("repeatability", 0.0)
         self._rng = rng
         self._arrival: tuple[Array, Array] | None = None
+        self._last: tuple[Array, Array] | None = None
         self._air = tuple(
             address.number(f"air_{name}", default)
             for name, default in (("temperature", np.nan), ("pressure", 100_800.0), ("humidity", 43.0))
@@ -97,11 +98,17 @@ class TrackerScene:
         """Return true positions of the reflector, m, (n, 3), at times (n,) of the world's clock, s."""
         machine = self.world.machine
         commanded = np.atleast_2d(self.world.path.place(times) if self.world.motion is None else self.world.position())
-        twist = machine.geometry.twist(commanded)
+        twist = self._geometric(commanded)
         if self._thermal:
             twist = twist + machine.thermal_twist(commanded, times)
         moved = commanded + self.lever + twist[:, :3] + np.cross(twist[:, 3:], self.lever)
         return np.broadcast_to(moved + self._arrived(commanded[-1]), (len(times), 3))
+
+    def _geometric(self, commanded: Array) -> Array:
+        """Return the geometric error twists of the machine; the last ones are kept, for a machine at rest."""
+        if self._last is None or not np.array_equal(self._last[0], commanded):
+            self._last = (commanded.copy(), self.world.machine.geometry.twist(commanded))
+        return self._last[1]
 
     def _arrived(self, place: Array) -> Array:
         """Return the error of repeatability at the position at which the machine has arrived, m."""
