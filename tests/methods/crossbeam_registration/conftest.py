@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -40,18 +41,11 @@ class Scanner:
         self.y = (np.arange(self.rows) - self.rows / 2) * PITCH_Y
 
     def true_heights(self, pose=None, dy=0.0):
-        """Heights in the frame at ``pose``: p on the line (x, y) with pose(p) on the surface (Newton's method)."""
+        """Heights in the frame at ``pose``, not to be changed; profiles are off by ``dy`` (row, 1)."""
         M = np.eye(4) if pose is None else pose.as_matrix()
-        x, y = self.x[None, :], self.y[:, None] + dy
-        z = self.surface(*np.broadcast_arrays(x, y + np.zeros((self.rows, 1))))[0]
-        for _ in range(30):
-            X, Y, Z = (M[i, 0] * x + M[i, 1] * y + M[i, 2] * z + M[i, 3] for i in range(3))
-            S, Sx, Sy = self.surface(X, Y)
-            step = (Z - S) / (M[2, 2] - Sx * M[0, 2] - Sy * M[1, 2])
-            z -= step
-            if np.max(np.abs(step)) < 1e-9:  # it squares with every step
-                break
-        return z
+        if np.any(dy):
+            return intersections(self.surface, self.x, self.y[:, None] + dy, M)
+        return known_intersections(self.surface, self.x.tobytes(), self.y.tobytes(), M.tobytes())
 
     def scan(self, rng, pose=None, *, jitter_z=0.0, jitter_y=0.0):
         """Return heights, x, y as a sensor gives them."""
@@ -68,10 +62,39 @@ class Scanner:
 
     def bound(self):
         """Return the Cramer-Rao bound (6, 6) of the twist at the origin of both noisy scans."""
-        X, Y = np.meshgrid(self.x, self.y)
-        Z, Sx, Sy = self.surface(X, Y)
-        J = np.stack([-Sx, -Sy, np.ones_like(X), Y + Sy * Z, -X - Sx * Z, Sx * Y - Sy * X]).reshape(6, -1)
-        return 2 * self.noise**2 * np.linalg.inv(J @ J.T)
+        return 2 * self.noise**2 * inverse_information(self.surface, self.x.tobytes(), self.y.tobytes())
+
+
+def intersections(surface, x, y, M):
+    """Heights z (row, column) so that M (x, y, z) is on the surface, for y (row, 1), by Newton's method."""
+    x = x[None, :]
+    z = surface(*np.broadcast_arrays(x, y))[0]
+    for _ in range(30):
+        X, Y, Z = (M[i, 0] * x + M[i, 1] * y + M[i, 2] * z + M[i, 3] for i in range(3))
+        S, Sx, Sy = surface(X, Y)
+        step = (Z - S) / (M[2, 2] - Sx * M[0, 2] - Sy * M[1, 2])
+        z -= step
+        if np.max(np.abs(step)) < 1e-9:  # it squares with every step
+            break
+    return z
+
+
+@lru_cache(maxsize=12)
+def known_intersections(surface, x, y, M):
+    """The same for the bytes of x, y (row,) and M, computed once."""
+    x, y, M = (np.frombuffer(each) for each in (x, y, M))
+    z = intersections(surface, x, y[:, None], M.reshape(4, 4))
+    z.flags.writeable = False
+    return z
+
+
+@lru_cache(maxsize=4)
+def inverse_information(surface, x, y):
+    """The inverse information (6, 6) of a scan about the twist, in units of the variance of its points."""
+    X, Y = np.meshgrid(np.frombuffer(x), np.frombuffer(y))
+    Z, Sx, Sy = surface(X, Y)
+    J = np.stack([-Sx, -Sy, np.ones_like(X), Y + Sy * Z, -X - Sx * Z, Sx * Y - Sy * X]).reshape(6, -1)
+    return np.linalg.inv(J @ J.T)
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ from errormotion.kinematics import poses
 from errormotion.methods.crossbeam_scan.identification.registration import clouds, register_clouds
 
 TWIST = np.array([23e-6, -41e-6, 17e-6, 30e-6, -55e-6, 80e-6])
-NOISE = 0.5e-6
-POINTS = 40000
+NOISE = 1e-6
+POINTS = 20000
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -41,12 +41,12 @@ def pair(shape, seed):
 @pytest.mark.slow
 def test_motion_of_a_cloud_that_is_no_height_map_and_what_it_is_worth():
     squares = []
-    for seed in range(16):
+    for seed in range(24):
         found = register_clouds(*pair(pebble, seed), point=np.zeros(3))
         error = found.twist - TWIST
         squares.append(error @ np.linalg.solve(found.covariance, error) / 6)
-    # The mean of 16 values of chi2(6) / 6 scatters by sqrt(2 / 6 / 16) = 0.14; three of it.
-    assert abs(np.mean(squares) - 1.0) < 0.43
+    # The mean of 24 values of chi2(6) / 6 scatters by sqrt(2 / 6 / 24) = 0.12; three of it.
+    assert abs(np.mean(squares) - 1.0) < 0.36
     # Curvature between neighbours adds to the noise, by an eighth here.
     assert found.noise[0] == pytest.approx(NOISE, rel=0.3)
     assert found.backend == "open3d_plane"
