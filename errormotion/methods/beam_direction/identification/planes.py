@@ -42,6 +42,8 @@ log = logging.getLogger(__name__)
 FALSE_ALARM = 1e-3
 """Probability that correct data are reported as noisier than stated, correlated, or not closing."""
 _NOTED_CURVATURE = 0.05
+_PARAMETERS = ["px", "py", "pz", "ux", "uy", "uz"]
+_LABELS = {"direction": list("xyz"), "direction_": list("xyz"), "p": _PARAMETERS, "p_": _PARAMETERS}
 
 
 def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
@@ -64,7 +66,7 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
     by_source = np.nan_to_num(influence) @ chart.T
     steps = ["gradients by generalised least squares", "maximum likelihood of the direction"]
     steps += [f"inclination compensation, {converged.iterations} iterations"] if sensor is not None else []
-    extras = _extras(beam, total, p, settings.beam)
+    extras = _extras(beam, total, p)
     if "bar_distance" in raw:
         if not np.isfinite(p).all():
             notes.append(
@@ -79,7 +81,7 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         errors,
         covariance,
         dims=("beam",),
-        coords={"beam": [settings.beam], "direction": ("direction", list("xyz"))},
+        coords={"beam": [settings.beam], **_LABELS},
         component="beam",
         machine=str(raw.attrs.get("machine", "unknown")),
         frame=str(raw.attrs.get("frame", "machine")),
@@ -331,20 +333,13 @@ def _corrected(
     return np.array(values)
 
 
-def _extras(beam: Determined, covariance: Array, origin: Array, name: str) -> dict[str, xr.DataArray]:
+def _extras(beam: Determined, covariance: Array, origin: Array) -> dict[str, xr.DataArray]:
     data, fits, converged, corrected = beam.data, beam.fits, beam.converged, beam.corrected
     direction, planes = converged.direction, converged.planes
-    coords: dict[str, Any] = {
-        "beam": [name],
-        "direction": list("xyz"),
-        "direction_": list("xyz"),
-        "p": ["px", "py", "pz", "ux", "uy", "uz"],
-        "p_": ["px", "py", "pz", "ux", "uy", "uz"],
-    }
 
     def array(values: Any, dims: tuple[str, ...], unit: str, meaning: str = "") -> xr.DataArray:
         attrs = ({"units": unit} if unit else {}) | ({"long_name": meaning} if meaning else {})
-        return xr.DataArray(values, {d: coords[d] for d in dims if d in coords}, dims, attrs=attrs)
+        return xr.DataArray(values, dims=dims, attrs=attrs)
 
     vector, by_plane, by_reading = ("beam", "direction"), ("plane", "direction"), ("plane", "reading")
     if converged.tilt is not None:

@@ -17,9 +17,9 @@ from errormotion.datasets.certificates import certified
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.identification import uncertainty
-from errormotion.methods.multilateration.identification.parameters import fit_machine
+from errormotion.methods.multilateration.identification.parameters import Parametric, fit_machine
 from errormotion.methods.multilateration.identification.state import State
-from errormotion.methods.multilateration.identification.volume import parametric_extras
+from errormotion.methods.multilateration.identification.volume import parametric_extras, parametric_labels
 from errormotion.methods.multilateration.network.alternating import alternate
 from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
 
@@ -58,7 +58,10 @@ def result(state: State, method: str, version: str) -> xr.Dataset:
     error = network.target - data.nominal
     values = np.full((len(error), 6), np.nan)
     values[:, :3] = error
-    extras = _extras(state) | _alternated(state) | _axes(state, error, parts)
+    extras, labels = _extras(state) | _alternated(state), _labels(state)
+    if (axes := _axes(state, error, parts)) is not None:
+        extras |= parametric_extras(axes)
+        labels |= parametric_labels(axes)
     covariance = parts.covariance(network.target_covariance, state.factor**2)
     if state.settings.together and state.machine.variance > 0:
         covariance[:, :3, :3] += state.machine.variance * np.eye(3)
@@ -71,7 +74,7 @@ def result(state: State, method: str, version: str) -> xr.Dataset:
         parts.influence,
         {
             "target": ("target", np.array(data.targets), {}),
-            "direction": ("direction", list("xyz"), {}),
+            **labels,
             **{name: ("target", position[:, k], {"units": "m"}) for k, name in enumerate("xyz")},
         },
         extras,
@@ -107,15 +110,15 @@ def _uncertainty(state: State) -> Parts:
     return parts
 
 
-def _axes(state: State, error: Array, parts: Parts) -> dict[str, xr.DataArray]:
+def _axes(state: State, error: Array, parts: Parts) -> Parametric | None:
     """Return the errors of the axes; if they are not determined, a note states the reason."""
     data, settings, notes = state.data, state.settings, state.notes
     if not settings.parametric:
-        return {}
+        return None
     chain = settings.chain or state.raw.attrs.get("chain")
     if not isinstance(chain, str):
         notes.append("No errors of the axes: the chain of the machine is unknown (setting or attribute 'chain').")
-        return {}
+        return None
     try:
         axes = fit_machine(
             chain,
@@ -128,12 +131,12 @@ def _axes(state: State, error: Array, parts: Parts) -> dict[str, xr.DataArray]:
         )
     except MethodError as refusal:
         notes.append(f"No errors of the axes. {refusal}")
-        return {}
+        return None
     notes.extend(axes.notes)
     if axes.undetermined:
         reasons = "; ".join(f"{name}: {each.reason}" for name, each in axes.undetermined.items())
         notes.append(f"Errors of the axes that these targets do not determine: {reasons}.")
-    return parametric_extras(axes)
+    return axes
 
 
 def _alternated(state: State) -> dict[str, xr.DataArray]:
@@ -172,20 +175,26 @@ def _steps(state: State) -> list[str]:
     return [*steps, "free network on the commanded positions"]
 
 
+def _labels(state: State) -> dict[str, Any]:
+    """Return the coordinates of the variables by `_extras`."""
+    labels = {
+        "station": state.data.stations,
+        "direction": list("xyz"),
+        "direction_": list("xyz"),
+        "cause": list(state.scatter.shares),
+    }
+    if state.drift is not None and state.drift.pairs:
+        labels["drift_term"] = ["dead path", "x", "y", "z"]
+    return {name: (name, values, {}) for name, values in labels.items()}
+
+
 def _extras(state: State) -> dict[str, xr.DataArray]:
     data, network, f2 = state.data, state.network, state.factor**2
     n = len(data.stations)
-    coords: dict[str, Any] = {
-        "station": data.stations,
-        "target": data.targets,
-        "direction": list("xyz"),
-        "direction_": list("xyz"),
-        "drift_term": ["dead path", "x", "y", "z"],
-    }
 
     def array(values: Any, dims: tuple[str, ...], unit: str, meaning: str = "") -> xr.DataArray:
         attrs = ({"units": unit} if unit else {}) | ({"long_name": meaning} if meaning else {})
-        return xr.DataArray(values, {d: coords[d] for d in dims if d in coords}, dims, attrs=attrs)
+        return xr.DataArray(values, dims=dims, attrs=attrs)
 
     left_out = np.zeros(data.displacement.shape, np.int8)
     for j, i in network.left_out:
@@ -219,7 +228,7 @@ def _extras(state: State) -> dict[str, xr.DataArray]:
         extras["repeatability_u"] = array(state.machine.uncertainty, (), "m")
     shares = state.scatter.shares
     extras["scatter_share"] = xr.DataArray(
-        list(shares.values()), {"cause": list(shares)}, "cause",
+        list(shares.values()), dims="cause",
         attrs={"units": "1", "long_name": "share of each cause in the variance of a reading"},
     )  # fmt: skip
     return extras

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -28,15 +28,12 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     ``EXX(X_position)`` ... and ``EXX_u``: error motions and standard uncertainties, NaN if not determined, with the
     reason as attribute ``unseen``; the attribute ``includes`` states errors with the same effect; ``EC0Y`` ... and
     ``EC0Y_u``: squareness; ``coefficient(term)`` with ``coefficient_covariance``, and the inputs of
-    `volumetric_errors`.
+    `volumetric_errors`. Their coordinates are `parametric_labels`.
     """
     extras: dict[str, xr.DataArray] = {}
     chain = axes.chain
     includes = _includes(axes.undetermined)
-    for k, axis in enumerate(AXES):
-        dim = f"{axis}_position"
-        q = np.linspace(chain.low[k], chain.high[k], CURVE_POINTS)
-        coords = xr.Coordinates({dim: (dim, q, {"units": "m"})})
+    for k, (dim, q) in enumerate(_curve_positions(chain).items()):
         for error in chain.machine.error_names[6 * k : 6 * k + 6]:
             unit = _unit(error)
             attrs = {
@@ -44,19 +41,15 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
                 "includes": includes.get(error, ""),
             }  # fmt: skip
             value, u = axes.curve(error, q)
-            extras[error] = xr.DataArray(value, coords, dim, attrs=attrs)
-            extras[f"{error}_u"] = xr.DataArray(u, coords, dim, attrs={"units": unit})
+            extras[error] = xr.DataArray(value, dims=dim, attrs=attrs)
+            extras[f"{error}_u"] = xr.DataArray(u, dims=dim, attrs={"units": unit})
     for error, (number, uncertainty) in axes.squareness().items():
         attrs = {"units": "rad", "unseen": _reason(axes, error), "includes": includes.get(error, "")}
         extras[error] = xr.DataArray(number, attrs=attrs)
         extras[f"{error}_u"] = xr.DataArray(uncertainty, attrs={"units": "rad"})
-    terms = {
-        "term_error": ("term", [term.error for term in axes.terms]),
-        "term_order": ("term", [term.order for term in axes.terms]),
-    }
     reasons = [f"{name}: {each.reason}" for name, each in axes.undetermined.items()]
     attrs_of_terms = {"chain": chain.machine.chain, "unseen": reasons or [""]}
-    extras["coefficient"] = xr.DataArray(axes.coefficient, terms, "term", attrs=attrs_of_terms)
+    extras["coefficient"] = xr.DataArray(axes.coefficient, dims="term", attrs=attrs_of_terms)
     extras["coefficient_covariance"] = xr.DataArray(axes.covariance, dims=("term", "term_"))
     extras["determined"] = xr.DataArray(
         axes.determined, dims="term", attrs={"units": "1", "long_name": "1: by the targets, 0: by the prior"}
@@ -69,10 +62,25 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
         "axes_low": chain.low,
         "axes_high": chain.high,
     }.items():
-        extras[name] = xr.DataArray(vector, {"direction": list("xyz")}, "direction", attrs=m)
+        extras[name] = xr.DataArray(vector, dims="direction", attrs=m)
     extras["axes_sigma0"] = xr.DataArray(axes.sigma0, attrs={"units": "1"})
     extras["axes_freedom"] = xr.DataArray(axes.freedom)
     return extras
+
+
+def parametric_labels(axes: Parametric) -> dict[str, Any]:
+    """Return the coordinates of the variables by `parametric_extras`: name to (dims, values, attributes)."""
+    return {
+        **{dim: (dim, q, {"units": "m"}) for dim, q in _curve_positions(axes.chain).items()},
+        "term_error": ("term", [term.error for term in axes.terms], {}),
+        "term_order": ("term", [term.order for term in axes.terms], {}),
+    }
+
+
+def _curve_positions(chain: Chain) -> dict[str, Array]:
+    """Return the positions of each axis at which its errors are tabulated, m, by the name of the dimension."""
+    ends = zip(AXES, chain.low, chain.high, strict=True)
+    return {f"{axis}_position": np.linspace(low, high, CURVE_POINTS) for axis, low, high in ends}
 
 
 def _reason(axes: Parametric, error: str) -> str:

@@ -68,13 +68,10 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
     )
     for note in notes:
         log.warning(note)
-    beam_axis, axis = ("beam", names), ("direction", list("xyz"))
     parameters = ["px", "py", "pz", "ux", "uy", "uz"]
 
     def vectors(values: Array, unit: str) -> xr.DataArray:
-        return xr.DataArray(
-            values, coords={"beam": beam_axis, "direction": axis}, dims=("beam", "direction"), attrs={"units": unit}
-        )
+        return xr.DataArray(values, dims=("beam", "direction"), attrs={"units": unit})
 
     extras = {
         "beam_origin": vectors(np.array([b.origin for b in found]), "m"),
@@ -85,26 +82,22 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
         "paper_direction": vectors(paper_direction, "1"),
         "beam_covariance": xr.DataArray(
             np.array([b.covariance for b in found]),
-            coords={"beam": beam_axis, "p": ("p", parameters), "p_": ("p_", parameters)},
             dims=("beam", "p", "p_"),
             attrs={"units": "SI: m for p, 1 for u"},
         ),
         "residual": xr.DataArray(
             np.array([b.residual for b in found]),
-            coords={"beam": beam_axis},
             dims=("beam", "profile", "step"),
             attrs={"units": "m"},
         ),
-        "noise": xr.DataArray(
-            np.array([b.noise for b in found]), coords={"beam": beam_axis}, dims="beam", attrs={"units": "m"}
-        ),
-        "left_out": xr.DataArray(np.array([len(b.left_out) for b in found]), coords={"beam": beam_axis}, dims="beam"),
+        "noise": xr.DataArray(np.array([b.noise for b in found]), dims="beam", attrs={"units": "m"}),
+        "left_out": xr.DataArray(np.array([len(b.left_out) for b in found]), dims="beam"),
     }
     ds = build_errors(
         errors,
         covariance,
         dims=("beam",),
-        coords={"beam": names},
+        coords={"beam": names, "direction": list("xyz"), "p": parameters, "p_": parameters},
         component="beam",
         machine=str(raw.attrs.get("machine", "unknown")),
         frame=str(raw.attrs.get("frame", "machine")),

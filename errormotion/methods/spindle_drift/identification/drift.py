@@ -138,7 +138,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         errors,
         independent + np.einsum("sti,stj->tij", influence, influence),
         dims=("time",),
-        coords=_coordinates(raw, record, time),
+        coords=_coordinates(raw, record, time) | iso230_3.LABELS,
         component="spindle",
         machine=str(raw.attrs.get("machine", "unknown")),
         frame=str(raw.attrs.get("frame", "machine")),
@@ -160,7 +160,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         influence=influence,
         sources=[name for name, _ in names],
         source_groups=[group for _, group in names],
-        extras=_extras(raw, averages, mean, state, bar, time) | results.as_extras(time, len(influence)),
+        extras=_extras(raw, averages, mean, state, bar) | results.as_extras(len(influence)),
         start=start_of(raw, zero),
         source_ids={s.name: s.identity for s in sources if s.identity}
         | certified(raw.attrs, {name: CERTIFIED[name] for name, _ in names if name in CERTIFIED}),
@@ -298,7 +298,11 @@ def beams_of(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Arr
 
 def _coordinates(raw: xr.Dataset, record: Record, time: Array) -> dict[str, Any]:
     start = str(raw.attrs.get("start", ""))
-    coords: dict[str, Any] = {"time": ("time", time, {"units": "s", **({"start": start} if start else {})})}
+    coords: dict[str, Any] = {
+        "time": ("time", time, {"units": "s", **({"start": start} if start else {})}),
+        "channel": list(CHANNELS),
+        "direction": list("xyz"),
+    }
     if record.temperature is not None:
         coords["temperature"] = (("time", "sensor"), record.temperature.T, {"units": "degC"})
         coords["sensor"] = ("sensor", sensors(raw))
@@ -307,16 +311,9 @@ def _coordinates(raw: xr.Dataset, record: Record, time: Array) -> dict[str, Any]
     return coords
 
 
-def _extras(
-    raw: xr.Dataset, averages: Averages, mean: Array, state: State, bar: Bar, time: Array
-) -> dict[str, xr.DataArray]:
-    channel = ("channel", list(CHANNELS))
-    axis = ("direction", list("xyz"))
-
+def _extras(raw: xr.Dataset, averages: Averages, mean: Array, state: State, bar: Bar) -> dict[str, xr.DataArray]:
     def over_channel(values: Array, unit: str) -> xr.DataArray:
-        return xr.DataArray(
-            values, coords={"channel": channel, "time": time}, dims=("channel", "time"), attrs={"units": unit}
-        )
+        return xr.DataArray(values, dims=("channel", "time"), attrs={"units": unit})
 
     # Distances of the measured points from the fitted bar; zero within rounding where the fit is exact.
     S = bar.origin[:, None] + bar.direction[:, None] * mean[:, :, None]
@@ -327,23 +324,17 @@ def _extras(
     first = int(np.flatnonzero(np.isfinite(state.E).all(axis=1))[0])
     vectors = {"beam_origin": (bar.origin, "m"), "beam_direction": (bar.direction, "1")}
     extras = {
-        name: xr.DataArray(
-            values, coords={"channel": channel, "direction": axis}, dims=("channel", "direction"), attrs={"units": unit}
-        )
+        name: xr.DataArray(values, dims=("channel", "direction"), attrs={"units": unit})
         for name, (values, unit) in vectors.items()
     }
     extras |= {
         "fit_residual": over_channel(residual, "m"),
         "distance_mean": over_channel(averages.mean, "m"),
         "valid_fraction": over_channel(averages.count / np.maximum(averages.expected, 1), "1"),
-        "bar_axis_point": xr.DataArray(
-            state.E[first], coords={"direction": axis}, dims="direction", attrs={"units": "m"}
-        ),
-        "bar_axis_direction": xr.DataArray(
-            state.a[first], coords={"direction": axis}, dims="direction", attrs={"units": "1"}
-        ),
+        "bar_axis_point": xr.DataArray(state.E[first], dims="direction", attrs={"units": "m"}),
+        "bar_axis_direction": xr.DataArray(state.a[first], dims="direction", attrs={"units": "1"}),
         "bar_radius": xr.DataArray(bar.radius, attrs={"units": "m"}),
-        "level_height": xr.DataArray(bar.levels, coords={"level": ["L1", "L2"]}, dims="level", attrs={"units": "m"}),
+        "level_height": xr.DataArray(bar.levels, dims="level", attrs={"units": "m"}),
     }
     for name in ("dropped_samples", "invalid_samples"):
         if name in raw:

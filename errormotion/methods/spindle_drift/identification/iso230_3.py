@@ -37,6 +37,7 @@ MEASURES = (
     "end_slope",
     "per_kelvin",
 )
+LABELS = {"level": ["L1", "L2"], "lateral": ["x", "y"], "quantity": list(QUANTITIES), "measure": list(MEASURES)}
 HOUR = 3600.0
 _SLOPE_SPAN = 600.0
 """Interval before the end of running over which the end slope is taken, s."""
@@ -99,24 +100,26 @@ class Results:
     sensor: str
     series: Series
 
-    def as_extras(self, time: Array, sources: int) -> dict[str, xr.DataArray]:
-        """Return the values as further variables of an error dataset with ``sources``; the last ones have no effect."""
-        table = {"quantity": list(QUANTITIES), "measure": list(MEASURES)}
+    def as_extras(self, sources: int) -> dict[str, xr.DataArray]:
+        """Return the values as further variables of an error dataset with ``sources``; the last ones have no effect.
+
+        Their coordinates are `LABELS`.
+        """
+        table = ("quantity", "measure")
         units = {"units": "SI: m or rad; s for time_constant; per s for end_slope; per K for per_kelvin"}
         shared = np.einsum("skt,skt->kt", self.series.influence, self.series.influence)
         u = np.sqrt(shared + self.series.variance)
         F = np.zeros((sources, *self.value.shape))
         F[: len(self.influence)] = self.influence
-        labels = {"level": ["L1", "L2"], "lateral": ["x", "y"], "time": time}
 
         def by_level(values: Array) -> xr.DataArray:
             by_place = values[[0, 2, 1, 3]].reshape(2, 2, -1)  # X1 Y1 at L1, X2 Y2 at L2
-            return xr.DataArray(by_place, coords=labels, dims=("level", "lateral", "time"), attrs={"units": "m"})
+            return xr.DataArray(by_place, dims=("level", "lateral", "time"), attrs={"units": "m"})
 
         return {
-            "iso_value": xr.DataArray(self.value, coords=table, dims=("quantity", "measure"), attrs=units),
-            "iso_uncertainty": xr.DataArray(self.uncertainty, coords=table, dims=("quantity", "measure"), attrs=units),
-            "iso_influence": xr.DataArray(F, coords=table, dims=("source", "quantity", "measure"), attrs=units),
+            "iso_value": xr.DataArray(self.value, dims=table, attrs=units),
+            "iso_uncertainty": xr.DataArray(self.uncertainty, dims=table, attrs=units),
+            "iso_influence": xr.DataArray(F, dims=("source", *table), attrs=units),
             "displacement": by_level(self.series.value[:4]),
             "displacement_u": by_level(u[:4]),
         }

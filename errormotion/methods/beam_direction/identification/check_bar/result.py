@@ -109,15 +109,14 @@ def bar_extras(
     notes.extend(f"Check bar: {note}" for note in (*points.notes, *bar.notes))
     left_out = np.zeros(len(bar.residuals), np.int8)
     left_out[list(bar.left_out)] = 1
-    coords = {"direction": list("xyz")}
     m = {"units": "m"}
     return {
-        "bar_point": xr.DataArray(points.points, coords, ("bar_reading", "direction"), attrs=m),
+        "bar_point": xr.DataArray(points.points, dims=("bar_reading", "direction"), attrs=m),
         "bar_residual": xr.DataArray(bar.residuals, dims="bar_reading", attrs=m),
         "bar_left_out": xr.DataArray(left_out, dims="bar_reading"),
-        "bar_centre": xr.DataArray(bar.centre, coords, "direction", attrs=m),
-        "bar_centre_u": xr.DataArray(np.sqrt(np.diag(bar.centre_covariance)), coords, "direction", attrs=m),
-        "bar_axis": xr.DataArray(bar.axis, coords, "direction", attrs={"units": "1"}),
+        "bar_centre": xr.DataArray(bar.centre, dims="direction", attrs=m),
+        "bar_centre_u": xr.DataArray(np.sqrt(np.diag(bar.centre_covariance)), dims="direction", attrs=m),
+        "bar_axis": xr.DataArray(bar.axis, dims="direction", attrs={"units": "1"}),
         "bar_radius_fitted": xr.DataArray(bar.free_radius, attrs=m),
         "bar_radius_u": xr.DataArray(bar.free_radius_u, attrs=m),
     }
