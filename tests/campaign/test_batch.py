@@ -286,15 +286,15 @@ def test_serial_execution_requires_no_dask() -> None:
 @pytest.mark.slow
 def test_threads_take_turns_where_numba_is_not_safe(raws: list[Path], tmp_path: Path) -> None:
     """With its 'workqueue' layer numba ends the process when two threads call a parallel kernel at once."""
-    command = ["identify", *map(str, raws), "--method", "spindle_drift", "--out", str(tmp_path / "out")]
+    command = ["identify", *map(str, raws[:3]), "--method", "spindle_drift", "--out", str(tmp_path / "out")]
     done = subprocess.run(
-        [sys.executable, "-m", "errormotion", *command, "--scheduler", "threads", "--workers", "4"],
+        [sys.executable, "-m", "errormotion", *command, "--scheduler", "threads", "--workers", "3"],
         env=os.environ | {"NUMBA_THREADING_LAYER": "workqueue", "XDG_STATE_HOME": str(tmp_path)},
         capture_output=True,
         text=True,
         check=False,
     )
     assert "one run at a time" in done.stderr
-    assert "4 identified, 0 existed already, 1 failed" in done.stdout
+    assert "2 identified, 0 existed already, 1 failed" in done.stdout
     assert f"failed: {raws[2]}: is truncated" in done.stdout
     assert done.returncode == 1
