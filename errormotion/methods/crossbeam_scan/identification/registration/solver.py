@@ -189,15 +189,24 @@ class Noise:
 
     def gains(self, A: Array) -> Array:
         """Return K of every row, (row, 2, 2)."""
-        first, mixed, last = line_gain(A[:, LINE][:, :, LINE], self.k, *self.tau)
+        (first, last), mixed = line_gain(*_parts(A[:, LINE][:, :, LINE]), self.k, np.array(self.tau))
         return np.stack([np.stack([first, mixed], axis=-1), np.stack([mixed, last], axis=-1)], axis=-1)
 
 
-def line_gain(C: Array, k: float, s: float, t: float) -> tuple[Array, Array, Array]:
-    """Return K00, K01 and K11 of every line (line,), with T = diag(s, t): what takes its sums to its effects."""
-    first, last, mixed = k + s * s * C[:, 0, 0], k + t * t * C[:, 1, 1], s * t * C[:, 0, 1]
-    determinant = first * last - mixed * mixed
-    return s * s * last / determinant, -s * t * mixed / determinant, t * t * first / determinant
+def line_gain(own: Array, mixed: Array, k: float, tau: Array) -> tuple[Array, Array]:
+    """Return K00 and K11 (2, line), and K01 (line,), of lines with C00 and C11 ``own`` and C01 ``mixed``.
+
+    K takes the sums of a line to its effects; T = diag(tau).
+    """
+    squares = (tau * tau)[:, None]
+    increased, between = k + squares * own, tau[0] * tau[1] * mixed
+    determinant = increased[0] * increased[1] - between * between
+    return squares * increased[::-1] / determinant, -tau[0] * tau[1] * between / determinant
+
+
+def _parts(C: Array) -> tuple[Array, Array]:
+    """Return the diagonals (2, line) and the other elements (line,) of symmetrical matrices (line, 2, 2)."""
+    return np.ascontiguousarray(C[:, [0, 1], [0, 1]].T), C[:, 0, 1].copy()
 
 
 def normal_equations(sums: Sums, noise: Noise) -> tuple[Array, Array]:
@@ -265,10 +274,12 @@ def estimate_noise(problem: Problem, state: State, sums: Sums, line_effects: boo
 
 def _maximised(C: Array, u: Array, k: float, tau: Array) -> Array:
     """Return the standard deviations of the line effects after some steps of expectation and maximisation."""
+    own, mixed = _parts(C)
+    sums = np.ascontiguousarray(u.T)
     for _ in range(_EM_STEPS):
-        K00, K01, K11 = line_gain(C, k, *tau)
-        of_z, of_y = K00 * u[:, 0] + K01 * u[:, 1], K01 * u[:, 0] + K11 * u[:, 1]
-        tau = np.sqrt([(of_z**2 + k * K00).mean(), (of_y**2 + k * K11).mean()])
+        gain, cross = line_gain(own, mixed, k, tau)
+        effects = gain * sums + cross * sums[::-1]
+        tau = np.sqrt((effects**2 + k * gain).mean(axis=1))
     return tau
 
 
