@@ -1,6 +1,7 @@
 """``errormotion compare``: files, run folders, folders of runs, names, and error messages."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +32,20 @@ def run(tmp_path, monkeypatch):
     return call
 
 
+@pytest.fixture(scope="module")
+def brought(results, tmp_path_factory):
+    """Return a folder with the files of `ALTERED` and an empty folder."""
+    folder = tmp_path_factory.mktemp("brought")
+    (folder / "empty").mkdir()
+    for name, alter in ALTERED.items():
+        datasets.save(alter(results["drift"], results["probing"]), folder / name)
+    return folder
+
+
 @pytest.fixture
-def files(tmp_path, results):
-    for name, ds in results.items():
-        datasets.save(ds, tmp_path / f"{name}.nc")
+def files(tmp_path, brought):
+    for name in ("drift.nc", "probing.nc"):
+        shutil.copy(brought / name, tmp_path)
 
 
 def stored(folder: Path, ds, test, created=""):
@@ -198,10 +209,8 @@ ALTERED = {
         (("drift.nc", "moment.nc"), 1, "depend on different dimensions ('drift': time; 'moment': none)"),
     ],
 )
-def test_errors_state_the_expected_input(run, results, arguments, code, message):
-    Path("empty").mkdir()
-    for name in {"drift.nc", *(each for each in arguments if each.endswith(".nc"))} & set(ALTERED):
-        datasets.save(ALTERED[name](results["drift"], results["probing"]), name)
+def test_errors_state_the_expected_input(run, brought, monkeypatch, arguments, code, message):
+    monkeypatch.chdir(brought)
     result = run("compare", *arguments, code=code)
     assert message in result.stderr
     assert "Traceback" not in result.output

@@ -265,9 +265,10 @@ def _with_falloff(N: Array, b: Array, unit: Array, order: Array, group: Array, p
 def _inverse(matrix: Array) -> tuple[Array, float]:
     """Return the inverse of a positive definite matrix, scaled for accuracy, and the logarithm of its determinant."""
     scale = 1 / np.sqrt(np.diag(matrix))
-    factor = linalg.cholesky(matrix * np.outer(scale, scale) + ROUNDING * np.eye(len(matrix)), lower=True)
-    half = linalg.solve_triangular(factor, np.diag(scale), lower=True)
-    found: Array = half.T @ half
+    both = np.outer(scale, scale)
+    factor = linalg.cholesky(matrix * both + ROUNDING * np.eye(len(matrix)), lower=True, check_finite=False)
+    lower = np.tril(linalg.lapack.dpotri(factor, lower=1)[0])
+    found: Array = both * (lower + np.tril(lower, -1).T)
     return found, 2 * float(np.log(np.diag(factor) / scale).sum())
 
 
