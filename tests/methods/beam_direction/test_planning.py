@@ -148,12 +148,6 @@ def test_impossible_plans_are_refused():
 # Plans of the method
 
 
-@pytest.fixture
-def no_search(monkeypatch):
-    """Replace the best set-ups, which have no effect on the expected uncertainty of the set-up in the settings."""
-    monkeypatch.setattr(design, "optimise", lambda limits, start: design.equal_strokes(start, limits))
-
-
 def settings(**changes):
     layout = {"nominal_direction": tuple(BEAM), "triangulation_normal": (0.0, 1.0, 0.0)}
     return Settings(layout=layout | changes.pop("layout", {}), **changes)
