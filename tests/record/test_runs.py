@@ -254,17 +254,17 @@ def test_dates_without_zone_are_utc(tmp_path: Path) -> None:
     assert listing.list_runs([tmp_path], since=datetime(2026, 1, 1, 9)).runs == ()
 
 
-def test_ten_thousand_runs_are_listed_quickly(tmp_path: Path) -> None:
+def test_thousands_of_runs_are_listed_quickly(tmp_path: Path) -> None:
     first = make(tmp_path, 0) / "run.json"
-    for number in range(1, 10_000):
+    for number in range(1, 2_000):
         folder = tmp_path / f"run-{number:05}"
         folder.mkdir()
         os.link(first, folder / "run.json")
     start = time.process_time()
-    assert len(listing.list_runs([tmp_path]).runs) == 10_000
+    assert len(listing.list_runs([tmp_path]).runs) == 2_000
     without = time.process_time() - start
     start = time.process_time()
-    assert len(listing.list_runs([tmp_path]).runs) == 10_000
+    assert len(listing.list_runs([tmp_path]).runs) == 2_000
     with_index = time.process_time() - start
     print(f"without index {without:.2f} s, with index {with_index:.2f} s")
-    assert with_index < 3.0
+    assert with_index < 0.6

@@ -1,5 +1,7 @@
 """Every instrument of this distribution passes the kit."""
 
+from dataclasses import replace
+
 import pytest
 
 from errormotion import plugins
@@ -8,8 +10,12 @@ from errormotion.testing.run import checks_for, subjects_of
 
 ALONE = {"linuxcnc"}  # only one LinuxCNC can run on a computer: the tests of LinuxCNC include the kit
 OURS = [plugin.id for plugin in plugins.available("instruments") if plugin.distribution.startswith("errormotion ")]
+MUTANTS = 100  # tests/instruments/test_mutated_frames.py reads further mutants, without a session for each
 SUBJECTS = [
-    subject for plugin_id in OURS if plugin_id not in ALONE for subject in subjects_of("instruments", plugin_id)
+    replace(subject, mutants=min(subject.mutants, MUTANTS))
+    for plugin_id in OURS
+    if plugin_id not in ALONE
+    for subject in subjects_of("instruments", plugin_id)
 ]
 CASES = [
     pytest.param(subject, check, id="-".join(filter(None, [subject.plugin.info.id, subject.name, check.name])))
