@@ -41,16 +41,19 @@ class Rig:
     pose_covariance: Array | None
     lever_uncertainty: Array
 
-    def changed(self) -> list[tuple[tuple[RigidTransform, Array], tuple[RigidTransform, Array]]]:
-        """Return (pose, lever) changed by plus and by minus one standard uncertainty of each of `chain.SOURCES`."""
+    def changed(self) -> list[tuple[tuple[RigidTransform, Array], ...]]:
+        """Return (pose, lever) changed by plus and by minus one standard uncertainty of each of `chain.SOURCES`.
+
+        A source without uncertainty changes nothing: its entry is empty.
+        """
         p = calibration.parameters(self.pose)
-        out = []
+        out: list[tuple[tuple[RigidTransform, Array], ...]] = []
         for row in chain.root(self.pose_covariance):
-            up, down = (calibration.pose(*(p + sign * row)) for sign in (1, -1))
-            out.append(((up, self.lever), (down, self.lever)))
+            steps = (row, -row) if row.any() else ()
+            out.append(tuple((calibration.pose(*(p + step)), self.lever) for step in steps))
         for axis, u in enumerate(self.lever_uncertainty):
             step = u * np.eye(3)[axis]
-            out.append(((self.pose, self.lever + step), (self.pose, self.lever - step)))
+            out.append(((self.pose, self.lever + step), (self.pose, self.lever - step)) if u else ())
         return out
 
 
@@ -127,9 +130,11 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
         e[c, used], C[c, used], gain = guided.twist, guided.covariance, guided.gain
         assumed[:, used[:, None], c, used] = transform(guided.assumed.reshape(2, used.size, used.size, 6), A)
         drift[c, used] = seen[:, 6:]
+        influence[:, c, used] = 0.0
         for s, pair in enumerate(changed):
-            plus, minus = (_errors(maps, gain, *matrices) for matrices in pair)
-            influence[s, c, used] = (plus - minus) / 2
+            if pair:
+                plus, minus = (_errors(maps, gain, *matrices) for matrices in pair)
+                influence[s, c, used] = (plus - minus) / 2
     covariance = transform_covariance(C, A)
     cold = _cold_influence(covariance, found)
     names = [f"cold scan {k + 1}, part {i + 1}" for k in range(artefacts) for i in range(6)]
