@@ -112,22 +112,22 @@ class Line(Shape):
         return [self.settle(np.concatenate([middle, axes[0]]))]
 
     def residuals(self, theta: Array, q: Array) -> Array:
-        c, u = np.split(theta, 2)
+        c, u = halves(theta)
         return (q - c) @ complement(u)
 
     def gradient(self, theta: Array, q: Array) -> Array:
-        c, u = np.split(theta, 2)
+        c, u = halves(theta)
         across = np.broadcast_to(complement(u).T, (len(q), self.components, self.dimensions))
         h = ((q - c) @ u)[:, None, None]
         return np.concatenate([-across, -h * across], axis=2)
 
     def tangent(self, theta: Array) -> Array:
-        c, u = np.split(theta, 2)
+        c, u = halves(theta)
         B = complement(u)
         return np.block([[B, -np.outer(u, c @ B)], [np.zeros_like(B), B]])
 
     def settle(self, theta: Array) -> Array:
-        c, u = np.split(theta, 2)
+        c, u = halves(theta)
         u = signed(u)
         return np.concatenate([c - u * (u @ c), u])
 
@@ -146,20 +146,20 @@ class Plane(Shape):
         return [self.settle(np.concatenate([middle, axes[2]]))]
 
     def residuals(self, theta: Array, q: Array) -> Array:
-        c, u = np.split(theta, 2)
+        c, u = halves(theta)
         return ((q - c) @ u)[:, None]
 
     def gradient(self, theta: Array, q: Array) -> Array:
-        c, u = np.split(theta, 2)
+        c, u = halves(theta)
         return np.concatenate([np.broadcast_to(-u, q.shape), q - c], axis=1)[:, None, :]
 
     def tangent(self, theta: Array) -> Array:
-        c, u = np.split(theta, 2)
+        c, u = halves(theta)
         B = complement(u)
         return np.block([[u[:, None], (c @ u) * B], [np.zeros((3, 1)), B]])
 
     def settle(self, theta: Array) -> Array:
-        c, u = np.split(theta, 2)
+        c, u = halves(theta)
         u = signed(u)
         return np.concatenate([(u @ c) * u, u])
 
@@ -217,7 +217,7 @@ class Circle3D(Shape):
     def starts(self, q: Array) -> list[Array]:
         found = []
         for plane in Plane().starts(q):
-            c, u = np.split(plane, 2)
+            c, u = halves(plane)
             B = complement(u)
             found = [self.settle(np.array([*(c + B @ flat[:2]), *u, flat[2]])) for flat in Circle().starts((q - c) @ B)]
         return found
@@ -244,6 +244,12 @@ class Circle3D(Shape):
         return np.array([*theta[:3], *signed(theta[3:6]), abs(theta[6])])
 
 
+def halves(theta: Array) -> tuple[Array, Array]:
+    """Return the two vectors of equal length in a parameter vector."""
+    middle = len(theta) // 2
+    return theta[:middle], theta[middle:]
+
+
 def norms(d: Array) -> tuple[Array, Array]:
     """Return lengths, (n,), and unit vectors, (n, dimensions), of vectors; that of a zero vector is 0."""
     length = np.sqrt(np.einsum("ni,ni->n", d, d))
@@ -261,7 +267,7 @@ def complement(u: Array) -> Array:
     """Return the orthonormal complement of a unit vector as columns, (d, d - 1), by a Householder reflection."""
     v = u.copy()
     v[0] += np.copysign(1.0, u[0])
-    return (np.eye(len(u)) - np.outer(v, v) * (2 / (v @ v)))[:, 1:]
+    return (np.eye(len(u)) - v[:, None] * v * (2 / (v @ v)))[:, 1:]
 
 
 def signed(u: Array) -> Array:

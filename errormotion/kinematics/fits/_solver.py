@@ -131,9 +131,9 @@ def levenberg(
         cost = float(f @ f)
         if np.linalg.norm(_solve(R, g)) < REFINED_STEP:
             return _refined(shape, theta, q, root_weights) if refine else Solution(theta, cost, converged=True)
-        marquardt = np.maximum(np.linalg.norm(R, axis=0), 1e-6)
+        marquardt, right = np.maximum(np.sqrt((R * R).sum(axis=0)), 1e-6), np.concatenate([g, np.zeros_like(g)])
         while damping < 1e10:
-            step = _solve(np.vstack([R, np.sqrt(damping) * np.diag(marquardt)]), np.append(g, 0 * marquardt))
+            step = _solve(np.concatenate([R, np.diag(np.sqrt(damping) * marquardt)]), right)
             trial = shape.settle(theta + shape.tangent(theta) @ step)
             misses = shape.residuals(trial, q) * root_weights[:, None]
             if np.sum(misses**2) < cost:
