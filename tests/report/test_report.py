@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import json
 import re
 from html.parser import HTMLParser
 
@@ -10,6 +11,7 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import build_errors
+from errormotion.datasets.provenance import of
 from errormotion.errors import DatasetError
 from errormotion.report import provenance, write_report
 from errormotion.report.document import Source
@@ -181,8 +183,8 @@ def test_hostile_names_are_text(read, make_drift):
     assert seen.unbalanced == []
 
 
-def test_simulated_data_are_marked(read, make_drift, simulated_instruments):
-    seen = read(make_drift(300, instruments=simulated_instruments))
+def test_simulated_data_are_marked(read, beams, simulated_instruments):
+    seen = read(beams.assign_attrs(provenance=json.dumps(of(beams) | {"instruments": simulated_instruments})))
     assert "SIMULATED DATA" in seen.text
     assert "sim://cframe/frame?seed=3" in seen.text
     # The banner is the first element.
