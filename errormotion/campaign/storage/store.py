@@ -383,6 +383,8 @@ def _encode(variable: xr.Variable, packing: Mapping[str, Any]) -> np.ndarray | N
     if not packing:
         if values.dtype.kind == "U":
             return values.astype(object)
+        if values.dtype.kind in "fiu":  # needs no encoding
+            return values
         return np.asarray(encode_cf_variable(xr.Variable(variable.dims, values)).values)
     scale, offset, fill = packing["scale_factor"], packing["add_offset"], packing["_FillValue"]
     limits = np.iinfo(packing["dtype"])
