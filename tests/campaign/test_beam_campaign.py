@@ -53,7 +53,7 @@ def measured(request, tmp_path_factory):
         plan = write(
             folder,
             [(KEYENCE, OPTO)],
-            [(ORIGIN, FROM_START), (COMPENSATION, f"{COMPENSATION}\nallow_other_sensor = true")],
+            [(ORIGIN, f"{FROM_START}\naverage = 1"), (COMPENSATION, f"{COMPENSATION}\nallow_other_sensor = true")],
         )
         truth = simulation.truth_beam(machine, machine.point_sensor.from_start(20e-3))
     (run,) = runner.run(plan, runs=folder / "runs", ask=never)
