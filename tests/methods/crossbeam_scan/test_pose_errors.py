@@ -12,6 +12,7 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose import cali
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
 from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
 from errormotion.twin import VirtualMachine
+from errormotion.twin.sensors.profiler import Profiler
 
 NOMINAL = RigidTransform.from_translation([0.0, 0.0, -0.17])
 SETTINGS = Settings(profiler_pose=PoseSettings(dz=-0.17))
@@ -26,7 +27,8 @@ def identify(raw, settings=SETTINGS):
 def raws():
     """Scans of the pocket on a few machines, with those."""
     machines = [VirtualMachine("gantry", seed=seed) for seed in SEEDS]
-    return [(machine, simulation.raw_pocket(machine, seed=machine.seed)) for machine in machines]
+    profiler = Profiler(800, 50e-6)
+    return [(machine, simulation.raw_pocket(machine, seed=machine.seed, profiler=profiler)) for machine in machines]
 
 
 @pytest.fixture(scope="module")
