@@ -311,8 +311,8 @@ def test_each_rest_is_an_independent_draw_and_a_resting_reference_affects_all_ot
 
 def test_errors_of_the_smoothed_frame_temperature_are_correlated(machine, method):
     """Means over half a minute share their smoothed temperature: their difference over seeds is what is stated."""
-    t = np.arange(0, 1800.0, 2.0)
-    late, later = (t > 600) & (t <= 630), (t > 1500) & (t <= 1530)
+    t = np.arange(0, 800.0, 2.0)
+    late, later = (t > 300) & (t <= 330), (t > 700) & (t <= 730)
     weights = later / later.sum() - late / late.sum()
     found, stated = [], []
     raw = simulation.raw_drift(machine, t, seed=0, expansion=True)

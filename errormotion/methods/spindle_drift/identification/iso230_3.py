@@ -228,7 +228,8 @@ def _time_constant(time: Array, y: Array) -> float:
         return np.nan
     pick = np.unique(np.linspace(0, time.size - 1, min(time.size, 500)).astype(int))
     t, v = time[pick] - time[pick][0], y[pick]
-    total = float(np.sum((v - v.mean()) ** 2))
+    centred = v - v.mean()
+    total = float(np.sum(centred**2))
 
     def rest(log_tau: float) -> float:
         rows = np.column_stack([np.ones(t.size), -np.expm1(-t / np.exp(log_tau))])
@@ -236,7 +237,10 @@ def _time_constant(time: Array, y: Array) -> float:
 
     low, high = np.log(t[-1] / 50), np.log(t[-1])
     grid = np.linspace(low, high, 25)
-    best = int(np.argmin([rest(g) for g in grid]))
+    X = -np.expm1(-t / np.exp(grid)[:, None])
+    X -= X.mean(axis=1, keepdims=True)
+    share = X @ centred / np.sum(X**2, axis=1)
+    best = int(np.argmin(np.sum((centred - share[:, None] * X) ** 2, axis=1)))
     if best in (0, grid.size - 1) or total == 0:
         return np.nan
     from scipy.optimize import minimize_scalar
