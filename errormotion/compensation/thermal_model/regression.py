@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.linear_model import Ridge
 from sklearn.model_selection import LeaveOneGroupOut
 
 from errormotion.arrays import Array
@@ -65,11 +64,16 @@ def target(records: Sequence[Record], freedom: int) -> tuple[Array, Array]:
 
 
 def solve(X: Array, y: Array, weight: Array, strengths: Array) -> Array:
-    """Return the coefficients of weighted ridge regressions without constant, (strength, feature)."""
+    """Return the coefficients of weighted ridge regressions without constant, (strength, feature).
+
+    One singular value decomposition serves all strengths.
+    """
     use = weight > 0
-    ridge = Ridge(alpha=strengths * float(weight[use].sum()), fit_intercept=False)
-    ridge.fit(X[use], np.tile(y[use, None], strengths.size), sample_weight=weight[use])
-    return np.atleast_2d(np.asarray(ridge.coef_, dtype=float))
+    root = np.sqrt(weight[use])
+    left, size, right = np.linalg.svd(X[use] * root[:, None], full_matrices=False)
+    ridge = strengths[:, None] * float(weight[use].sum())
+    found: Array = size * (left.T @ (y[use] * root)) / (size**2 + ridge) @ right
+    return found
 
 
 def left_out_residuals(X: Array, y: Array, weight: Array, group: NDArray[np.int64]) -> Array:
