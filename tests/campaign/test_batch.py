@@ -67,8 +67,8 @@ def local_cluster(workers: int) -> LocalCluster:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[LocalCluster]:
-    """A cluster of two."""
-    with local_cluster(2) as made:
+    """A cluster of one worker, in a process of its own."""
+    with local_cluster(1) as made:
         yield made
 
 
