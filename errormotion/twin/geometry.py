@@ -129,7 +129,7 @@ class GeometricErrors:
         return reduce(mul, table, still), reduce(mul, head, still)
 
     def displacement(self, points: ArrayLike) -> Array:
-        """Return EX, EY, EZ of `twist`, (..., 3), m; hundreds of times faster for the axes X, Y and Z."""
+        """Return EX, EY, EZ of `twist`, (..., 3), m; fifty times faster for the axes X, Y and Z."""
         if self.machine.axis_names != ("X", "Y", "Z"):
             return self.twist(points)[..., :3]
         order, motions, levers, tilts = self._linear_axes
