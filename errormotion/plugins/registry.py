@@ -52,9 +52,12 @@ _REQUIRED: Mapping[Group, tuple[type[InstrumentInfo | MethodInfo | DatasetInfo],
 
 def _name_and_version(dist: Distribution | None) -> str:
     try:
-        return f"{dist.name} {dist.version}" if dist is not None else "unknown"
+        stated = None if dist is None else dist.metadata
     except (AttributeError, KeyError, OSError, TypeError):  # a distribution without readable metadata
+        stated = None
+    if stated is None or "Name" not in stated or "Version" not in stated:
         return "unknown"
+    return f"{stated['Name']} {stated['Version']}"
 
 
 def _with_plugins() -> Iterator[tuple[Distribution, str]]:

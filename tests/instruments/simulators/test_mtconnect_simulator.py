@@ -51,7 +51,7 @@ class Client:
         """Return status, code and text of a refused request."""
         status, document = self.get(target, **query)
         assert document.tag == "MTConnectError"
-        (error,) = document.find("Errors") or ()
+        (error,) = document.iterfind("Errors/")
         return status, error.attrib["errorCode"], error.findtext("ErrorMessage") or error.text or ""
 
 
