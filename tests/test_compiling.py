@@ -49,6 +49,7 @@ def run(folder, where):
     return done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_the_terminal_shows_one_line_while_loops_are_compiled_and_none_once_they_are_cached(tmp_path):
     line = "Compiling the loops of a test, once: about 3 s\n"
     assert run(tmp_path, "terminal") == ("7.0\n9.0\n", line)

@@ -101,6 +101,7 @@ def test_a_batch_returns_the_results_of_the_method(reference: list[Outcome], raw
     assert errors.attrs["provenance"] == direct.attrs["provenance"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
 def test_threads_and_processes_return_identical_results(
     reference: list[Outcome], identify: Identify, scheduler: str

@@ -110,6 +110,7 @@ def test_a_calibration_that_is_deleted_after_reading_of_the_campaign_ends_the_te
     assert not (folder / "raw.zarr").exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_campaign_continues_with_the_remaining_faces(tmp_path, monkeypatch):
     plan = write(tmp_path / "lab")
     acquire = BeamDirection.acquire

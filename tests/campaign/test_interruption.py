@@ -56,6 +56,7 @@ def held(folder: RunFolder) -> int:
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)  # two processes start: a minute each where six others want the processors
 def test_kill_9_loses_at_most_the_last_second_and_resume_continues(
     tmp_path: Path, write: Callable[..., Path], command: Start, lab: None, pace: Path, bench: str

@@ -219,6 +219,7 @@ def test_the_log_of_a_monitor_is_no_campaign_to_resume(tmp_path: Path) -> None:
         runner.resume(runs=tmp_path)
 
 
+@pytest.mark.slow
 def test_the_memory_of_a_long_log_is_constant(tmp_path: Path) -> None:
     """Six hundred rows instead of two hundred: memory that grows with the rows would be three times as large."""
     with Monitor(bench(CONTROL), tmp_path, 1e-3) as monitor:

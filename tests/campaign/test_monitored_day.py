@@ -13,6 +13,7 @@ from errormotion.campaign.monitor import sources
 MINUTES = 8
 
 
+@pytest.mark.slow
 def test_every_gap_is_marked_and_no_sample_is_repeated(tmp_path: Path) -> None:
     folder, day = watch(tmp_path, MINUTES / 60, 30.0, seed=2)
     assert not day.errors

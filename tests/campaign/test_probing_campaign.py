@@ -310,6 +310,7 @@ def test_a_thermometer_without_answer_for_a_cycle_leaves_a_gap(lab: Lab, monkeyp
 # ---------------------------------------------------------------------- going on
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("driver", ["controller_probe", "dprnt"])
 def test_an_interrupted_run_has_the_data_of_an_uninterrupted_one(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, driver: str
@@ -335,6 +336,7 @@ def test_an_interrupted_run_has_the_data_of_an_uninterrupted_one(
         np.testing.assert_array_equal(raw[name].values, whole_values.values, err_msg=str(name))
 
 
+@pytest.mark.slow
 def test_a_killed_process_loses_only_its_present_cycle(lab: Lab, command: Callable[..., Any]) -> None:
     plan, runs = lab(minutes=100)
     process = command("run", plan.folder / "campaign.toml", "--runs", runs, "--no-report")

@@ -132,6 +132,7 @@ class PowerCutError(Exception):
     """The process ends here."""
 
 
+@pytest.mark.slow
 def test_after_any_last_write_readers_see_complete_samples_and_writing_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

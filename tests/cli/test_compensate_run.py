@@ -91,6 +91,7 @@ def test_the_name_of_the_machine_must_be_right(place: Path) -> None:
     assert "the machine of bench.toml is 'Mill 5'. Nothing was written." in result.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signals", [1, 2], ids=["once", "twice"])
 def test_ctrl_c_ramps_to_zero_a_second_one_ends_at_once(place: Path, signals: int) -> None:
     text = BENCH.replace('slew = "20 um/s"', f'slew = "{20 if signals == 1 else 0.01} um/s"')

@@ -26,6 +26,7 @@ def short_campaign(measured: tuple[Path, list[RunFolder]], monkeypatch: pytest.M
     monkeypatch.setattr(demonstration, "work", lambda *_, **__: folders)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_campaign")
 def test_the_demo_prints_results_and_true_values(run: Callable[..., Result], tmp_path: Path) -> None:
     found = json.loads(run("demo", "--json").stdout)

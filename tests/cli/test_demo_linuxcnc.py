@@ -37,6 +37,7 @@ def short_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_campaign")
 @pytest.mark.timeout(500)
 def test_linuxcnc_probes_the_balls_of_the_twin(run: Callable[..., Result], tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ def run(*arguments: str):
     return CliRunner().invoke(app, list(arguments))
 
 
+@pytest.mark.slow
 def test_a_check_writes_its_page_and_prints_the_path(folder: Path) -> None:
     reported = run("model", "check", "m.nc", "third.nc", "--report", "page.html")
     assert reported.exit_code == 0, reported.output

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from errormotion import datasets
 
 ROOT = Path(__file__).parents[2]
@@ -9,6 +11,7 @@ BEAM = ROOT / "examples" / "virtual_beam" / "campaign.toml"
 GANTRY = ROOT / "examples" / "virtual_gantry" / "campaign.toml"
 
 
+@pytest.mark.slow
 def test_a_plan_states_expected_uncertainties_and_possible_improvements(run, tmp_path):
     shown = run("plan", BEAM, "--out", tmp_path / "plan.nc").stdout
     assert "beam (beam_direction):" in shown

@@ -79,6 +79,7 @@ def both_ways(ds):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_freedom_unknown_to_one_dataset_is_omitted(run, files, results):
     datasets.save(without(results["probing"], "EX", "EA", "EB"), "blind.nc")
     run("compare", "drift.nc", "blind.nc", "--out", "c.nc")

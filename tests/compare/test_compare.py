@@ -165,6 +165,7 @@ def test_a_simulated_error_is_detected_and_named(name):
     assert first >= 4, found["cause"].values[0].tolist()
 
 
+@pytest.mark.slow
 def test_the_size_of_a_mistake_is_estimated_with_its_uncertainty():
     rng = np.random.default_rng(6)
     inside = 0

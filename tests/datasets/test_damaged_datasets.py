@@ -60,6 +60,7 @@ def test_damaged_raw_datasets(tmp_path: Path) -> None:
 NUMBERS = (np.nan, np.inf, -1e308, 1e-320, 0.0, -1.0, 1e30)
 
 
+@pytest.mark.slow
 def test_calibrations_with_other_numbers(tmp_path: Path) -> None:
     path = tmp_path / "calibration.nc"
     path.write_bytes(CALIBRATION.read_bytes())

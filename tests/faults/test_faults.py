@@ -59,6 +59,7 @@ def test_jumps_and_orders_that_are_not_in_the_audit_log_are_found(tmp_path: Path
     assert len(fault_compensation._audited(tmp_path, steps)) == len(steps)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_run_on_a_full_disk_ends_with_a_sentence_and_finishes_with_space(
     tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch

@@ -99,6 +99,7 @@ def test_netcdf_height_maps_that_were_cut_off(tmp_path: Path) -> None:
     assert refused > 50
 
 
+@pytest.mark.slow
 def test_netcdf_height_maps_with_other_content(tmp_path: Path) -> None:
     heights = np.arange(12.0).reshape(3, 4)
     good = b"um"

@@ -157,6 +157,7 @@ def test_a_measurement_that_another_implementation_encodes_is_read(measuring_por
     assert found.refraction_index == 1.00027
 
 
+@pytest.mark.slow
 def test_a_foreign_client_measures_with_the_simulator() -> None:
     device = SimulatedEmScon(
         parse_address("sim://cframe/tracker?seed=3&tracker=AT4xx&noise=0&angle_noise=0&dead_path=0")

@@ -143,6 +143,7 @@ def test_any_grid_with_a_few_holes_is_found_again(shape: tuple[int, int], ratio:
     assert rows == pytest.approx(y)
 
 
+@pytest.mark.slow
 def test_parallel_kernels_start_without_a_warning_after_a_cloud_was_read(tmp_path: Path) -> None:
     path = write_cloud(tmp_path / "scan.ply", (1e3 * points()).astype("f4"))
     program = f"""

@@ -52,6 +52,7 @@ def test_it_passes_every_check_of_the_kit():
     assert not any(result.skipped for result in results)
 
 
+@pytest.mark.slow
 def test_its_own_test_passes():
     arguments = ["-q", "-c", "pyproject.toml", "--rootdir", ".", "-p", "no:cacheprovider", "tests"]
     done = subprocess.run(

@@ -121,6 +121,7 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return run
 
 
+@pytest.mark.slow
 def test_the_step_is_named_by_the_note_between_its_runs(lab: Path, call: Callable[..., Any]) -> None:
     found = call(lab, "--figure", "EZ after 60 min", "--json")
     (step,) = found["steps"]

@@ -215,6 +215,7 @@ def test_an_unusable_node_is_named(control: Control) -> None:
             compensator.write(OFFSET)
 
 
+@pytest.mark.slow
 def test_a_server_that_is_restarted_is_found_again() -> None:
     control = Control()
     try:

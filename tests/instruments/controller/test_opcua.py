@@ -149,6 +149,7 @@ def own():
         cnc.close()
 
 
+@pytest.mark.slow
 def test_the_cnc_model_is_found_and_read_in_the_units_of_the_server(shared):
     with OpcUa(shared(cnc_model).url) as cnc:
         identity, state = cnc.identify(), cnc.state()
@@ -166,6 +167,7 @@ def test_the_cnc_model_is_found_and_read_in_the_units_of_the_server(shared):
     assert state["position_time"] <= state["time"]
 
 
+@pytest.mark.slow
 def test_a_value_with_a_bad_status_is_unknown_and_named(own):
     server = own(cnc_model)
     with OpcUa(server.url) as cnc:
@@ -285,6 +287,7 @@ def test_a_node_that_does_not_exist_is_refused_by_its_key(shared):
         OpcUa(shared(plain_nodes).url, OpcUaSettings(nodes=NODES | {"program": "nonsense"}, units=UNITS)).open()
 
 
+@pytest.mark.slow
 def test_a_server_that_was_restarted_is_read_again(own):
     server = own(cnc_model)
     with OpcUa(server.url, OpcUaSettings(timeout=2.0)) as cnc:

@@ -53,6 +53,7 @@ def test_the_published_model_is_read_with_its_units(server):
     assert state["unavailable"] == ["estop"]
 
 
+@pytest.mark.slow
 def test_two_sessions_one_after_the_other(server):
     found = []
     for _ in range(2):

@@ -18,6 +18,7 @@ pytestmark = pytest.mark.skipif(not INSTALLED, reason="needs Node.js and 'npm ci
 CHANNEL, SPINDLE = "CncInterface/CncChannelList/Channel1", "CncInterface/CncSpindleList/S1"
 
 
+@pytest.mark.slow
 def test_a_foreign_client_finds_the_model_reads_it_and_writes_nothing():
     paths = {
         "CncInterface/VendorName": "errormotion",

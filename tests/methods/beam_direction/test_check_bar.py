@@ -73,6 +73,7 @@ def test_laser_at_reading_0_and_touch_probe_have_no_systematic_residual() -> Non
     assert published("scheme3").notes == ()
 
 
+@pytest.mark.slow
 def test_clean_bars_cause_few_false_alarms_and_intervals_cover_the_true_value() -> None:
     # Noise of 1 um at each point: each alarm is set to 1 %, and more than 6 of 150 come once in 1000 then. Of 95 %
     # intervals 150 cover between 133 and 150 times, but for one case in 1000.

@@ -220,6 +220,7 @@ def calibration(tmp_path_factory):
     return calibrate(raw, CalibrationSettings()).save(tmp_path_factory.mktemp("lab") / "sensor.nc")
 
 
+@pytest.mark.slow
 def test_the_best_planes_are_those_that_the_calibration_covers(calibration):
     ds = BeamDirection().plan(settings(compensation=str(calibration)))
     best = design.plane_normals(np.stack([ds["best_inclination"], ds["best_rotation"]], axis=-1))

@@ -373,6 +373,7 @@ def extras_of(errors):
     return sorted(set(errors.data_vars) - {"covariance", *DOF})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [slice(i, None, 8) for i in range(8)] + [slice(None)])
 def test_whatever_extra_is_missing_the_rest_is_reported(page, part):
     errors = result()

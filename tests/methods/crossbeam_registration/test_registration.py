@@ -63,6 +63,7 @@ def test_pose_is_how_the_profiler_moved(scanner, freedom):
     assert found.twist[freedom] / found.sigma[freedom] > 100
 
 
+@pytest.mark.slow
 def test_errors_are_at_the_bound_and_the_covariance_says_so(scanner):
     results = [found for family in (7, 11) for found in pairs(scanner, TWIST, 60, family=family)]
     bound = scanner.bound()
@@ -157,6 +158,7 @@ def blobs_missing(rng, z):
     return z
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoil", [outliers, speckles_missing, blobs_missing])
 def test_dirt_costs_little(scanner, spoil):
     results = list(pairs(scanner, TWIST, 10, spoil=spoil))

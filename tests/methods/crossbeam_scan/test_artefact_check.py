@@ -81,6 +81,7 @@ def clean(raw):
     return {strain: identify(raw, strain=strain) for strain in ("free", "guided")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strain", ["free", "guided"])
 def test_no_artefact_is_reported_if_none_moved(strain, clean):
     ds = clean[strain]

@@ -88,6 +88,7 @@ def test_perfect_scans_give_the_pose(scan_pocket, truth):
     assert found.matrix == pytest.approx(calibration.pose(*truth).as_matrix(), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_truth_lies_within_the_stated_uncertainty(scan_pocket, truth):
     misses, squares = [], []
     for seed in range(28):

@@ -136,6 +136,7 @@ def test_values_at_two_times_share_the_cold_scan(gantry, rig):
     assert apart < 0.7
 
 
+@pytest.mark.slow
 def test_values_at_two_positions_share_pose_and_lever(gantry, rig):
     shared, _ = difference(gantry, rig, (2, 0), (2, 3), true_maps(gantry.crossbeam), 1e-6 * COVARIANCE)
     assert shared == pytest.approx(1, abs=0.16)

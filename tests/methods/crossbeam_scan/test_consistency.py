@@ -107,6 +107,7 @@ def test_artefact_at_the_end_is_found_by_a_greater_step(artefact, size, freedom)
     assert moved(CYCLES, PLACES, errors, C) == [(artefact, 5)]
 
 
+@pytest.mark.slow
 def test_step_is_measured_with_its_covariance():
     jump = np.array([3e-6, -2e-6, 1e-6, 15e-6, -5e-6, 10e-6])
     score = []

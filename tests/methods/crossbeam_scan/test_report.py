@@ -220,6 +220,7 @@ def table(html, caption):
     return [[words_of(cell) for cell in re.findall(r"<t[hd].*?</t[hd]>", row, flags=re.DOTALL)] for row in rows]
 
 
+@pytest.mark.slow
 def test_the_chapter_has_its_sections(html):
     for name in ("summary", "errors", "registration", "setup", "stability", "uncertainty", "quality", "provenance"):
         assert f'id="{name}-1"' in html
@@ -430,6 +431,7 @@ def test_pose_of_the_profiler_has_a_separate_chapter(page):
     assert correlation["a"][4] == "0.60"
 
 
+@pytest.mark.slow
 def test_an_error_that_is_the_same_everywhere_is_drawn_without_a_warning(page, small):
     errors = small.assign(EX=0 * small["EX"], EB=0 * small["EB"] + 1e-6)
     assert "largest EXY 0.000 µm" in words_of(page(errors))

@@ -180,6 +180,7 @@ def coverage(seeds, smoothed):
     return np.mean(inside, axis=0)
 
 
+@pytest.mark.slow
 def test_band_between_the_positions_contains_the_truth():
     between = PLACES[:-1, None] + [0.05, 0.1, 0.15]
 
@@ -197,6 +198,7 @@ def test_band_between_the_positions_contains_the_truth():
     assert (found < 0.985).all()
 
 
+@pytest.mark.slow
 def test_band_between_the_cycles_contains_the_truth_with_a_shared_cold_scan():
     moments = 60.0 * np.array([2, 5, 10, 22, 37, 52, 75, 105, 135, 165])
     root = np.linalg.cholesky(COVARIANCE / 2).T  # of the cold scan's half of the noise

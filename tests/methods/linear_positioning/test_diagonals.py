@@ -87,6 +87,7 @@ def test_body_diagonals_do_not_separate_scale_and_squareness():
     assert any("do not separate" in note for note in seen[0].em.notes)
 
 
+@pytest.mark.slow
 def test_coverage_of_deviations_squareness_and_figures():
     """48 machines: coverage of 95 % intervals; with n = 8 runs a known drift is stated larger by sqrt(7 / 5)."""
     settings = along(("PP0", "NP0", "P0P", "N0P", "PPP"), runs=8)

@@ -109,6 +109,7 @@ def test_a_target_at_a_station_and_extreme_noise_are_refused():
         bound(u, np.where(GOOD[0, 0] == GOOD, np.nan, GOOD))
 
 
+@pytest.mark.slow
 def test_any_stations_result_in_a_network_or_a_method_error():
     rng, refused = np.random.default_rng(0), 0
     for k in range(60):

@@ -42,6 +42,7 @@ def brute(low, high, sight=OPEN, points=7):
     return min(largest(np.vstack([place, FIXED]), sight) for place in places)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("low", [LOW, (-0.4, -0.4, 0.1)])
 def test_no_position_on_a_grid_is_better(low):
     found = best(low)
@@ -51,6 +52,7 @@ def test_no_position_on_a_grid_is_better(low):
     assert largest(found) <= brute(low, HIGH) * (1 + 1e-6)
 
 
+@pytest.mark.slow
 def test_a_search_is_reproducible():
     np.testing.assert_array_equal(layout.optimise(CUBE, one_free(LOW, HIGH), OPEN, noise=1e-6), best())
 

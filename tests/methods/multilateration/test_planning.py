@@ -34,6 +34,7 @@ def ds():
     return planned()
 
 
+@pytest.mark.slow
 def test_a_plan_is_an_error_dataset_of_zeros_that_conforms_to_the_schema(ds):
     datasets.validate(ds)
     for name in ("EX", "EY", "EZ"):
@@ -106,6 +107,7 @@ def test_without_freedom_the_best_layout_is_that_of_the_settings():
     assert "No better layout was found within the boxes." in ds.attrs["notes"]
 
 
+@pytest.mark.slow
 def test_blocked_lines_of_sight_and_undetermined_targets_are_counted():
     # A pillar close to one target hides it from the three stations that stand together, two of which may move.
     pillar = Box(low=(-0.13, -0.02, 0.08), high=(-0.12, 0.02, 0.12))

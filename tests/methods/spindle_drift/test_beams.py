@@ -46,6 +46,7 @@ def test_jacobian_is_that_of_finite_differences():
         np.testing.assert_allclose(jacobian[..., 3 + k], numeric, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_spread_meets_the_bound_and_the_stated_covariance():
     rng = np.random.default_rng(2)
     seeds = 150

@@ -39,6 +39,7 @@ def truth_of(machine, errors):
     return (twist - twist[0])[:, SEEN]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_paper")
 def test_stated_intervals_contain_the_truth_and_the_joint_covariance_is_right(machine, method):
     seeds, inside, joint, slopes = 60, [], [], []

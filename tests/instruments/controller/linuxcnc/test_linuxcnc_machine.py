@@ -505,6 +505,7 @@ def test_another_machine_is_refused_while_one_runs(machine: LinuxCNC) -> None:
     assert machine.state()["enabled"]
 
 
+@pytest.mark.slow
 def test_an_ini_file_in_inches_switched_on_and_homed_manually_and_no_process_left() -> None:
     with LinuxCNC("sim://cframe/linuxcnc?seed=3&unit=inch&ready=0&linger=0", ARMED) as machine:
         (control,) = [each for each in linuxcnc._controls.values() if each.process.running]
