@@ -28,6 +28,7 @@ def test_the_optoncdt_is_among_them():
     assert "optoncdt" in OURS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("subject", "check"), CASES)
 def test_passes(subject, check):
     result = run_check(check, subject)

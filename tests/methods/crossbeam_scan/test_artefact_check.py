@@ -91,6 +91,7 @@ def test_no_artefact_is_reported_if_none_moved(strain, clean):
     assert not named(ds, "cold scan and its repetition")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("artefact", "since", "step"),
     [

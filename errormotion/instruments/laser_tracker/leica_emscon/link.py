@@ -159,7 +159,10 @@ class Link:
             time.sleep(BUSY_INTERVAL)
         yield packet
         for _ in range(total(packet) - 1):
-            yield self._answer(number, allowed)
+            packet = self._answer(number, allowed)
+            if packet.kind == ERROR or packet.status != statuses.OK:
+                raise self._refusal(number, packet.status)
+            yield packet
 
     def _resynchronise(self) -> None:
         """Exchange a marker, and ignore what arrives before its answer.
