@@ -19,6 +19,7 @@ from errormotion.instruments.laser_tracker.leica_emscon import EmSconSettings, L
 SETTINGS = EmSconSettings(timeout=0.3, measuring_time=0.1, busy_timeout=2.0)
 STATUS, SET_UNITS, GET_UNITS, SET_KIND, GET_KIND, GET_AIR, GET_INDEX = 1, 5, 6, 26, 27, 21, 23
 SET_SYSTEM, GET_SYSTEM, START, SET_CONTINUOUS = 47, 48, 49, 30
+NAME_BYTES = 64  # 32 wide characters
 
 
 class HeaderServer:
@@ -176,6 +177,19 @@ def test_a_server_that_stays_silent_gives_typed_errors(server: HeaderServer) -> 
         for _ in range(6):
             with pytest.raises(InstrumentError):
                 tracker.environment()
+
+
+def test_a_refused_part_of_an_answer_is_an_error(server: HeaderServer) -> None:
+    reflector = struct.pack("<iiId", 2, 1, 1, 0.0) + bytes(NAME_BYTES)
+
+    def two_parts(number: int, parameters: bytes) -> None:
+        server.send(0, struct.pack("<II", number, 0) + reflector)
+        server.send(0, struct.pack("<II", number, 3))
+
+    with LeicaEmScon(server.url, SETTINGS) as tracker:
+        server._obey = two_parts  # type: ignore[method-assign]
+        with pytest.raises(InstrumentError, match="GetReflectors"):
+            tracker.reflectors()
 
 
 @pytest.mark.parametrize(
