@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.kinematics.twists import cross_matrix
+from errormotion.kinematics.twists import cross, cross_matrix
 
 __all__ = [
     "across",
@@ -41,15 +41,9 @@ _PARALLEL_SINE = 1e-6
 
 def across(direction: Array) -> Array:
     """Return two unit vectors (2, 3) that span the plane perpendicular to a direction (3,)."""
-    first = _cross(direction, _AXES[np.argmin(np.abs(direction))])
+    first = cross(direction, _AXES[np.argmin(np.abs(direction))])
     first /= np.linalg.norm(first)
-    return np.stack([first, _cross(direction, first)])
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return the cross product of two vectors (3,), in a fifth of the time of ``np.cross``."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    return np.stack([first, cross(direction, first)])
 
 
 def turned(direction: Array, angles: Array) -> Array:

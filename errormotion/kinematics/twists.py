@@ -23,6 +23,16 @@ __all__ = ["adjoint", "cross_matrix", "known_product", "move", "to_frame", "tran
 ROUNDING_OF_ROTATION = 1e-15
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Return the vector products of (..., 3) and (..., 3), as `np.cross`; several times faster for few vectors."""
+    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
+    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
+    x = a1 * b2 - a2 * b1
+    out = np.empty((*x.shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = x, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    return out
+
+
 def cross_matrix(v: ArrayLike) -> Array:
     """Return the matrix of the cross product: ``cross_matrix(v) @ w`` is ``v x w``.
 

@@ -23,6 +23,7 @@ def test_every_gap_is_marked_and_no_sample_is_repeated(tmp_path: Path) -> None:
     descriptors = [each.descriptors for each in day.resources]
     half = len(descriptors) // 2  # connections that are made anew come and go; what is lost stays
     assert min(descriptors[half:]) <= max(descriptors[:half])
+    assert day.end >= MINUTES * FAULT_INTERVAL - INTERVAL
     with datasets.load(folder.raw) as log:  # a busy computer is late by seconds, which are thirty times as long here
         assert np.diff([*log.time.values, MINUTES * FAULT_INTERVAL]).max() < 100 * INTERVAL
 

@@ -88,6 +88,7 @@ class Day:
 
     rows: int = 0
     duration: float = 0.0
+    end: float = 0.0
     seconds: float = 0.0
     speed: float = 0.0
     faults: Counter[str] = field(default_factory=Counter)
@@ -174,6 +175,7 @@ def watch(runs: Path, hours: float, speed: float, seed: int = 1) -> tuple[RunFol
                 if last.time >= due:
                     choice(start)
                     due = last.time + FAULT_INTERVAL
+            day.end = clock.now() - start
         day.duration, day.seconds = last.time, time.monotonic() - began
         day.disturbances = choice.made
         day.faults = Counter(each.kind for each in choice.made)

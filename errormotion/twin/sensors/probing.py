@@ -19,9 +19,10 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
+from errormotion.kinematics.twists import cross
 from errormotion.twin import kernels, truth
 from errormotion.twin.artefacts.balls import Balls, Probe, seeded_balls, seeded_probe
-from errormotion.twin.geometry import GeometricErrors, cross
+from errormotion.twin.geometry import GeometricErrors
 from errormotion.twin.heat.state import ThermalState
 
 ErrorAt = Callable[[Array], Array]

@@ -90,7 +90,7 @@ def test_the_lobes_are_found_and_nothing_else_without_noise() -> None:
 
 
 def test_map_contains_the_truth_as_often_as_stated() -> None:
-    seeds = 100
+    seeds = 200
     deviation = np.empty((seeds, 200))
     highest = []
     for seed in range(seeds):
