@@ -3,6 +3,7 @@ import io
 import json
 import os
 import shutil
+import time
 import warnings
 from pathlib import Path
 
@@ -229,6 +230,21 @@ def test_a_limit_of_the_system_is_reported(errors, tmp_path) -> None:
                 save(big, tmp_path / name)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert names(tmp_path) == []
+
+
+def test_chunks_written_after_a_failed_one_do_not_create_the_folder_again(tmp_path) -> None:
+    resource = pytest.importorskip("resource", reason="limits of a process are a matter of Unix")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    values = np.zeros((4000, 2000))
+    values[:600] = np.random.default_rng(0).standard_normal((600, 2000))  # the other chunks are small enough
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
+    try:
+        with pytest.raises(DatasetError, match="larger than allowed"):
+            save(xr.Dataset({"values": (("x", "y"), values)}), tmp_path / "raw.zarr")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    time.sleep(0.2)
     assert names(tmp_path) == []
 
 

@@ -115,8 +115,9 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
     with writing(path, part):
         if path.suffix == ".zarr":
-            # xarray's overloads do not know the type of a plain path together with zarr_format
-            storable(ds).to_zarr(part, mode="w-", zarr_format=3, consolidated=False)
+            from errormotion.datasets.storage.folder_store import FolderStore  # loads zarr
+
+            storable(ds).to_zarr(FolderStore(part), mode="w-", zarr_format=3, consolidated=False)
         else:
             # Composed in memory, since HDF5 crashes the process if the disk is full while a file is open.
             ready = storable(ds)
