@@ -64,11 +64,13 @@ class WithResult:
 """
 
 CLIENT = """
-import logging, sys
+import logging, sys, time
 from CESAPI.command import CommandSync
-from CESAPI.connection import Connection
+from CESAPI.connection import Connection, PacketStream
 from CESAPI.packet import ES_CS_SCC, ES_LU_Millimeter, SystemUnitsDataT
 logging.disable(logging.CRITICAL)
+unread = PacketStream.unreadCount  # asked without a pause while an answer is awaited
+PacketStream.unreadCount = lambda stream: unread(stream) or time.sleep(0.005) or 0
 connection = Connection()
 connection.connect(host="127.0.0.1", port=int(sys.argv[1]))
 command = CommandSync(connection)

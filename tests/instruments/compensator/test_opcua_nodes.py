@@ -17,6 +17,7 @@ from asyncua import Server, ua
 from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator import opcua_nodes
 from errormotion.instruments.compensator.opcua_nodes import OpcUaNodes, OpcUaNodesSettings
+from errormotion.instruments.simulators.controller.opcua.space import SmallServer
 from errormotion.instruments.transports.opc import Credentials
 
 LIMIT = 50e-6
@@ -27,9 +28,10 @@ GIVEN: dict[str, Any] = {"offset": (X, Y, Z), "heartbeat": BEAT, "timeout": 5.0}
 
 
 class Control:
-    """A server in its own thread."""
+    """A server in its own thread: with all its standard nodes, or with those of a small server."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, small: bool = False) -> None:
+        self._small = small
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
@@ -43,7 +45,7 @@ class Control:
         self.run(self._start())
 
     async def _start(self) -> None:
-        self.server = Server()
+        self.server = Server(SmallServer() if self._small else None)
         await self.server.init()
         self.server.iserver.disabled_clock = True
         self.server.set_endpoint(f"opc.tcp://127.0.0.1:{self.port}/plc")
@@ -217,7 +219,7 @@ def test_an_unusable_node_is_named(control: Control) -> None:
 
 @pytest.mark.slow
 def test_a_server_that_is_restarted_is_found_again() -> None:
-    control = Control()
+    control = Control(small=True)
     try:
         with made(control, timeout=2.0) as compensator:
             compensator.arm(LIMIT)

@@ -14,21 +14,26 @@ from asyncua import Server, ua
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.controller.opcua import OpcUa, OpcUaSettings
+from errormotion.instruments.simulators.controller.opcua.space import SmallServer
 
 CNC = "http://opcfoundation.org/UA/CNC"
 MM, RPM, PERCENT, MM_MIN = ("MMT", "mm"), ("RPM", "r/min"), ("P1", "%"), ("H81", "mm/min")
 
 
 class Cnc:
-    """A server on a free port, in its own thread; ``build`` adds its nodes."""
+    """A server on a free port, in its own thread; ``build`` adds its nodes.
 
-    def __init__(self, build):
+    The 6000 nodes of ``standard`` take more than a second; a small server has those that its clients use.
+    """
+
+    def __init__(self, build, *, standard=False):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.url = f"opc.tcp://127.0.0.1:{self.port}/cnc"
         self.nodes = {}
         self._build = build
+        self._standard = standard
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
@@ -38,7 +43,7 @@ class Cnc:
         self.run(self._start())
 
     async def _start(self):
-        self.server = Server()
+        self.server = Server(None if self._standard else SmallServer())
         await self.server.init()
         self.server.set_endpoint(self.url)
         self.server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
@@ -130,7 +135,7 @@ async def plain_nodes(cnc):
 @pytest.fixture(scope="module", autouse=True)
 def shared():
     """Servers shared by tests that only read; tests that stop or change a server use their own."""
-    made = {build: Cnc(build) for build in (cnc_model, two_spindles, plain_nodes)}
+    made = {build: Cnc(build, standard=build is cnc_model) for build in (cnc_model, two_spindles, plain_nodes)}
     yield made.__getitem__
     for cnc in made.values():
         cnc.close()

@@ -512,11 +512,13 @@ def test_coordinates_that_it_cannot_transform_are_refused_and_not_ignored(made: 
 # ------------------------------------------------------------------ a foreign client
 
 CLIENT = """
-import logging, sys
+import logging, sys, time
 from CESAPI.command import CommandSync
-from CESAPI.connection import Connection
+from CESAPI.connection import Connection, PacketStream
 from CESAPI.packet import *
 logging.disable(logging.CRITICAL)
+unread = PacketStream.unreadCount  # asked without a pause while an answer is awaited
+PacketStream.unreadCount = lambda stream: unread(stream) or time.sleep(0.005) or 0
 connection = Connection()
 connection.connect(host="127.0.0.1", port=int(sys.argv[1]))
 command = CommandSync(connection)
