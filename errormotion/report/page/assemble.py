@@ -11,7 +11,7 @@ from functools import cache
 from hashlib import sha256
 from importlib.resources import files
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context
 from markupsafe import Markup
 
 import errormotion
@@ -64,6 +64,7 @@ def page(
     shown = {
         "title": t.word(title) or f"{machine}: {body[0].title}",
         "heading": t.word(title) or body[0].title,
+        "t": t,
         "language": t.language,
         "head": head,
         "facts": [(name, t(name), t.word(fact) if name in _COMPOSED else fact) for name, fact in found],
@@ -88,7 +89,7 @@ def page(
     tables += [(section.title, table) for part in body for section in part.sections for table in _tables(section)]
     tables += [(t("Limits"), decision.table)] if decision else []
     tables += [(section.title, table) for section in appended for table in _tables(section)]
-    return Page(_templates(t).get_template("report.html.j2").render(shown), tables)
+    return Page(_templates().get_template("report.html.j2").render(shown), tables)
 
 
 def _translated(decision: Verdict | None, t: Catalogue) -> Verdict | None:
@@ -107,7 +108,9 @@ def _tables(section: Section) -> list[Table]:
     return [block for block in section.blocks if isinstance(block, Table)]
 
 
-def _templates(t: Catalogue) -> Environment:
+@cache
+def _templates() -> Environment:
+    """Return the compiled templates, which take the catalogue ``t`` from what they show."""
     templates = Environment(
         loader=PackageLoader("errormotion.report.page"),
         autoescape=True,
@@ -117,7 +120,7 @@ def _templates(t: Catalogue) -> Environment:
     )
     templates.tests["table"] = lambda block: isinstance(block, Table)
     templates.tests["cell"] = lambda value: isinstance(value, Cell)
-    templates.filters["t"] = t
+    templates.filters["t"] = pass_context(lambda context, text: context["t"](text))
     templates.filters["kind"] = lambda block: type(block).__name__.lower()
     return templates
 
