@@ -73,7 +73,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """Leave modules and tests out of every search for garbage: they stay, and a search through them takes 0.5 s."""
-    gc.collect()
     gc.freeze()
     gc.enable()
 
