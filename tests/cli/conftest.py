@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from typer.testing import CliRunner, Result
+from command_line import CliRunner, Result
 
 from errormotion import datasets
 from errormotion.cli.app import app

@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import pytest
 import xarray as xr
-from typer.testing import Result
+from command_line import Result
 
 from errormotion import datasets, plugins
 from errormotion.plugins.contracts import Status

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import CliRunner
 
 from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import load_bench

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from command_line import Result
 from short_demonstration import measure
-from typer.testing import Result
 
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.demo import spindle as demonstration

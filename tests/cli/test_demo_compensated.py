@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import Result
+from command_line import Result
 
 from errormotion.campaign.files import load_campaign
 from errormotion.cli.demo import closed_loop, compensated, compensated_probing

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import Result
+from command_line import Result
 
 from errormotion.cli.demo import probing as probing_demonstration
 from errormotion.instruments.simulators.controller import linuxcnc, linuxcnc_process

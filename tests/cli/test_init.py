@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import Result
+from command_line import Result
 
 from errormotion.campaign.files import load_bench, load_campaign
 from errormotion.cli.commands.campaigns.init import command

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from command_line import CliRunner
 from rich.console import Console
-from typer.testing import CliRunner
 
 from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.monitor.watch import Monitor, Snapshot

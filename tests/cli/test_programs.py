@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import Result
+from command_line import Result
 
 ROOT = Path(__file__).parents[2]
 GANTRY = ROOT / "examples" / "virtual_gantry" / "campaign.toml"

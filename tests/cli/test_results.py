@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import xarray as xr
-from typer.testing import Result
+from command_line import Result
 
 from errormotion import datasets
 from errormotion.datasets import provenance

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from command_line import CliRunner
 
 from errormotion.cli.app import app
 from errormotion.cli.commands.plugins.new import id_of

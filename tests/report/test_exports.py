@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 from zipfile import ZipFile
 
 import pytest
-from typer.testing import CliRunner
+from command_line import CliRunner
 
 from errormotion.cli.app import app
 from errormotion.datasets import save

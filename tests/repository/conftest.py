@@ -26,11 +26,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import CliRunner
 from sybil import Document, Example
 from sybil.parsers.myst import CodeBlockParser, PythonCodeBlockParser, SkipParser
 from sybil.parsers.myst.lexers import DirectiveLexer
 from sybil.region import Region
-from typer.testing import CliRunner
 
 from errormotion.cli.app import app
 from errormotion.instruments import simulators
