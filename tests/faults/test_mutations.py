@@ -33,7 +33,7 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> list[Kind]:
     library = Library(tmp_path_factory.mktemp("good"))
     made = [*file_kinds.texts(library), *file_kinds.results(library)]
     source, _, commands = made[-1].cases[0]
-    for words in commands:
+    for words in commands[:-1]:  # the last one plans, which takes seconds and imports no more
         file_trials.preload(words, source, library.folder / "log")
     return made
 
@@ -132,9 +132,12 @@ def test_reading_takes_at_most_five_copies_of_the_values_that_a_file_states(tmp_
     for variable in many.variables.values():
         variable.encoding = {}
     packed = {str(name): {"zlib": True} for name in many.variables if many[name].dtype.kind == "f"}
-    many.to_netcdf(tmp_path / "errors.nc", engine="h5netcdf", encoding=packed)
-    for words in (["validate", "errors.nc"], ["report", "errors.nc", "--out", "page.html"]):
+    commands = (["validate", "errors.nc"], ["report", "errors.nc", "--out", "page.html"])
+    shutil.copy(file_kinds.GOOD / "spindle_drift_drift.nc", tmp_path / "errors.nc")
+    for words in commands:
         file_trials.preload(words, tmp_path, tmp_path / "log")
+    many.to_netcdf(tmp_path / "errors.nc", engine="h5netcdf", encoding=packed)
+    for words in commands:
         ended = file_trials.run(words, tmp_path, tmp_path / "log")
         assert ended.code == 0, ended.answer
         assert ended.memory <= 5 * sum(each.nbytes for each in many.variables.values())
