@@ -88,7 +88,7 @@ def test_notices(vector: Vector) -> None:
 @pytest.mark.parametrize(("points", "first_bit"), [(3200, 64000), (300, 6000), (100, 2000), (4, 80), (12, 240)])
 def test_intensities_start_at_bit_20_n_without_padding(points: int, first_bit: int) -> None:
     layout = StreamLayout(1, INTENSITY, points, UNIT, 0.0, 1e-5)
-    assert layout.words == 6 + -(-20 * points // 32) + -(-10 * points // 32) + 1  # as the maker's library reserves
+    assert layout.words == 6 + -(-20 * points // 32) + -(-10 * points // 32) + 1  # as reserved by Keyence's library
     words = np.zeros((1, layout.words), dtype=np.uint32)
     second = first_bit + 30  # the upper half of the second 20-bit field
     words[0, 6 + second // 32] |= np.uint32(1 << second % 32)

@@ -22,7 +22,7 @@ UM1 = DISPLAYS["0.1 um"]
 @pytest.mark.parametrize(
     ("text", "display", "value"),
     [
-        ("+01.2345", MM4, 1.2345e-3),  # the four numbers printed in the maker's manual, LK-G-M-NO5-E, page 5-6
+        ("+01.2345", MM4, 1.2345e-3),  # the four numbers printed in the manufacturer's manual, LK-G-M-NO5-E, page 5-6
         ("-00.0120", MM4, -0.0120e-3),
         ("+1234.56", UM2, 1234.56e-6),
         ("-00001.2", UM1, -1.2e-6),

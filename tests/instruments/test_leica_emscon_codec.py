@@ -199,7 +199,7 @@ def test_any_bytes_are_a_packet_or_a_protocol_error(data: bytes) -> None:
 
 @pytest.mark.parametrize("number", sorted(codec.COMMANDS.keys() - {codec.SET_CONTINUOUS_TIME}))
 def test_commands_are_byte_for_byte_those_of_another_implementation(number: int) -> None:
-    """CESAPI (PyPI) was generated from the maker's C definitions for the AT4xx; each field gets a number of its own."""
+    """CESAPI (PyPI) is made from the manufacturer's C definitions for the AT4xx; each field has another number."""
     pytest.importorskip("CESAPI", reason="the package CESAPI, another implementation, is not installed")
     theirs = importlib.import_module("CESAPI.packet")
     for suffix, layout in (("CT", codec.COMMANDS[number].request), ("RT", codec.COMMANDS[number].answer)):

@@ -32,8 +32,8 @@ QUICK = {"timeout": 0.3, "retry": 0.0}
 
 @pytest.mark.parametrize("vector", vectors(DEVICE, "identity"), ids=str)
 def test_identities(vector: Vector) -> None:
-    maker, model, serial, _ = codec.parse_identity(codec.decode(vector.data))
-    assert {"maker": maker, "model": model, "serial": serial} == vector.expected
+    manufacturer, model, serial, _ = codec.parse_identity(codec.decode(vector.data))
+    assert {"manufacturer": manufacturer, "model": model, "serial": serial} == vector.expected
 
 
 @pytest.mark.parametrize("vector", vectors(DEVICE, "scan list"), ids=str)

@@ -5,7 +5,7 @@ from typing import Any, Self
 
 
 class DataPortClient:
-    """Two sockets, as opened by a program of the maker."""
+    """Two sockets, as opened by a program of the manufacturer."""
 
     def __init__(self, device: Any) -> None:
         self.device = device

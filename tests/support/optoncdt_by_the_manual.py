@@ -1,4 +1,4 @@
-"""An optoNCDT for tests that answers as the maker's manuals print it, and refuses what they do not list.
+"""An optoNCDT for tests that answers as the manufacturer's manuals print it, and refuses what they do not list.
 
 2300: *optoNCDT 2300 Instruction Manual*, chapters 8, 9 and A 6; 1420: *optoNCDT 1420 Instruction Manual*, chapters 7.5,
 8 and A 3. Independent of the driver and of its simulator. The numbers of the errors are examples: no page at hand shows

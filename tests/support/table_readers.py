@@ -1,4 +1,4 @@
-"""Readers of compensation tables as the controls read them, written from the makers' descriptions.
+"""Readers of compensation tables as the controls read them, written from the manufacturers' descriptions.
 
 Each returns a function from commanded positions and directions (m, +1 or -1) to the motion of the corrected axis, m.
 """

@@ -74,8 +74,9 @@ def find_pdos(node: CanNode, inputs: Sequence[Input]) -> list[TransmitPdo]:
     if not any(pdo.place(*value) for pdo in sent for value in values):
         raise InstrumentError(
             f"{node.url}: node {node.node} sends none of its inputs in a PDO at SYNC or at an interval; map "
-            f"{', '.join(f'0x{index:04X}:{subindex}' for index, subindex in sorted(values))} with the maker's tool, "
-            "with a transmission type of 1 to 240 or an event timer, or set transfer = 'sdo'"
+            f"{', '.join(f'0x{index:04X}:{subindex}' for index, subindex in sorted(values))} "
+            "with the manufacturer's tool, with a transmission type of 1 to 240 or an event timer, or set "
+            "transfer = 'sdo'"
         )
     return [pdo for pdo in sent if any(pdo.place(*entry) for entry in values | states)]
 

@@ -160,7 +160,7 @@ class CanTemperature(Thermometer):
         )
 
     def configure(self, settings: CanSettings) -> None:
-        """Use other settings from now on; the node itself is configured with the maker's tool."""
+        """Use other settings from now on; the node itself is configured with the manufacturer's tool."""
         self.settings = settings
         if self._transport is not None:
             self._prepare()

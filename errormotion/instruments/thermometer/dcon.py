@@ -159,7 +159,7 @@ class DconTemperature(LineThermometer):
         )
 
     def configure(self, settings: DconSettings) -> None:
-        """Use other settings from now on; the module itself is configured with the maker's tool."""
+        """Use other settings from now on; the module itself is configured with the manufacturer's tool."""
         self.settings = settings
 
     def _measure(self) -> dict[str, tuple[float, str]]:

@@ -50,7 +50,7 @@ class ModbusTemperature(ModbusDriver, Thermometer):
         return self.identity(settings.map)
 
     def configure(self, settings: ModbusSettings) -> None:
-        """Use other settings from now on; the device itself is configured with the maker's tool."""
+        """Use other settings from now on; the device itself is configured with the manufacturer's tool."""
         self.settings = settings
 
     def _measure(self) -> dict[str, tuple[float, str]]:

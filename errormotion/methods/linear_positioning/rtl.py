@@ -1,7 +1,7 @@
 """Files ``.rtl`` of laser calibration software: targets, and the deviation at each target of each run.
 
 The layout is that of five published programs that read or write such files (docs/reference/positioning-files.md names
-them); no description by the maker was found. Sections start with ``NAME::``. ``TARGET DATA::`` contains
+them); no description by the manufacturer was found. Sections start with ``NAME::``. ``TARGET DATA::`` contains
 ``Target-count:`` and, after ``Targets :``, the positions in mm; ``RUNS::`` contains ``Run-count:``; ``DEVIATIONS::``
 contains, after ``Run Target Data:``, lines of run, target and deviation. A run is one pass; its lines are in the order
 of measurement.

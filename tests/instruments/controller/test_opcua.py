@@ -117,7 +117,7 @@ async def two_spindles(cnc):
 
 
 async def plain_nodes(cnc):
-    """Add variables with ids as texts, without units, as the controls of some makers do."""
+    """Add variables with ids as texts, without units, as the controls of some manufacturers do."""
     index = await cnc.server.register_namespace("Lab")
     for name, value in {
         "/Channel/MachineAxis/pos[u1,1]": 12.5,

@@ -1,4 +1,4 @@
-"""The simulated DCON module: the makers' documented dialogues, its grammar, other units of the bus, faults."""
+"""The simulated DCON module: the manufacturers' documented dialogues, its grammar, other units of the bus, faults."""
 
 import socket
 import time

@@ -1,7 +1,7 @@
-"""The simulated LJ-X8000A on its lines, with the bytes that the maker's Linux library sends and the positions it reads.
+"""The simulated LJ-X8000A, with the bytes that the manufacturer's Linux library sends and the positions it reads.
 
-Source of the sequences: LJX8_IF_Linux.cpp, LJXA_ACQ.cpp and ProfileDataConvert.cpp of the maker's library 1.0.0; of the
-return codes: the maker's sample application for LJ-X8000A.
+Source of the sequences: LJX8_IF_Linux.cpp, LJXA_ACQ.cpp and ProfileDataConvert.cpp of the manufacturer's library 1.0.0;
+of the return codes: the manufacturer's sample application for LJ-X8000A.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAGIC = 0xFFFFFFFF
 
 
 class MakersClient:
-    """The calls of the maker's library that the tests use, with a socket as in the library."""
+    """The calls of the manufacturer's library that the tests use, with a socket as in the library."""
 
     def __init__(self, device: SimulatedLJX) -> None:
         self.device = device

@@ -1,4 +1,4 @@
-"""The simulated optoNCDT on its line, against the maker's manuals."""
+"""The simulated optoNCDT on its line, against the manufacturer's manuals."""
 
 import re
 import select

@@ -8,7 +8,7 @@ from errormotion.compensation.tables.table import AxisTable
 from errormotion.errors import DatasetError
 
 CHECK_SIGN = "Check the sign with one value before use: it is from memory (inverted = true reverses it)."
-"""Remark of formats whose sign is not stated by a document of the maker."""
+"""Remark of formats whose sign is not stated by a document of the manufacturer."""
 
 
 def check_points(table: AxisTable, most: int, control: str) -> None:

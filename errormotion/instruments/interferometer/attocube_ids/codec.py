@@ -81,7 +81,7 @@ class Reply:
 
 
 def request(method: str, number: int, *parameters: bool | int | str) -> bytes:
-    """Return a request, in the form of the maker's client: without a line end."""
+    """Return a request, in the form of the manufacturer's client: without a line end."""
     found: dict[str, Any] = {"jsonrpc": "2.0", "method": method, "id": number, "api": API}
     if parameters:
         found["params"] = list(parameters)
@@ -118,7 +118,7 @@ def reply(line: bytes) -> Reply:
 
 
 def _code(value: Any) -> int:
-    if value is None or value == "null":  # as the maker's client reads it
+    if value is None or value == "null":  # as the manufacturer's client reads it
         return 0
     if not isinstance(value, int) or isinstance(value, bool):
         raise ProtocolError(

@@ -174,7 +174,7 @@ class AttocubeIds(Driver):
             time.sleep(POLL_INTERVAL)
 
     def identify(self) -> Identity:
-        """Return maker, model, serial number, firmware and settings of the device."""
+        """Return manufacturer, model, serial number, firmware and settings of the device."""
         average = self._request(codec.DISPLACEMENT + "getAverageN").quantity(0)
         return Identity(
             manufacturer="attocube",

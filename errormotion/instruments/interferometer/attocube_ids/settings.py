@@ -47,7 +47,7 @@ class IdsSettings(PluginSettings):
     start_timeout: Time = Field(default=90.0, gt=0, description="time limit for starting and stopping a measurement")
     after_break: Literal["restart", "clear"] = Field(
         default="restart",
-        description="action of the first zero after a beam was broken: restart the measurement, as the maker "
+        description="action of the first zero after a beam was broken: restart the measurement, as the manufacturer "
         "recommends, or clear the error",
     )
     timeout: Time = Field(default=3.0, gt=0, description="time limit for an answer")

@@ -91,7 +91,7 @@ _TEXTS = {
 
 
 def name(call: int) -> str:
-    """Return the name of a call in the maker's manual."""
+    """Return the name of a call in the manufacturer's manual."""
     return f"{_NAMES.get(call, 'unknown')} ({call})"
 
 

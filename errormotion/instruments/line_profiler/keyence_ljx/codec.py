@@ -40,7 +40,7 @@ REPLY_HEAD = 28
 BODY_LENGTH, COMMAND, RETURN_CODE, PROGRAM = 12, 16, 17, 24  # positions in a reply
 BODY = 16  # position at which the body of a reply starts
 MAX_REPLY_BYTES = 3000 * 1024
-"""Longest reply, bytes: the receive buffer of the maker's Linux library."""
+"""Longest reply, bytes: the receive buffer of the manufacturer's Linux library."""
 FROM_NEXT = 2  # argument of PREPARE_STREAM: start with the next profile
 PROGRAMS = 16
 
@@ -119,7 +119,7 @@ def reply_length(head: bytes) -> int:
 def parse_reply(frame: bytes) -> Reply:
     """Return a decoded reply; ProtocolError if one of its two lengths is wrong.
 
-    A body length of 0 is accepted: the maker's client does not read it.
+    A body length of 0 is accepted: the manufacturer's client does not read it.
     """
     if len(frame) < REPLY_HEAD or reply_length(frame[:4]) != len(frame):
         raise ProtocolError(f"Expected a reply; found {len(frame)} bytes, {frame[:REPLY_HEAD].hex(' ')}")

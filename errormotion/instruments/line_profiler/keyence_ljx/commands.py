@@ -20,10 +20,10 @@ _HEAD = 4  # bytes of a reply that state its length
 class CommandLine:
     """Requests and replies on one connection.
 
-    Unread bytes are discarded before a request, as by the maker's client. A reply states its command, so that a late
-    reply is not mistaken for the reply to a later request. After a timeout, the next exchange is preceded by a reading
-    request of another opcode; once its reply has arrived, no earlier reply is outstanding. If the device does not state
-    the command, or does not answer this request either, the connection is lost and must be opened again.
+    Unread bytes are discarded before a request, as by the manufacturer's client. A reply states its command, so that a
+    late reply is not mistaken for the reply to a later request. After a timeout, the next exchange is preceded by a
+    reading request of another opcode; once its reply has arrived, no earlier reply is outstanding. If the device does
+    not state the command, or does not answer this request either, the connection is lost and must be opened again.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Commands and answers of a capaNCDT 6200: ASCII on TCP port 23.
 
-Operating instructions of the maker ("6200": capaNCDT 6200; "6500": capaNCDT 6500, of the same family). A command is
-``$``, three letters, parameters, CR LF. The controller echoes what it receives and adds the rest of its answer, which
-ends in ``OK`` CR LF (6200 p. 59): ``$STI1200`` is answered ``$STI1200,960OK``.
+Operating instructions of the manufacturer ("6200": capaNCDT 6200; "6500": capaNCDT 6500, of the same family). A command
+is ``$``, three letters, parameters, CR LF. The controller echoes what it receives and adds the rest of its answer,
+which ends in ``OK`` CR LF (6200 p. 59): ``$STI1200`` is answered ``$STI1200,960OK``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ ERRORS = ("$UNKNOWN COMMAND", "$WRONG PARAMETER", "$WRONG PASSWORD", "$TIMEOUT")
 """Refusals. An independent driver of the DT6220 reads the first two; the others are assumptions."""
 
 UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
-"""Units of a measuring range, m; the maker's example is ``µm`` (6500 p. 44)."""
+"""Units of a measuring range, m; the manufacturer's example is ``µm`` (6500 p. 44)."""
 
 _NUMBER = re.compile(r"[+-]?\d{1,12}(?:\.\d{1,9})?")
 _FIELD = re.compile(r"([A-Z]{3})(.*)")

@@ -5,8 +5,8 @@ value: ``MS,01`` is answered by ``MS,01,+01.2345``. A refusal is ``ER,command,co
 eight characters: a sign and seven digits with a decimal point, or one of three texts that mean no value. The text does
 not state whether it is in mm or um: this depends on a setting of the controller, its smallest displayed unit.
 
-Formats, modes and errors of the LK-G3000 are from the maker's manual (LK-G-M-NO5-E, pages 5-5 and 5-6), errors of the
-LK-G5000 from other clients. Facts marked (m) are from memory; each is a single line to correct.
+Formats, modes and errors of the LK-G3000 are from the manufacturer's manual (LK-G-M-NO5-E, pages 5-5 and 5-6), errors
+of the LK-G5000 from other clients. Facts marked (m) are from memory; each is a single line to correct.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ HEADS: Mapping[str, tuple[float, float]] = {
 }
 
 
-#: Sign of a reading by the side on which the controller's readings are positive; default of the maker: near (m).
+#: Sign of a reading by the side on which the controller's readings are positive; default of the manufacturer: near (m).
 SIGNS: Mapping[str, float] = {"near": -1.0, "far": 1.0}
 
 

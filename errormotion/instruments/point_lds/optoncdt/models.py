@@ -1,4 +1,4 @@
-"""Facts of the sensor families, with the page of the maker's manual for each.
+"""Facts of the sensor families, with the page of the manufacturer's manual for each.
 
 2300: *optoNCDT 2300 Instruction Manual*; 1420: *optoNCDT 1420 Instruction Manual*. Facts without a page are marked (m).
 """

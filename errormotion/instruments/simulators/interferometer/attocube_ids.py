@@ -1,7 +1,7 @@
 """A simulated attocube IDS3010: JSON-RPC over TCP, three beams to reflectors at the tool of the virtual machine.
 
-Written from the maker's published clients and from logs of real devices, without the driver: see the page of the device
-for the sources, and for assumptions (codes of errors, the count while a beam is broken).
+Written from the manufacturer's published clients and from logs of real devices, without the driver: see the page of the
+device for the sources, and for assumptions (codes of errors, the count while a beam is broken).
 """
 
 from __future__ import annotations

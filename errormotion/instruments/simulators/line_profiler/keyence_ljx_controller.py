@@ -1,7 +1,7 @@
 """The commands and the state of an LJ-X8000A.
 
-Commands and layouts are those of the maker's Linux library (LJX8_IF_Linux 1.0.0), return codes those of the maker's
-sample application for LJ-X8000A. What neither shows is listed on the device's page as assumed.
+Commands and layouts are those of the manufacturer's Linux library (LJX8_IF_Linux 1.0.0), return codes those of the
+manufacturer's sample application for LJ-X8000A. What neither shows is listed on the device's page as assumed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The settings of an LJ-X8000A on three levels: environment, common settings, and sixteen programs.
 
-Levels and types are those of the maker's header LJX8_IF_Linux.h; sizes of the blocks are those of the maker's sample
-(60, 20 and 10980 bytes).
+Levels and types are those of the manufacturer's header LJX8_IF_Linux.h; sizes of the blocks are those of the
+manufacturer's sample (60, 20 and 10980 bytes).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Settings:
     def write(self, level: int, target: Target, data: bytes) -> bool:
         """Write a setting to a level and those below it; False if level, type or value is invalid.
 
-        The maker's library always sends 20 kB; bytes beyond the size of the setting are ignored.
+        The manufacturer's library always sends 20 kB; bytes beyond the size of the setting are ignored.
         """
         if level > SAVED or not _exists(target) or not _allowed(target, data):
             return False

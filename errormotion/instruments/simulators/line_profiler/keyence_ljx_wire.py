@@ -1,7 +1,7 @@
 """Bytes that an LJ-X8000A sends: replies to commands, profiles, notices.
 
-Written from the maker's Linux library (LJX8_IF_Linux 1.0.0 and its ProfileDataConvert), not from this project's driver.
-All numbers are little-endian.
+Written from the manufacturer's Linux library (LJX8_IF_Linux 1.0.0 and its ProfileDataConvert), not from this project's
+driver. All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ TRIGGER_WORD, ENCODER_WORD = 1, 2
 
 
 class Code(IntEnum):
-    """Return codes, byte 17 of a reply; the maker's library adds 0x8000. The meaning of some depends on the command."""
+    """Return codes, byte 17 of a reply; the manufacturer's library adds 0x8000. Some depend on the command."""
 
     OK = 0x00
     OTHER_MODEL = 0x21

@@ -44,7 +44,7 @@ DISPLAYS: tuple[tuple[float, int], ...] = (
     (1e-6, 2),
     (1e-6, 3),
 )
-"""Unit (m) and decimals of the display units 0..6: LKIF_DISPLAYUNIT of the maker's header LKIF2.h."""
+"""Unit (m) and decimals of the display units 0..6: LKIF_DISPLAYUNIT of the manufacturer's header LKIF2.h."""
 
 NO_VALUE, OVER, UNDER = "XXXXXXXX", "+FFFFFFF", "-FFFFFFF"
 WIDTH = 7

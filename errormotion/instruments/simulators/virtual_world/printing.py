@@ -1,4 +1,4 @@
-"""Printing by a control: the grammar of ``DPRNT[...]`` and the characters that controls of two makers send.
+"""Printing by a control: the grammar of ``DPRNT[...]`` and the characters that controls of two manufacturers send.
 
 Sources: Haas 96-8000 rev. AC, May 2010, p. 116 (text, formats, rounding, leading spaces, growing fields); NCT 2000M/99M
 Programmer's Manual, p. 193 (digits before and after the point, ISO code with even parity, line feed). The format of

@@ -21,7 +21,7 @@ OVERLOAD = 9.9e37
 _NUMBER = re.compile(r"[+-]?(?:[0-9]{1,20}(?:\.[0-9]{0,20})?|\.[0-9]{1,20})(?:[eE][+-]?[0-9]{1,3})?")
 _CHANNEL = re.compile(r"[0-9]{3,4}")
 _ERROR = re.compile(r'([+-]?[0-9]{1,5}),"([^"]{0,300})"')
-_NAME = re.compile(r"[A-Za-z]{2}")  # of a maker; a reading has at most one letter
+_NAME = re.compile(r"[A-Za-z]{2}")  # of a manufacturer; a reading has at most one letter
 _BLOCK = re.compile(r"#([1-4])")
 
 
@@ -71,10 +71,10 @@ def parse_channels(text: str) -> list[int]:
 
 
 def parse_identity(text: str) -> tuple[str, str, str, str]:
-    """Return maker, model, serial number and revision of an answer to ``*IDN?``; ProtocolError for anything else."""
+    """Return manufacturer, model, serial number and revision in an answer to ``*IDN?``; else ProtocolError."""
     cells = [cell.strip() for cell in text.split(",")]
     if len(cells) != 4 or not _NAME.search(cells[0]) or not cells[1]:
-        raise ProtocolError(f"'*IDN?': expected maker, model, serial number and revision; found '{text[:80]}'")
+        raise ProtocolError(f"'*IDN?': expected manufacturer, model, serial number and revision; found '{text[:80]}'")
     return cells[0], cells[1], cells[2], cells[3]
 
 

@@ -52,15 +52,15 @@ class ScpiTemperature(LineThermometer):
     _ready = False
 
     def identify(self) -> Identity:
-        """Return maker, model, serial number and revision of the unit; InstrumentError for another model."""
-        maker, model, serial, revision = self._query("*IDN?", codec.parse_identity)
+        """Return manufacturer, model, serial number and revision of the unit; InstrumentError for another model."""
+        manufacturer, model, serial, revision = self._query("*IDN?", codec.parse_identity)
         if model not in self.settings.models:
             raise InstrumentError(
-                f"{self.address}: expected one of {', '.join(self.settings.models)}; found a {maker} {model}. Add it "
-                "to 'models' if it has the same commands"
+                f"{self.address}: expected one of {', '.join(self.settings.models)}; found a {manufacturer} {model}. "
+                "Add it to 'models' if it has the same commands"
             )
         return Identity(
-            manufacturer=maker,
+            manufacturer=manufacturer,
             model=model,
             serial_number=serial,
             firmware=revision,

@@ -1,4 +1,4 @@
-"""Device documents in the styles of two makers, written after public documents."""
+"""Device documents in the styles of two manufacturers, written after public documents."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from errormotion.instruments.simulators.controller.mtconnect.style_parts import 
 
 
 def okuma(name: str, uuid: str, serial: str) -> str:
-    """Return a document in the style of a maker's lathe, schema 2: each position in machine and in work coordinates.
+    """Return a document in one manufacturer's style: a lathe, schema 2: positions in machine and work coordinates.
 
     Source of the style: the demo device OKUMA of mtconnect/cppagent.
     """
@@ -149,7 +149,7 @@ def okuma(name: str, uuid: str, serial: str) -> str:
 
 
 def mazak(name: str, uuid: str, serial: str) -> str:
-    """Return a document in the style of a maker's five-axis mill, schema 1.7: extensions, data sets, a tilting table.
+    """Return a document in one manufacturer's style: a 5-axis mill, schema 1.7: extensions, data sets, tilting table.
 
     Source of the style: the demo device Mazak of mtconnect/cppagent.
     """

@@ -17,8 +17,8 @@ from errormotion.instruments.transports import Address
 class SimulatedGeoComStation(SimulatedDevice):
     """A total station with target recognition that measures the reflector at the machine's tool.
 
-    Directions are clockwise, as those of the maker: east, north and height are a right-handed system whose north is the
-    x axis of `TrackerScene`, and whose east is its negative y axis.
+    Directions are clockwise, as those of the manufacturer: east, north and height are a right-handed system whose north
+    is the x axis of `TrackerScene`, and whose east is its negative y axis.
 
     Further parameters of the address: those of `telescope.Telescope`; ``model`` (``TS30``, ``TCRP1201``, ``TM30``).
 

@@ -1,4 +1,4 @@
-"""A simulated capaNCDT 6200 controller for capacitive sensors on Ethernet, from the maker's manuals.
+"""A simulated capaNCDT 6200 controller for capacitive sensors on Ethernet, from the manufacturer's manuals.
 
 Facts and their sources (operating instructions of Micro-Epsilon: "6200" is capaNCDT 6200, pages as at
 easymanua.ls/micro-epsilon/cs02; "6400" is combiSENSOR 6400, "6500" is capaNCDT 6500 and "6228" is capaNCDT 6228/6238,

@@ -1,4 +1,4 @@
-"""A simulated confocalDT IFC2451, IFC2461 or IFC2471 on Ethernet, from the maker's manual.
+"""A simulated confocalDT IFC2451, IFC2461 or IFC2471 on Ethernet, from the manufacturer's manual.
 
 Facts and their sources (operating instructions confocalDT 24x1 of Micro-Epsilon, pages as at
 manualshive.com/en/manual/micro-epsilon/confocal-dt2471/1785336; "2300" is optoNCDT 2300, which has the same grammar):

@@ -1,4 +1,4 @@
-"""A simulated optoNCDT laser sensor on RS422, from the maker's manuals: commands, refusals, and the data stream.
+"""A simulated optoNCDT laser sensor on RS422, from the manufacturer's manuals: commands, refusals, and the data stream.
 
 Two models, distinguished throughout: ILD2300 and ILD1420. Facts and their sources (operating instructions of
 Micro-Epsilon: "2300" is optoNCDT 2300, "1420" optoNCDT 1420, "1320" the related optoNCDT 1320, "24x1" confocalDT 24x1,
