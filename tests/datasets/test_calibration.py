@@ -160,7 +160,7 @@ def test_settings_on_a_line_support_only_this_line(tilts: list[list[float]]) -> 
 
 
 def test_a_reading_beyond_the_calibrated_depths_is_refused(good: InclinationCalibration) -> None:
-    with pytest.raises(MethodError, match=r"a reading 12\.000 mm from mid range is beyond the calibrated -10\.000"):
+    with pytest.raises(MethodError, match=r"a reading 12\.000 mm from mid-range is beyond the calibrated -10\.000"):
         good.compensate([1e-3, 12e-3], tilt_vector(0.1, 0.0))
     assert good.compensate([12e-3], tilt_vector(0.1, 0.0), extrapolate=True).value.shape == (1,)
 

@@ -47,10 +47,10 @@ def test_all_differences_are_stated_at_once() -> None:
     with pytest.raises(DatasetError) as caught:
         compare("lk", "A", "B", mid_ranges=(0.0, 5e-3))
     assert str(caught.value) == (
-        "Calibration 'lk': it belongs to the sensor with serial number A; the sensor in use has B; its mid range is "
+        "Calibration 'lk': it belongs to the sensor with serial number A; the sensor in use has B; its mid-range is "
         "0 mm; that of the sensor in use (serial number B, calibrated: A) is 5 mm. Use the calibration of this sensor, "
         "or set allow_other_sensor = true."
     )
     first, second = compare("lk", "A", "B", mid_ranges=(0.0, 5e-3), allow_other_sensor=True)
     assert "serial number A; the sensor in use has B" in first
-    assert "mid range" in second
+    assert "mid-range" in second

@@ -199,7 +199,7 @@ def test_a_calibration_of_another_serial_number_is_refused_unless_allowed(known)
 
 def test_a_calibration_of_another_mid_range_is_refused(known) -> None:
     serial = "4711"
-    with opto() as sensor, pytest.raises(DatasetError, match=rf"mid range is 0 mm; .*calibrated: {serial}\) is 10 mm"):
+    with opto() as sensor, pytest.raises(DatasetError, match=rf"mid-range is 0 mm; .*calibrated: {serial}\) is 10 mm"):
         CompensatedSensor(sensor, of_sensor(known, serial), allow_other_sensor=False)
 
 

@@ -200,7 +200,7 @@ class InclinationCalibration(Calibration):
         Raises
         ------
         DatasetError
-            The calibration belongs to a sensor with another serial number or another mid range.
+            The calibration belongs to a sensor with another serial number or another mid-range.
         """
         mid_ranges = self.mid_range, mid_range
         return owner.compare(
@@ -325,8 +325,8 @@ class InclinationCalibration(Calibration):
         if wrong.size:
             worst = wrong.flat[np.argmax(np.abs(wrong))]
             raise MethodError(
-                f"Calibration '{self.name}': a reading {1e3 * worst:.3f} mm from mid range is beyond the calibrated "
-                f"{1e3 * low:.3f} to {1e3 * high:.3f} mm ({wrong.size} of {depth.size} readings). Check the mid range "
+                f"Calibration '{self.name}': a reading {1e3 * worst:.3f} mm from mid-range is beyond the calibrated "
+                f"{1e3 * low:.3f} to {1e3 * high:.3f} mm ({wrong.size} of {depth.size} readings). Check the mid-range "
                 "of the sensor, measure within the calibrated range, or allow extrapolation (extrapolate = true in the "
                 "test's settings)."
             )

@@ -1,4 +1,4 @@
-"""Assignment of a calibration to its sensor, by serial number and mid range."""
+"""Assignment of a calibration to its sensor, by serial number and mid-range."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ATTRIBUTE = "serial_number"
 UNKNOWN = "unknown"
 """Serial number of a sensor that reports none."""
 MID_RANGE_TOLERANCE = 1e-6
-"""Largest difference of two mid ranges that count as equal, m."""
+"""Largest difference of two mid-ranges that count as equal, m."""
 
 
 def serial_number(attrs: Mapping[str, Any], kind: str) -> str:
@@ -57,14 +57,14 @@ def compare(
     calibrated, used : str
         Serial numbers of the calibrated sensor and of the one that measures; empty if unknown.
     mid_ranges : (float, float), optional
-        Mid range of the calibrated sensor and of the one that measures, m.
+        Mid-range of the calibrated sensor and of the one that measures, m.
     allow_other_sensor : bool
         State another sensor in a note instead of refusing it.
 
     Raises
     ------
     DatasetError
-        The serial numbers or the mid ranges differ.
+        The serial numbers or the mid-ranges differ.
     """
     differences = []
     if calibrated and used and calibrated != used:
@@ -72,7 +72,7 @@ def compare(
     if mid_ranges is not None and abs(mid_ranges[0] - mid_ranges[1]) > MID_RANGE_TOLERANCE:
         low, high = (f"{1e3 * value:g} mm" for value in mid_ranges)
         differences.append(
-            f"its mid range is {low}; that of the sensor in use (serial number {used or UNKNOWN}, calibrated: "
+            f"its mid-range is {low}; that of the sensor in use (serial number {used or UNKNOWN}, calibrated: "
             f"{calibrated or UNKNOWN}) is {high}"
         )
     if differences and not allow_other_sensor:

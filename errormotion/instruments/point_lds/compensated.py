@@ -57,7 +57,7 @@ class CompensatedSensor:
     extrapolate : bool
         Whether tilts and depths beyond the calibrated ones are compensated; refused otherwise.
     allow_other_sensor : bool
-        Whether a calibration of another sensor, by its serial number or mid range, is used; refused otherwise.
+        Whether a calibration of another sensor, by its serial number or mid-range, is used; refused otherwise.
 
     Attributes
     ----------

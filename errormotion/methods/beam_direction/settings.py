@@ -39,7 +39,7 @@ class Settings(PluginSettings):
         default=False, description="compensate also at tilts and readings that the calibration does not cover"
     )
     allow_other_sensor: bool = Field(
-        default=False, description="use a calibration of a sensor with another serial number or mid range"
+        default=False, description="use a calibration of a sensor with another serial number or mid-range"
     )
     triangulation_normal_uncertainty: Angle = Field(
         default=float(np.radians(0.5)),

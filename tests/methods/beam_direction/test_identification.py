@@ -141,7 +141,7 @@ def test_calibration_of_another_sensor_is_refused_with_both_serial_numbers(machi
     np.testing.assert_array_equal(other["beam_direction"], same["beam_direction"])
     unknown = identify(raw.assign_attrs(by("T1", kind="thermometer")), compensation=path)
     assert "The sensor reports no serial number" in notes(unknown)
-    with pytest.raises(DatasetError, match=r"its mid range is 0 mm; .* is 1 mm"):
+    with pytest.raises(DatasetError, match=r"its mid-range is 0 mm; .* is 1 mm"):
         identify(raw.assign_attrs(by("S1")).assign(mid_range=((), 1e-3, {"units": "m"})), compensation=path)
 
 

@@ -189,7 +189,7 @@ def test_uncertainty_of_the_calibration_is_shared(scan: Callable[..., Points], b
     assert all(source.startswith("inclination calibration") for source in found.sources)
     shared = np.einsum("sni,sni->n", found.influence, found.influence)
     own = np.trace(found.covariance, axis1=1, axis2=2)
-    # Nothing at mid range, where the error vanishes; steep and deep ends know it worst.
+    # Nothing at mid-range, where the error vanishes; steep and deep ends know it worst.
     assert np.argmin(shared) in np.argsort(np.abs(found.distance - float(bar["mid_range"])))[:4]
     np.testing.assert_allclose(np.sqrt(own), float(bar["distance_noise"]), rtol=0.05)
 

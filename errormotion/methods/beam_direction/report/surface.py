@@ -42,7 +42,7 @@ class _Tilts:
     group : (group,) of int
         Setting of each group of readings.
     depth, error : (group,)
-        Depth from mid range and error there, m.
+        Depth from mid-range and error there, m.
     group_left_out : (group,) of bool
     """
 
@@ -119,8 +119,8 @@ def _description(calibration: InclinationCalibration) -> str:
     interval = ds["remaining_error_interval"].values
     return (
         f"Calibration '{calibration.name}': slope k of the error with depth at {integer(n)} tilts{left}, fitted by a "
-        f"polynomial of order {calibration.order}, depths {fixed(1e3 * low, 1)} to {fixed(1e3 * high, 1)} mm from mid "
-        f"range. Remaining error of k at tilts that were left out of the fit: {significant(1e3 * remaining)} µm per mm "
+        f"polynomial of order {calibration.order}, depths {fixed(1e3 * low, 1)} to {fixed(1e3 * high, 1)} mm from "
+        f"mid-range. Remaining error of k at tilts that were left out of the fit: {significant(1e3 * remaining)} µm per mm "
         f"(95 %: {significant(1e3 * interval[0])} to {significant(1e3 * interval[1])}), which is "
         f"{significant(1e6 * remaining * farthest)} µm at {fixed(1e3 * farthest, 1)} mm."
     )

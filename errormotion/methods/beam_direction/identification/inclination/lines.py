@@ -72,7 +72,7 @@ class Lines:
     Attributes
     ----------
     slope, offset : ndarray (setting,)
-        k, and the error at mid range, m; the offset is 0 if it was not free.
+        k, and the error at mid-range, m; the offset is 0 if it was not free.
     slope_variance : ndarray (setting,)
         From the noise.
     residual : ndarray (group,)
@@ -289,7 +289,7 @@ class MidRange:
 def mid_range(readings: Readings, lines: Lines) -> MidRange:
     """Return the common point of the lines.
 
-    The error at the stated mid range is b = b0 - k (m_found - m): a line over k.
+    The error at the stated mid-range is b = b0 - k (m_found - m): a line over k.
     """
     known = len(lines.slope) - 2
     if not lines.free_offsets or known < 3 or np.ptp(lines.slope) < 5 * np.sqrt(np.median(lines.slope_variance)):
