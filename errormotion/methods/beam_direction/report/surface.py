@@ -120,8 +120,8 @@ def _description(calibration: InclinationCalibration) -> str:
     return (
         f"Calibration '{calibration.name}': slope k of the error with depth at {integer(n)} tilts{left}, fitted by a "
         f"polynomial of order {calibration.order}, depths {fixed(1e3 * low, 1)} to {fixed(1e3 * high, 1)} mm from "
-        f"mid-range. Remaining error of k at tilts that were left out of the fit: {significant(1e3 * remaining)} µm per "
-        f"mm (95 %: {significant(1e3 * interval[0])} to {significant(1e3 * interval[1])}), which is "
+        f"mid-range. Remaining error of k at tilts that were left out of the fit: {significant(1e3 * remaining)} µm "
+        f"per mm (95 %: {significant(1e3 * interval[0])} to {significant(1e3 * interval[1])}), which is "
         f"{significant(1e6 * remaining * farthest)} µm at {fixed(1e3 * farthest, 1)} mm."
     )
 
