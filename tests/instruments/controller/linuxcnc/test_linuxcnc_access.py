@@ -18,15 +18,9 @@ from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.controller.linuxcnc import BRIDGE, LinuxCNC, LinuxCNCSettings
 from errormotion.instruments.controller.linuxcnc.codec import decode_welcome, encode_request, parts_of
 
-FAKE = f"""
-import sys
-sys.path[:0] = {[str(Path(__file__).parent)]}
-"""
-LINUXCNC = (
-    FAKE
-    + """
+LINUXCNC = """
 import os
-from test_linuxcnc_bridge import FakeLinuxCNC
+from linuxcnc_fakes import FakeLinuxCNC
 made = FakeLinuxCNC()
 class Command:
     serial = 0
@@ -43,17 +37,13 @@ for name in dir(FakeLinuxCNC):
         globals()[name] = getattr(FakeLinuxCNC, name)
 made.values.echo_serial_number = 1 << 30
 """
-)
-HAL = (
-    FAKE
-    + """
+HAL = """
 from types import SimpleNamespace
-from test_linuxcnc_bridge import FakeHAL
+from linuxcnc_fakes import FakeHAL
 def component(name): return SimpleNamespace(ready=lambda: None)
 _hal = FakeHAL()
 get_value, pin_has_writer, set_p = _hal.get_value, _hal.pin_has_writer, _hal.set_p
 """
-)
 Start = Callable[..., dict[str, Any]]
 
 
