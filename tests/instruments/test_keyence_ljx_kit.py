@@ -3,4 +3,6 @@ from errormotion.testing import InstrumentConformance, InstrumentSubject
 
 
 class TestKit(InstrumentConformance):
-    subject = InstrumentSubject(KeyenceLJX, "sim://cframe/profiler?seed=3&points=397&intensity=1", name="odd")
+    subject = InstrumentSubject(
+        KeyenceLJX, "sim://cframe/profiler?seed=3&points=397&intensity=1", name="odd", mutants=100
+    )
