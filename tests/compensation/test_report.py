@@ -53,13 +53,17 @@ def model(warm_ups):
     return fit(warm_ups[:2], settings)
 
 
+def page_of(model, measured, folder):
+    """Return the comparison of a model with a measurement, and its page."""
+    found = check(model, measured)
+    figures = {name: getattr(found, name) for name in FIGURES}
+    page = write_model_report(model.dataset, measured, folder / "r.html", predicted=found.predicted, figures=figures)
+    return found, page.read_text(encoding="utf-8")
+
+
 @pytest.fixture(scope="module")
 def checked(model, warm_ups, tmp_path_factory):
-    found = check(model, warm_ups[2])
-    figures = {name: getattr(found, name) for name in FIGURES}
-    path = tmp_path_factory.mktemp("check") / "r.html"
-    write_model_report(model.dataset, warm_ups[2], path, predicted=found.predicted, figures=figures)
-    return found, path.read_text(encoding="utf-8")
+    return page_of(model, warm_ups[2], tmp_path_factory.mktemp("check"))
 
 
 def test_figures_of_the_check_are_on_the_page(checked):
@@ -104,19 +108,13 @@ def test_a_simulated_measurement_has_a_banner(checked):
     assert "SIMULATED DATA" in checked[1]
 
 
-def test_residual_outside_the_interval_is_red(model, warm_ups, tmp_path):
+def test_residual_outside_the_interval_is_red(checked, model, warm_ups, tmp_path):
     wrong = warm_ups[2].copy(deep=True)
     wrong["EZ"][7] += 300e-6
     drawn = []
-    for measured in (warm_ups[2], wrong):
-        found = check(model, measured)
-        figures = {name: getattr(found, name) for name in FIGURES}
-        page = write_model_report(
-            model.dataset, measured, tmp_path / "r.html", predicted=found.predicted, figures=figures
-        )
-        html = page.read_text(encoding="utf-8")
+    for found, html in (checked, page_of(model, wrong, tmp_path)):
         section = html[html.index("<h2>Residuals</h2>") : html.index("<h2>Temperatures and working parameters</h2>")]
-        red = sum(np.round((1 - found.held) * measured.sizes["time"]).astype(int))
+        red = sum(np.round((1 - found.held) * wrong.sizes["time"]).astype(int))
         # Each marker is one use of its symbol, with its colour.
         drawn.append(len(re.findall(r"<use [^>]*fill: #b3261e", section)) - red)
     assert drawn == [0, 0]
@@ -126,10 +124,7 @@ def test_residual_outside_the_interval_is_red(model, warm_ups, tmp_path):
 def test_error_that_was_not_measured_is_not_compared(model, warm_ups, tmp_path):
     part = warm_ups[2].copy(deep=True)
     part["EC"][:] = np.nan
-    found = check(model, part)
-    figures = {name: getattr(found, name) for name in FIGURES}
-    page = write_model_report(model.dataset, part, tmp_path / "r.html", predicted=found.predicted, figures=figures)
-    html = page.read_text(encoding="utf-8")
+    _, html = page_of(model, part, tmp_path)
     assert "Not compared because unknown: EC." in words(html)
     assert html.count("not compared") == 2
     row = next(row for row in rows(html, "Root mean square of the measured errors") if row[0] == "EC")

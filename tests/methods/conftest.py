@@ -18,3 +18,11 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     from errormotion.report import canvas
 
     monkeypatch.setattr(canvas, "draw", lambda *_: Markup("<svg></svg>"))
+
+
+@pytest.fixture
+def unprinted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fill the figures of a report, but do not print them, for tests of what may be missing in a result."""
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(Figure, "savefig", lambda _, buffer, **__: buffer.write("<svg></svg>"))

@@ -205,12 +205,19 @@ def number(text):
     return float(text.split()[0].replace("−", "-"))
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder in which the calibration is found by its name."""
+    found = tmp_path_factory.mktemp("lab")
+    (found / "calibrations").mkdir()
+    calibration().save(found / "calibrations" / "lk-h050.nc")
+    return found
+
+
 @pytest.fixture
-def page(tmp_path, monkeypatch):
-    """Write the report in a folder in which the calibration is found by its name."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "calibrations").mkdir()
-    calibration().save(tmp_path / "calibrations" / "lk-h050.nc")
+def page(folder, tmp_path, monkeypatch):
+    """Write the report in the folder with the calibration."""
+    monkeypatch.chdir(folder)
 
     def write(errors, **more):
         return write_report(errors, tmp_path / "report.html", **more).read_text(encoding="utf-8")
@@ -219,12 +226,11 @@ def page(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def html(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("beam")
+def html(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        calibration().save(folder / "lk-h050.nc")
-        return write_report(result(compensation="lk-h050.nc"), folder / "report.html").read_text(encoding="utf-8")
+        errors = result(compensation="calibrations/lk-h050.nc")
+        return write_report(errors, folder / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_chapter_has_its_sections(html):
@@ -340,12 +346,9 @@ def test_a_calibration_of_the_same_name_and_another_content_is_not_shown(page):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_the_calibration_beside_the_campaign_is_found_from_elsewhere(tmp_path, monkeypatch):
-    there = tmp_path / "there"
-    (there / "calibrations").mkdir(parents=True)
-    calibration().save(there / "calibrations" / "lk-h050.nc")
+def test_the_calibration_beside_the_campaign_is_found_from_elsewhere(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run = {"campaign": {"folder": str(there)}}
+    run = {"campaign": {"folder": str(folder)}}
     html = write_report(result(), tmp_path / "report.html", run=run).read_text(encoding="utf-8")
     assert "Calibration 'lk-h050': slope k" in words_of(html)
 
@@ -373,7 +376,7 @@ def extras_of(errors):
     return sorted(set(errors.data_vars) - {"covariance", *DOF})
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("unprinted")
 @pytest.mark.parametrize("part", [slice(i, None, 8) for i in range(8)] + [slice(None)])
 def test_whatever_extra_is_missing_the_rest_is_reported(page, part):
     errors = result()
@@ -400,6 +403,7 @@ def test_strokes_are_read_from_the_raw_dataset(page):
     assert row[1] == "X"
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_two_planes_have_no_closure(page):
     html = page(result(PLANES[:2]))
     assert "Two planes always fit a beam exactly: their closures are 0 by definition" in words_of(html)
@@ -413,6 +417,7 @@ def test_contradicting_planes_are_a_warning(page):
     assert "plane 3 by 20.0 times its standard uncertainty" in re.search(r'<p class="warning">(.*?)</p>', html)[1]
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_the_rotation_about_the_beam_is_reported_as_unknown(page):
     errors = result()
     along = np.array([[0.0, 0.0, -1.0]])
@@ -431,6 +436,7 @@ def test_remarks_of_the_method_are_warnings(page):
     assert '<p class="warning">The compensation took 4 iterations.</p>' in page(errors)
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_many_planes_are_reported_and_some_are_drawn(page):
     html = page(result(tuple((20, angle) for angle in range(0, 360, 24))))
     assert len(table(html, "The planes.")) == 15
@@ -448,6 +454,7 @@ def measured():
     return raw
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_a_result_of_the_method_is_reported_completely(page, measured):
     errors = BeamDirection().identify(measured, Settings(compensation="lk-h050", extrapolate=True, ordered=False))
     html = page(errors, raw=measured)

@@ -143,6 +143,7 @@ def test_rotations_in_the_budget_are_dashes_and_never_zero(html):
     assert len(re.findall("<td>—<sup>", row)) == 3
 
 
+@pytest.mark.usefixtures("unprinted")
 @pytest.mark.parametrize(
     "lost",
     [
@@ -168,6 +169,7 @@ def test_missing_variables_are_accepted(tmp_path, lost):
     assert "nan" not in words(html).lower().split()
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_a_chapter_of_only_errors_states_what_is_missing(tmp_path):
     text = words(page(bare(), tmp_path))
     for sentence in ("No error vectors are drawn", "The result contains no stations", "contains no residuals"):
@@ -183,6 +185,7 @@ def test_alternating_scheme_is_reported_if_it_was_applied(tmp_path):
     assert "iterations of the alternating scheme 715 its estimated remaining error / µm 0.250" in html
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_unknown_targets_are_counted(tmp_path):
     errors = measured()[0].copy(deep=True)
     for name in ("EX", "EY", "EZ", "covariance", "influence"):
@@ -190,6 +193,7 @@ def test_unknown_targets_are_counted(tmp_path):
     assert "The errors of 2 targets are unknown" in words(page(errors, tmp_path))
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_result_without_known_targets_is_reported(tmp_path):
     errors = bare()
     for name in ("EX", "EY", "EZ", "covariance"):

@@ -193,6 +193,7 @@ def test_centre_that_lost_its_top_touch_is_not_drawn_as_a_displacement():
     assert "Not drawn: 1 centres" in balls(seen, "k").caption
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_undetermined_freedom_is_a_dash_with_its_reason(folder):
     html = page(cframe, folder)
     row = next(row for row in rows(html, "The six errors") if row[0] == "EC")
@@ -214,6 +215,7 @@ def test_temperatures_and_speed_share_the_time_axis_of_the_errors(folder):
         assert str(sensor) in figure
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_sensors_are_at_the_positions_of_their_thermometer(tmp_path):
     errors, raw = clean()
     run = {
@@ -234,6 +236,7 @@ def test_sensors_are_at_the_positions_of_their_thermometer(tmp_path):
     assert re.search(r"Position unknown: .*bed", text)
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_unknown_temperature_is_not_a_number(tmp_path):
     errors, raw = clean()
     values = errors["temperature"].values.copy()
@@ -258,6 +261,7 @@ def test_result_by_the_normals_is_labelled(tmp_path):
     assert "Normals minus fit" not in text
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_result_without_any_of_its_extras_still_has_a_page(tmp_path):
     errors, _ = clean()
     bare = errors[["EX", "EY", "EZ", "EA", "EB", "EC", "covariance"]].drop_vars(
@@ -270,6 +274,7 @@ def test_result_without_any_of_its_extras_still_has_a_page(tmp_path):
     assert "No temperatures were recorded." in text
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_cycles_that_are_all_unknown_are_reported(tmp_path):
     errors, raw = clean()
     gone = errors.copy(deep=True)
