@@ -213,7 +213,7 @@ def _maximum_evidence(blank: _Fit, N: Array, b: Array, gain: Array, square: floa
     unit = np.where(size > 1e-9 * size.max(), 1 / np.where(size > 0, size, 1.0), 1.0)
     found = [_with_falloff(N * np.outer(unit, unit), b * unit, unit, order, group, p) for p in FALLOFFS]
     best = max(found, key=lambda each: each.evidence)
-    C, value = best.covariance * np.outer(unit, unit), best.value * unit
+    C, value = best.half.T @ best.half * np.outer(unit, unit), best.value * unit
     rest, degrees = max(square - float(b @ value), 0.0), max(count - int((group < 0).sum()), 1)
     factor = rest / degrees if chi2.sf(rest, degrees) < FALSE_ALARM else 1.0
     shared = C @ gain
@@ -231,10 +231,10 @@ def _maximum_evidence(blank: _Fit, N: Array, b: Array, gain: Array, square: floa
 
 @dataclass(frozen=True)
 class _Posterior:
-    """Coefficients in scaled units with covariance, size of the prior of each group, and its exponent p in n^-p."""
+    """Coefficients in scaled units, covariance H' H, size of the prior of each group, and its exponent p in n^-p."""
 
     value: Array
-    covariance: Array
+    half: Array
     tau: dict[int, float]
     falloff: float
     evidence: float
@@ -250,25 +250,26 @@ def _with_falloff(N: Array, b: Array, unit: Array, order: Array, group: Array, p
         prior = np.full(len(N), FLAT)
         for g, members in groups.items():
             prior[members] = (unit[members] / (tau[g] * shape[members])) ** 2
-        C, log_det = _inverse(N + np.diag(prior))
-        x = C @ b
+        half, log_det = _half_of_inverse(N, prior)
+        x = half.T @ (half @ b)
+        variance = np.einsum("ij,ij->j", half, half)
         before = dict(tau)
         for g, members in groups.items():
-            second = (x[members] ** 2 + np.diag(C)[members]) * (unit[members] / shape[members]) ** 2
+            second = (x[members] ** 2 + variance[members]) * (unit[members] / shape[members]) ** 2
             tau[g] = max(float(np.sqrt(second.mean())), least[g])
         if all(abs(np.log(tau[g] / before[g])) < SETTLED for g in groups):
             break
     evidence = float(b @ x) - log_det + float(np.log(prior).sum())
-    return _Posterior(x, C, tau, p, evidence)
+    return _Posterior(x, half, tau, p, evidence)
 
 
-def _inverse(matrix: Array) -> tuple[Array, float]:
-    """Return the inverse of a positive definite matrix, scaled for accuracy, and the logarithm of its determinant."""
-    scale = 1 / np.sqrt(np.diag(matrix))
-    both = np.outer(scale, scale)
-    factor = linalg.cholesky(matrix * both + ROUNDING * np.eye(len(matrix)), lower=True, check_finite=False)
-    lower = np.tril(linalg.lapack.dpotri(factor, lower=1)[0])
-    found: Array = both * (lower + np.tril(lower, -1).T)
+def _half_of_inverse(N: Array, prior: Array) -> tuple[Array, float]:
+    """Return H with H' H the inverse of N + diag(prior), scaled for accuracy, and the logarithm of its determinant."""
+    scale = 1 / np.sqrt(np.diag(N) + prior)
+    scaled = N * scale[:, None] * scale
+    np.fill_diagonal(scaled, 1.0 + ROUNDING)
+    factor = linalg.cholesky(scaled, lower=True, overwrite_a=True, check_finite=False)
+    found: Array = linalg.lapack.dtrtri(factor, lower=1)[0] * scale
     return found, 2 * float(np.log(np.diag(factor) / scale).sum())
 
 
