@@ -119,6 +119,14 @@ def test_honest_under_line_jitter_and_yaw_unharmed(scanner):
     assert yaw < 1.5 * np.sqrt(scanner.bound()[5, 5])
 
 
+@pytest.mark.parametrize("seed", [2, 11, 25, 32])
+def test_line_jitter_that_was_found_is_not_lost_again(make_scanner, motion, seed):
+    """In these scans its own contribution to the residuals once hid it, at every third step."""
+    scanner, rng = make_scanner(rows=100, columns=400), np.random.default_rng(seed)
+    cold, warm = scanner.scan(rng, jitter_z=0.5e-6), scanner.scan(rng, motion, jitter_z=0.5e-6)
+    assert register(prepare(*cold), prepare(*warm)).line_jitter[0] > 0.0
+
+
 def test_honest_under_jitter_along_the_feed(make_scanner):
     scanner = make_scanner(rows=240, columns=800)
     results = []

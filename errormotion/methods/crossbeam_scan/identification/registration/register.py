@@ -45,7 +45,7 @@ NEAR = 0.01
 """The noise is estimated when a step changes its variance by at most this share."""
 STRAIGHT = 400.0
 """Steps up to this squared length, in standard deviations, are linear: an error of 0.01 remains."""
-_STEPS = 12
+_STEPS = 20
 
 
 def register(
@@ -236,7 +236,7 @@ def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool)
         sums = problem.evaluate(state, gate)
         for _ in range(2):
             if near:
-                noise = estimate_noise(problem, state, sums, line_effects)
+                noise = estimate_noise(problem, state, sums, line_effects, noise)
             H, h = problem.equations(sums, noise, state)
             move = solve(H, h, free.motions, free.radius)
             before, state = state, problem.stepped(state, move)

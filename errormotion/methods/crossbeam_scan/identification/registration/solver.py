@@ -238,8 +238,11 @@ def inverse(H: Array, motions: Array) -> Array:
     return C
 
 
-def estimate_noise(problem: Problem, state: State, sums: Sums, line_effects: bool = True) -> Noise:
+def estimate_noise(problem: Problem, state: State, sums: Sums, line_effects: bool, before: Noise) -> Noise:
     """Estimate k and the line effects from the residuals at the solution.
+
+    ``before`` is the noise by which this solution was found. If it has line effects, they are in the residuals but not
+    in its k, by which they are compared with the noise of the blocks: the k of all residuals would contain them.
 
     The covariance needs the noise of slow patterns. Between two nodes the spline averages the cold noise, and
     neighbours share speckle: so k is the sum of the covariances of neighbouring residuals, up to two blocks apart, and
@@ -254,7 +257,7 @@ def estimate_noise(problem: Problem, state: State, sums: Sums, line_effects: boo
     # Independent columns: the part of Sy that is no constant.
     ridge = C + 1e-9 * np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(2)
     effects = np.linalg.solve(ridge, u[..., None])[..., 0]
-    if not _significant(effects, ridge, k, sums.used):
+    if not _significant(effects, ridge, before.k if any(before.tau) else k, sums.used):
         return Noise(k)
     white = np.sqrt(np.mean(np.linalg.inv(ridge).diagonal(axis1=1, axis2=2), axis=0))
     tau = np.maximum(np.sqrt(np.mean(effects**2, axis=0)), np.sqrt(k) * white)
