@@ -454,7 +454,6 @@ def measured():
     return raw
 
 
-@pytest.mark.usefixtures("unprinted")
 def test_a_result_of_the_method_is_reported_completely(page, measured):
     errors = BeamDirection().identify(measured, Settings(compensation="lk-h050", extrapolate=True, ordered=False))
     html = page(errors, raw=measured)

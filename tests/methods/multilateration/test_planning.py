@@ -11,6 +11,8 @@ from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.planning.plan import boxes_of, plan, reading_noise
 from errormotion.methods.multilateration.settings import Box, Planning, Settings
 
+pytestmark = pytest.mark.usefixtures("short_searches")
+
 CLOSE = ((-0.3, -0.1, 0.0), (-0.3, 0.0, 0.1), (-0.3, 0.1, 0.0), (0.0, 0.05, 0.6))
 LAYOUT = {
     "low": (-0.1, -0.1, 0.0), "high": (0.1, 0.1, 0.2), "count": (3, 3, 3), "stations": CLOSE,
@@ -30,11 +32,10 @@ def planned(planning=ROOM, **changes):
 
 
 @pytest.fixture(scope="module")
-def ds():
+def ds(short_searches):
     return planned()
 
 
-@pytest.mark.slow
 def test_a_plan_is_an_error_dataset_of_zeros_that_conforms_to_the_schema(ds):
     datasets.validate(ds)
     for name in ("EX", "EY", "EZ"):
@@ -107,7 +108,6 @@ def test_without_freedom_the_best_layout_is_that_of_the_settings():
     assert "No better layout was found within the boxes." in ds.attrs["notes"]
 
 
-@pytest.mark.slow
 def test_blocked_lines_of_sight_and_undetermined_targets_are_counted():
     # A pillar close to one target hides it from the three stations that stand together, two of which may move.
     pillar = Box(low=(-0.13, -0.02, 0.08), high=(-0.12, 0.02, 0.12))
