@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from command_line import CliRunner
 
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign

@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from typer.testing import CliRunner
+from command_line import CliRunner
 
 from errormotion.cli.app import app
 from errormotion.datasets.files.runfile import read_run

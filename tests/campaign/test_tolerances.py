@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
+from command_line import CliRunner, Result
 
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
@@ -31,7 +31,7 @@ def call(*arguments: Any, code: int = 0) -> Result:
 def test_run_report_and_runs_state_the_decision(
     lab: None, write: Callable[..., Path], tmp_path: Path, limit: str, verdict: str, code: int
 ) -> None:
-    found = call("run", write(TEST.format(limit)), code=code).stdout
+    found = call("run", write(TEST.format(limit)), "--no-report", code=code).stdout
     assert found.splitlines()[2].startswith(f"  Tolerances: {verdict} (ISO 14253-1, guard band 1 U (k = 2))")
     (run,) = json.loads(call("runs", tmp_path / "runs", "--json").stdout)["runs"]
     assert run["verdict"] == verdict
@@ -46,7 +46,7 @@ def test_a_file_of_limits_replaces_those_of_the_campaign(lab: None, write: Calla
     strict = tmp_path / "strict.toml"
     strict.write_text('schema = "errormotion.tolerances/1"\n[tolerances]\nfreedoms = { EX = "1 um" }\n')
     assert "valid" in call("validate", strict).stdout
-    call("run", write(TEST.format("11 um")), "--tolerances", strict, "--json", code=4)
+    call("run", write(TEST.format("11 um")), "--tolerances", strict, "--no-report", "--json", code=4)
     ((path),) = (tmp_path / "runs").glob("2*")
     assert "nonconformity proved" in call("runs", tmp_path / "runs").stdout
     strict.write_text(strict.read_text().replace("1 um", "1 mm"))
@@ -79,7 +79,7 @@ def test_a_resumed_run_keeps_its_limits(plan: Callable[..., CampaignPlan], tmp_p
 
 
 def test_without_tolerances_nothing_is_decided(lab: None, write: Callable[..., Path], tmp_path: Path) -> None:
-    assert "Tolerances" not in call("run", write('name = "a"')).stdout
+    assert "Tolerances" not in call("run", write('name = "a"'), "--no-report").stdout
     (run,) = json.loads(call("runs", tmp_path / "runs", "--json").stdout)["runs"]
     assert run["verdict"] == ""
 
