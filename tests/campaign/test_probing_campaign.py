@@ -310,12 +310,10 @@ def test_a_thermometer_without_answer_for_a_cycle_leaves_a_gap(lab: Lab, monkeyp
 # ---------------------------------------------------------------------- going on
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("driver", ["controller_probe", "dprnt"])
-def test_an_interrupted_run_has_the_data_of_an_uninterrupted_one(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, driver: str
-) -> None:
-    plan, runs = lab(driver=driver, settings='moves = [["1 m", "0 m", "0.5 m"], ["3 m", "0 m", "0.5 m"]]')
+def test_an_interrupted_run_with_programs_has_the_data_of_an_uninterrupted_one(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:  # with single touches: tests/faults/test_continued.py
+    plan, runs = lab(driver="dprnt", settings='moves = [["1 m", "0 m", "0.5 m"], ["3 m", "0 m", "0.5 m"]]')
     (whole,) = runner.run(plan, runs=runs)
     acquire = NormalVector.acquire
 

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+MOVES = 'moves = [["1 m", "0 m", "0.5 m"], ["3 m", "0 m", "0.5 m"]]'
 
 SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
     "beam_direction": ("virtual_beam", "campaign.toml", []),
@@ -43,7 +44,7 @@ SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
         "virtual_probing",
         "monday.toml",
         [
-            (r'duration = "180 min"', 'duration = "50 min"\ntouches = 4'),
+            (r'duration = "180 min"', 'duration = "50 min"\ntouches = 4\n' + MOVES),
             (r'"60 min"', '"10 min"'),
             (r'"120 min"', '"30 min"'),
         ],
