@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import xarray as xr
 
 from errormotion.kinematics import twists
 from errormotion.kinematics.iso import DOF
+from errormotion.plugins import MethodSubject
 from errormotion.testing.kit import require
+
+
+def raw_data(subject: MethodSubject) -> xr.Dataset:
+    """Return a copy of the raw data of seed 0; they are simulated once for all checks."""
+    return _simulated(subject).copy(deep=True)
+
+
+@lru_cache(maxsize=4)
+def _simulated(subject: MethodSubject) -> xr.Dataset:
+    return subject.make(0)[0]
 
 
 def place_dims(errors: xr.Dataset) -> tuple[str, ...]:

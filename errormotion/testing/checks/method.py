@@ -27,7 +27,7 @@ from errormotion.testing.checks.coverage import coverage, differences, recovers_
 from errormotion.testing.checks.redraw import sources_as_stated, sources_drawn, why_no_redrawing
 from errormotion.testing.checks.text import chapters_translated, why_no_texts
 from errormotion.testing.kit import Checks, require
-from errormotion.testing.results import covariance, functional_point, names, sigma, values
+from errormotion.testing.results import covariance, functional_point, names, raw_data, sigma, values
 
 METHOD_CHECKS: Checks[MethodSubject] = Checks()
 
@@ -87,7 +87,7 @@ def _texts_of(plugin: Any) -> set[str]:
 @METHOD_CHECKS.add()
 def schema(subject: MethodSubject) -> str:
     """Raw data and result conform to their schemas, and the result states its method and settings."""
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     tables = tuple(getattr(subject.plugin, "raw_schemas", ()))
     if tables or variants(str(raw.attrs.get("schema"))):  # a method without tables validates its raw data itself
         datasets.validate(raw, tables)
@@ -111,7 +111,7 @@ def joins_along_a_dimension(subject: MethodSubject) -> str:
     """The parts of an acquisition are joined along a dimension of the raw data, and their expected length is known."""
     method, settings = subject.plugin(), subject.effective_settings()
     dim, length = method.append_dim(settings), method.progress(settings)
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     # Acquired data may be another variant of the schema than the data of the kit.
     known = {str(d) for d in raw.dims}
     tables = getattr(method, "raw_schemas", ()) or variants(method.needs.raw_schema)
@@ -149,7 +149,7 @@ def frame_invariance(subject: MethodSubject) -> str:
     """Raw data transformed to another frame result in the same errors and covariance, transformed to that frame."""
     rotation, shift = (np.array(part) for part in subject.motion)
     pose = RigidTransform.from_components(shift, Rotation.from_rotvec(rotation))
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     here, _ = subject.outcome(0)
     there = _moved_subject(subject, pose).identify(moved_raw(raw, subject.raw_vectors, pose))
     if names(here) != DOF:
@@ -212,7 +212,7 @@ def moved_raw(raw: xr.Dataset, vectors: Any, pose: RigidTransform) -> xr.Dataset
 @METHOD_CHECKS.add()
 def number_format(subject: MethodSubject) -> str:
     """Measured values stored as float32 result in the same errors, within a tenth of their uncertainty."""
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     single = raw.copy()
     for name in measured_variables(subject, raw):
         single[name] = raw[name].astype(np.float32)
@@ -225,7 +225,7 @@ def number_format(subject: MethodSubject) -> str:
 @METHOD_CHECKS.add()
 def units(subject: MethodSubject) -> str:
     """Measured values in mm with this unit result in the same errors or a typed error."""
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     lengths = [name for name in measured_variables(subject, raw) if raw[name].attrs.get("units") == "m"]
     require(bool(lengths), "no measured variable has the attribute units = 'm'")
     straight, verdicts = subject.outcome(0)[0], []
@@ -239,7 +239,7 @@ def units(subject: MethodSubject) -> str:
 @METHOD_CHECKS.add()
 def layout(subject: MethodSubject) -> str:
     """The order of dimensions and of their labels has no effect, or is refused with a typed error."""
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     straight, _ = subject.outcome(0)
     turned = raw.copy()
     for name in map(str, raw.data_vars):
@@ -265,7 +265,7 @@ def _same_or_refused(subject: MethodSubject, one: xr.Dataset, raw: xr.Dataset, w
 @METHOD_CHECKS.add(limit=60.0)
 def refuses_missing_inputs(subject: MethodSubject) -> str:
     """Without a required variable, or with data of another schema, the method raises a typed error that names it."""
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     for name in map(str, raw.data_vars):
         less = raw.drop_vars(name)
         if name in subject.optional:
@@ -280,7 +280,7 @@ def refuses_missing_inputs(subject: MethodSubject) -> str:
 @METHOD_CHECKS.add()
 def nothing_measured(subject: MethodSubject) -> str:
     """Without any measured value, the method raises a typed error or returns NaN."""
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     blank = raw.copy()
     for name in measured_variables(subject, raw):
         blank[name] = raw[name] * np.nan
@@ -296,7 +296,7 @@ def nothing_measured(subject: MethodSubject) -> str:
 @METHOD_CHECKS.add()
 def leaves_inputs_alone(subject: MethodSubject) -> str:
     """Identification does not change the raw dataset or its attributes, and accepts read-only arrays."""
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     for variable in raw.variables.values():
         if isinstance(variable.data, np.ndarray):
             variable.data.flags.writeable = False
@@ -314,7 +314,7 @@ def leaves_inputs_alone(subject: MethodSubject) -> str:
 @METHOD_CHECKS.add(limit=60.0)
 def round_trip(subject: MethodSubject) -> str:
     """A result is unchanged after storage; raw data from a file (NetCDF, Zarr) have the same result."""
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     errors, _ = subject.outcome(0)
     with TemporaryDirectory() as folder:
         datasets.save(errors, Path(folder) / "errors.nc")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 
 import numpy as np
 import xarray as xr
@@ -14,7 +15,7 @@ from errormotion.montecarlo.trials import redrawing_of, sample, trial
 from errormotion.plugins import MethodSubject, Redrawing
 from errormotion.testing.checks.coverage import require_honest, tested_places
 from errormotion.testing.kit import require
-from errormotion.testing.results import covariance, influence, names, values
+from errormotion.testing.results import covariance, influence, names, raw_data, values
 
 TRIALS = 40
 """Trials of each source; with five freedoms, a standard uncertainty that is 1.25 times too large is detected."""
@@ -68,9 +69,10 @@ def sources_as_stated(subject: MethodSubject) -> str:
     return f"{TRIALS} trials; " + "; ".join(verdicts)
 
 
+@lru_cache(maxsize=4)
 def _drawn(subject: MethodSubject) -> tuple[xr.Dataset, xr.Dataset, Redrawing]:
-    """Return raw data, result, and the draws of the sources."""
-    raw, _ = subject.make(0)
+    """Return raw data, result, and the draws of the sources, for two checks."""
+    raw = raw_data(subject)
     errors, _ = subject.outcome(0)
     with _quiet():
         return raw, errors, redrawing_of(subject.plugin(), raw, subject.effective_settings(), errors)

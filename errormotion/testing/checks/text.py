@@ -5,6 +5,7 @@ from __future__ import annotations
 from errormotion.plugins import MethodSubject
 from errormotion.report.page.language import LANGUAGES
 from errormotion.testing.kit import require
+from errormotion.testing.results import raw_data
 
 
 def languages_of(subject: MethodSubject) -> list[str]:
@@ -22,7 +23,7 @@ def chapters_translated(subject: MethodSubject) -> str:
     """No text of a chapter is missing in the catalogues of the method."""
     from errormotion.report.untranslated import untranslated
 
-    raw, _ = subject.make(0)
+    raw = raw_data(subject)
     errors, _ = subject.outcome(0)
     languages = languages_of(subject)
     for language in languages:
