@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.methods.linear_positioning.diagonals.redrawing import FEWEST_TRIALS, draw_effects, redraw_diagonals
+from errormotion.methods.linear_positioning.diagonals.redrawing import draw_effects, redraw_diagonals
 from errormotion.methods.linear_positioning.identification import budget, moving
 from errormotion.methods.linear_positioning.identification.identify import Evaluated, evaluate
 from errormotion.methods.linear_positioning.identification.reading import labels, length_uncertainty
@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 
 def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
-    """Return the readings, and the draws of their sources: scatter, drift, instrument, alignment, expansion."""
+    """Return the readings, and the draws of their sources: scatter, drift, instrument, alignment, expansion.
+
+    The figures of redrawn readings are not used: they are found without bias and uncertainty.
+    """
     if "end_deviation" in raw:
         return _moving(raw, settings, errors)
     if "diagonal_deviation" in raw:
@@ -36,7 +39,7 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     groups = dict.fromkeys(source.group for source in evaluated.sources if source.group != budget.END)
     sources = {"readings": Redraw(_readings(evaluated), groups=(budget.END,), own=True)}
     sources |= {group: Redraw(_shared(evaluated, group), groups=(group,)) for group in groups}
-    return Redrawing(raw.load(), settings.model_copy(update={"trials": FEWEST_TRIALS}), sources)
+    return Redrawing(raw.load(), settings.model_copy(update={"trials": 0}), sources)
 
 
 def _moving(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
@@ -54,7 +57,7 @@ def _moving(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawin
     )
 
     def changed(raw: xr.Dataset, change: Array) -> xr.Dataset:
-        deviation = raw["end_deviation"].transpose(*dims)
+        deviation = raw.variables["end_deviation"].transpose(*dims)
         return raw.assign(end_deviation=deviation.copy(data=deviation.values + change))
 
     def readings(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
@@ -106,5 +109,5 @@ class _Draw:
         approaches = [APPROACHES.index(label) for label in labels(raw, "approach")]
         rank = np.argsort(np.argsort(raw["target_position"].values))
         by_label = np.nan_to_num(change)[:, approaches][..., rank]
-        deviation = raw["deviation"].transpose("freedom", "approach", "run", "target")
+        deviation = raw.variables["deviation"].transpose("freedom", "approach", "run", "target")
         return raw.assign(deviation=deviation.copy(data=deviation.values + by_label[:, :, None, :])), settings

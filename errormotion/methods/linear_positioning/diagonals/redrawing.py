@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from errormotion.arrays import Array
     from errormotion.methods.linear_positioning.settings import Settings
 
-FEWEST_TRIALS = 200
-"""Trials for the figures of a redrawn test, which are not used."""
-
 
 def redraw_diagonals(raw: xr.Dataset, settings: Settings) -> Redrawing:
-    """Return the readings, and the draws of their sources: scatter, drift, scale, alignment."""
+    """Return the readings, and the draws of their sources: scatter, drift, scale, alignment.
+
+    The figures of redrawn readings are not used: they are found without bias and uncertainty.
+    """
     diagonals = evaluate_diagonals(raw, settings, [])
     _, groups, effects = shared_sources(diagonals)
     size = np.array([each.evaluated.scatter_of_means()[0] for each in diagonals])  # (diagonal, approach, stop)
@@ -40,7 +40,7 @@ def redraw_diagonals(raw: xr.Dataset, settings: Settings) -> Redrawing:
         return Redraw(draw, groups=(group,))
 
     sources = {"readings": Redraw(readings, own=True)} | {group: shared(group) for group in dict.fromkeys(groups)}
-    return Redrawing(raw.load(), settings.model_copy(update={"trials": FEWEST_TRIALS}), sources)
+    return Redrawing(raw.load(), settings.model_copy(update={"trials": 0}), sources)
 
 
 def draw_effects(effects: Array, group: str, generator: np.random.Generator) -> Array:
@@ -57,5 +57,5 @@ def _changed(raw: xr.Dataset, change: Array) -> xr.Dataset:
     """Add a change (diagonal, approach, stop), approaches forward and backward, to the readings of all runs."""
     shape = (change.shape[0], len(APPROACHES), change.shape[2])
     by_label = np.broadcast_to(change, shape)[:, [APPROACHES.index(label) for label in labels(raw, "approach")]]
-    deviation = raw["diagonal_deviation"].transpose(*STOPS)
+    deviation = raw.variables["diagonal_deviation"].transpose(*STOPS)
     return raw.assign(diagonal_deviation=deviation.copy(data=deviation.values + by_label[:, None]))

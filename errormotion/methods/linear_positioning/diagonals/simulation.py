@@ -32,13 +32,6 @@ class Scatter:
     reversal: float = 1.5e-6
 
 
-def true_deviations(machine: VirtualMachine, line: Line, stops: Array) -> Array:
-    """Return the true displacement along a diagonal since its first stop minus the commanded one, (stop,), m."""
-    points = np.array([line.point(float(distance)) for distance in stops])
-    displaced = machine.geometry.twist(points)[:, :3]
-    return np.asarray((displaced - displaced[0]) @ line.unit)
-
-
 def simulate_diagonals(
     settings: Settings, seed: int, behaviour: Scatter | None = None
 ) -> tuple[xr.Dataset, xr.Dataset]:
@@ -55,16 +48,17 @@ def simulate_diagonals(
     shape = (settings.runs, 2, distance.shape[1])
     sign = np.array([1.0, -1.0])[:, None]
     true, read = [], []
-    for line, stops in zip(diagonals, distance, strict=True):
+    points = np.array([[line.point(float(s)) for s in stops] for line, stops in zip(diagonals, distance, strict=True)])
+    displaced = machine.geometry.twist(points)[..., :3]
+    for line, stops, moved in zip(diagonals, distance, displaced, strict=True):
         displacement = stops - stops[0]
-        deviation = true_deviations(machine, line, stops) - behaviour.reversal / 2.0
+        deviation = (moved - moved[0]) @ line.unit - behaviour.reversal / 2.0
         angle = settings.uncertainty.alignment * draw(2)
         z = displacement / (displacement[-1] / 2.0) - 1.0
         drift = behaviour.offset * draw((shape[0], 1, 1)) + behaviour.slope * draw((shape[0], 1, 1)) * z
         errors = sign * behaviour.reversal / 2.0 + drift + behaviour.noise * draw(shape)
         true.append(deviation)
         read.append(deviation + errors + (scale - (angle @ angle) / 2.0) * displacement)
-    points = np.array([[line.point(float(s)) for s in stops] for line, stops in zip(diagonals, distance, strict=True)])
     variables: dict[str, Any] = {
         "diagonal_deviation": (STOPS, np.array(read), _M),
         "stop_point": (("diagonal", "stop", "direction"), points, _M),

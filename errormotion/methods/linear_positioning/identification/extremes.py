@@ -85,9 +85,12 @@ def figures(x: Array, spread: Scatter, shared: Array, target_u: float, *, straig
     straight : bool
         Whether the freedom is a straightness, of which a line is removed.
     trials : int
+        0: bias and uncertainty are not determined (NaN).
     """
     observed = standard.statistics(x)
     value = _evaluate(observed, spread.z, straight)
+    if not trials:
+        return Figures(value, *np.full((2, value.size), np.nan))
     true = _evaluate(_trials(x, observed, spread, shared, target_u, trials), spread.z, straight)
     bias = value - np.median(true, axis=0)
     u = np.hypot(true.std(axis=0, ddof=1), BIAS_UNCERTAINTY * bias)

@@ -159,19 +159,22 @@ def _lines(x: Array, Z: Array) -> tuple[Array, Array, Array]:
     n = known.sum(axis=1, keepdims=True)
     mean = np.where(known, x, 0.0).sum(axis=1, keepdims=True) / np.maximum(n, 1)
     centred = np.where(known & (n > 1), x - mean, np.nan)
-    coefficient = np.full((*x.shape[:2], 2), np.nan)
-    residual, cofactors = np.full_like(x, np.nan), []
-    for a, j in np.ndindex(*x.shape[:2]):
-        here = np.isfinite(centred[a, j])
+    residual, (coefficient, cofactors) = np.full_like(x, np.nan), np.full((2, *x.shape[:2], 2), np.nan)
+    there = np.isfinite(centred)
+    for here in np.unique(there.reshape(-1, len(Z)), axis=0):  # runs with readings at the same targets
         if here.sum() < 3 or np.ptp(Z[here, 1]) == 0:
             continue
+        runs = (there == here).all(axis=-1)
         normal = np.linalg.inv(Z[here].T @ Z[here])
-        coefficient[a, j] = normal @ Z[here].T @ centred[a, j, here]
-        residual[a, j, here] = centred[a, j, here] - Z[here] @ coefficient[a, j]
-        cofactors.append(np.diagonal(normal))
-    if not cofactors:
+        readings = centred[runs][:, here, None]
+        fitted = normal @ Z[here].T @ readings
+        coefficient[runs] = fitted[..., 0]
+        residual[runs[..., None] & here] = (readings - Z[here] @ fitted).ravel()
+        cofactors[runs] = np.diagonal(normal)
+    usable = np.isfinite(cofactors[..., 0])
+    if not usable.any():
         raise MethodError("deviation: expected runs with readings at three targets or more; found none")
-    return residual, coefficient, np.mean(cofactors, axis=0)
+    return residual, coefficient, cofactors[usable].mean(axis=0)
 
 
 def _own(residual: Array, kind: str) -> tuple[Array, float, bool]:
