@@ -14,6 +14,7 @@ from errormotion.compensation.thermal_model import Settings, ThermalModel, check
 from errormotion.compensation.thermal_model.fitting import MIN_SAMPLES
 from errormotion.compensation.thermal_model.model import ROWS
 from errormotion.compensation.thermal_model.plugin import ThermalModelDataset
+from errormotion.compensation.thermal_model.regression import left_out_residuals
 from errormotion.datasets.schemas import DOF
 from errormotion.errors import DatasetError
 
@@ -242,3 +243,23 @@ def test_the_page_of_schemas_has_the_table_of_the_model() -> None:
     for line, row in zip(reported, ROWS, strict=True):
         assert row.meaning in line
         assert ", ".join(row.dims) in line
+
+
+def test_nothing_is_predicted_for_a_campaign_without_another() -> None:
+    rng = np.random.default_rng(0)
+    inputs, errors, campaign = rng.standard_normal((8, 2)), rng.standard_normal(8), np.repeat([0, 1], 4)
+    known = left_out_residuals(inputs, errors, np.ones(8), campaign)
+    assert np.isfinite(known).all()
+    assert np.isnan(left_out_residuals(inputs, errors, np.repeat([1.0, 0.0], 4), campaign)).all()
+
+
+def test_an_error_that_only_one_campaign_contains_is_not_modelled(pair: list[xr.Dataset]) -> None:
+    without = pair[1].assign(EY=pair[1]["EY"] * np.nan)
+    model = fit([pair[0], without], LAGGED)
+    coefficient = model.dataset["coefficient"].values
+    assert np.isnan(coefficient[1]).all()
+    assert np.isfinite(np.delete(coefficient, 1, axis=0)).all()
+    assert model.predict(pair[1])["EY"].isnull().all()
+    empty = [ds.assign({name: ds[name] * np.nan for name in DOF}) for ds in pair]
+    with pytest.raises(DatasetError, match="found no such error"):
+        fit([pair[0], empty[1]], LAGGED)

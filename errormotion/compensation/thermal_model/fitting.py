@@ -85,8 +85,12 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     Raises
     ------
     DatasetError
-        Campaigns of different machines, components or functional points, no common sensors, too few values, or more
-        than `MAX_VALUES` or `MAX_SENSORS`.
+        Campaigns of different machines, components or functional points, no common sensors, no error with enough
+        values, or more than `MAX_VALUES` or `MAX_SENSORS`.
+
+    Notes
+    -----
+    The model of an error is NaN if fewer than `MIN_SAMPLES` values are known, or only one of several campaigns has any.
     """
     settings = settings or Settings()
     if not campaigns:
@@ -94,12 +98,23 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     _check_size(campaigns)
     _check_alike(campaigns)
     records = [read_record(ds, f"campaign {number + 1}") for number, ds in enumerate(campaigns)]
-    seen = [k for k in range(6) if sum(int(np.isfinite(r.errors[:, k]).sum()) for r in records) >= MIN_SAMPLES]
+    seen = [k for k in range(6) if _is_known([int(np.isfinite(r.errors[:, k]).sum()) for r in records])]
     if not seen:
-        raise DatasetError(f"Expected at least {MIN_SAMPLES} known values of an error in all campaigns; found fewer.")
+        raise DatasetError(
+            f"Expected at least {MIN_SAMPLES} known values of an error in all campaigns together, of two campaigns if "
+            "there are several; found no such error."
+        )
     columns = regression.Columns(records)
     best, tried = _chosen(columns, seen, settings)
     return _made(campaigns, columns, seen, best, tried, settings)
+
+
+def _is_known(values: Sequence[int]) -> bool:
+    """Return whether an error can be modelled, from its number of known values in each campaign.
+
+    Of several campaigns, each is predicted from the others: an error that only one contains has no uncertainty.
+    """
+    return sum(values) >= MIN_SAMPLES and (len(values) == 1 or sum(map(bool, values)) > 1)
 
 
 def _check_size(campaigns: Sequence[xr.Dataset]) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.model_selection import LeaveOneGroupOut
 
 from errormotion.arrays import Array
 from errormotion.compensation.thermal_model.features import Feature, matrix
@@ -77,13 +76,17 @@ def solve(X: Array, y: Array, weight: Array, strengths: Array) -> Array:
 
 
 def left_out_residuals(X: Array, y: Array, weight: Array, group: NDArray[np.int64]) -> Array:
-    """Return measured minus predicted of each row by models fitted without its campaign, (n, strength)."""
+    """Return measured minus predicted of each row by models fitted without its campaign, (n, strength).
+
+    NaN where the row, or every other campaign, is unknown.
+    """
     known = (weight > 0) & np.isfinite(X).all(axis=1)
     residual = np.full((y.size, STRENGTHS.size), np.nan)
     rows = np.flatnonzero(known)
-    for train, test in LeaveOneGroupOut().split(X[rows], groups=group[rows]):
-        coefficient = solve(X[rows[train]], y[rows[train]], weight[rows[train]], STRENGTHS)
-        residual[rows[test]] = y[rows[test], None] - X[rows[test]] @ coefficient.T
+    campaigns = np.unique(group[rows])
+    for left_out in campaigns if campaigns.size > 1 else ():
+        test, train = rows[group[rows] == left_out], rows[group[rows] != left_out]
+        residual[test] = y[test, None] - X[test] @ solve(X[train], y[train], weight[train], STRENGTHS).T
     return residual
 
 
