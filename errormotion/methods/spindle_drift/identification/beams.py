@@ -234,7 +234,7 @@ def circles_and_line(
 
     from scipy.optimize import least_squares
 
-    solution = least_squares(gaps, np.zeros(4), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    solution = least_squares(gaps, np.zeros(4), method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
     point, u = line(solution.x)
     along = crossing(point, u) - np.array(lowest)
     return point + along.mean() * u, u
@@ -250,9 +250,15 @@ def _arc(s: Array, readings: Array, radius: float) -> tuple[float, float]:
         s0, y0, R = p * unit
         return np.asarray((y0 + R - np.sqrt(np.maximum(R * R - (s - s0) ** 2, 0.0)) - readings) * 1e6)
 
+    def slopes(p: Array) -> Array:
+        s0, _, R = p * unit
+        root = np.sqrt(np.maximum(R * R - (s - s0) ** 2, 1e-12 * R * R))
+        return np.stack([(s0 - s) / root, np.ones(len(s)), 1.0 - R / root], axis=1) * (1e6 * unit)
+
     from scipy.optimize import least_squares
 
-    s0, y0, _ = least_squares(misfit, start / unit, xtol=1e-14, ftol=1e-14, gtol=1e-14).x * unit
+    found = least_squares(misfit, start / unit, slopes, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    s0, y0, _ = found.x * unit
     return float(s0), float(y0)
 
 
