@@ -126,7 +126,7 @@ def _motion(data: Readings, settings: Settings) -> Motion:
                 f"Ball {names[i]} was touched in {touched[i]} directions; a sphere needs four, preferably five: "
                 "around it and on top."
             )
-        centre, radius = rigid.spheres(seen)
+        centre, radius = seen.spheres
     else:
         count = np.maximum(seen.valid[..., 0].sum(axis=0), 1)[:, None]
         centre = np.where(seen.valid[..., :1], seen.position[:, :, 0], 0.0).sum(axis=0) / count

@@ -15,6 +15,7 @@ For a dataset of centres, p is the centre, and p + e(p, t) = b_i replaces the eq
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,10 +58,15 @@ class Observations:
     cycle_time: Array
     touched: bool
 
-    @property
+    @cached_property
     def valid(self) -> NDArray[np.bool_]:
         """Which numbers were measured, (k, b, m)."""
-        return np.diagonal(self.weight, axis1=2, axis2=3) > 0
+        return np.asarray(np.diagonal(self.weight, axis1=2, axis2=3) > 0)
+
+    @cached_property
+    def spheres(self) -> tuple[Array, Array]:
+        """Centres (b, 3) and radii (b,) of spheres through the touches of each ball without drift, m."""
+        return _spheres(self.position, self.valid)
 
     def without(self, wrong: NDArray[np.bool_]) -> Observations:
         """Return the observations without the outliers ``wrong`` (k, b, m)."""
@@ -69,6 +75,8 @@ class Observations:
 
     def cycles(self, which: NDArray[np.intp]) -> Observations:
         """Return the selected cycles."""
+        if np.array_equal(which, np.arange(len(self.cycle_time))):
+            return self
         return replace(
             self,
             position=self.position[which],
@@ -140,7 +148,7 @@ def fit(seen: Observations, motion: Motion, *, interpolate: bool = True) -> Rigi
         )
     time = mean_time(seen) if interpolate else seen.cycle_time
     to_knots = knot_weights(time, seen.time, interpolate)
-    twist, anchor = np.zeros((k, 6)), spheres(seen)[0] if seen.touched else None
+    twist, anchor = np.zeros((k, 6)), seen.spheres[0] if seen.touched else None
     for _ in range(MOST_ITERATIONS):
         previous = twist
         twist, solved, parts = _step(seen, motion, to_knots, twist, anchor)
@@ -160,7 +168,7 @@ def fit(seen: Observations, motion: Motion, *, interpolate: bool = True) -> Rigi
 
 def determined(seen: Observations, motion: Motion) -> NDArray[np.bool_]:
     """Return which cycles determine the motion alone, (k,)."""
-    normal = _directions(seen.position, spheres(seen)[0]) if seen.touched else _axes(seen.position)
+    normal = _directions(seen.position, seen.spheres[0]) if seen.touched else _axes(seen.position)
     H = motion.design(motion.lever(seen.position), normal)
     valid = seen.valid
     positions = seen.position[valid]
@@ -200,11 +208,6 @@ def at_times(to_knots: Array, twist: Array) -> Array:
     edge = np.zeros((1, 6))
     around = np.stack([np.concatenate([edge, twist[:-1]]), twist, np.concatenate([twist[1:], edge])], axis=1)
     return np.asarray(np.einsum("kbms,ksd->kbmd", to_knots, around))
-
-
-def spheres(seen: Observations) -> tuple[Array, Array]:
-    """Return centres (b, 3) and radii (b,) of spheres through the touches of each ball without drift, m."""
-    return _spheres(seen.position, seen.valid)
 
 
 def _spheres(position: Array, valid: NDArray[np.bool_], about: Array | None = None) -> tuple[Array, Array]:
