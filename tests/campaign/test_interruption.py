@@ -63,7 +63,7 @@ def test_kill_9_loses_at_most_the_last_second_and_resume_continues(
 ) -> None:
     long = f'name = "long"\nsettings = {{count = {COUNT}}}'
     campaign = write('name = "first"\nsettings = {count = 100}', long, bench=bench)
-    process = command("run", campaign)
+    process = command("run", campaign, "--no-report")
     folder = wait_for(tmp_path, process, 1500)
     before = committed_length(folder.raw, "time")
     time.sleep(1.0)
@@ -76,7 +76,7 @@ def test_kill_9_loses_at_most_the_last_second_and_resume_continues(
     assert kept >= before + 0.1 * RATE, "nothing came to the disk within a second"
     assert RunFolder.open(folder.path).data["status"] == "running"
     assert folder.data["test"] == "long"
-    process = command("run", "--resume", "--runs", tmp_path / "runs", "--json")
+    process = command("run", "--resume", "--runs", tmp_path / "runs", "--no-report", "--json")
     out, err = process.communicate(timeout=100)
     assert process.returncode == 0, err
     found = json.loads(out)
