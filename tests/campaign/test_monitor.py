@@ -221,18 +221,18 @@ def test_the_log_of_a_monitor_is_no_campaign_to_resume(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_memory_of_a_long_log_is_constant(tmp_path: Path) -> None:
-    """Six hundred rows instead of two hundred: memory that grows with the rows would be three times as large."""
+    """Three hundred rows instead of one hundred: memory that grows with the rows would be three times as large."""
     with Monitor(bench(CONTROL), tmp_path, 1e-3) as monitor:
         watched = monitor.watch()
         tracemalloc.start()
         try:
-            next(islice(watched, 200, None))
+            next(islice(watched, 100, None))
             early = tracemalloc.get_traced_memory()[0]
-            next(islice(watched, 400, None))
+            next(islice(watched, 200, None))
             late = tracemalloc.get_traced_memory()[0]
         finally:
             tracemalloc.stop()
-    assert late - early < 300_000  # bytes; rows kept as they are handed over would be 2 MB, at 5 kB each
+    assert late - early < 300_000  # bytes; rows kept as they are handed over would be 1 MB, at 5 kB each
 
 
 def test_ticks_that_were_missed_are_not_counted_as_rows(tmp_path):
