@@ -14,13 +14,13 @@ NOMINAL_LIFT = -0.17
 
 
 def subjects() -> tuple[MethodSubject, ...]:
-    """Return the two procedures: scans of three artefacts in three cycles, and the pose of the profiler.
+    """Return the two procedures: a cold and a warm scan of three artefacts, and the pose of the profiler.
 
     Both have an eighth of the points of a real profiler, those of the scans at twice their distance. The axis is Y of
     every frame: the frame of the scans is turned about Y, that of the pocket not at all.
     """
     small = {"scan_length": 28e-3, "line_pitch": 140e-6, "layout": {"points": 800, "width": 20e-3}}
-    scan = {"positions": POSITIONS, "warm_up": (1800.0, 7200.0)}
+    scan = {"positions": POSITIONS, "warm_up": (7200.0,)}
     pose = {"procedure": "profiler_pose", "profiler_pose": {"dz": NOMINAL_LIFT}}
     coarse = {"line_pitch": 140e-6, "layout": {"points": 800, "width": 40e-3}}
     return (

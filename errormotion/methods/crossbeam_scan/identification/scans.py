@@ -144,13 +144,14 @@ def _dataset(
     for note in notes:
         log.warning(note)
     curve = curves(axis, found, rig, position, time[1:], warm, check.wrong)
+    extras, labels = _extras(found, axis, rig, rows, cold, reason, own, curve | check.extras())
     rig_share = influence[: len(SOURCES)]  # `own` contains the noise of the cold scans already
     total = own + np.einsum("stki,stkj->tkij", rig_share, rig_share)
     ds = build_errors(
         values,
         total,
         dims=("time", "position"),
-        coords={"time": time, "y": ("position", position, _METRES)},
+        coords={"time": time, "y": ("position", position, _METRES)} | labels,
         component="Y",
         machine=str(raw.attrs.get("machine", "unknown")),
         frame="carriage, machine directions",
@@ -163,7 +164,7 @@ def _dataset(
         influence=influence,
         sources=axis.sources,
         source_groups=axis.source_groups,
-        extras=_extras(found, axis, rig, rows, cold, reason, own, curve | check.extras()),
+        extras=extras,
         start=warm_up_start(raw, found.time, cold),
         source_ids=pose_identities(rig.pose, rig.pose_covariance),
         reference_sources=axis.sources[len(SOURCES) :],
@@ -257,7 +258,8 @@ def _extras(
     reason: NDArray[np.object_],
     own: Array,
     further: dict[str, Any],
-) -> Mapping[str, xr.DataArray]:
+) -> tuple[dict[str, xr.DataArray], dict[str, Any]]:
+    """Return the extra results without coordinates, and their coordinates."""
     two = ("time", "position")
     quality = {name: values[rows] for name, values in found.quality.items()}
     deviation = np.sqrt(np.diagonal(own, axis1=-2, axis2=-1))
@@ -285,10 +287,11 @@ def _extras(
         u = np.sqrt(np.diagonal(axis.covariance[repeats], axis1=-2, axis2=-1))
         out["cold_repeat_u"] = (("repeat", "position", "dof"), u)
     out |= _map_extras(found.maps, rows) | further
-    coords = {"jitter": ["z", "y"], "direction": list("xyz"), "pose_parameter": ["a", "b", "g", "dx", "dy", "dz"]}
-    ds = xr.Dataset(out)
-    ds = ds.assign_coords({name: labels for name, labels in coords.items() if name in ds.dims})
-    return {str(name): ds[name] for name in ds.data_vars}
+    coords: dict[str, Any] = {name: out.pop(name) for name in ("place", "moment")}
+    coords |= {"jitter": ["z", "y"], "direction": list("xyz")}
+    if "pose_u" in out:
+        coords["pose_parameter"] = ["a", "b", "g", "dx", "dy", "dz"]
+    return {name: xr.DataArray(xr.Variable(*parts)) for name, parts in out.items()}, coords
 
 
 def _map_extras(maps: list[Maps | None], rows: list[int]) -> dict[str, Any]:

@@ -282,7 +282,7 @@ def _maximised(C: Array, u: Array, k: float, tau: Array) -> Array:
     for _ in range(_EM_STEPS):
         gain, cross = line_gain(own, mixed, k, tau)
         effects = gain * sums + cross * sums[::-1]
-        tau = np.sqrt((effects**2 + k * gain).mean(axis=1))
+        tau = np.sqrt((effects**2 + k * gain).sum(axis=1) / len(u))
     return tau
 
 
