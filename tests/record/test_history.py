@@ -28,8 +28,8 @@ from errormotion.report import write_run_report
 pytestmark = pytest.mark.usefixtures("translated")
 
 FIRST = datetime(2024, 1, 10, 8, tzinfo=UTC)
-BEFORE = 14
-"""Runs before the step of 10 um; the machine was hit between this one and the one before."""
+RUNS, BEFORE = 14, 8
+"""Monthly runs, and those before the step of 10 um; the machine was hit between the last of these and the next."""
 BAR = 0.5e-6
 """Standard uncertainty of the bar that all runs share, m."""
 
@@ -86,9 +86,9 @@ def save(runs: Path, number: int, result: xr.Dataset, **changes: Any) -> Path:
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder of 26 monthly runs of one machine with a step, and a note on its cause."""
+    """Return a folder of monthly runs of one machine with a step, and a note on its cause."""
     runs, rng = tmp_path_factory.mktemp("lab") / "runs", np.random.default_rng(5)
-    for k in range(26):
+    for k in range(RUNS):
         end = 12e-6 + (10e-6 if k >= BEFORE else 0.0) + 0.3e-6 * rng.normal() + BAR
         values = {"EX": 0.0, "EY": 0.0, "EZ": [0.0, end, end], "EA": 20e-6, "EB": 0.0, "EC": 0.0}
         save(runs, k, errors(values, ("time",), {"time": [0.0, 3600.0, 3600.0 + k + 1]}))
@@ -121,7 +121,6 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return run
 
 
-@pytest.mark.slow
 def test_the_step_is_named_by_the_note_between_its_runs(lab: Path, call: Callable[..., Any]) -> None:
     found = call(lab, "--figure", "EZ after 60 min", "--json")
     (step,) = found["steps"]
@@ -168,12 +167,12 @@ def test_dataset_and_page(lab: Path, call: Callable[..., Any], tmp_path: Path) -
     assert "another machine" not in shown
     found = datasets.load(out)
     assert datasets.violations(found) == []
-    assert (found.sizes["run"], found.sizes["step"], found.sizes["event"]) == (26, 1, 2)
+    assert (found.sizes["run"], found.sizes["step"], found.sizes["event"]) == (RUNS, 1, 2)
     assert found["step_event"].values.tolist() == ["hit the vice"]
     text = page.read_text()
     assert text.count("<svg") == 3
     assert not re.search(r"(?:src|href)=\"(?!#)|https?://(?!www\.w3\.org)", text)
-    for words in ("hit the vice", "coolant off", "Moving ranges", "run-25"):
+    for words in ("hit the vice", "coolant off", "Moving ranges", f"run-{RUNS - 1}"):
         assert words in text
     assert "already exists" in call(lab, "--figure", "EZ", "--out", out, code=1)
     assert CliRunner().invoke(app, ["validate", str(out)]).exit_code == 0
