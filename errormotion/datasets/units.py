@@ -270,6 +270,8 @@ def si_unit(unit: str) -> str:
     """Return the SI unit (m, rad, s, 1/min, degC, Hz, m/s, m/K) of the kind of ``unit``."""
     if unit in _PER_MINUTE:
         return SPEED.unit
+    if unit in _EXACT:
+        return _EXACT[unit][0]
     for kind in (kind for kind in KINDS if kind is not SPEED):
         try:
             _linear(unit, kind.unit)
