@@ -213,8 +213,8 @@ class Commands(StateCommands):
     def _single(self) -> bytes:
         device, tracker = self._device, self._device.tracker
         change = b""
-        if abs(tracker.index() - self._reported_index) > 1e-8:
-            self._reported_index = tracker.index()
+        if abs((index := tracker.index()) - self._reported_index) > 1e-8:
+            self._reported_index = index
             change = self._status_changes(Event.REFRACTION)
         self._last_point = position = tracker.now()
         extended = device.always_extended or device.blocks[NUMBERS["SetStatisticMode"]].values[0]

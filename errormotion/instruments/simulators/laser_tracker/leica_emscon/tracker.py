@@ -134,8 +134,10 @@ class Tracker:
         times = np.array([self._world.time]) if times is None else times
         true = np.tile(NEST, (len(times), 1)) if self.nested else self.scene.seen(times)
         noise = self._rng.normal(size=true.shape) * (self.angle_noise, self.angle_noise, self.noise)
-        when = float(times[0])
-        true[:, 2] *= refraction_index(*self.scene.air(when)) / self.index(when)
+        index = refraction_index(*self.scene.air(float(times[0])))
+        if self.meteo == METEO_REFRACTION:
+            self._index = index
+        true[:, 2] *= index / self._index
         true[:, 2] += self.dead_path
         return np.asarray(true + noise)
 
