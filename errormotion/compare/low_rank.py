@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from errormotion.arrays import Array, filled
 
@@ -101,7 +102,7 @@ def whitener(own: Array, influence: Array) -> Whitener:
     fixed, rest = right[:rank].T, right[rank:].T
     carried, G = (G @ fixed, G @ rest) if rank else (G[:, :0], G)
     root_of_inner = np.linalg.cholesky(np.eye(G.shape[1]) + G.T @ G)
-    factor = np.linalg.inv(root_of_inner)
+    factor = linalg.lapack.dtrtri(root_of_inner, lower=1)[0] if len(root_of_inner) else root_of_inner
     log_determinant = (
         2 * float((total > 0).sum(axis=0) @ np.log(scale))
         + float(np.log(power[strong]).sum())
