@@ -103,7 +103,7 @@ def scanner():
     return Scanner()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_scanner():
     """Return what makes a scanner of any surface."""
     return Scanner

@@ -12,7 +12,7 @@ from errormotion.methods.crossbeam_scan.identification.registration import cloud
 TWIST = np.array([23e-6, -41e-6, 17e-6, 30e-6, -55e-6, 80e-6])
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def small_pair(make_scanner):
     """Return a pair of scans of 10 mm x 14 mm, one of the points missing."""
     scanner = make_scanner(rows=200, columns=800)
@@ -22,13 +22,19 @@ def small_pair(make_scanner):
     return prepare(*cold), prepare(*warm)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def _open3d(small_pair):
     # The pair first: numba warns where it starts its threads after Open3D has loaded a TBB of its own.
     try:
         import open3d  # noqa: F401
     except (ImportError, OSError) as error:
         pytest.skip(f"open3d cannot be loaded: {error}")
+
+
+@pytest.fixture(scope="module")
+def found(small_pair, _open3d):
+    """Return what each of the backends finds for the pair."""
+    return {name: register(*small_pair, registration=name, point=np.zeros(3)) for name in ("open3d_plane", "paper")}
 
 
 def test_points_are_those_with_a_value(small_pair):
@@ -41,24 +47,20 @@ def test_points_are_those_with_a_value(small_pair):
     assert np.ptp(trimmed[:, 0]) == pytest.approx(np.ptp(x) - 2 * 250e-6)
 
 
-@pytest.mark.usefixtures("_open3d")
-def test_every_backend_states_what_its_pose_is_worth(small_pair):
+def test_every_backend_states_what_its_pose_is_worth(small_pair, found):
     best = register(*small_pair, point=np.zeros(3))
-    for backend in ("open3d_plane", "paper"):
-        found = register(*small_pair, registration=backend, point=np.zeros(3))
-        error = found.twist - TWIST
-        assert found.backend == backend
+    for backend, result in found.items():
+        error = result.twist - TWIST
+        assert result.backend == backend
         # Its own error, as the height map sees it, is in the covariance: no freedom off by more than 4 sigma.
-        assert np.abs(error / found.sigma).max() < 4
-        assert (found.sigma >= 0.99 * best.sigma).all()
+        assert np.abs(error / result.sigma).max() < 4
+        assert (result.sigma >= 0.99 * best.sigma).all()
         # Millions of neighbour distances do not make the pose better: they are as long as the points are apart.
-        assert found.rms > 20 * best.rms
+        assert result.rms > 20 * best.rms
 
 
-@pytest.mark.usefixtures("_open3d")
-def test_the_published_chain_locks_to_the_points_and_its_rms_does_not_tell(small_pair):
-    plane = register(*small_pair, registration="open3d_plane", point=np.zeros(3))
-    chain = register(*small_pair, registration="paper", point=np.zeros(3))
+def test_the_published_chain_locks_to_the_points_and_its_rms_does_not_tell(found):
+    plane, chain = found["open3d_plane"], found["paper"]
     off_plane, off_chain = np.abs(plane.twist - TWIST)[:3].max(), np.abs(chain.twist - TWIST)[:3].max()
     assert off_chain > 10 * off_plane
     assert chain.rms < plane.rms
