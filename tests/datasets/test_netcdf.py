@@ -2,6 +2,7 @@
 
 import io
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -69,6 +70,34 @@ def test_files_are_read_as_xarray_reads_them(kind: str, tmp_path: Path) -> None:
         xr.testing.assert_identical(found.load(), expected.load())
 
 
+def _group(file: h5py.File) -> None:
+    file.create_group("more")
+
+
+def _fixed_text(file: h5py.File) -> None:
+    file["long"].attrs["units"] = np.bytes_("mm")
+
+
+def _other_byte_order(file: h5py.File) -> None:
+    file.create_dataset("turned", data=np.arange(6, dtype=">f8")).dims[0].attach_scale(file["place"])
+
+
+def _without_identifiers(file: h5py.File) -> None:
+    del file["long"].attrs["_Netcdf4Coordinates"]
+
+
+@pytest.mark.parametrize("change", [_group, _fixed_text, _other_byte_order, _without_identifiers])
+def test_files_of_other_programs_are_read_as_xarray_reads_them(
+    change: Callable[[h5py.File], None], tmp_path: Path
+) -> None:
+    file = tmp_path / "some.nc"
+    file.write_bytes(by_xarray(storable(example("usual"))))
+    with h5py.File(file, "r+") as written:
+        change(written)
+    with open_netcdf(file) as found, xr.open_dataset(file, engine="h5netcdf", **PLAIN) as expected:
+        xr.testing.assert_identical(found.load(), expected.load())
+
+
 def test_an_open_file_can_be_sent_to_another_process(tmp_path: Path) -> None:
     file = tmp_path / "some.nc"
     file.write_bytes(by_xarray(storable(example("usual"))))
@@ -94,4 +123,4 @@ def test_each_object_is_looked_up_once(tmp_path: Path, monkeypatch: pytest.Monke
         with open_netcdf(file) as found:
             found.load()
 
-    assert count(read) < 8
+    assert count(read) < 3  # to describe it, and for its values
