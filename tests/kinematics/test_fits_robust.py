@@ -119,7 +119,6 @@ def test_outliers_are_listed_and_have_no_effect(shape):
     np.testing.assert_allclose(robust.residuals[rest], clean.residuals, atol=2e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "fits"), [("circle", 150), ("plane", 100), ("line", 100), ("cylinder", 12)])
 def test_clean_points_are_rarely_excluded(shape, fits):
     rng = np.random.default_rng(20)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import FitError
-from errormotion.kinematics.fits._shapes import Shape
+from errormotion.kinematics.fits._shapes import Shape, norms
 from errormotion.kinematics.fits._solver import EPS, Frame, design, levenberg
 
 __all__ = ["FALSE_ALARMS", "outliers"]
@@ -102,20 +102,26 @@ def _least_trimmed(shape: Shape, q: Array, root: Array) -> tuple[Array, float]:
     starts = sorted(shape.robust_starts(q, rng), key=rank)[: shape.robust_tries]
     if not starts:
         raise FitError(f"no small set of the points determines a {shape.name}; plot the points")
-    trimmed = [_concentrate(shape, theta, q, root, half) for theta in starts]
-    best = min(trimmed, key=rank)
+    seen: set[bytes] = set()
+    trimmed = [_concentrate(shape, theta, q, root, half, seen) for theta in starts]
+    best = min((theta for theta in trimmed if theta is not None), key=rank)
     quantile = _normal_length(half / n, shape.components)
     small_sample = 1 + 5 / max(n * shape.components - shape.tangent(best).shape[1], 1)
     return best, rank(best) / quantile * small_sample
 
 
-def _concentrate(shape: Shape, theta: Array, q: Array, root: Array, half: int) -> Array:
-    before: NDArray[np.intp] | None = None
+def _concentrate(shape: Shape, theta: Array, q: Array, root: Array, half: int, seen: set[bytes]) -> Array | None:
+    """Fit the shape to the nearest half until this no longer changes; None if it was that of an earlier start."""
+    own: set[bytes] = set()
     for _ in range(15):
         nearest = np.sort(np.argpartition(_misses(shape, theta, q, root), half - 1)[:half])
-        if before is not None and np.array_equal(nearest, before):
+        key = nearest.tobytes()
+        if key in own:
             break
-        before = nearest
+        if key in seen:
+            return None
+        own.add(key)
+        seen.add(key)
         theta = levenberg(shape, theta, q[nearest], root[nearest], limit=20, refine=False).theta
     return theta
 
@@ -158,8 +164,9 @@ def _normal_length(share: float, m: int) -> float:
 
 
 def _misses(shape: Shape, theta: Array, q: Array, root: Array) -> Array:
-    length: Array = np.linalg.norm(shape.residuals(theta, q), axis=1) * root
-    return length
+    misses = shape.residuals(theta, q)
+    length = np.abs(misses[:, 0]) if shape.components == 1 else norms(misses)[0]
+    return np.asarray(length * root)
 
 
 def _check_majority(shape: Shape, clean: Flags) -> None:

@@ -90,8 +90,12 @@ class Shape(ABC):
 
     def robust_starts(self, q: Array, rng: np.random.Generator) -> Iterator[Array]:
         """Yield candidates through few points each, some of them without outliers."""
-        for _ in range(50 * self.minimum):
-            yield from self.starts(q[rng.choice(len(q), self.minimum, replace=False)])
+        few = [rng.choice(len(q), self.minimum, replace=False) for _ in range(50 * self.minimum)]
+        yield from self.through(q[np.array(few)])
+
+    def through(self, sets: Array) -> list[Array]:
+        """Return the parameter vectors to start from of all sets of points (m, n, dimensions)."""
+        return [theta for q in sets for theta in self.starts(q)]
 
 
 class Line(Shape):
@@ -105,11 +109,12 @@ class Line(Shape):
         self.components = dimensions - 1
 
     def starts(self, q: Array) -> list[Array]:
-        middle = q.mean(axis=0)
-        _, s, axes = np.linalg.svd(q - middle, full_matrices=False)
-        if s[0] - s[1] <= 1e-9 * s[0]:
-            return []  # the direction is not determined
-        return [self.settle(np.concatenate([middle, axes[0]]))]
+        return self.through(q[None])
+
+    def through(self, sets: Array) -> list[Array]:
+        middle, s, axes = principal_axes(sets)
+        known = s[:, 0] - s[:, 1] > 1e-9 * s[:, 0]  # the direction is determined
+        return [self.settle(theta) for theta in np.concatenate([middle, axes[:, 0]], axis=1)[known]]
 
     def residuals(self, theta: Array, q: Array) -> Array:
         c, u = halves(theta)
@@ -139,11 +144,12 @@ class Plane(Shape):
     groups = (Group("point", "position", 3), Group("normal", "direction", 3))
 
     def starts(self, q: Array) -> list[Array]:
-        middle = q.mean(axis=0)
-        _, s, axes = np.linalg.svd(q - middle, full_matrices=False)
-        if s[1] - s[2] <= 1e-9 * s[0]:
-            return []
-        return [self.settle(np.concatenate([middle, axes[2]]))]
+        return self.through(q[None])
+
+    def through(self, sets: Array) -> list[Array]:
+        middle, s, axes = principal_axes(sets)
+        known = s[:, 1] - s[:, 2] > 1e-9 * s[:, 0]
+        return [self.settle(theta) for theta in np.concatenate([middle, axes[:, 2]], axis=1)[known]]
 
     def residuals(self, theta: Array, q: Array) -> Array:
         c, u = halves(theta)
@@ -174,18 +180,21 @@ class Sphere(Shape):
 
     def starts(self, q: Array) -> list[Array]:
         """Return Taubin's algebraic fit (IEEE Trans. PAMI 13 (1991) 1115), by singular values."""
-        middle = q.mean(axis=0)
-        d = q - middle
-        z = np.einsum("ni,ni->n", d, d)
-        if not (mean := z.mean()) > 0:
-            return []
-        A = np.column_stack([(z - mean) / (2 * np.sqrt(mean)), d])
-        a = np.linalg.svd(A, full_matrices=False)[2][-1]
-        a0 = a[0] / (2 * np.sqrt(mean))
-        if abs(a0) < 1e-14:
-            return []
-        c = -a[1:] / (2 * a0)
-        return [np.array([*(c + middle), np.sqrt(c @ c + mean)])]
+        return self.through(q[None])
+
+    def through(self, sets: Array) -> list[Array]:
+        middle = sets.mean(axis=1)
+        d = sets - middle[:, None]
+        z = np.einsum("mni,mni->mn", d, d)
+        mean = z.mean(axis=1)
+        d, z, mean, middle = (each[mean > 0] for each in (d, z, mean, middle))
+        size = 2 * np.sqrt(mean)[:, None]
+        a = np.linalg.svd(np.concatenate([((z - mean[:, None]) / size)[..., None], d], axis=2), full_matrices=False)[2]
+        a0 = a[:, -1, :1] / size
+        round_ = np.abs(a0[:, 0]) >= 1e-14
+        c = -a[round_, -1, 1:] / (2 * a0[round_])
+        radius = np.sqrt(np.einsum("mi,mi->m", c, c) + mean[round_])
+        return list(np.column_stack([c + middle[round_], radius]))
 
     def residuals(self, theta: Array, q: Array) -> Array:
         miss: Array = norms(q - theta[:-1])[0] - theta[-1]
@@ -242,6 +251,12 @@ class Circle3D(Shape):
 
     def settle(self, theta: Array) -> Array:
         return np.array([*theta[:3], *signed(theta[3:6]), abs(theta[6])])
+
+
+def principal_axes(sets: Array) -> tuple[Array, Array, Array]:
+    """Return the means, singular values and principal axes (rows) of sets of points (m, n, dimensions)."""
+    middle = sets.mean(axis=1)
+    return middle, *np.linalg.svd(sets - middle[:, None], full_matrices=False)[1:]
 
 
 def halves(theta: Array) -> tuple[Array, Array]:
