@@ -77,7 +77,7 @@ def preload(words: Sequence[str], folder: Path, place: Path) -> None:
     for name in _read(place / "imports").split():
         with suppress(Exception):
             import_module(name)
-    convert(1.0, "mm", "m")  # the registry of units
+    convert(1.0, "hPa", "Pa")  # the registry of units
 
 
 def run(words: Sequence[str], folder: Path, place: Path, imports: Path | None = None) -> Ended:
