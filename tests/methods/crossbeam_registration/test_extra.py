@@ -15,6 +15,12 @@ RARE = 33.7
 """Chi squared of nine freedoms is larger once in 10 000 times."""
 
 
+@pytest.fixture
+def scanner(make_scanner):
+    """Return a scanner of a part of the free-form artefact."""
+    return make_scanner(rows=280, columns=1120)
+
+
 class Strained:
     """What a pose does and, after it, d = sum e G (P - CENTRE): what the scanner asks of a motion."""
 
