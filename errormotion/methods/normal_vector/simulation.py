@@ -74,10 +74,8 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         point = np.round((centre - machine.probe_error(centre, np.zeros(balls))).mean(axis=0), 4)
     steps = int((settings.interval * (count - 1) + cycle) / TRUTH_STEP) + 4
     truth = machine.truth_probing(cycle / 2 + TRUTH_STEP * np.arange(steps), point)
-    for name in truth.data_vars:
-        if truth[name].dims == ("time",):
-            truth[name] = (truth[name] - truth[name][0]).assign_attrs(truth[name].attrs)
-    return data, truth
+    over_time = [array for array in truth.data_vars.values() if array.dims == ("time",)]
+    return data, truth.assign({array.name: array.copy(data=array.values - array.values[0]) for array in over_time})
 
 
 def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:
