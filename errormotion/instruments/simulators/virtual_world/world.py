@@ -62,7 +62,10 @@ class VirtualWorld(Motion):
         self._devices: set[Device] = set()
 
     def _compile(self) -> None:
-        """Compile the twin's loops before the first samples."""
+        """Compile the twin's loops before the first samples, once for each type of machine."""
+        if self.name in _compiled:
+            return
+        _compiled.add(self.name)
         resting = StepProgram((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 1e-5, 1)
         self.machine.distances(0, 1, 1e3, tool="bar")
         self.machine.distances(0, 1, 1e3, tool="sphere", motion=resting)
@@ -273,6 +276,7 @@ class VirtualWorld(Motion):
 
 
 _worlds: dict[tuple[str, int, bool], VirtualWorld] = {}
+_compiled: set[str] = set()
 _lock = threading.RLock()
 
 
