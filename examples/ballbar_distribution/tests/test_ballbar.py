@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from ballbar_test import extremes, simulation
+from ballbar_test import circles, evaluation, extremes, simulation
 from ballbar_test.conformance import subjects
 from ballbar_test.method import Ballbar
 from ballbar_test.path import PARAMETERS, basis, circle
@@ -71,14 +71,17 @@ def test_each_error_is_found_and_makes_the_deviation_of_its_formula(name):
 @pytest.fixture(scope="module")
 def tests():
     """Return the errors of parameters and figures by their standard uncertainty, (seed, n) each."""
-    settings, method = Ballbar.Settings(**SMALL), Ballbar()
+    settings = Ballbar.Settings(**SMALL)
     ratios = {"parameters": [], "figures": []}
     for seed in range(SEEDS):
-        raw, truth = Ballbar.simulate(settings, seed)
-        errors = method.identify(raw, settings)
-        for name, covariance in (("parameters", "parameter_covariance"), ("figures", "figure_covariance")):
-            u = np.sqrt(np.diagonal(errors[covariance].values))
-            ratios[name].append((errors[name].values - truth[name].values) / u)
+        rng = np.random.default_rng(seed)
+        machine = simulation.draw_machine(settings, rng)
+        raw = simulation.measure(settings, machine, rng, missing=simulation.MISSING)
+        found = evaluation.evaluate(circles.read(raw, []), settings, [])
+        u = np.sqrt(np.diagonal(found.parameter_covariance))
+        ratios["parameters"].append((found.parameters - machine.parameters) / u)
+        true = extremes.evaluate(machine.deviation(settings))
+        ratios["figures"].append((found.figures.value - true) / found.figures.u)
     return {name: np.array(values) for name, values in ratios.items()}
 
 
