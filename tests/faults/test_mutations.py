@@ -56,10 +56,15 @@ def test_internal_errors_markup_and_messages_without_a_name_are_found(tmp_path: 
     assert file_trials.harm(tmp_path)
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def good_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with datasets.load(file_kinds.GOOD / "spindle_drift_drift.nc") as good:
-        return datasets.save(good, tmp_path / "errors.zarr")
+        return datasets.save(good, tmp_path_factory.mktemp("store") / "errors.zarr")
+
+
+@pytest.fixture
+def store(good_store: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(good_store, tmp_path / "errors.zarr")
 
 
 @pytest.mark.parametrize("number", range(6))
