@@ -16,6 +16,8 @@ from errormotion.datasets.schemas import CARRIED, DOF, ERROR_ROWS, ERROR_UNITS, 
 from errormotion.errors import DatasetError
 
 _ROWS = {row.name: row for row in ERROR_ROWS}
+_LABELS = {name: xr.Variable(name, list(DOF)).to_index_variable() for name in ("dof", "dof_")}
+"""Indexes of all error datasets, made once."""
 
 
 def build_errors(
@@ -113,7 +115,7 @@ def build_errors(
     }
     variables |= {f"{dim}{INDEX}": ((dim,), np.arange(size)) for dim, size in zip(dims, E.shape, strict=False)}
     variables["covariance"] = ((*dims, "dof", "dof_"), C, {"long_name": "total covariance; m^2, m rad, rad^2"})
-    own_coords: dict[str, Any] = {"dof": list(DOF), "dof_": list(DOF)}
+    own_coords: dict[str, Any] = dict(_LABELS)
     if influence is not None:
         variables["influence"], source_coords = _influence(influence, unseen, dims, sources, source_groups)
         own_coords |= source_coords | _identities(list(sources or ()), source_ids or {}, reference_sources)
