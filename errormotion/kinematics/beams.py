@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.kinematics.twists import cross, cross_matrix
+from errormotion.kinematics.twists import cross_matrix
 
 __all__ = [
     "across",
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 
-_AXES = np.eye(3)
+_AXES = np.eye(3).tolist()
 _PARALLEL_COSINE = np.cos(np.radians(1e-4))
 """Cosine of the angle above which a direction is parallel to an axis."""
 _PARALLEL_SINE = 1e-6
@@ -41,9 +41,16 @@ _PARALLEL_SINE = 1e-6
 
 def across(direction: Array) -> Array:
     """Return two unit vectors (2, 3) that span the plane perpendicular to a direction (3,)."""
-    first = cross(direction, _AXES[np.argmin(np.abs(direction))])
+    u = direction.tolist()
+    size = [abs(each) for each in u]
+    first = np.array(_product(u, _AXES[size.index(min(size))]))
     first /= np.linalg.norm(first)
-    return np.stack([first, cross(direction, first)])
+    return np.array([first, _product(u, first.tolist())])
+
+
+def _product(a: list[float], b: list[float]) -> tuple[float, float, float]:
+    """Return the vector product of two lists; faster than with arrays."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def turned(direction: Array, angles: Array) -> Array:

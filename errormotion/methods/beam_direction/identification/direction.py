@@ -27,7 +27,7 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.kinematics.beams import across, turned
+from errormotion.kinematics.beams import across
 from errormotion.methods.beam_direction.identification.slopes import gradient_covariance
 
 if TYPE_CHECKING:
@@ -236,11 +236,13 @@ def _descend(gradients: Array, covariances: Array, u: Array) -> tuple[float, Arr
 
     r, J = misfit(u)
     for _ in range(100):
-        step = np.asarray(np.linalg.lstsq(J @ across(u).T, -r, rcond=1e-12)[0], np.float64)
+        basis = across(u)
+        step = np.asarray(np.linalg.lstsq(J @ basis.T, -r, rcond=1e-12)[0], np.float64)
         size = float(np.linalg.norm(step))
         step *= min(1.0, 0.3 / size) if size > 0 else 1.0
         for _ in range(30):
-            new_u = turned(u, step)
+            new_u = u + step @ basis
+            new_u /= np.linalg.norm(new_u)
             new_r, new_J = misfit(new_u)
             if new_r @ new_r <= r @ r or size < 1e-12:
                 break
