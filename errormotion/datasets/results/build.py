@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,6 @@ from errormotion.datasets.schemas import CARRIED, DOF, ERROR_ROWS, ERROR_UNITS, 
 from errormotion.errors import DatasetError
 
 _ROWS = {row.name: row for row in ERROR_ROWS}
-_LABELS = {name: xr.Variable(name, list(DOF)).to_index_variable() for name in ("dof", "dof_")}
-"""Indexes of all error datasets, made once."""
 
 
 def build_errors(
@@ -115,7 +114,7 @@ def build_errors(
     }
     variables |= {f"{dim}{INDEX}": ((dim,), np.arange(size)) for dim, size in zip(dims, E.shape, strict=False)}
     variables["covariance"] = ((*dims, "dof", "dof_"), C, {"long_name": "total covariance; m^2, m rad, rad^2"})
-    own_coords: dict[str, Any] = dict(_LABELS)
+    own_coords: dict[str, Any] = dict(_labels())
     if influence is not None:
         variables["influence"], source_coords = _influence(influence, unseen, dims, sources, source_groups)
         own_coords |= source_coords | _identities(list(sources or ()), source_ids or {}, reference_sources)
@@ -162,6 +161,12 @@ def build_errors(
     if found:
         raise DatasetError(f"The result of method '{method}' breaks the schema {SCHEMA}:", found)
     return ds
+
+
+@cache
+def _labels() -> dict[str, xr.Variable]:
+    """Return the labels of the freedoms with their indexes, the same in all error datasets."""
+    return {name: xr.Variable(name, list(DOF)).to_index_variable() for name in ("dof", "dof_")}
 
 
 def build_deviations(
