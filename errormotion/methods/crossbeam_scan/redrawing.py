@@ -137,11 +137,9 @@ def _guide(found: Registrations, raw: xr.Dataset, rig: Rig, uncertainty: float, 
     def act(errors: xr.Dataset, generator: Generator) -> xr.Dataset:
         drawn = generator.normal(size=assumed.shape[:2])
         change = np.einsum("ac,acki->cki", drawn, assumed)
+        values = {name: errors.variables[name].transpose("time", "position") for name in DOF}
         return errors.assign(
-            {
-                name: errors[name].copy(data=errors[name].transpose("time", "position").values + change[..., k])
-                for k, name in enumerate(DOF)
-            }
+            {name: each.copy(data=each.values + change[..., k]) for k, (name, each) in enumerate(values.items())}
         )
 
     return Redraw(act=act, groups=("cold scan",))

@@ -147,9 +147,25 @@ def record(machine, path, settings=SETTINGS, done=None, **keywords):
     return store(record_scans(bench_of(machine), settings, None, done), path, append=done is not None, **keywords)
 
 
-def test_campaign_has_cold_passes_then_moves_and_a_pass_for_each_warm_up_time(tmp_path):
-    machine = Machine()
-    raw = record(machine, tmp_path / "raw.zarr")
+@pytest.fixture(scope="module")
+def machine():
+    """Return the machine of an uninterrupted campaign."""
+    return Machine()
+
+
+@pytest.fixture(scope="module")
+def chunks(machine):
+    """Return what it yields, not to be changed."""
+    return list(record_scans(bench_of(machine), SETTINGS, None, None))
+
+
+@pytest.fixture(scope="module")
+def raw(chunks, tmp_path_factory):
+    """Return the record of it, not to be changed."""
+    return store(chunks, tmp_path_factory.mktemp("campaign") / "raw.zarr")
+
+
+def test_campaign_has_cold_passes_then_moves_and_a_pass_for_each_warm_up_time(machine, raw):
     assert machine.orders == [
         *["pass.nc"] * 2, "warm_up_1.nc", "pass.nc", "warm_up_2.nc", "pass.nc", "warm_up_3.nc", "pass.nc"
     ]  # fmt: skip
@@ -171,17 +187,14 @@ def test_campaign_has_cold_passes_then_moves_and_a_pass_for_each_warm_up_time(tm
     assert scans.notes == []
 
 
-def test_lines_have_the_time_at_which_they_were_taken(tmp_path):
-    machine = Machine()
-    raw = record(machine, tmp_path / "raw.zarr")
+def test_lines_have_the_time_at_which_they_were_taken(machine, raw):
     warm = (raw["cycle_of_line"].values > 1) & np.isfinite(raw["encoder"].values)
     true = raw["record"].values[warm, 1] * 1e6 - machine.warm_since
     # the begin of the warm-up is looked for every 0.1 s; float32 holds 1800e-6 to 1e-10, 0.1 ms
     np.testing.assert_allclose(raw["line_time"].values[warm], true, atol=0.06)
 
 
-def test_only_lines_at_artefacts_are_kept(tmp_path):
-    raw = record(Machine(), tmp_path / "raw.zarr")
+def test_only_lines_at_artefacts_are_kept(raw):
     place = raw["encoder"].values * 1e-6
     off = np.abs(place[np.isfinite(place), None] - np.array(SETTINGS.positions)).min(axis=1)
     assert off.max() <= SETTINGS.scan_length / 2 + SETTINGS.margin + 1e-9
@@ -189,16 +202,13 @@ def test_only_lines_at_artefacts_are_kept(tmp_path):
     assert expected_lines(SETTINGS) == pytest.approx(raw.sizes["line"], rel=0.03)
 
 
-def test_chunks_are_small_and_counts_are_kept(tmp_path):
-    chunks = list(record_scans(bench_of(Machine()), SETTINGS, None, None))
+def test_chunks_are_small_and_counts_are_kept(chunks, raw):
     assert max(chunk.sizes["line"] for chunk in chunks) < CHUNK_LINES + 64
-    raw = store(chunks, tmp_path / "raw.zarr")
     assert json.loads(raw.attrs["invalid"])["dark"] > 100
     assert raw.attrs["dropped"] == 0
 
 
-def test_dataset_contains_schedule_and_programs(tmp_path):
-    raw = record(Machine(), tmp_path / "raw.zarr")
+def test_dataset_contains_schedule_and_programs(raw):
     assert json.loads(raw.attrs["schedule"])[2]["program"] == "warm_up_1.nc"
     assert json.loads(raw.attrs["programs"])["pass.nc"].splitlines()[-2] == "M30"
 
@@ -280,8 +290,7 @@ def test_pose_of_an_earlier_test_has_priority_over_the_settings(tmp_path):
     np.testing.assert_array_equal(raw["pose_covariance"], np.eye(6) * 1e-9)
 
 
-def test_a_stated_pose_has_its_stated_uncertainty(tmp_path):
-    raw = record(Machine(), tmp_path / "raw.zarr")
+def test_a_stated_pose_has_its_stated_uncertainty(raw):
     assert float(raw["profiler_pose"][2, 3]) == -0.17
     np.testing.assert_allclose(np.sqrt(np.diag(raw["pose_covariance"])), 5e-3)
 
@@ -289,9 +298,8 @@ def test_a_stated_pose_has_its_stated_uncertainty(tmp_path):
 # ---------------------------------------------------------------------- going on
 
 
-def cut_off(tmp_path, cycle, place):
+def cut_off(chunks, tmp_path, cycle, place):
     """Return the record of a run that was killed in a pass at a position of the axis."""
-    chunks = list(record_scans(bench_of(Machine()), SETTINGS, None, None))
     kept = []
     for chunk in chunks:
         here = chunk["cycle_of_line"].values == cycle
@@ -304,14 +312,15 @@ def cut_off(tmp_path, cycle, place):
 
 
 @pytest.mark.parametrize("cycle", [0, 1, 3])
-def test_a_virtual_machine_repeats_the_campaign_after_a_crash_and_the_record_is_an_uninterrupted_one(tmp_path, cycle):
-    uninterrupted = record(Machine(), tmp_path / "whole.zarr")
-    done = cut_off(tmp_path, cycle, 0.4)
-    assert 0 < done.sizes["line"] < uninterrupted.sizes["line"]
-    raw = record(Machine(), tmp_path / "raw.zarr", done=done)
-    assert raw.attrs["invalid"] == uninterrupted.attrs["invalid"]
-    for name, expected in uninterrupted.variables.items():
-        np.testing.assert_array_equal(raw[name].values, expected.values, err_msg=str(name))
+def test_a_virtual_machine_repeats_the_campaign_after_a_crash_and_the_record_is_an_uninterrupted_one(
+    chunks, raw, tmp_path, cycle
+):
+    done = cut_off(chunks, tmp_path, cycle, 0.4)
+    assert 0 < done.sizes["line"] < raw.sizes["line"]
+    again = record(Machine(), tmp_path / "raw.zarr", done=done)
+    assert again.attrs["invalid"] == raw.attrs["invalid"]
+    for name, expected in raw.variables.items():
+        np.testing.assert_array_equal(again[name].values, expected.values, err_msg=str(name))
 
 
 def still_there(done):
@@ -321,8 +330,8 @@ def still_there(done):
     return machine
 
 
-def test_running_virtual_machine_keeps_the_interrupted_pass_and_makes_the_next_one(tmp_path):
-    done = cut_off(tmp_path, 3, 0.4)
+def test_running_virtual_machine_keeps_the_interrupted_pass_and_makes_the_next_one(chunks, tmp_path):
+    done = cut_off(chunks, tmp_path, 3, 0.4)
     machine = still_there(done)
     raw = record(machine, tmp_path / "raw.zarr", done=done)
     assert machine.orders == ["warm_up_3.nc", "pass.nc"]
@@ -333,8 +342,8 @@ def test_running_virtual_machine_keeps_the_interrupted_pass_and_makes_the_next_o
     assert 1800 < scans.scan(4, 1)[3] < 1820
 
 
-def test_cold_pass_is_repeated_after_a_crash_before_the_warm_up(tmp_path):
-    done = cut_off(tmp_path, 1, 0.4)
+def test_cold_pass_is_repeated_after_a_crash_before_the_warm_up(chunks, tmp_path):
+    done = cut_off(chunks, tmp_path, 1, 0.4)
     machine = still_there(done)
     raw = record(machine, tmp_path / "raw.zarr", done=done)
     assert machine.orders[:2] == ["pass.nc", "warm_up_1.nc"]
@@ -369,8 +378,10 @@ def test_passes_on_a_real_machine_start_at_their_warm_up_times(tmp_path, day):
 
 
 @pytest.mark.parametrize(("ago", "made", "first"), [(700.0, [3, 4], 900), (1300.0, [3, 4], 1300), (1900.0, [4], 1900)])
-def test_warm_up_of_a_real_machine_continues_by_the_clock_without_overdue_passes(tmp_path, day, ago, made, first):
-    done = cut_off(tmp_path, 2, 0.4)
+def test_warm_up_of_a_real_machine_continues_by_the_clock_without_overdue_passes(
+    chunks, tmp_path, day, ago, made, first
+):
+    done = cut_off(chunks, tmp_path, 2, 0.4)
     mark = int(np.flatnonzero(done["line_time"].values == 0)[0])
     began = datetime.now(UTC) - timedelta(seconds=ago + float(done["line_clock"][mark]))
     done = done.assign_attrs(start=began.isoformat())
@@ -387,8 +398,8 @@ def test_warm_up_of_a_real_machine_continues_by_the_clock_without_overdue_passes
             Scans(raw).scan(cycle, 0)
 
 
-def test_record_without_a_start_time_is_not_resumed(tmp_path, day):
-    done = cut_off(tmp_path, 2, 0.4)
+def test_record_without_a_start_time_is_not_resumed(chunks, tmp_path, day):
+    done = cut_off(chunks, tmp_path, 2, 0.4)
     del done.attrs["start"]
     with pytest.raises(MethodError, match="does not state when it started"):
         record_scans(bench_of(day(Machine(real=True))), SETTINGS, None, done)

@@ -30,6 +30,12 @@ def _quiet(caplog):
     caplog.set_level(logging.ERROR)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _remembering(remembering):
+    with remembering():
+        yield
+
+
 def scan(machine, times, places, seed=3):
     return simulation.raw_scans(machine, times, places, seed=seed, profiles=400, feed=70e-6, profiler=PROFILER)
 

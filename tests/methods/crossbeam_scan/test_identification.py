@@ -64,9 +64,10 @@ def campaigns(machines):
 
 
 @pytest.fixture(scope="module")
-def found(campaigns):
+def found(campaigns, remembering):
     """Errors of all campaigns, by way of treating the strain."""
-    return {strain: [identify(raw, strain=strain) for raw in campaigns] for strain in ("free", "guided", "rigid")}
+    with remembering():
+        return {strain: [identify(raw, strain=strain) for raw in campaigns] for strain in ("free", "guided", "rigid")}
 
 
 @pytest.fixture(scope="module")
@@ -141,11 +142,11 @@ def test_a_guide_makes_pitch_certain(found):
     assert np.all(guided[..., 1] < 0.5 * free[..., 1])  # pitch acts over 2.2 m
 
 
-@pytest.mark.slow  # registers all scans twice again
-def test_trials_of_a_guided_carriage_draw_the_guide(campaigns, found):
+def test_trials_of_a_guided_carriage_draw_the_guide(campaigns, found, remembering):
     """Most of the stated uncertainty of the pitch is that of the guide, which no redrawn reading contains."""
     settings, errors = Settings(strain="guided"), found["guided"][0]
-    drawn = redrawing_of(CrossbeamScan(), campaigns[0], settings, errors)
+    with remembering():
+        drawn = redrawing_of(CrossbeamScan(), campaigns[0], settings, errors)
     act, rng = drawn.sources["guide"].act, np.random.default_rng(1)
     trials = np.array([act(errors, rng).em.twist().values[1:] for _ in range(300)])
     share = trials.std(axis=0) / stated(errors)

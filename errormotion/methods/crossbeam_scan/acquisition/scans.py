@@ -387,11 +387,11 @@ class Pending:
     def chunk(self) -> xr.Dataset:
         """Return all pending lines as a dataset."""
         units = {"record": "m", "line_time": "s", "line_clock": "s"}
-        found = {name: np.concatenate(parts) for name, parts in self._parts.items()}
-        ds = self.static.assign(x=("point", self.x, {"units": "m"}))
-        for name, values in found.items():
+        found: dict[str, Any] = {"x": ("point", self.x, {"units": "m"})}
+        for name, parts in self._parts.items():
             dims = ("line", "point") if name == "record" else ("line",)
-            ds[name] = (dims, values, {"units": units[name]} if name in units else {})
+            found[name] = (dims, np.concatenate(parts), {"units": units[name]} if name in units else {})
+        ds = self.static.assign(found)
         ds.attrs |= {"dropped": self.dropped, "invalid": dict(self.invalid)}
         self._parts, self.lines, self.dropped, self.invalid = {}, 0, 0, {}
         self._since = time.monotonic()
