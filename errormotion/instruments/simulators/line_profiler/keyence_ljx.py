@@ -27,7 +27,7 @@ from errormotion.instruments.transports.loopback.stream_serving import NewestCon
 
 __all__ = ["SimulatedLJX", "packed"]
 
-LINES_AT_ONCE = 16  # profiles in a block without a pace
+LINES_AT_ONCE = 4  # profiles in a block without a pace: more are measured in vain when a stream ends
 STARTING_TIME = 5.0  # s
 
 
