@@ -5,8 +5,10 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
+from markupsafe import Markup
 
 from errormotion.datasets import build_errors, provenance
+from errormotion.report import canvas
 
 CHANNELS = ["X1", "X2", "Y1", "Y2", "Z"]
 QUANTITIES = ["X1", "X2", "Y1", "Y2", "Z", "A", "B"]
@@ -203,6 +205,12 @@ def beam_dataset():
         provenance=provenance.make({"procedure": "beam_detection"}, None, INSTRUMENTS),
         extras=extras,
     )
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Leave out what is in the figures of a report, for tests of its texts and tables."""
+    monkeypatch.setattr(canvas, "draw", lambda *_, **__: Markup("<svg></svg>"))
 
 
 @pytest.fixture

@@ -83,6 +83,7 @@ def test_a_workbook_has_a_sheet_for_each_table_with_numbers(tmp_path):
     assert second[2] == {"A": "=HYPERLINK(1)", "B": 1.25}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_every_table_of_a_report_is_exported(drift, tmp_path):
     page = write_report(drift, tmp_path / "r.html", form=Form(also=("csv", "xlsx")))
     count = page.read_text(encoding="utf-8").count("<table")
@@ -93,6 +94,7 @@ def test_every_table_of_a_report_is_exported(drift, tmp_path):
     assert float(rows[1][3]) == pytest.approx(0.40)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_without_a_printing_program_the_message_names_packages(beams, tmp_path, monkeypatch):
     monkeypatch.setattr(pdf, "browser", lambda: "")
     monkeypatch.setitem(sys.modules, "weasyprint", None)
@@ -114,6 +116,7 @@ def test_the_command_prints_with_the_stated_paper(beams, tmp_path: Path) -> None
 
 
 @pytest.mark.skipif(not pdf.browser(), reason="no browser is installed")
+@pytest.mark.usefixtures("undrawn")
 def test_a_browser_that_fails_is_named(beams, tmp_path, monkeypatch):
     monkeypatch.setattr(pdf, "browser", lambda: shutil.which("false"))
     with pytest.raises(RunError, match=r"false could not print it \(exit code 1\)"):

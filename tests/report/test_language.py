@@ -74,6 +74,7 @@ def test_a_spindle_report_is_completely_german(german, make_drift):
     assert re.search(r"software\.numpy</th>\s*<td[^>]*>\d+\.\d+", html)  # a version is no number
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_unknown_language_of_a_campaign_is_english(drift, tmp_path):
     html = write_report(drift, tmp_path / "r.html", run={"head": {"language": "xx"}}).read_text(encoding="utf-8")
     assert '<html lang="en">' in html

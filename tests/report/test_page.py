@@ -16,7 +16,7 @@ from errormotion.report.page.verdict import share, verdict
 from errormotion.tolerances.conformity import Conformity, Row
 from errormotion.tolerances.table import Tolerances
 
-pytestmark = pytest.mark.usefixtures("translated")
+pytestmark = pytest.mark.usefixtures("translated", "undrawn")
 
 HOSTILE = '</style><script>alert("1")</script>'
 HEAD = {

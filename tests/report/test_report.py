@@ -183,6 +183,7 @@ def test_hostile_names_are_text(read, make_drift):
     assert seen.unbalanced == []
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_simulated_data_are_marked(read, beams, simulated_instruments):
     seen = read(beams.assign_attrs(provenance=json.dumps(of(beams) | {"instruments": simulated_instruments})))
     assert "SIMULATED DATA" in seen.text
@@ -217,6 +218,7 @@ def test_measured_data_have_no_banner(page):
     assert "REPLAYED" not in page.text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_replayed_recording_is_named(read, beams):
     run = {"instruments": [{"address": "replay://frame.jsonl"}]}
     assert "REPLAYED RECORDING" in read(beams, run=run).text
@@ -251,6 +253,7 @@ def test_a_record_with_few_values_has_a_page(read, drift, instants):
     assert read(drift.isel(time=slice(0, instants))).unbalanced == []
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_remarks_of_the_method_and_lost_samples_are_reported(read, drift):
     raw = xr.Dataset(attrs={"dropped": 1234, "invalid": '{"out_of_range": 7}'})
     text = read(drift.assign_attrs(notes=["Sensor X1 was cold."]), raw=raw).text
@@ -263,6 +266,7 @@ def test_the_page_of_a_long_record_is_small(make_drift, tmp_path):
     assert path.stat().st_size < 2_000_000
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_older_report_is_replaced_without_remains(beams, tmp_path):
     path = tmp_path / "report.html"
     path.write_text("old")

@@ -8,6 +8,8 @@ from errormotion.datasets import save
 from errormotion.errors import RunError
 from errormotion.report import write_run_report
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 @pytest.fixture
 def run_folder(tmp_path, make_drift):
