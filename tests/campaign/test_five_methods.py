@@ -14,9 +14,9 @@ from errormotion.instruments.simulators import reset
 EXAMPLE = Path(__file__).parents[2] / "examples" / "one_machine"
 SHORTER = {
     'procedure = "beam_detection"': 'procedure = "beam_detection"\nsteps = 21\nscan_length = "1.6 mm"',
-    'duration = "181 min"': 'duration = "18 min"',
-    'duration = "183 min"': 'duration = "17 min"',
-    'warm_up = ["7 min", "30 min", "60 min", "120 min", "180 min"]': 'warm_up = ["12 min"]',
+    'duration = "181 min"': 'duration = "13 min"',
+    'duration = "183 min"': 'duration = "15 min"',
+    'warm_up = ["7 min", "30 min", "60 min", "120 min", "180 min"]': 'warm_up = ["9 min"]',
     'positions = ["-600 mm", "-200 mm", "200 mm", "600 mm"]': 'positions = ["-200 mm", "200 mm"]',
     "count = [4, 3, 3]": "count = [3, 3, 3]",
 }
