@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -9,6 +10,7 @@ import typer
 from errormotion.cli.app import app
 
 ROOT = Path(__file__).parents[2]
+COMMAND: Any = typer.main.get_command(app)
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 # A call is at the start of a line of a block (after "$ " or not), or in backquotes.
 CALL = re.compile(r"(?:^(?:\$ )?|`|&& |python -m )errormotion[ \t]+([^`\n#|&;]*)", re.MULTILINE)
@@ -22,7 +24,7 @@ def _calls(page: Path) -> list[str]:
 
 def mistake(call: str) -> str | None:
     """Return the mistake in the words after ``errormotion``; None for a valid call."""
-    command = typer.main.get_command(app)
+    command = COMMAND
     words = call.split()
     while (commands := getattr(command, "commands", None)) and words and not words[0].startswith("-"):
         name = words.pop(0)
