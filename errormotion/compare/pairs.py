@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.compare.low_rank import whitener
@@ -25,7 +25,7 @@ class ChiSquare:
     @property
     def p(self) -> float:
         """Probability of a larger value; NaN without degrees of freedom."""
-        return float(chi2.sf(self.value, self.degrees)) if self.degrees else float("nan")
+        return float(special.chdtrc(self.degrees, self.value)) if self.degrees else float("nan")
 
 
 @dataclass(frozen=True)

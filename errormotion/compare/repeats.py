@@ -15,8 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from scipy.stats import chi2
-from scipy.stats import f as fisher
+from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.compare.stack import Estimate
@@ -210,12 +209,12 @@ def _components(w: _Square | None, b: _Square | None, h: float) -> dict[str, Arr
 def _larger(each: _Square) -> float:
     if not each.stated > 0 or not np.isfinite(each.degrees):
         return float("nan")
-    return float(chi2.sf(each.degrees * each.value / each.stated, each.degrees))
+    return float(special.chdtrc(each.degrees, each.degrees * each.value / each.stated))
 
 
 def _bounds(degrees: float) -> tuple[float, float]:
     """Return G and H of a mean square: its interval is from (1 - G) to (1 + H) times its value."""
-    low, high = (float(chi2.ppf(p, degrees)) / degrees for p in ENDS)
+    low, high = (float(2 * special.gammaincinv(degrees / 2, p)) / degrees for p in ENDS)  # of chi-square
     return 1 - 1 / high, 1 / low - 1
 
 
@@ -236,7 +235,7 @@ def _sum(parts: Sequence[tuple[_Square, float]]) -> tuple[float, float]:
 
 def _difference(b: _Square, w: _Square, h: float) -> tuple[float, float]:
     """Return the interval of (MS_b - MS_w) / h (Ting et al. 1990)."""
-    low, high = (float(fisher.ppf(p, b.degrees, w.degrees)) for p in ENDS)
+    low, high = (float(special.fdtri(b.degrees, w.degrees, p)) for p in ENDS)
     (G1, H1), (G2, H2) = _bounds(b.degrees), _bounds(w.degrees)
     G12 = ((high - 1) ** 2 - (G1 * high) ** 2 - H2**2) / high
     H12 = ((1 - low) ** 2 - (H1 * low) ** 2 - G2**2) / low

@@ -17,8 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
-from scipy import linalg
-from scipy.stats import chi2
+from scipy import linalg, special
 
 from errormotion.arrays import Array
 from errormotion.compare.chain.curve import Curve, factor_of, is_straightness, sources_of
@@ -215,7 +214,7 @@ def _maximum_evidence(blank: _Fit, N: Array, b: Array, gain: Array, square: floa
     best = max(found, key=lambda each: each.evidence)
     C, value = best.half.T @ best.half * np.outer(unit, unit), best.value * unit
     rest, degrees = max(square - float(b @ value), 0.0), max(count - int((group < 0).sum()), 1)
-    factor = rest / degrees if chi2.sf(rest, degrees) < FALSE_ALARM else 1.0
+    factor = rest / degrees if special.chdtrc(degrees, rest) < FALSE_ALARM else 1.0
     shared = C @ gain
     own = np.sqrt(factor) * factor_of(C - shared @ shared.T, np.sqrt(np.diag(C)))
     low = np.flatnonzero((order <= DECISIVE_ORDER) | (group < 0))

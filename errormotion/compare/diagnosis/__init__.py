@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.compare.diagnosis.causes import Candidate, Corrected, Shifted, candidates
@@ -120,7 +120,7 @@ def _judged(
         shift = fitted(candidate.course, candidate.sign, candidate.time, d.value, white)
         if shift is None or shift.gain <= 0:
             return None
-        p = float(chi2.sf(max(whole - shift.gain, 0.0), max(white.degrees - 1, 1)))
+        p = float(special.chdtrc(max(white.degrees - 1, 1), max(whole - shift.gain, 0.0)))
         size = Size("shift", shift.value, shift.standard_uncertainty, "s")
         return Cause("shift in time", (size,), shift.gain / 2, float(shift.gain - np.log(count)), p)
     effects = np.where(np.isfinite(d.value), np.nan_to_num(candidate.effects), 0.0)
@@ -144,7 +144,7 @@ def _judged(
         Size(candidate.labels[i][0], float(value), float(u), candidate.labels[i][1])
         for i, value, u in zip(used, beta, np.sqrt(np.diag(C)), strict=True)
     )
-    p = float(chi2.sf(max(whole - gain, 0.0), max(white.degrees - len(used), 1)))
+    p = float(special.chdtrc(max(white.degrees - len(used), 1), max(whole - gain, 0.0)))
     return Cause(candidate.name, sizes, gain / 2, float(score), p)
 
 
@@ -173,7 +173,7 @@ def _corrected(candidate: Corrected, d: Estimate, white: Whitener, whole: float)
     counted = (np.isfinite(d.value) & (np.nan_to_num(d.variance()) > 0)).sum(axis=0)
     stretched = float(counted @ np.log(candidate.stretch)) if candidate.stretch is not None else 0.0
     gain = whole - rest + white.log_determinant - its.log_determinant + stretched
-    p = float(chi2.sf(rest, its.degrees)) if its.degrees else float("nan")
+    p = float(special.chdtrc(its.degrees, rest)) if its.degrees else float("nan")
     return Cause(candidate.name, (), gain / 2, gain, p)
 
 

@@ -46,14 +46,15 @@ def test_stated_intervals_contain_the_truth_and_the_joint_covariance_is_right(ma
     for seed in range(seeds):
         raw = simulation.raw_drift(machine, TIMES, seed=seed, beams=detected(machine, method, 1000 + seed))
         errors = method.identify(raw, Settings(compensate_frame=False))
-        miss = np.asarray(errors.em.twist())[:, SEEN] - truth_of(machine, errors)
+        truth = truth_of(machine, errors)
+        miss = np.asarray(errors.em.twist())[:, SEEN] - truth
         covariance = errors["covariance"].values[:, SEEN, SEEN]
         inside.append(np.abs(miss[1:]) <= 1.96 * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[1:])
         joint += [miss[t] @ np.linalg.solve(covariance[t], miss[t]) for t in range(1, 5)]
         # The change between two late instants: the reference state drops out, which only the influences know.
         change = errors.em.combine([0.0, 0.0, 0.0, -1.0, 1.0], dim="time")
         value, spread = np.asarray(change[0])[SEEN], np.asarray(change[1])[SEEN, SEEN]
-        off = value - (truth_of(machine, errors)[4] - truth_of(machine, errors)[3])
+        off = value - (truth[4] - truth[3])
         slopes.append(off @ np.linalg.solve(spread, off))
     # 60 seeds of 4 instants that share their reference: the share of 60 draws, within 99.9 %.
     fraction = np.mean(inside, axis=(0, 1))
