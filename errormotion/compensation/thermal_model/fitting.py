@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from errormotion.arrays import Array
 from errormotion.compensation.thermal_model import regression
@@ -284,7 +284,7 @@ def _made(
         )
         freedom = max(regression.effective_count(residual, group), 1.0)
         # Standard uncertainty with few degrees of freedom, enlarged so that k = 1.96 gives 95 %.
-        misfit[k] = np.sqrt(square) * student.ppf(0.975, freedom) / student.ppf(0.975, np.inf)
+        misfit[k] = np.sqrt(square) * stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975)
         of_scaled = regression.covariance(X, weight, strength, square, residual, group)
         covariance[k] = of_scaled / np.outer(scale, scale)
         removed[k] = 1 - np.sqrt(regression.mean_square(residual, weight) / regression.mean_square(y, weight))
