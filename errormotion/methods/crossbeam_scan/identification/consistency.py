@@ -260,15 +260,14 @@ class _Scans:
         without[np.flatnonzero(self.known[:, k]) == step.since, used == k] = np.nan
         positions = self.position[used]
         order = min(ORDER, used.size - 2)  # one artefact less still provides evidence
-        likelihood = [
-            smooth(
-                positions, points[..., d], noise[..., d, d], positions[:1], order=order, together=True
-            ).log_likelihood
+        variance = np.moveaxis(np.diagonal(noise, axis1=-2, axis2=-1), -1, 0)
+        curves = [
+            smooth(positions, np.moveaxis(points, -1, 0), variance, positions[:1], order=order, together=True, sets=6)
             for points in (change, without)
-            for d in range(6)
         ]
-        each = np.nanmax(likelihood, axis=-1)  # shared; NaN for a cycle with too few artefacts
-        return float(each[6:].sum() - each[:6].sum())
+        # shared by the cycles of a freedom; NaN for a cycle with too few artefacts
+        before, after = np.nanmax([each.log_likelihood for each in curves], axis=-1)
+        return float(after.sum() - before.sum())
 
     def changes(self, k: int, used: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
         """Return the changes of the errors at the artefacts used between the scans of artefact k.

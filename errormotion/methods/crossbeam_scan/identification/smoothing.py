@@ -123,6 +123,7 @@ def smooth(
     *,
     exact_zero: bool = False,
     together: bool = False,
+    sets: int = 1,
     order: int | None = None,
     rougher: bool = True,
 ) -> Smooth:
@@ -139,7 +140,9 @@ def smooth(
     exact_zero : bool
         Whether all curves start at position 0 with value 0; positions below 0 are then taken as 0.
     together : bool
-        Whether all curves share one amplitude.
+        Whether all curves of a set share one amplitude.
+    sets : int
+        Number of sets, along the first axis of the curves, with the same points known in each.
     order : {1, 2, 3}, optional
         By default 3, or less where even the curve with the most points has too few for evidence.
     rougher : bool
@@ -184,18 +187,20 @@ def smooth(
         alike = _alike(v[rows], known[rows])
         y = np.where(known, y, 0.0)[rows]
         by_order = [_Series.of(_Basis.of(x, to, order, q, exact_zero), y, alike) for q in orders]
-        weighed = [_weigh(*series.groups(together)) for series in by_order]
+        groups = sets if together else len(rows)
+        of_row = np.arange(len(rows)) // (len(rows) // groups)
+        weighed = [_weigh(*series.groups(groups)) for series in by_order]
         log = np.array([one.log_evidence for one in weighed])
         share = np.exp(log - log.max(axis=0))
         share /= share.sum(axis=0)  # of each order, (order, group)
-        parts = [series.mixture(one) for series, one in zip(by_order, weighed, strict=True)]
-        curves[rows], spread[rows], W[rows] = _mixed(share, parts)
-        best = np.argmax([one.best_likelihood for one in weighed], axis=0), np.arange(share.shape[1])
+        parts = [series.mixture(one, of_row) for series, one in zip(by_order, weighed, strict=True)]
+        curves[rows], spread[rows], W[rows] = _mixed(share[:, of_row], parts)
+        best = np.argmax([one.best_likelihood for one in weighed], axis=0)[of_row], of_row
         sizes = [series.amplitude_unit * one.amplitude for series, one in zip(by_order, weighed, strict=True)]
         amplitude[rows] = np.array(sizes)[best]
         evidence[rows] = np.array([one.evidence for one in weighed])[best]
         likelihood[rows] = np.array([one.best_likelihood for one in weighed])[best]
-        rough[rows] = share[1:].sum(axis=0)
+        rough[rows] = share[1:].sum(axis=0)[of_row]
     return Smooth(
         curves.reshape(*batch, to.size),
         spread.reshape(*batch, to.size),
@@ -243,16 +248,23 @@ def smooth_twists(
     y, C = np.asarray(values, dtype=float), np.asarray(covariance, dtype=float)
     if y.ndim < 2 or y.shape[-1] != 6 or C.shape != (*y.shape, 6):
         raise MethodError(f"Expected values (..., n, 6) and covariance (..., n, 6, 6); found {y.shape}, {C.shape}.")
-    each = [
-        smooth(positions, y[..., d], C[..., d, d], at, exact_zero=exact_zero, together=True, order=order)
-        for d in range(6)
-    ]
+    v = np.diagonal(C, axis1=-2, axis2=-1)
+    known = np.isfinite(y) & np.isfinite(v)
+    _, pattern = np.unique(known.reshape(-1, 6), axis=1, return_inverse=True)  # freedoms with the same points known
+    each: dict[int, tuple[Smooth, int]] = {}
+    for k in np.unique(pattern):
+        some = np.flatnonzero(pattern == k)
+        values_, variance = (np.moveaxis(array[..., some], -1, 0) for array in (y, v))
+        found = smooth(
+            positions, values_, variance, at, exact_zero=exact_zero, together=True, sets=some.size, order=order
+        )
+        each |= {int(d): (found, i) for i, d in enumerate(some)}
     arrays: dict[str, Any] = {
-        name: np.stack([getattr(one, name) for one in each], axis=y.ndim - 2)
+        name: np.stack([getattr(one, name)[i] for one, i in (each[d] for d in range(6))], axis=y.ndim - 2)
         for name in Smooth.__dataclass_fields__
         if name != "order"
     }
-    merged = Smooth(**arrays, order=min(one.order for one in each))
+    merged = Smooth(**arrays, order=min(one.order for one, _ in each.values()))
     W = merged.weights  # (..., 6, m, n)
     noise = np.einsum("...imn,...nij,...jmn->...mij", W, np.nan_to_num(C), W)
     own = np.swapaxes(merged.variance, -1, -2) - np.diagonal(noise, axis1=-2, axis2=-1)  # of the curves without noise
@@ -363,15 +375,14 @@ class _Series:
         contrast = (to_contrast @ y[..., None])[..., 0]
         return cls(y, basis.unit, gain, contrast, reach, own, fit, to_contrast, noise, unit)
 
-    def groups(self, together: bool) -> tuple[Array, Array, Array]:
+    def groups(self, number: int) -> tuple[Array, Array, Array]:
         """Return gains and contrasts of each group with one amplitude, (group, c), and its log of the density."""
-        shape = (1, -1) if together else self.gain.shape
-        unit = self.unit.sum(keepdims=True) if together else self.unit
-        return self.gain.reshape(shape), self.contrast.reshape(shape), unit
+        gain, contrast, unit = (each.reshape(number, -1) for each in (self.gain, self.contrast, self.unit))
+        return gain, contrast, unit.sum(axis=1)
 
-    def mixture(self, weighed: _Weighed) -> tuple[Array, Array, Array]:
-        """Return values (r, m), variance (r, m) and weights (r, m, n) over all amplitudes."""
-        A, share = weighed.amplitudes[..., None], weighed.share[:, None]
+    def mixture(self, weighed: _Weighed, of_row: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+        """Return values (r, m), variance (r, m) and weights (r, m, n) over the amplitudes of each curve's group."""
+        A, share = weighed.amplitudes[of_row, :, None], weighed.share[of_row, None]
         held = A / (1 + A * self.gain[:, None])  # of each contrast by each amplitude
         curves = (self.fit @ self.y[..., None]).mT + (held * self.contrast[:, None]) @ self.reach.mT
         values = share @ curves
