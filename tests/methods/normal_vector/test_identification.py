@@ -17,17 +17,15 @@ def sigma(errors):
     return np.sqrt(np.einsum("kii->ki", errors["covariance"].values))
 
 
-@pytest.mark.parametrize(("kind", "seen"), [("gantry", 6), ("cframe", 5)])
-def test_recovers_truth_with_true_uncertainty(probed, off, kind, seen):
+def test_recovers_truth_with_true_uncertainty_on_a_gantry(probed, off):
+    """The C-frame is the subject of the conformance kit."""
     z, alarms = [], 0
     for seed in range(25):
-        machine, raw = probed(kind, seed)
+        machine, raw = probed("gantry", seed)
         errors = METHOD.identify(raw)
         z.append(off(machine, errors)[1:])
         alarms += int((errors["left_out"].values > 1).any())
     z = np.array(z)
-    assert np.isnan(z).all(axis=(0, 1)).sum() == 6 - seen
-    z = z[..., :seen]
     # 25 seeds; the cycles of a seed share half of their variance: the standard deviation of the mean square of one
     # freedom is sqrt(0.5 / 25 * 1.3), of all together about 0.07.
     assert abs(np.mean(z**2) - 1) < 0.3
