@@ -127,6 +127,10 @@ class Machine:
             max(map(abs, motion)),
         )
 
+    def _without_offset(self) -> bool:
+        given, applied = self.pins("errormotion-limit-x.out", "axis.x.eoffset")
+        return given == 0 and abs(applied) < SETTLED
+
     def kill_bridge(self) -> None:
         """Kill the bridge and return when another one runs."""
         announced = self.process.folder / "announced.json"
@@ -140,7 +144,7 @@ class Machine:
         self.control.enable()
         if not self.control.state()["homed"]:
             self.control.home()
-        until(lambda: self.offset() == 0 and abs(self.pins("axis.x.eoffset")[0]) < SETTLED)
+        until(self._without_offset)
         self.control.move_to([0.001, 0.0, 0.0])  # LinuxCNC's interpreter may not know how far an offset was left behind
         self.control.move_to([0.0, 0.0, 0.0])
 
@@ -150,4 +154,4 @@ def until(condition: Callable[[], bool], limit: float = 20.0) -> None:
     end = time.monotonic() + limit
     while not condition():
         assert time.monotonic() < end, "the condition does not come true"
-        time.sleep(0.02)
+        time.sleep(0.05)
