@@ -92,7 +92,7 @@ def test_perfect_scans_give_the_pose(scan_pocket, truth):
 def test_truth_lies_within_the_stated_uncertainty(scan_pocket, truth):
     misses, squares = [], []
     for seed in range(28):
-        found = calibrate(*scan_pocket(seed), POCKET)
+        found = calibrate(*scan_pocket(seed, points=1600), POCKET)
         miss = found.values - truth
         misses.append(miss / np.sqrt(np.diag(found.covariance)))
         squares.append(miss @ np.linalg.solve(found.covariance, miss))

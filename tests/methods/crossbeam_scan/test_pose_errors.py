@@ -75,7 +75,7 @@ def test_covariance_is_that_of_small_changes_of_the_parameters(found):
     p = calibration.parameters(RigidTransform.from_matrix(ds["profiler_pose"].values))
     rng = np.random.default_rng(1)
     draws = rng.multivariate_normal(np.zeros(6), ds["pose_covariance"].values, 4000)
-    twists = np.array([displacement(calibration.pose(*(p + d)) * NOMINAL.inv(), NOMINAL.translation) for d in draws])
+    twists = displacement(calibration.pose(*(p + draws).T) * NOMINAL.inv(), NOMINAL.translation)
     u = np.sqrt(np.diag(ds["covariance"].values[0]))
     # 4000 draws: a standard deviation to 1.1 %, a correlation to 0.016
     sampled = np.cov(twists.T) / np.outer(u, u)

@@ -1,5 +1,7 @@
 """Smooth curves through few points: against other ways of computing them, both ends of the evidence, and coverage."""
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
@@ -19,9 +21,15 @@ COVARIANCE = np.outer(SIGMA, SIGMA) * (0.5 * np.eye(6) + 0.5)
 INSIDE = 1.96
 
 
+@lru_cache(maxsize=1)
+def crossbeam_of(seed):
+    """Return the crossbeam of a virtual gantry."""
+    return VirtualMachine("gantry", seed=seed).crossbeam
+
+
 def truth(seed, times, places):
     """Twists of the virtual gantry in the profiler's frame, (t, n, 6), and the way back to the carriage."""
-    crossbeam = VirtualMachine("gantry", seed=seed).crossbeam
+    crossbeam = crossbeam_of(seed)
     to_carriage = carriage_adjoint(RigidTransform.from_matrix(crossbeam.pose), crossbeam.lever)
     return crossbeam.twist(np.asarray(times)[:, None], places) @ np.linalg.inv(to_carriage).T, to_carriage
 

@@ -42,9 +42,10 @@ WORST_ANGLE, WORST_POSITION = 0.05, 2e-3
 _UNIT = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 1e-5])
 
 
-def pose(a: float, b: float, g: float, dx: float, dy: float, dz: float) -> RigidTransform:
+def pose(a: ArrayLike, b: ArrayLike, g: ArrayLike, dx: ArrayLike, dy: ArrayLike, dz: ArrayLike) -> RigidTransform:
     """Return H = T(dx, dy, dz) R_X(a) R_Y(b) R_Z(g), profiler to tool frame (eq. 5 of Zhao et al.); rad, m."""
-    return RigidTransform.from_components([dx, dy, dz], Rotation.from_euler("XYZ", [a, b, g]))
+    shift, angles = np.stack([dx, dy, dz], axis=-1), np.stack([a, b, g], axis=-1)
+    return RigidTransform.from_components(shift, Rotation.from_euler("XYZ", angles))
 
 
 def parameters(H: RigidTransform) -> Array:
