@@ -194,10 +194,9 @@ def _fit(points: Array, contact: float, highest: int) -> _Fit | None:
         distance = np.linalg.norm(offset, axis=1)
         n = offset / distance[:, None]
         A = np.hstack([harmonics(n, degrees, orders), -n])  # R + r - |p - c| = H b - n dc
-        values = np.linalg.svd(A, compute_uv=False)
-        if values[-1] < _SINGULAR * values[0]:
+        found, _, _, singular = np.linalg.lstsq(A, contact - distance, rcond=None)
+        if singular[-1] < _SINGULAR * singular[0]:
             return None
-        found = np.linalg.lstsq(A, contact - distance, rcond=None)[0]
         centre = centre + found[-3:]
         if np.abs(found[-3:]).max() < 1e-12:
             break
