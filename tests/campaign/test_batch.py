@@ -21,7 +21,7 @@ from errormotion.plugins import PluginSettings
 from errormotion.twin import Event, VirtualMachine
 
 Identify = Callable[..., list[Outcome]]
-COUNT = 4
+COUNT = 3
 
 
 def settings(average: float = 2.0) -> PluginSettings:
@@ -31,7 +31,7 @@ def settings(average: float = 2.0) -> PluginSettings:
 
 @pytest.fixture(scope="module")
 def raws(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Four records of a minute, and an incomplete one between them."""
+    """Three records of a minute, and an incomplete one between them."""
     folder = tmp_path_factory.mktemp("raw")
     machine = VirtualMachine("cframe", seed=1)
     machine.start([Event(0.0, 15000.0, None)])
@@ -81,7 +81,7 @@ def reference(raws: list[Path], tmp_path_factory: pytest.TempPathFactory) -> lis
 def same_as(reference: list[Outcome], outcomes: list[Outcome]) -> None:
     """Every error dataset is identical, and only the incomplete record failed."""
     assert [outcome.raw for outcome in outcomes] == [outcome.raw for outcome in reference]
-    assert [bool(outcome.reason) for outcome in outcomes] == [False, False, True, False, False]
+    assert [bool(outcome.reason) for outcome in outcomes] == [False, False, True, False]
     assert "truncated" in outcomes[2].reason
     assert outcomes[2].errors is None
     for outcome, wanted in zip(outcomes, reference, strict=True):
@@ -157,12 +157,12 @@ def test_an_interrupted_test_continues(raws: list[Path], identify: Identify, tmp
             if done == 2:
                 raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match="2 of 5 runs are done; repeat the command"):
+    with pytest.raises(KeyboardInterrupt, match="2 of 4 runs are done; repeat the command"):
         identify(progress=Impatient())
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
     assert sorted(path.name for path in before) == ["run0.nc", "run1.nc"]
     outcomes = identify()
-    assert [outcome.stepped_over for outcome in outcomes] == [True, True, False, False, False]
+    assert [outcome.stepped_over for outcome in outcomes] == [True, True, False, False]
     assert all(path.stat().st_mtime_ns == then for path, then in before.items())
 
 
