@@ -71,6 +71,14 @@ def test_spread_meets_the_bound_and_the_stated_covariance():
     assert np.sqrt(np.mean(np.square(paper_ratio), axis=0))[0] > 1.2
 
 
+def test_circles_and_line_find_the_beam_of_exact_readings():
+    P, u = true_beam(np.random.default_rng(4))
+    origin, direction = circles_and_line(sphere_reading(P, u, CENTRE, R)[0], CENTRE, SCANS, R, U0)
+    # The profile of a beam that is not perpendicular to its scan is not quite a circle.
+    np.testing.assert_allclose(origin, P, atol=1e-6)
+    np.testing.assert_allclose(direction, u, atol=1e-5)
+
+
 def test_outliers_are_reported_and_excluded():
     rng = np.random.default_rng(3)
     P, u = true_beam(rng)
