@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from errormotion.datasets.units import Length, Speed, Velocity, format_quantity
@@ -82,13 +82,13 @@ class Extent:
 def extent(steps: Sequence[Step]) -> Extent:
     """Return the requirements of steps on a machine."""
     moving = [step for step in steps if step.place is not None]
-    positions = [step.place for step in moving if step.place is not None]
-    columns = [[x for x in column if not math.isnan(x)] for column in zip(*positions, strict=True)] or [[]] * 3
+    places = np.array([step.place for step in moving], float).reshape(-1, 3)
+    ways = np.sqrt(np.nansum(np.diff(places, axis=0) ** 2, axis=1))
     return Extent(
         math.fsum(step.seconds for step in steps if not math.isnan(step.seconds)),
-        math.fsum(_distance(a, b) for a, b in pairwise(positions)),
-        tuple(min(column, default=math.nan) for column in columns),
-        tuple(max(column, default=math.nan) for column in columns),
+        math.fsum(ways),
+        tuple(np.fmin.reduce(places, axis=0, initial=np.nan).tolist()),
+        tuple(np.fmax.reduce(places, axis=0, initial=np.nan).tolist()),
         max((step.feed for step in moving if not math.isnan(step.feed)), default=0.0),
         max((abs(step.spindle_speed) for step in steps), default=0.0),
         sum(step.what == "touch" for step in steps),
@@ -96,10 +96,6 @@ def extent(steps: Sequence[Step]) -> Extent:
         sum(math.isnan(step.feed) for step in moving),
         sum(math.isnan(step.seconds) for step in steps),
     )
-
-
-def _distance(a: Sequence[float], b: Sequence[float]) -> float:
-    return math.sqrt(sum((x - y) ** 2 for x, y in zip(a, b, strict=True) if not math.isnan(x - y)))
 
 
 def violations(found: Extent, limits: Limits) -> list[str]:
