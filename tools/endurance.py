@@ -19,7 +19,7 @@ from fuzz import PAGE, write_section  # noqa: E402
 from monitored_day import Day  # noqa: E402
 
 TITLE = "A monitor over 24 hours"
-LARGEST_GROWTH = 0.05
+MAX_GROWTH = 0.05
 """Of the memory after the first hour."""
 NAMES = {
     "corrupt": "answers with a wrong bit",
@@ -38,7 +38,7 @@ def failures(day: Day) -> list[str]:
     """Return the failures of a day."""
     found = list(day.errors)
     first, last = day.resources[0], day.resources[-1]
-    if day.growth() > LARGEST_GROWTH:
+    if day.growth() > MAX_GROWTH:
         found.append(f"the memory grew from {first.memory / 2**20:.1f} to {last.memory / 2**20:.1f} MiB")
     for name in ("descriptors", "threads"):
         numbers = sorted({getattr(each, name) for each in day.resources})

@@ -37,7 +37,7 @@ TABLE = (
     "| read | inputs tried | steps reached by good ones | by all | corpus | slowest | largest memory | errors |",
     "|---|---|---|---|---|---|---|---|",
 )
-MOST_SAVED = 50
+MAX_SAVED = 50
 """Failures, and slow inputs, of one search."""
 SHOWN = 5
 MANY = (100, 1000, 5000)
@@ -82,7 +82,7 @@ def search(name: str, folder: Path, seconds: float) -> None:
 
     def save(data: bytes, why: str) -> None:
         places[why] += 1
-        if places[why] == 1 and len(places) <= MOST_SAVED:
+        if places[why] == 1 and len(places) <= MAX_SAVED:
             (found / f"failure{len(places)}").write_bytes(data)
 
     def one(data: bytes) -> None:

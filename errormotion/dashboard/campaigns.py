@@ -21,7 +21,7 @@ from errormotion.campaign.planning.motions import Motions, beside_limits, headli
 from errormotion.dashboard.lab import NotFoundError
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.datasets.files.tomlfile import Key, parse_toml, read_toml
-from errormotion.datasets.files.tomltext import LONGEST_TEXT, value
+from errormotion.datasets.files.tomltext import MAX_TEXT, value
 from errormotion.errors import BenchError, ErrormotionError
 from errormotion.report.text import rounded, signs
 
@@ -74,7 +74,7 @@ class Campaigns:
         if Path(name).name != name or "\0" in name or not _is_campaign(self.folder / name):
             raise NotFoundError(f"No campaign file {name[:100]!r} in {self.folder}.")
         try:
-            return read_bytes(self.folder / name, LONGEST_TEXT).decode("utf-8-sig")
+            return read_bytes(self.folder / name, MAX_TEXT).decode("utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
             raise BenchError(f"{self.folder / name}: cannot be read: {error}") from error
 
@@ -145,8 +145,8 @@ class Campaigns:
 
     @staticmethod
     def _short(text: str) -> str:
-        if len(text) > LONGEST_TEXT:
-            raise BenchError(f"expected a campaign of at most {LONGEST_TEXT} characters; found {len(text)}")
+        if len(text) > MAX_TEXT:
+            raise BenchError(f"expected a campaign of at most {MAX_TEXT} characters; found {len(text)}")
         return text
 
     def _path(self, name: str) -> Path:

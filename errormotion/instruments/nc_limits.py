@@ -14,7 +14,7 @@ import re
 from errormotion.errors import InstrumentError
 from errormotion.instruments.door import Door
 
-MOST_CHARACTERS = 1 << 24
+MAX_CHARACTERS = 1 << 24
 _WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d{1,15}(?:\.\d{0,15})?|\.\d{1,15}))\s*")
 _COMMENT = re.compile(r"\([^()]*\)")
 _PRINTING = re.compile(r"(?:N\d{1,9}\s*)?(?:POPEN|PCLOS|DPRNT\s*\[(?:[^][]|\[[^][]*\])*\])")
@@ -34,8 +34,8 @@ def check_program(text: str, door: Door) -> None:
         A line exceeds the limits, or its path is unknown; the message has its number. Without limits only the length is
         checked.
     """
-    if len(text) > MOST_CHARACTERS:
-        raise InstrumentError(f"expected a program of at most {MOST_CHARACTERS} characters; found {len(text)}")
+    if len(text) > MAX_CHARACTERS:
+        raise InstrumentError(f"expected a program of at most {MAX_CHARACTERS} characters; found {len(text)}")
     limits = door.limits
     if not limits.spans and limits.feed is None and limits.spindle_speed is None:
         return

@@ -27,7 +27,7 @@ def with_query(address: str, query: str) -> str:
     return urlunsplit(parts._replace(query=joined))
 
 
-LONGEST_WARM_UP = 240.0
+MAX_WARM_UP = 240.0
 """Time limit for the compilation of a method, s."""
 
 _WARM: set[type] = set()
@@ -272,7 +272,7 @@ class MethodSubject:
 
         worker = threading.Thread(target=work, name="warm-up", daemon=True)
         worker.start()
-        worker.join(LONGEST_WARM_UP)
+        worker.join(MAX_WARM_UP)
 
     @lru_cache(maxsize=1024)  # noqa: B019 - subjects live as long as the tests that share their results
     def outcome(self, seed: int) -> tuple[xr.Dataset, xr.Dataset]:

@@ -26,13 +26,13 @@ Marks = dict[str, dict[str, str]]
 _EXPANDED: WeakKeyDictionary[Line2D, Array] = WeakKeyDictionary()
 _UNIT = re.compile(r"^(.*?)\s*/\s*\(?([^()/]*(?:/[^()/]*)?)\)?\s*$")
 _UNITS = ("µm", "mm", "m", "arcsec", "°C", "K", "s", "min", "%")
-_MOST_POINTS = 2000
+_MAX_POINTS = 2000
 """Points of a curve with an uncertainty each."""
 
 
 def state_uncertainty(line: Line2D, expanded: Array) -> None:
     """State the expanded uncertainty of each point of a drawn line, in the unit of its ordinate."""
-    if expanded.size <= _MOST_POINTS:
+    if expanded.size <= _MAX_POINTS:
         _EXPANDED[line] = np.asarray(expanded, dtype=float)
 
 

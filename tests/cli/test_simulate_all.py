@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 WAIT = 60  # s
 ROOM = 600  # s; a computer has room for one LinuxCNC, and other tests use it
-MOST_LINES = 4
+MAX_LINES = 4
 
 
 def first_reading(instrument: Any) -> None:
@@ -84,7 +84,7 @@ def free_port() -> int:
     while True:
         port = random.randrange(10_000, 32_000)
         with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
-            for number in range(MOST_LINES + 1):
+            for number in range(MAX_LINES + 1):
                 stack.enter_context(socket.create_server(("127.0.0.1", port + number)))
             return port
 

@@ -219,6 +219,6 @@ def test_a_plugin_reads_its_own_maps(run, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
 def test_a_line_without_end_is_refused_before_it_is_in_memory(tmp_path: Path, encoding: str) -> None:
     log = tmp_path / "log.csv"
-    log.write_bytes(f"a,b\n1,2\n{'3' * (log_reader.LONGEST_LINE + 1)}".encode(encoding))
+    log.write_bytes(f"a,b\n1,2\n{'3' * (log_reader.MAX_LINE + 1)}".encode(encoding))
     with pytest.raises(DatasetError, match=r"log\.csv, line 3: expected at most \d+ characters"):
         list(log_reader.top_lines(log, Format(encoding=encoding, skip=3)))

@@ -54,7 +54,7 @@ def test_the_maker_takes_null_for_no_error() -> None:
         b'{"jsonrpc":"2.0","id":1,"result":[0,NaN]}',
         b'{"jsonrpc":"2.0","id":1,"result":["system idle"]}',  # an old interface
         b'{"jsonrpc":"2.0","id":1,"result":' + 1500 * b"[" + 1500 * b"]" + b"}",
-        b'{"jsonrpc":"2.0","id":1,"result":[0,"' + codec.LONGEST_REPLY * b"x" + b'"]}',
+        b'{"jsonrpc":"2.0","id":1,"result":[0,"' + codec.MAX_REPLY * b"x" + b'"]}',
         b'{"jsonrpc":"2.0","id":1,"result":[0]}{"jsonrpc":"2.0","id":2,"result":[0]}',
     ],
 )

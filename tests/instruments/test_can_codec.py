@@ -13,7 +13,7 @@ from errormotion.instruments.thermometer.cia404 import (
     CELSIUS,
     FAHRENHEIT,
     KELVIN,
-    MOST_DIGITS,
+    MAX_DIGITS,
     NUMBERS,
     flag_of,
     scale_of,
@@ -90,7 +90,7 @@ def test_floats_round_trip(value: float) -> None:
     assert NUMBERS["float"].decode(struct.pack("<f", value)) == value
 
 
-@given(st.integers(-(2**31), 2**31 - 1), st.integers(0, MOST_DIGITS))
+@given(st.integers(-(2**31), 2**31 - 1), st.integers(0, MAX_DIGITS))
 def test_integers_round_trip_with_their_digits(value: int, digits: int) -> None:
     number = NUMBERS["integer 32"].decode(struct.pack("<i", value))
     assert scale_of(CELSIUS, digits).celsius(number) == float(f"{value}e-{digits}")

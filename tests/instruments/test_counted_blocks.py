@@ -52,7 +52,7 @@ CONTROLLERS = (
         capancdt.block_decoder,
         lambda: capancdt.readings_of(1, Channel("DL6220", "1", 0.0, 1e-3)),
         1e-3 / capancdt.FULL_SCALE,
-        capancdt.LONGEST_GAP,
+        capancdt.MAX_GAP,
     ),
     Controller(
         "confocaldt",
@@ -62,7 +62,7 @@ CONTROLLERS = (
         confocaldt.block_decoder,
         confocaldt.readings,
         confocaldt.RESOLUTION,
-        confocaldt.LONGEST_GAP,
+        confocaldt.MAX_GAP,
     ),
 )
 every = pytest.mark.parametrize("of", CONTROLLERS, ids=lambda each: each.name)

@@ -173,7 +173,7 @@ def test_profiles_are_packed_as_in_the_reference_and_round_trip(
     assert end is None
     assert profiles.shape == (1, where.words)
     got, counts = heights(profiles, reasons, where)
-    known = np.array(raws) >= codec.SMALLEST_HEIGHT
+    known = np.array(raws) >= codec.MIN_HEIGHT
     assert got[0][known] == pytest.approx(np.array(raws)[known] * UNIT, rel=1e-15)
     assert np.isnan(got[0][~known]).all()
     assert sum(counts.values()) == (~known).sum()

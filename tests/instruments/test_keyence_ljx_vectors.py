@@ -63,9 +63,9 @@ def test_profiles(vector: Vector) -> None:
     unpack = HeightDecoder(layout)
     heights, counts = np.empty((1, raws.size)), np.zeros(len(REASONS), dtype=np.int64)
     unpack.heights(chunk.values, chunk.reasons, heights, counts)
-    known = raws >= codec.SMALLEST_HEIGHT
+    known = raws >= codec.MIN_HEIGHT
     assert heights[0][known] == pytest.approx(raws[known] * UNIT, rel=1e-15)
-    assert counts[:4].tolist() == [int((raws == codec.SMALLEST_HEIGHT - 4 + i).sum()) for i in range(4)]
+    assert counts[:4].tolist() == [int((raws == codec.MIN_HEIGHT - 4 + i).sum()) for i in range(4)]
     assert unpack.encoder(chunk.values[:, codec.ENCODER_WORD], chunk.reasons) == [vector.expected["encoder"]]
     if light.size:
         intensities = np.empty((1, raws.size), dtype=np.uint16)

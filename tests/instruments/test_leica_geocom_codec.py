@@ -41,7 +41,7 @@ def test_replies(vector: Vector) -> None:
         b'%R1P,0,0:0,"TS30',
         b'%R1P,0,0:0,"TS30"5,6',
         b"%R1Q,5004,1:",
-        b"%R1P,0,1:0," + codec.LONGEST_REPLY * b"1",
+        b"%R1P,0,1:0," + codec.MAX_REPLY * b"1",
     ],
 )
 def test_invalid_replies_are_an_error(line: bytes) -> None:
@@ -80,7 +80,7 @@ def examine(line: bytes) -> None:
                 continue
 
 
-@given(st.binary(max_size=codec.LONGEST_REPLY + 10))
+@given(st.binary(max_size=codec.MAX_REPLY + 10))
 def test_any_bytes_are_a_reply_or_an_error(line: bytes) -> None:
     examine(line)
     examine(b"%R1P,0,1:0," + line)
@@ -100,7 +100,7 @@ def test_mutated_replies_are_replies_or_errors(line: bytes, changes: list[tuple[
 @pytest.mark.parametrize("filling", [b",", b'"', b"\\", b'"\\', b"'", b"9", b'"",', b"0x"])
 def test_the_longest_replies_are_decoded_in_linear_time(filling: bytes) -> None:
     head = b"%R1P,0,1:0,"
-    line = head + (filling * codec.LONGEST_REPLY)[: codec.LONGEST_REPLY - len(head)]
+    line = head + (filling * codec.MAX_REPLY)[: codec.MAX_REPLY - len(head)]
     best = 1.0
     for _ in range(3):
         start = time.perf_counter()

@@ -17,8 +17,8 @@ from errormotion.instruments.controller import virtual
 from errormotion.instruments.controller.linuxcnc import codec as linuxcnc
 from errormotion.instruments.controller.shdr import codec as shdr
 from errormotion.instruments.laser_tracker.leica_geocom import codec as geocom
-from errormotion.instruments.point_lds.optoncdt.commands import MOST_LINES, parse_answer
-from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, PATTERN, parse_line
+from errormotion.instruments.point_lds.optoncdt.commands import MAX_LINES, parse_answer
+from errormotion.instruments.touch_probe.dprnt.codec import MAX_LINE, PATTERN, parse_line
 from errormotion.instruments.transports.recording import read_index
 
 QUICK = 200
@@ -99,15 +99,15 @@ def test_a_long_line_of_digits_is_refused_quickly() -> None:
     for text in (f"X{'1' * 80}Y{'1' * 80}Z{'1' * 80}?", f"X{' ' * 250}", f"A{'a' * 240}X1Y2Z"):
         with pytest.raises(ProtocolError, match="such as 'N12"):
             dprnt_line(text.encode())
-    with pytest.raises(ProtocolError, match=f"at most {LONGEST_LINE}"):
-        parse_line("X1 Y2 Z3" + " " * LONGEST_LINE, re.compile(PATTERN))
+    with pytest.raises(ProtocolError, match=f"at most {MAX_LINE}"):
+        parse_line("X1 Y2 Z3" + " " * MAX_LINE, re.compile(PATTERN))
 
 
 def test_an_answer_of_a_sensor_has_a_limited_number_of_lines() -> None:
-    assert len(parse_answer("PRINT", b"MEASRATE 4\r\n" * MOST_LINES)) == MOST_LINES
+    assert len(parse_answer("PRINT", b"MEASRATE 4\r\n" * MAX_LINES)) == MAX_LINES
     for end in (b"\n", b"->"):
-        with pytest.raises(ProtocolError, match=f"more than {MOST_LINES} lines"):
-            parse_answer("PRINT", end * (2 * MOST_LINES + 1))
+        with pytest.raises(ProtocolError, match=f"more than {MAX_LINES} lines"):
+            parse_answer("PRINT", end * (2 * MAX_LINES + 1))
 
 
 @pytest.mark.parametrize("text", ["s", r"\s", r"\\"])

@@ -296,8 +296,8 @@ def test_any_answer_of_the_sensor_is_an_answer_or_an_error_of_the_project(text: 
 
 
 def test_an_answer_that_is_too_long_is_a_protocol_error() -> None:
-    with pytest.raises(ProtocolError, match=f"{commands.LONGEST_ANSWER} at most"):
-        commands.parse_answer("PRINT", b"x" * (commands.LONGEST_ANSWER + 1))
+    with pytest.raises(ProtocolError, match=f"{commands.MAX_ANSWER} at most"):
+        commands.parse_answer("PRINT", b"x" * (commands.MAX_ANSWER + 1))
 
 
 @pytest.mark.parametrize("wrong", ["20.00um", "mm", "-1.00mm", "0.00mm", "1e99mm", "9" * 400 + "mm"])

@@ -10,8 +10,8 @@ from wire_vectors import Vector, vectors
 
 from errormotion.errors import ProtocolError
 from errormotion.instruments.controller.shdr.codec import (
-    MOST_ASSET_BYTES,
-    MOST_LINE_BYTES,
+    MAX_ASSET_BYTES,
+    MAX_LINE_BYTES,
     Command,
     Keys,
     Lines,
@@ -137,7 +137,7 @@ def feed(lines: Lines, data: bytes, times: int) -> None:
 
 def test_a_line_without_an_end_is_refused_and_the_next_one_is_read() -> None:
     lines = Lines()
-    with pytest.raises(ProtocolError, match=f"at most {MOST_LINE_BYTES} bytes"):
+    with pytest.raises(ProtocolError, match=f"at most {MAX_LINE_BYTES} bytes"):
         feed(lines, b"x" * 1000, 100)
     assert list(lines.feed(b"|a|1\n")) == [b"|a|1"]
 
@@ -145,7 +145,7 @@ def test_a_line_without_an_end_is_refused_and_the_next_one_is_read() -> None:
 def test_an_asset_without_an_end_is_refused() -> None:
     lines = Lines()
     assert len(list(lines.feed(b"|@ASSET@|1|CuttingTool|--multiline--AB\n"))) == 1
-    with pytest.raises(ProtocolError, match=f"within {MOST_ASSET_BYTES} bytes"):
+    with pytest.raises(ProtocolError, match=f"within {MAX_ASSET_BYTES} bytes"):
         feed(lines, b"x" * 999 + b"\n", 2000)
     assert list(lines.feed(b"|a|1\n")) == [b"|a|1"]
 

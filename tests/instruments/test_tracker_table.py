@@ -8,7 +8,7 @@ import pytest
 
 from errormotion.errors import InstrumentError, ReplayError
 from errormotion.instruments.laser_tracker.table_conformance import length_table
-from errormotion.instruments.laser_tracker.table_reader import MOST_LINES
+from errormotion.instruments.laser_tracker.table_reader import MAX_LINES
 from errormotion.instruments.laser_tracker.tracker_table import TrackerTable, TrackerTableSettings
 from errormotion.testing import InstrumentConformance, InstrumentSubject
 
@@ -35,14 +35,14 @@ class TestKit(InstrumentConformance):
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\x0b", "\u2028"])
 def test_a_table_of_too_many_lines_is_refused_before_it_is_parsed(tmp_path: Path, end: str) -> None:
     path = tmp_path / "lines.csv"
-    path.write_bytes((HEAD + end + (MOST_LINES + 1) * f"]{end}").encode())
+    path.write_bytes((HEAD + end + (MAX_LINES + 1) * f"]{end}").encode())
     tracemalloc.start()
     try:
         message = refusal(str(path))
         assert tracemalloc.get_traced_memory()[1] < 2 << 20
     finally:
         tracemalloc.stop()
-    assert f"at most {MOST_LINES} lines; found {MOST_LINES + 2}" in message
+    assert f"at most {MAX_LINES} lines; found {MAX_LINES + 2}" in message
 
 
 def test_lengths_are_by_station_and_target_in_si(tmp_path: Path) -> None:

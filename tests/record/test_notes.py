@@ -149,11 +149,11 @@ def test_a_damaged_line_is_counted_and_the_others_are_kept(
 
 def test_a_file_that_is_too_large_is_not_read_and_not_extended(tmp_path: Path) -> None:
     line = json.dumps({"text": "x" * 900, "noted": "2026-03-01T08:00:00"}) + "\n"
-    (tmp_path / "events.jsonl").write_text(line * (events.LARGEST_FILE // len(line)))
+    (tmp_path / "events.jsonl").write_text(line * (events.MAX_FILE // len(line)))
     assert len(events.read(tmp_path)[0]) > 1000
     with pytest.raises(RunError, match="the note does not fit"):
         events.append(tmp_path, events.event("x" * 1000))
-    (tmp_path / "events.jsonl").write_text(line * (events.LARGEST_FILE // len(line) + 1))
+    (tmp_path / "events.jsonl").write_text(line * (events.MAX_FILE // len(line) + 1))
     assert "it is larger" in events.read(tmp_path)[1][0]
 
 

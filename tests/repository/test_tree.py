@@ -10,7 +10,7 @@ import pytest
 import errormotion
 
 ROOT = Path(__file__).parents[2]
-MOST_MODULES = 12
+MAX_MODULES = 12
 TARGETS = {"setup", "demo", "test", "lint", "docs", "bench", "validate"}
 
 
@@ -77,7 +77,7 @@ def test_no_folder_has_more_than_twelve_modules() -> None:
     full = {
         str(folder.relative_to(ROOT)): count
         for folder in sorted({path.parent for path in (ROOT / "errormotion").rglob("*.py")})
-        if (count := sum(path.name != "__init__.py" for path in folder.glob("*.py"))) > MOST_MODULES
+        if (count := sum(path.name != "__init__.py" for path in folder.glob("*.py"))) > MAX_MODULES
     }
     assert not full, "Modules in one folder: divide them into rooms, each a package with one purpose"
 

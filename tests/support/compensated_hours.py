@@ -37,7 +37,7 @@ STEADY = 20.0
 """degC"""
 SLICE = 0.1
 """Interval at which the offset in effect is looked at, s."""
-LONGEST_FAULT = 0.6
+MAX_FAULT = 0.6
 """Of the interval between two faults."""
 FAULTS = (
     *("silent", "unknown", "outside", "wild"),  # temperatures
@@ -181,7 +181,7 @@ class Hours:
         if not self._menu:
             self._menu = self._random.sample(FAULTS, len(FAULTS))
         self._kind = self._menu.pop()
-        self._ends = now + self._random.uniform(2.0, LONGEST_FAULT * self.interval)
+        self._ends = now + self._random.uniform(2.0, MAX_FAULT * self.interval)
         self.found.faults[self._kind] += 1
         match self._kind:
             case "silent" | "unknown" | "outside" | "wild":

@@ -13,7 +13,7 @@ import numpy as np
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.instruments.thermometer.dcon import checksum
 
-MOST_READINGS = 190_000
+MAX_READINGS = 190_000
 """Readings of one module: numbers up to here are temperatures that the log of a monitor admits."""
 POLL_INTERVAL, EVENT_POLL = 0.005, 0.02  # s
 
@@ -77,7 +77,7 @@ class Module:
     """
 
     def __init__(self) -> None:
-        self.sent = np.full(MOST_READINGS, np.nan)
+        self.sent = np.full(MAX_READINGS, np.nan)
         self.open = False
         self.count = 0
         self._rest = b""

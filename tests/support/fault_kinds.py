@@ -30,7 +30,7 @@ from errormotion import datasets
 from errormotion.campaign.folder import list_runs
 from errormotion.datasets.clock import joins
 
-LONGEST_LOSS = 1.0
+MAX_LOSS = 1.0
 """Samples older than this are on disk whatever happens, where the computer keeps up with the data, s."""
 BATCH = 3
 """Runs of a batch."""
@@ -399,7 +399,7 @@ class Kinds:
         if ended.code == 0:
             result.different = self._different(method, runs)
             result.faults += result.different
-        gap = begun - killed, time.monotonic() - killed + 2 * LONGEST_LOSS
+        gap = begun - killed, time.monotonic() - killed + 2 * MAX_LOSS
         for folder in list_runs(runs):
             resumed = (
                 kept.get(folder.data["test"], 0)
@@ -514,7 +514,7 @@ class Kinds:
 
 def longest_loss() -> float:
     """Return the longest loss on the computer as it is: longer where more processes want a processor than it has."""
-    return LONGEST_LOSS * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    return MAX_LOSS * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 def _named(code: int) -> str:

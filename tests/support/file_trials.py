@@ -28,7 +28,7 @@ MARKUP = "<script>alert("
 """Start of the markup that alterations put into names and attributes."""
 LONGEST = 30.0
 """Processor time of a command, s."""
-LONGEST_WAIT = 300.0
+MAX_WAIT = 300.0
 """Time until a command is ended, s; other processes may use the processors meanwhile."""
 ADDRESS_SPACE = 3 << 30
 """What a command may reserve beyond its parent, bytes; it must not occupy so much."""
@@ -91,7 +91,7 @@ def run(words: Sequence[str], folder: Path, place: Path, imports: Path | None = 
     child = os.fork()
     if child == 0:
         _child(list(words), folder, place, imports)
-    until = time.monotonic() + LONGEST_WAIT
+    until = time.monotonic() + MAX_WAIT
     while True:
         found, status, usage = os.wait4(child, os.WNOHANG)
         if found:

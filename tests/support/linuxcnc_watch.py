@@ -26,9 +26,9 @@ from errormotion.instruments.simulators.controller.linuxcnc_process import Linux
 DISPLAY = Path(__file__).with_name("linuxcnc_display.py")
 TRAVEL = 0.1  # m, in both directions
 RAPID = 0.1  # m/s
-LONGEST_WAIT = 600.0  # s, for another simulated LinuxCNC on this computer
+MAX_WAIT = 600.0  # s, for another simulated LinuxCNC on this computer
 MICROMETRE = 1e-3  # mm, the unit of the INI file
-LONGEST_ANSWER = 20.0  # s, on a computer with other work
+MAX_ANSWER = 20.0  # s, on a computer with other work
 SETTLED = 1e-7  # mm; LinuxCNC's planner comes closer than that in some cycles
 DRIVERS = {"external": LinuxCNCOffset, "feedback": LinuxCNCFeedback}
 WATCH = """
@@ -77,10 +77,10 @@ class Machine:
             "machine_bridge.py": BRIDGE.read_text(),
             "watch.hal": WATCH.format(offset="watch-x axis.x.eoffset" if external else "errormotion-offset-x"),
         }
-        self.process = LinuxCNCProcess(files, DISPLAY, wait=LONGEST_WAIT)
+        self.process = LinuxCNCProcess(files, DISPLAY, wait=MAX_WAIT)
         self.address = f"unix://{self.process.socket}"
         self.token = self.process.folder / "token"
-        self.control = LinuxCNC(self.address, LinuxCNCSettings(arm=True, token_file=self.token, timeout=LONGEST_ANSWER))
+        self.control = LinuxCNC(self.address, LinuxCNCSettings(arm=True, token_file=self.token, timeout=MAX_ANSWER))
 
     def compensator(self) -> LinuxCNCOffset:
         """Return another compensator, not yet open."""

@@ -40,8 +40,8 @@ LATENCY = 0.1
 THREADS = 5
 """That wait by the clock of the monitor: its own, and one for each instrument."""
 FAULT_INTERVAL = 60.0  # s
-LONGEST_FAULT = 40.0  # s
-LONGEST_RECOVERY = 30.0 + 2 * TIMEOUT
+MAX_FAULT = 40.0  # s
+MAX_RECOVERY = 30.0 + 2 * TIMEOUT
 """Of an instrument whose fault has ended: the longest interval between two attempts to open it, s."""
 SUSPENSION = (10.0, 60.0)  # s
 WALL_JUMPS = (3600.0, -3600.0, 86400.0, -86400.0, 50 * 365.25 * 86400.0, -50 * 365.25 * 86400.0)  # s
@@ -134,7 +134,7 @@ class _Choice:
         line = chance.choice(self._lines)
         kinds = ON_A_MODULE if isinstance(line.device, Module) else ON_A_LINE
         kind = chance.choice([*kinds, *OF_THE_COMPUTER])
-        seconds = chance.uniform(5.0, LONGEST_FAULT)
+        seconds = chance.uniform(5.0, MAX_FAULT)
         if kind == "suspension":
             seconds = chance.uniform(*SUSPENSION)
             self._clock.leap(seconds)
@@ -270,7 +270,7 @@ def _examine_gaps(day: Day, name: str, at: np.ndarray, gap: np.ndarray, slack: f
     explained = np.zeros(at.size, dtype=bool)
     for each in day.disturbances:
         if each.name in ("", name):
-            explained |= (at >= each.start) & (at <= each.end + LONGEST_RECOVERY + slack)
+            explained |= (at >= each.start) & (at <= each.end + MAX_RECOVERY + slack)
         if each.name == name and each.kind in ("silence", "late", "refuse"):
             certain = (at > each.start + OLDEST_READING * INTERVAL + slack) & (at < each.end - slack)
             if not gap[certain].all():

@@ -15,7 +15,7 @@ from errormotion.errors import ProtocolError
 from errormotion.instruments.controller import virtual
 from errormotion.instruments.controller.linuxcnc import codec as linuxcnc
 from errormotion.instruments.controller.mtconnect import xml
-from errormotion.instruments.controller.shdr.codec import MOST_LINE_BYTES
+from errormotion.instruments.controller.shdr.codec import MAX_LINE_BYTES
 from errormotion.instruments.interferometer.attocube_ids import codec as ids
 from errormotion.instruments.laser_tracker import table_reader
 from errormotion.instruments.laser_tracker.leica_emscon import codec as emscon
@@ -29,11 +29,11 @@ from errormotion.instruments.point_lds.optoncdt import commands
 from errormotion.instruments.point_lds.optoncdt.codec import encode_value
 from errormotion.instruments.thermometer import dcon
 from errormotion.instruments.thermometer.scpi import codec as scpi
-from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, Line, format_line
+from errormotion.instruments.touch_probe.dprnt.codec import MAX_LINE, Line, format_line
 from errormotion.instruments.transports import opc
 from errormotion.instruments.transports.base import CHUNK, PIECE
 from errormotion.instruments.transports.can import sdo
-from errormotion.instruments.transports.http.answer import MOST_LINE_BYTES as MOST_HEAD_LINE
+from errormotion.instruments.transports.http.answer import MAX_LINE_BYTES as MAX_HEAD_LINE
 from errormotion.instruments.transports.modbus import codec as modbus
 from errormotion.instruments.transports.recording import Recorder, add_note, parts_of, read_recording, write_index
 from errormotion.testing.run import subjects_of
@@ -272,7 +272,7 @@ _FRAMINGS: tuple[modbus.Framing, ...] = ("tcp", "rtu")
 _THERMOMETERS = {framing: f"modbus_temperature ({framing.upper()})" for framing in _FRAMINGS}
 
 CODECS: Sequence[Codec] = (
-    Codec("optoncdt", "answers", readers.optoncdt_answer, optoncdt_answers, commands.LONGEST_ANSWER),
+    Codec("optoncdt", "answers", readers.optoncdt_answer, optoncdt_answers, commands.MAX_ANSWER),
     *(
         Codec(
             *("optoncdt", f"values, {what}", readers.optoncdt_stream(counter, first)),
@@ -288,7 +288,7 @@ CODECS: Sequence[Codec] = (
         capancdt.MAX_LINE_BYTES,
     ),
     Codec("capancdt", "blocks", readers.capancdt_blocks, capancdt_frames, MAX_BLOCK_BYTES),
-    Codec("confocaldt", "answers", readers.confocaldt_answer, confocaldt_answers, commands.LONGEST_ANSWER),
+    Codec("confocaldt", "answers", readers.confocaldt_answer, confocaldt_answers, commands.MAX_ANSWER),
     Codec("confocaldt", "blocks", readers.confocaldt_blocks, confocaldt_frames, MAX_BLOCK_BYTES),
     Codec("keyence_lk", "answers", readers.keyence_lk, lk_answers, lk.MAX_LINE_BYTES),
     Codec(
@@ -303,11 +303,9 @@ CODECS: Sequence[Codec] = (
         *("leica_emscon", "commands", emscon.decode_command, lambda: rows("leica_emscon", "command")),
         emscon.MAX_PACKET_BYTES,
     ),
-    Codec("leica_geocom", "replies", geocom_values, lambda: rows("leica_geocom", "reply"), geocom.LONGEST_REPLY),
-    Codec("attocube_ids", "replies", ids_values, lambda: rows("attocube_ids", "reply"), ids.LONGEST_REPLY),
-    Codec(
-        "tracker_table", "files", readers.tracker_table, tables, table_reader.LONGEST_TABLE, tried=4096, per_byte=128
-    ),
+    Codec("leica_geocom", "replies", geocom_values, lambda: rows("leica_geocom", "reply"), geocom.MAX_REPLY),
+    Codec("attocube_ids", "replies", ids_values, lambda: rows("attocube_ids", "reply"), ids.MAX_REPLY),
+    Codec("tracker_table", "files", readers.tracker_table, tables, table_reader.MAX_TABLE, tried=4096, per_byte=128),
     Codec(
         "dcon_temperature",
         "answers",
@@ -318,14 +316,14 @@ CODECS: Sequence[Codec] = (
     *(
         Codec(
             *(_THERMOMETERS[framing], "answers", readers.modbus_answer(framing)),
-            *(partial(modbus_answers, framing), modbus.LONGEST_FRAME[framing]),
+            *(partial(modbus_answers, framing), modbus.MAX_FRAME[framing]),
         )
         for framing in _FRAMINGS
     ),
     *(
         Codec(
             *(_THERMOMETERS[framing], "requests", readers.modbus_request(framing)),
-            *(partial(modbus_requests, framing), modbus.LONGEST_FRAME[framing]),
+            *(partial(modbus_requests, framing), modbus.MAX_FRAME[framing]),
         )
         for framing in _FRAMINGS
     ),
@@ -336,8 +334,8 @@ CODECS: Sequence[Codec] = (
         lambda: [*can_frames(), *rows("can_temperature", "sdo")],
         sdo.FRAME_BYTES,
     ),
-    Codec("can_temperature", "SDO transfers", readers.sdo_transfer, sdo_transfers, sdo.LONGEST_TRANSFER),
-    Codec("can_temperature", "entries of CiA 404", readers.cia404_entries, cia404_entries, sdo.LONGEST_TRANSFER),
+    Codec("can_temperature", "SDO transfers", readers.sdo_transfer, sdo_transfers, sdo.MAX_TRANSFER),
+    Codec("can_temperature", "entries of CiA 404", readers.cia404_entries, cia404_entries, sdo.MAX_TRANSFER),
     Codec("can_temperature", "PDO", readers.pdo_frames, pdo_frames, sdo.FRAME_BYTES),
     Codec(
         *("scpi_temperature", "answers", readers.scpi_answer),
@@ -347,13 +345,13 @@ CODECS: Sequence[Codec] = (
         *("mtconnect", "documents", readers.mtconnect_document),
         *(documents, xml.LONGEST, PIECE),
     ),
-    Codec("mtconnect", "HTTP", readers.http_answer, http_answers, MOST_HEAD_LINE),
+    Codec("mtconnect", "HTTP", readers.http_answer, http_answers, MAX_HEAD_LINE),
     Codec(
-        "shdr", "lines", readers.shdr_lines, lambda: [joined("shdr"), *rows("shdr", "line", "stream")], MOST_LINE_BYTES
+        "shdr", "lines", readers.shdr_lines, lambda: [joined("shdr"), *rows("shdr", "line", "stream")], MAX_LINE_BYTES
     ),
-    Codec("opcua", "lines of a session", readers.opcua_lines, lambda: [joined("opcua")], opc.MOST_BYTES),
-    Codec("linuxcnc", "lines", readers.linuxcnc_line, linuxcnc_lines, linuxcnc.LONGEST_LINE),
-    Codec("virtual_controller", "lines", readers.virtual_line, virtual_lines, virtual.LONGEST_LINE),
-    Codec("dprnt", "lines", readers.dprnt_line, dprnt_lines, LONGEST_LINE),
+    Codec("opcua", "lines of a session", readers.opcua_lines, lambda: [joined("opcua")], opc.MAX_BYTES),
+    Codec("linuxcnc", "lines", readers.linuxcnc_line, linuxcnc_lines, linuxcnc.MAX_LINE),
+    Codec("virtual_controller", "lines", readers.virtual_line, virtual_lines, virtual.MAX_LINE),
+    Codec("dprnt", "lines", readers.dprnt_line, dprnt_lines, MAX_LINE),
     Codec("all", "recordings", readers.in_file(readers.recording), recordings, CHUNK, tried=4096),
 )

@@ -55,7 +55,7 @@ from errormotion.instruments.transports.recording import parts_of, read_index, r
 
 Read = Callable[[bytes], object]
 URL = "tcp://192.0.2.1:1"
-PROFILE_POINTS, MOST_BLOCKS, MOST_READINGS = 16, 16, 35_000
+PROFILE_POINTS, MAX_BLOCKS, MAX_READINGS = 16, 16, 35_000
 EMSCON = EmSconSettings(timeout=1e-9)
 LAYOUT = ljx.StreamLayout(1, ljx.INTENSITY, PROFILE_POINTS, 0.8e-6, 0.0, 1e-5)
 MODBUS = {
@@ -168,7 +168,7 @@ def counted_blocks(decoder: Callable[[], BlockDecoder], readings: Callable[[], C
         for piece, last in pieces(data):
             for block in split.feed(piece, last=last):
                 found.add(block)
-            values, codes = found.take(min(found.waiting, MOST_READINGS))
+            values, codes = found.take(min(found.waiting, MAX_READINGS))
             assert values.shape == codes.shape
 
     return read
@@ -235,7 +235,7 @@ def emscon_packets(data: bytes) -> None:
 
 def emscon_points(data: bytes) -> None:
     with suppress(InstrumentTimeoutError):  # behind the last byte
-        for _ in islice(points(Link(Received(data), 0.0, 0.0), EMSCON, block=1), MOST_BLOCKS):
+        for _ in islice(points(Link(Received(data), 0.0, 0.0), EMSCON, block=1), MAX_BLOCKS):
             pass
 
 
@@ -367,7 +367,7 @@ def pdo_frames(data: bytes) -> None:
     mapping, _, frame = data.partition(bytes(8))
     entries = [int.from_bytes(mapping[i : i + 4], "little") for i in range(0, len(mapping), 4)]
     pdo.decode_identifier(entries[0] if entries else 0)
-    for place in pdo.decode_mapping(entries[: pdo.MOST_ENTRIES]):
+    for place in pdo.decode_mapping(entries[: pdo.MAX_ENTRIES]):
         place.data(frame[:8])
 
 

@@ -10,7 +10,7 @@ from errormotion.campaign.background.processes import Background
 from errormotion.campaign.folder import RunFolder, is_locked
 from errormotion.campaign.runner import stored_plan
 from errormotion.campaign.storage.store import committed_length
-from errormotion.datasets.files.containers import LARGEST_METADATA
+from errormotion.datasets.files.containers import MAX_METADATA
 from errormotion.datasets.files.reading import parse_json, read_bytes
 from errormotion.errors import ErrormotionError
 
@@ -78,6 +78,6 @@ def _progress(folder: RunFolder) -> tuple[float, float]:
     if not root.exists():
         return 0.0, expected
     samples = committed_length(folder.raw, method.append_dim(test.settings))
-    attributes = parse_json(read_bytes(root, LARGEST_METADATA)).get("attributes", {})
+    attributes = parse_json(read_bytes(root, MAX_METADATA)).get("attributes", {})
     rate = attributes.get("sample_rate")
     return samples / float(rate) if rate else float(samples), expected

@@ -14,7 +14,7 @@ from errormotion.campaign.files import BenchInstrument
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.storage.journal import cause_of
 
-FIRST_RETRY_INTERVAL, LONGEST_RETRY_INTERVAL = 1.0, 30.0
+FIRST_RETRY_INTERVAL, MAX_RETRY_INTERVAL = 1.0, 30.0
 """Time until an instrument is opened again after a failure, s; doubled after each failure up to the longest."""
 
 FAILURES_BEFORE_RECONNECT = 3
@@ -130,7 +130,7 @@ class Source:
                         self._close()
                         self._ready.set()
                         self._clock.wait(self._stop, wait)
-                        wait = min(2 * wait, LONGEST_RETRY_INTERVAL)
+                        wait = min(2 * wait, MAX_RETRY_INTERVAL)
                         continue
                 else:
                     wait, failed = FIRST_RETRY_INTERVAL, 0

@@ -24,7 +24,7 @@ from xarray.conventions import encode_cf_variable
 from zarr.codecs import BloscCodec
 
 from errormotion.campaign.folder import Presence, replace_text
-from errormotion.datasets.files.containers import LARGEST_METADATA
+from errormotion.datasets.files.containers import MAX_METADATA
 from errormotion.datasets.files.reading import parse_json, read_bytes
 from errormotion.datasets.files.writing import sync
 from errormotion.errors import RunError
@@ -319,7 +319,7 @@ def committed_length(path: Path, dim: str) -> int:
     """
     file = path / "zarr.json"
     try:
-        root = parse_json(read_bytes(file, LARGEST_METADATA))
+        root = parse_json(read_bytes(file, MAX_METADATA))
         if set(root) <= BEFORE_COMMIT and root["zarr_format"] == 3:
             return 0
         for metadata in root["consolidated_metadata"]["metadata"].values():

@@ -29,14 +29,14 @@ MUCH = 512 << 20
 """Bytes of values that a file or folder may state in addition to `OWN_BYTES` at any compression."""
 PER_BYTE_OF_MUCH = 64
 """Bytes of values for each byte of the file or folder above `MUCH`. Reading needs up to five copies of the values."""
-MOST_VARIABLES = 2000
-LARGEST_METADATA = 16 << 20
+MAX_VARIABLES = 2000
+MAX_METADATA = 16 << 20
 """Largest size of a zarr.json, bytes."""
 DEEPEST = 24
 """Largest number of levels of folders in a Zarr folder."""
 CODECS = ("bytes", "transpose", "blosc", "zstd", "crc32c", "vlen-utf8")
 """Accepted codecs of Zarr v3, which decode numbers and texts only."""
-LONGEST_TEXT = 1 << 20
+MAX_TEXT = 1 << 20
 """Largest size of a text of fixed length, bytes."""
 _TEXT, _WIDE = "string", "fixed_length_utf32"
 _NUMBERS = ("bool", *(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)),
@@ -56,8 +56,8 @@ def check_netcdf(path: Path) -> None:
     size = path.stat().st_size
     with h5py.File(path) as file:
         file.attrs.get("_nc3_strict")  # h5netcdf leaves an incomplete object if this fails
-        if len(file) > MOST_VARIABLES:
-            raise DatasetError(f"{path}: expected at most {MOST_VARIABLES} variables; found {len(file)}")
+        if len(file) > MAX_VARIABLES:
+            raise DatasetError(f"{path}: expected at most {MAX_VARIABLES} variables; found {len(file)}")
         found, total = [], 0
         for name in file:
             link = file.get(name, getlink=True)
@@ -105,8 +105,8 @@ def check_zarr(path: Path) -> None:
             if name not in arrays:
                 raise DatasetError(f"{path}: {name!r:.100}: expected a folder of this name with its array; found none")
             arrays[f"{name} (consolidated)"] = each
-    if len(arrays) > 2 * MOST_VARIABLES:
-        raise DatasetError(f"{path}: expected at most {MOST_VARIABLES} arrays; found {len(arrays)}")
+    if len(arrays) > 2 * MAX_VARIABLES:
+        raise DatasetError(f"{path}: expected at most {MAX_VARIABLES} arrays; found {len(arrays)}")
     found, total = [], 0
     for name, metadata in arrays.items():
         if isinstance(metadata, dict) and metadata.get("node_type") == "group":
@@ -151,7 +151,7 @@ def _files(folder: Path, store: Path, depth: int) -> Iterator[int]:
 
 
 def _metadata(file: Path) -> dict[str, Any]:
-    found = parse_json(read_bytes(file, LARGEST_METADATA))
+    found = parse_json(read_bytes(file, MAX_METADATA))
     if not isinstance(found, dict):
         raise DatasetError(f"{file}: expected an object; found {type(found).__name__}")
     return found
@@ -200,7 +200,7 @@ def _item(metadata: Mapping[str, Any]) -> int:
     if isinstance(kind, dict):
         configuration = kind.get("configuration")
         length = configuration.get("length_bytes") if isinstance(configuration, dict) else None
-        known = kind.get("name") == _WIDE and type(length) is int and 0 < length <= LONGEST_TEXT
+        known = kind.get("name") == _WIDE and type(length) is int and 0 < length <= MAX_TEXT
         return int(length) if known and length is not None else 0
     return 16 if kind == _TEXT else int(np.dtype(kind).itemsize) if kind in _NUMBERS else 0
 

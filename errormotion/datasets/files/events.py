@@ -16,11 +16,11 @@ from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import RunError
 
 FILE = "events.jsonl"
-LARGEST_FILE = 1 << 20
+MAX_FILE = 1 << 20
 """Largest size of a file of notes, bytes."""
-LONGEST_TEXT = 1000
+MAX_TEXT = 1000
 """Largest number of characters of a note."""
-LONGEST_NAME = 100
+MAX_NAME = 100
 """Largest number of characters of the name of an author or a machine."""
 CLOCK_ERROR = timedelta(days=1)
 """Largest accepted time of an event in the future."""
@@ -92,8 +92,8 @@ def append(folder: Path, made: Event) -> Path:
     try:
         with file.open("ab+") as stream, _locked(stream):
             size = stream.seek(0, os.SEEK_END)
-            if size + len(data) + 1 > LARGEST_FILE:
-                raise RunError(f"{file}: the note does not fit: {size} of at most {LARGEST_FILE} bytes are used")
+            if size + len(data) + 1 > MAX_FILE:
+                raise RunError(f"{file}: the note does not fit: {size} of at most {MAX_FILE} bytes are used")
             if size:
                 stream.seek(-1, os.SEEK_END)
                 if stream.read(1) != b"\n":  # an incomplete line
@@ -112,13 +112,13 @@ def read(folder: Path) -> tuple[tuple[Event, ...], tuple[str, ...]]:
     try:
         require_regular(file)
         with file.open("rb") as stream:
-            data = stream.read(LARGEST_FILE + 1)
+            data = stream.read(MAX_FILE + 1)
     except FileNotFoundError:
         return (), ()
     except OSError as error:
         return (), (f"{file}: cannot be read: {error.strerror}",)
-    if len(data) > LARGEST_FILE:
-        return (), (f"{file}: expected at most {LARGEST_FILE} bytes; it is larger",)
+    if len(data) > MAX_FILE:
+        return (), (f"{file}: expected at most {MAX_FILE} bytes; it is larger",)
     found, wrong = list[Event](), list[str]()
     for number, line in enumerate(data.decode(errors="replace").split("\n"), 1):
         if not line.strip():
@@ -147,7 +147,7 @@ def from_plain(line: Any) -> Event | str:
 def _mistake(values: dict[str, Any]) -> str:
     """Return the first mistake in the fields of a note; empty if there is none."""
     for name, value in values.items():
-        longest = LONGEST_TEXT if name == "text" else LONGEST_NAME
+        longest = MAX_TEXT if name == "text" else MAX_NAME
         if not isinstance(value, str) or len(value) > longest or not value.isprintable():
             return f"{name}: expected one line of at most {longest} printable characters"
     if not values["text"]:

@@ -13,7 +13,7 @@ from errormotion.errors import RunError
 
 FILE = "run.json"
 SCHEMA = "errormotion.run/1"
-LARGEST_FILE = 16 << 20
+MAX_FILE = 16 << 20
 """Largest size of a run.json, bytes."""
 
 
@@ -112,7 +112,7 @@ def read_run(folder: Path) -> State:
     """
     file = folder / FILE
     try:
-        found = parse_json(read_bytes(file, LARGEST_FILE))
+        found = parse_json(read_bytes(file, MAX_FILE))
     except OSError as error:
         raise RunError(f"{folder}: expected a run folder with a {FILE}; {error.strerror}") from error
     except ValueError as error:

@@ -21,7 +21,7 @@ from errormotion.datasets.files.reading import read_bytes
 from errormotion.datasets.units import EDGE, Quantity
 from errormotion.errors import DatasetError, ErrormotionError
 
-LARGEST_FILE = 4 << 20
+MAX_FILE = 4 << 20
 """Largest size of a file, bytes."""
 DEEPEST = 32
 """Largest number of levels of arrays and tables."""
@@ -87,7 +87,7 @@ def read_toml(path: str | Path, *, error: type[ErrormotionError] = DatasetError)
         Of the type ``error``: missing, unreadable, too large, not UTF-8, not TOML, nested too deep.
     """
     try:
-        raw = read_bytes(path, LARGEST_FILE)
+        raw = read_bytes(path, MAX_FILE)
     except OSError as reason:
         raise error(f"{path}: cannot be read: {reason.strerror}. Expected a TOML file there.") from reason
     try:

@@ -14,7 +14,7 @@ from typing import Any
 from errormotion.datasets.files.tomlfile import Key, dotted, parse_toml
 from errormotion.errors import DatasetError
 
-LONGEST_TEXT = 1 << 16
+MAX_TEXT = 1 << 16
 """Largest number of characters of a text in which values are changed."""
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
@@ -115,8 +115,8 @@ def without_table(text: str, name: str, number: int) -> str:
 
 
 def _read(text: str) -> dict[str, Any]:
-    if len(text) > LONGEST_TEXT:
-        raise DatasetError(f"expected at most {LONGEST_TEXT} characters; found {len(text)}")
+    if len(text) > MAX_TEXT:
+        raise DatasetError(f"expected at most {MAX_TEXT} characters; found {len(text)}")
     return parse_toml(text, "text")
 
 

@@ -12,10 +12,10 @@ from errormotion.arrays import Array
 from errormotion.datasets.results.checks import error_violations
 from errormotion.datasets.schemas import SCHEMA
 
-LEAST_COMPRESSED = 2**16
+MIN_COMPRESSED = 2**16
 """Smallest size of a compressed variable, bytes; below, chunks need the space that compression saves."""
 
-LEAST_ROUNDED = 2**20
+MIN_ROUNDED = 2**20
 """Smallest size of a rounded influence, bytes."""
 
 SIGNIFICANT_BITS = 28
@@ -24,10 +24,10 @@ SIGNIFICANT_BITS = 28
 ROUNDED = "_QuantizeBitRoundNumberOfSignificantBits"
 """Attribute with the number of significant bits, after the convention of NetCDF."""
 
-LARGEST_CHUNK = 2**17
+MAX_CHUNK = 2**17
 """Largest number of values of a chunk, which fits into the cache of HDF5."""
 
-LEAST_SERIES = 2**10
+MIN_SERIES = 2**10
 """Smallest number of values of a chunk of one series; shorter series share chunks."""
 
 _INFLUENCES = ("influence", "deviation_influence")
@@ -47,7 +47,7 @@ def as_stored(ds: xr.Dataset) -> xr.Dataset:
     rounded = {}
     for name in _INFLUENCES:
         variable = ds.variables.get(name)
-        if variable is not None and variable.dtype == np.float64 and variable.nbytes >= LEAST_ROUNDED:
+        if variable is not None and variable.dtype == np.float64 and variable.nbytes >= MIN_ROUNDED:
             kept = variable.copy(data=round_significand(np.asarray(variable.values)))
             kept.attrs = {**variable.attrs, ROUNDED: SIGNIFICANT_BITS}
             rounded[name] = kept
@@ -63,9 +63,7 @@ def encoding(ds: xr.Dataset) -> dict[Any, dict[str, Any]]:
     if ds.attrs.get("schema") != SCHEMA:
         return {}
     large = {
-        name: each
-        for name, each in ds.variables.items()
-        if each.dtype.kind in "fiu" and each.nbytes >= LEAST_COMPRESSED
+        name: each for name, each in ds.variables.items() if each.dtype.kind in "fiu" and each.nbytes >= MIN_COMPRESSED
     }
     return {
         name: {"zlib": True, "complevel": 1, "shuffle": True, **_chunks(each, ds["EX"].dims)}
@@ -77,8 +75,8 @@ def _chunks(variable: xr.Variable, along: tuple[Any, ...]) -> dict[str, Any]:
     """Return chunks with one series over the dimensions of the errors each, whose neighbouring values are similar."""
     sizes = [size if dim in along else 1 for dim, size in variable.sizes.items()]
     for k in range(len(sizes)):
-        sizes[k] = max(1, min(sizes[k], LARGEST_CHUNK * sizes[k] // math.prod(sizes)))
-    return {"chunksizes": tuple(sizes)} if math.prod(sizes) >= LEAST_SERIES else {}
+        sizes[k] = max(1, min(sizes[k], MAX_CHUNK * sizes[k] // math.prod(sizes)))
+    return {"chunksizes": tuple(sizes)} if math.prod(sizes) >= MIN_SERIES else {}
 
 
 def round_significand(values: Array) -> Array:

@@ -33,7 +33,7 @@ _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _CLASSIC_SIGNATURE = b"CDF"
 
 # Longer time coordinates get no index, which would load them into memory.
-_LONGEST_INDEX = 100_000
+_MAX_INDEX = 100_000
 
 
 def load(path: str | Path) -> xr.Dataset:
@@ -297,7 +297,7 @@ def _tidy_value(value: Any) -> Any:
 
 def _with_indexes(ds: xr.Dataset) -> xr.Dataset:
     for dim, size in ds.sizes.items():
-        if dim in ds.coords and ds.coords[dim].dims == (dim,) and (dim != "time" or size <= _LONGEST_INDEX):
+        if dim in ds.coords and ds.coords[dim].dims == (dim,) and (dim != "time" or size <= _MAX_INDEX):
             ds = ds.set_xindex(str(dim))
     rate = ds.attrs.get("sample_rate")
     if "time" in ds.sizes and "time" not in ds.variables and isinstance(rate, (int, float)) and rate > 0:

@@ -12,7 +12,7 @@ from errormotion.errors import DatasetError
 
 NUMBER = re.compile(r"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?")
 """A decimal number; possessive, so that the time for a long text is proportional to its length."""
-LARGEST_FILE = 64 << 20
+MAX_FILE = 64 << 20
 """Largest size of a file, bytes; its cells need more memory."""
 
 _KEY = re.compile(r"#\s*([^\W\d]\w*)\s*=\s*(.*)")
@@ -70,7 +70,7 @@ def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        data = read_bytes(path, LARGEST_FILE)
+        data = read_bytes(path, MAX_FILE)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):

@@ -28,11 +28,11 @@ Place = str | int | list[str | int]
 NOTES = "import_notes"
 """Attribute of an imported dataset with notes, JSON list of sentences."""
 
-_FEWEST_INTERVALS = 4
+_MIN_INTERVALS = 4
 """Smallest number of intervals with which a usual one is determined."""
 _SHARE_OF_USUAL = 0.7
 """Smallest fraction of usual intervals with which a longer one counts as a hole."""
-LONGEST_LINE = 1 << 20
+MAX_LINE = 1 << 20
 """Largest number of characters of a line."""
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
@@ -133,7 +133,7 @@ def holes(times: Array, lines: NDArray[np.int64]) -> list[str]:
     steps = np.diff(t)
     at = at[1:][steps > 0]
     steps = steps[steps > 0]
-    if steps.size < _FEWEST_INTERVALS:
+    if steps.size < _MIN_INTERVALS:
         return []
     usual = float(np.median(steps))
     wide = np.flatnonzero(steps > 1.5 * usual)
@@ -218,9 +218,9 @@ def _lines(log: Path, encoding: str) -> Iterator[tuple[int, str]]:
 
 def _bounded(file: IO[AnyStr], log: Path) -> Iterator[tuple[int, AnyStr]]:
     """Yield the lines of a file with their numbers; DatasetError names one that is too long."""
-    for number, line in enumerate(iter(partial(file.readline, LONGEST_LINE + 1), file.read(0)), 1):
-        if len(line) > LONGEST_LINE:
-            raise DatasetError(f"{log}, line {number}: expected at most {LONGEST_LINE} characters; it is longer")
+    for number, line in enumerate(iter(partial(file.readline, MAX_LINE + 1), file.read(0)), 1):
+        if len(line) > MAX_LINE:
+            raise DatasetError(f"{log}, line {number}: expected at most {MAX_LINE} characters; it is longer")
         yield number, line
 
 

@@ -180,7 +180,7 @@ class LinuxCNCOffset(Driver):
 
     def _answer(self, line: Transport) -> codec.Answer:
         try:
-            message = codec.decode(line.read_until(codec.LINE_END, limit=codec.LONGEST_LINE))
+            message = codec.decode(line.read_until(codec.LINE_END, limit=codec.MAX_LINE))
         except InstrumentTimeoutError:
             raise InstrumentTimeoutError(
                 f"{self.address}: the bridge of LinuxCNC did not answer within {self.settings.timeout:g} s"

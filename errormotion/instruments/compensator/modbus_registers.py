@@ -17,7 +17,7 @@ from errormotion.instruments.modbus_driver import ModbusDriver
 from errormotion.instruments.transports.modbus.client import READ_HOLDING
 from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo
 
-MOST_READ, MOST_WRITTEN = 125, 123
+MAX_READ, MAX_WRITTEN = 125, 123
 """Largest number of registers in one request."""
 
 
@@ -126,7 +126,7 @@ class ModbusRegisters(ModbusDriver):
             words.update(enumerate(settings.words(count), start=first))
         self._heartbeat = (self._heartbeat + 1) % (1 << 16)
         words[settings.heartbeat] = self._heartbeat
-        parts = list(runs(words, MOST_WRITTEN if settings.function == 16 else 1))
+        parts = list(runs(words, MAX_WRITTEN if settings.function == 16 else 1))
         alive = settings.heartbeat
         for first, part in sorted(parts, key=lambda part: part[0] <= alive < part[0] + len(part[1])):
             line.write_registers(first, part, function=settings.function)
@@ -139,7 +139,7 @@ class ModbusRegisters(ModbusDriver):
     def _read(self, wanted: dict[int, int]) -> dict[int, int]:
         """Return registers by their numbers."""
         found: dict[int, int] = {}
-        for first, part in runs(wanted, MOST_READ):
+        for first, part in runs(wanted, MAX_READ):
             found.update(enumerate(self.line.registers(READ_HOLDING, first, len(part)), start=first))
         return found
 

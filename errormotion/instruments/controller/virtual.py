@@ -22,9 +22,9 @@ from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, MachineLimits
 
 LINE_END = b"\n"
-MOST_DIGITS = 300
+MAX_DIGITS = 300
 """Largest number of digits of a whole number."""
-LONGEST_LINE = 1 << 16
+MAX_LINE = 1 << 16
 """Longest answer, bytes."""
 
 # ---------------------------------------------------------------------- codec
@@ -64,7 +64,7 @@ def decode_answer(line: bytes, number: int) -> Answer:
 
 def _whole(text: str) -> int:
     """Return a whole number; ValueError beyond the range of a float."""
-    if len(text) > MOST_DIGITS:
+    if len(text) > MAX_DIGITS:
         raise ValueError(f"a whole number of {len(text)} digits")
     return int(text)
 
@@ -408,7 +408,7 @@ class VirtualController(Driver):
         with self.exchange() as line:
             self._number += 1
             line.write(encode_request(self._number, op, arguments))
-            answer = decode_answer(line.read_until(LINE_END, limit=LONGEST_LINE), self._number)
+            answer = decode_answer(line.read_until(LINE_END, limit=MAX_LINE), self._number)
         return answer.result  # after the block: a refusal is a complete answer
 
     def _connect(self) -> Transport:

@@ -50,13 +50,13 @@ QUANTITIES: Mapping[str, Quantity] = {
 KEYS: Mapping[str, tuple[str, ...]] = {"station": ("tracker",), "target": ("point",)}
 AIR = ("temperature", "pressure", "humidity")
 
-LONGEST_TABLE = 1 << 24
+MAX_TABLE = 1 << 24
 """Longest table, bytes."""
-MOST_LINES = 100_000
+MAX_LINES = 100_000
 """Largest number of lines of a table: rows take more memory than their bytes."""
 
 _ENDS, _LONG_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e", (b"\xc2\x85", b"\xe2\x80\xa8", b"\xe2\x80\xa9")  # line ends of text
-_MOST_HINTS = 10  # columns for which a name is suggested
+_MAX_HINTS = 10  # columns for which a name is suggested
 _TITLE = re.compile(r"([^\W\d]\w*(?: \w+)*)\s*(?:[\[(]([^\])]*)[\])]|/\s*(\S.*))?")
 _EMPTY = ("", "NaN", "nan", "-", "---")
 _UNITS = {"°C": "degC", "C": "degC", "K": "kelvin", "mbar": "mbar", "%RH": "%", "% RH": "%", "%rH": "%"}
@@ -136,12 +136,12 @@ def read_table(
 
 
 def _refuse_long(path: Path) -> None:
-    if (size := path.stat().st_size) > LONGEST_TABLE:
-        raise DatasetError(f"{path}: expected a table of at most {LONGEST_TABLE} bytes; found {size}")
+    if (size := path.stat().st_size) > MAX_TABLE:
+        raise DatasetError(f"{path}: expected a table of at most {MAX_TABLE} bytes; found {size}")
     data = path.read_bytes()
     lines = len(data) - len(data.translate(None, _ENDS)) - data.count(b"\r\n") + sum(map(data.count, _LONG_ENDS))
-    if lines > MOST_LINES:
-        raise DatasetError(f"{path}: expected a table of at most {MOST_LINES} lines; found {lines}")
+    if lines > MAX_LINES:
+        raise DatasetError(f"{path}: expected a table of at most {MAX_LINES} lines; found {lines}")
 
 
 def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
@@ -162,7 +162,7 @@ def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
         elif name in QUANTITIES:
             found[name] = (column, _unit(title, name, unit, line, mistakes))
         else:
-            near = get_close_matches(name, [*KEYS, *QUANTITIES, *others], n=1) if mistakes.count < _MOST_HINTS else []
+            near = get_close_matches(name, [*KEYS, *QUANTITIES, *others], n=1) if mistakes.count < _MAX_HINTS else []
             hint = f"; did you mean '{near[0]}'?" if near else ""
             mistakes.add(line, f"column '{title}': expected one of {', '.join([*KEYS, *QUANTITIES])}{hint}")
     for name in ("station", "target", "length"):

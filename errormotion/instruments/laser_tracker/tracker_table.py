@@ -14,7 +14,7 @@ from errormotion.datasets.files.reading import read_bytes
 from errormotion.datasets.units import Length
 from errormotion.errors import DatasetError, InstrumentError, ReplayError
 from errormotion.instruments.driver import Openable
-from errormotion.instruments.laser_tracker.table_reader import AIR, LONGEST_TABLE, Readings, Repeats, read_table
+from errormotion.instruments.laser_tracker.table_reader import AIR, MAX_TABLE, Readings, Repeats, read_table
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, PluginSettings
 from errormotion.plugins.readings import Environment
 
@@ -90,7 +90,7 @@ class TrackerTable(Openable):
         wrong = ReplayError if scheme == "replay" else InstrumentError
         path = Path(rest)
         try:
-            data = read_bytes(path, LONGEST_TABLE)
+            data = read_bytes(path, MAX_TABLE)
             readings = read_table(
                 path,
                 stations=self.settings.stations,

@@ -17,7 +17,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayEr
 from errormotion.instruments.transports.recording import EndOfRecordingError
 
 FIRST_READINGS = 3
-MOST_READINGS = 1000
+MAX_READINGS = 1000
 INTERVAL = 0.2
 """Interval between two readings of an instrument without a stream, s."""
 SHOWN = 8
@@ -114,7 +114,7 @@ def run_live(driver: Any, seconds: float, full: Callable[[], bool], identified: 
 
     ``identified()`` is called when the instrument has reported its identity.
 
-    An instrument without a stream is read repeatedly, at most `MOST_READINGS` times.
+    An instrument without a stream is read repeatedly, at most `MAX_READINGS` times.
     """
     streams, start = _streams(driver), math.nan
 
@@ -127,7 +127,7 @@ def run_live(driver: Any, seconds: float, full: Callable[[], bool], identified: 
             start = time.monotonic()  # now the device is open, which may take minutes
         if count < FIRST_READINGS:
             return True
-        if streams or count >= MOST_READINGS or not more():
+        if streams or count >= MAX_READINGS or not more():
             return False
         time.sleep(INTERVAL)
         return True

@@ -17,7 +17,7 @@ from errormotion.instruments.point_lds.optoncdt.settings import SensorSettings
 from errormotion.instruments.transports import parse_address
 
 KIND = "point_lds"
-HIGHEST_POLLING_RATE = 1e3
+MAX_POLLING_RATE = 1e3
 """Highest rate of sensors that are read one by one, Hz."""
 CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 Vector = tuple[float, float, float]
@@ -129,10 +129,9 @@ class FrameSettings(SensorSettings):
             raise ValueError(
                 "expected the address of each sensor in its own table 'sensors'; found 'addresses' as well"
             )
-        elif not self.synchronised and self.rate > HIGHEST_POLLING_RATE:
+        elif not self.synchronised and self.rate > MAX_POLLING_RATE:
             raise ValueError(
-                f"rate: these sensors are read one by one, at {HIGHEST_POLLING_RATE:g} Hz at most; "
-                f"found {self.rate:g} Hz"
+                f"rate: these sensors are read one by one, at {MAX_POLLING_RATE:g} Hz at most; found {self.rate:g} Hz"
             )
 
     @property

@@ -17,7 +17,7 @@ from errormotion.instruments.thermometer.cia404 import (
     FAHRENHEIT,
     IDENTITY,
     KELVIN,
-    MOST_DIGITS,
+    MAX_DIGITS,
     NAME,
     NUMBERS,
     PROFILE,
@@ -54,7 +54,7 @@ class CanSettings(ThermometerSettings):
         default=None,
         description="decimal digits of whole numbers; default: as stated in object 0x6132",
         ge=0,
-        le=MOST_DIGITS,
+        le=MAX_DIGITS,
     )
     transfer: Literal["sdo", "pdo"] = Field(
         default="sdo",

@@ -24,8 +24,8 @@ CELSIUS, KELVIN = 0x002D0000, 0x00050000
 FAHRENHEIT = 0x00AC0000  # assumption: CiA 303-2, from memory
 FAULTY_SENSOR, OVER, UNDER = 1, 2, 4
 """Bits of the status: sensor faulty or missing (also with one of the others), above its range, below its range."""
-MOST_DIGITS = 9
-LONGEST_NUMBER = 4  # bytes
+MAX_DIGITS = 9
+MAX_NUMBER = 4  # bytes
 _ZEROS = {CELSIUS: (0.0, 1.0), KELVIN: (273.15, 1.0), FAHRENHEIT: (32.0, 5 / 9)}
 """0 degC in a unit, and K per unit."""
 
@@ -58,7 +58,7 @@ class Number:
 
         A node that does not state the size of its entries sends 4 bytes for a number of 2 bytes.
         """
-        if len(data) not in (self.size, LONGEST_NUMBER):
+        if len(data) not in (self.size, MAX_NUMBER):
             what = f"{'a whole number' if self.whole else 'a float'} of {self.size} bytes"
             raise ProtocolError(f"0x{self.index:04X}: expected {what}; found {data.hex(' ') or 'none'}")
         (value,) = struct.unpack_from(self.form, data)
@@ -106,8 +106,8 @@ def scale_of(unit: int, digits: int = 0) -> Scale:
     ProtocolError
         An impossible number of digits.
     """
-    if not 0 <= digits <= MOST_DIGITS:
-        raise ProtocolError(f"0x{DIGITS:04X}: expected 0 to {MOST_DIGITS} decimal digits; found {digits}")
+    if not 0 <= digits <= MAX_DIGITS:
+        raise ProtocolError(f"0x{DIGITS:04X}: expected 0 to {MAX_DIGITS} decimal digits; found {digits}")
     exponent = (unit >> 24 ^ 0x80) - 0x80 - digits  # the prefix is signed
     if unit & 0x00FFFFFF not in _ZEROS:
         raise InstrumentError(

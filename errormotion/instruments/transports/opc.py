@@ -36,17 +36,17 @@ if TYPE_CHECKING:
     from asyncua import ua
     from asyncua.client.client import Client
 
-MOST_NODES = 1000
+MAX_NODES = 1000
 """Largest number of nodes in one request or answer."""
-MOST_ELEMENTS = 64
+MAX_ELEMENTS = 64
 """Largest number of elements of an array that are read."""
-MOST_TEXT = 4096
+MAX_TEXT = 4096
 """Largest number of characters of a text; the rest is cut off."""
 DROP_TIMEOUT = 0.5
 """Time limit for disconnecting from a server, s."""
 WRITABLE = 2
 """Bit of an access level: the present value can be written."""
-MOST_BYTES = 16 << 20
+MAX_BYTES = 16 << 20
 """Largest message of a server, bytes."""
 
 Result = TypeVar("Result")
@@ -195,7 +195,7 @@ class OpcUaTransport(Transport):
         from asyncua.client.client import Client
 
         client = Client(self._server, timeout=self.timeout)
-        client.max_messagesize, client.max_chunkcount = MOST_BYTES, MOST_BYTES // 8192
+        client.max_messagesize, client.max_chunkcount = MAX_BYTES, MAX_BYTES // 8192
         if self._credentials.user:
             client.set_user(self._credentials.user)
             client.set_password(self._credentials.password)
@@ -222,11 +222,11 @@ class OpcUaTransport(Transport):
             case {"browse": str(node)}:
                 return await _browse(client, node)
             case {"read": list(nodes)}:
-                return await _read(client, nodes[:MOST_NODES])
+                return await _read(client, nodes[:MAX_NODES])
             case {"describe": list(nodes)}:
-                return await _describe(client, nodes[:MOST_NODES])
+                return await _describe(client, nodes[:MAX_NODES])
             case {"write": list(values)}:
-                return await _write(client, values[:MOST_NODES])
+                return await _write(client, values[:MAX_NODES])
         raise ProtocolError(f"{self.url}: unknown request {sorted(request)}")
 
 
@@ -244,7 +244,7 @@ async def _browse(client: Client, node: str) -> list[dict[str, Any]]:
     found = await _node(client, node).get_children_descriptions()
     return [
         {"id": each.NodeId.to_string(), "namespace": each.BrowseName.NamespaceIndex, "name": text(each.BrowseName.Name)}
-        for each in found[:MOST_NODES]
+        for each in found[:MAX_NODES]
     ]
 
 
@@ -319,13 +319,13 @@ def plain(value: Any) -> Any:
     if isinstance(value, ua.EUInformation):
         return {"unit": text(value.DisplayName.Text or ""), "code": value.UnitId}
     if isinstance(value, list):
-        return [plain(each) for each in value[:MOST_ELEMENTS]]
+        return [plain(each) for each in value[:MAX_ELEMENTS]]
     return None
 
 
 def text(value: Any) -> str:
     """Return a text of a bounded length."""
-    return str(value)[:MOST_TEXT]
+    return str(value)[:MAX_TEXT]
 
 
 def open_session(
@@ -362,7 +362,7 @@ def request(line: Transport, content: Mapping[str, Any]) -> Any:
         The answer is not JSON.
     """
     line.write(json.dumps(content).encode("ascii") + b"\n")
-    answer = line.read_until(b"\n", limit=MOST_BYTES)
+    answer = line.read_until(b"\n", limit=MAX_BYTES)
     try:
         return json.loads(answer)
     except (ValueError, RecursionError) as error:

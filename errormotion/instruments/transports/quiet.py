@@ -8,9 +8,9 @@ from contextlib import suppress
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError, ReplayError
 from errormotion.instruments.transports.base import CHUNK, Transport
 
-MOST_STRAY_BYTES = 1 << 20
+MAX_STRAY_BYTES = 1 << 20
 """Largest number of unread bytes that can be late answers; with more, the device sends without a request."""
-MOST_INTERVALS = 10
+MAX_INTERVALS = 10
 """Time after which a line that is not quiet is an error, as a multiple of the interval."""
 
 
@@ -18,7 +18,7 @@ def discard_input(line: Transport) -> bytes:
     """Discard and return the unread bytes of a line, such as late answers; detect a lost connection."""
     old = b""
     with suppress(InstrumentError):  # a timeout is expected; the next write opens a lost connection again
-        while len(old) < MOST_STRAY_BYTES and (data := line.read(CHUNK, timeout=0.0)):
+        while len(old) < MAX_STRAY_BYTES and (data := line.read(CHUNK, timeout=0.0)):
             old += data
     return old
 
@@ -50,7 +50,7 @@ def await_quiet(line: Transport, interval: float, since: float | None = None) ->
             return count
         now = time.monotonic()
         end = now + interval
-        if count > MOST_STRAY_BYTES or now - start > MOST_INTERVALS * interval:
+        if count > MAX_STRAY_BYTES or now - start > MAX_INTERVALS * interval:
             raise ProtocolError(
                 f"{line.url}: {count} bytes arrived in {now - start:.1f} s without a request; expected a line without "
                 f"data for {interval:g} s. Stop the output of the device, and open it again"

@@ -39,10 +39,10 @@ FORMAT = "errormotion-session/1"
 INDEX_FORMAT = "errormotion-sessions/1"
 WITH_NOTE = {FORMAT: "errormotion-session/2", INDEX_FORMAT: "errormotion-sessions/2"}
 NOTE = "NOTE "
-MOST_NOTE_BYTES = 1 << 20
-MOST_PARTS = 64
+MAX_NOTE_BYTES = 1 << 20
+MAX_PARTS = 64
 """Largest number of recordings in a list."""
-MOST_INDEX = MOST_NOTE_BYTES + (1 << 16)
+MAX_INDEX = MAX_NOTE_BYTES + (1 << 16)
 """Largest size of a list of recordings, bytes."""
 
 
@@ -262,14 +262,14 @@ def write_index(path: Path, parts: Sequence[str]) -> dict[str, Path]:
 def read_index(path: Path) -> dict[str, Path]:
     """Return the recordings in a list, by part; ReplayError if it is not such a list."""
     try:
-        if (size := require_regular(path).st_size) > MOST_INDEX:
-            raise ReplayError(f"{path}: expected a list of recordings of at most {MOST_INDEX} bytes; found {size}")
+        if (size := require_regular(path).st_size) > MAX_INDEX:
+            raise ReplayError(f"{path}: expected a list of recordings of at most {MAX_INDEX} bytes; found {size}")
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ReplayError(f"The recording {path} cannot be read: {error}") from None
     expected = WITH_NOTE[INDEX_FORMAT] if _has_note(lines) else INDEX_FORMAT
-    if (count := len(lines) - 1 - _has_note(lines)) > MOST_PARTS:
-        raise ReplayError(f"{path}: expected a list of at most {MOST_PARTS} recordings; found {count}")
+    if (count := len(lines) - 1 - _has_note(lines)) > MAX_PARTS:
+        raise ReplayError(f"{path}: expected a list of at most {MAX_PARTS} recordings; found {count}")
     pairs = [line.partition(" ") for line in lines[-count:]] if count > 0 else []
     if not lines or lines[0] != expected or not all(_is_name(name) for _, _, name in pairs):
         raise ReplayError(f"{path} is not a list of recordings: expected a first line '{INDEX_FORMAT}'")
@@ -288,7 +288,7 @@ def parts_of(path: Path, levels: int = 2) -> list[Path]:
     try:
         require_regular(path)
         with path.open(encoding="utf-8", errors="replace") as file:
-            word = file.readline(MOST_NOTE_BYTES).split(" ")[0].strip()
+            word = file.readline(MAX_NOTE_BYTES).split(" ")[0].strip()
     except OSError as error:
         raise ReplayError(f"The recording {path} cannot be read: {error.strerror}") from None
     if word not in (INDEX_FORMAT, WITH_NOTE[INDEX_FORMAT]) or not levels:
@@ -302,9 +302,9 @@ def add_note(path: Path, note: Mapping[str, Any]) -> None:
     word, _, rest = lines[0].partition(" ")
     word = WITH_NOTE.get(word, word)
     text = NOTE + json.dumps(note, allow_nan=False)
-    if len(text) > MOST_NOTE_BYTES:
+    if len(text) > MAX_NOTE_BYTES:
         raise InstrumentError(
-            f"The note of the recording {path} has {len(text)} bytes; expected at most {MOST_NOTE_BYTES}"
+            f"The note of the recording {path} has {len(text)} bytes; expected at most {MAX_NOTE_BYTES}"
         )
     head = f"{word} {rest}".rstrip()
     path.write_text("\n".join([head, text, *lines[1 + _has_note(lines) :]]) + "\n", encoding="utf-8")
@@ -315,8 +315,8 @@ def read_note(path: Path) -> dict[str, Any] | None:
     try:
         require_regular(path)
         with path.open(encoding="utf-8") as file:
-            file.readline(MOST_NOTE_BYTES)
-            line = file.readline(MOST_NOTE_BYTES)
+            file.readline(MAX_NOTE_BYTES)
+            line = file.readline(MAX_NOTE_BYTES)
         note = json.loads(line.removeprefix(NOTE)) if line.startswith(NOTE) else None
     except UnicodeDecodeError:
         raise ReplayError(f"{path} is not a recording: its first lines are not text") from None

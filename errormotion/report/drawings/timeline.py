@@ -26,7 +26,7 @@ DOTTED = 80
 UNKNOWN = "#B3261E"
 _HOUR, _DAY = 3600.0, 86400.0
 _SHADE = "#f3c9a8"
-_SMALLEST_SPAN = 1.0  # K; smallest span of the axis of temperatures, so that noise does not resemble warming
+_MIN_SPAN = 1.0  # K; smallest span of the axis of temperatures, so that noise does not resemble warming
 _LEGEND_ROW = 0.135  # inch
 _LOOKS = tuple((colour, dash) for dash in canvas.DASHES for colour in canvas.COLOURS)
 
@@ -248,8 +248,8 @@ def _panel(axes: Axes, panel: Panel, time: Array) -> None:
     axes.margins(y=0.08)
     if panel.legend:
         low, high = axes.get_ylim()
-        if high - low < _SMALLEST_SPAN:
-            axes.set_ylim((low + high - _SMALLEST_SPAN) / 2, (low + high + _SMALLEST_SPAN) / 2)
+        if high - low < _MIN_SPAN:
+            axes.set_ylim((low + high - _MIN_SPAN) / 2, (low + high + _MIN_SPAN) / 2)
         curves = [drawn for drawn in axes.get_lines() if drawn.get_linestyle() != "None"]
         axes.legend(
             curves, [" " + line.name for line in panel.lines], loc="center left", bbox_to_anchor=(1.005, 0.5),

@@ -17,8 +17,8 @@ _PACKAGE = "http://schemas.openxmlformats.org/package/2006"
 _TYPE = "application/vnd.openxmlformats-officedocument.spreadsheetml"
 _HEAD = '<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'
 _ILLEGAL = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-_MOST_DECIMALS = 9
-_BOLD = _MOST_DECIMALS + 2
+_MAX_DECIMALS = 9
+_BOLD = _MAX_DECIMALS + 2
 _LONGEST = 32_000
 """Characters of a text in a cell."""
 
@@ -73,20 +73,20 @@ def _workbook(names: Sequence[str]) -> str:
 def _styles() -> str:
     """Return the formats: 0 general, k + 1 for k decimals, the last one bold."""
     formats = "".join(
-        f'<numFmt numFmtId="{164 + k}" formatCode="0{"." if k else ""}{"0" * k}"/>' for k in range(_MOST_DECIMALS + 1)
+        f'<numFmt numFmtId="{164 + k}" formatCode="0{"." if k else ""}{"0" * k}"/>' for k in range(_MAX_DECIMALS + 1)
     )
     cells = "".join(
         f'<xf numFmtId="{164 + k}" fontId="0" fillId="0" borderId="0" xfId="0" applyNumberFormat="1"/>'
-        for k in range(_MOST_DECIMALS + 1)
+        for k in range(_MAX_DECIMALS + 1)
     )
     font = '<font>{}<sz val="10"/><name val="Arial"/></font>'
     return (
-        f'<styleSheet xmlns="{_MAIN}"><numFmts count="{_MOST_DECIMALS + 1}">{formats}</numFmts>'
+        f'<styleSheet xmlns="{_MAIN}"><numFmts count="{_MAX_DECIMALS + 1}">{formats}</numFmts>'
         f'<fonts count="2">{font.format("")}{font.format("<b/>")}</fonts>'
         '<fills count="2"><fill><patternFill patternType="none"/></fill><fill><patternFill patternType="gray125"/>'
         '</fill></fills><borders count="1"><border><left/><right/><top/><bottom/><diagonal/></border></borders>'
         '<cellStyleXfs count="1"><xf numFmtId="0" fontId="0" fillId="0" borderId="0"/></cellStyleXfs>'
-        f'<cellXfs count="{_MOST_DECIMALS + 3}"><xf numFmtId="0" fontId="0" fillId="0" borderId="0" xfId="0"/>{cells}'
+        f'<cellXfs count="{_MAX_DECIMALS + 3}"><xf numFmtId="0" fontId="0" fillId="0" borderId="0" xfId="0"/>{cells}'
         '<xf numFmtId="0" fontId="1" fillId="0" borderId="0" xfId="0" applyFont="1"/></cellXfs>'
         '<cellStyles count="1"><cellStyle name="Normal" xfId="0" builtinId="0"/></cellStyles></styleSheet>'
     )
@@ -120,7 +120,7 @@ def _sheet(each: Sheet) -> str:
 
 def _cell(at: str, entry: Entry, decimals: int | None, style: int) -> str:
     if isinstance(entry, float):
-        chosen = min(decimals, _MOST_DECIMALS) + 1 if decimals is not None else style
+        chosen = min(decimals, _MAX_DECIMALS) + 1 if decimals is not None else style
         return f'<c r="{at}" s="{chosen}"><v>{entry!r}</v></c>'
     text = escape(_ILLEGAL.sub("", str(entry))[:_LONGEST])
     return f'<c r="{at}" s="{style}" t="inlineStr"><is><t xml:space="preserve">{text}</t></is></c>'

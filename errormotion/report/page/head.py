@@ -13,7 +13,7 @@ from errormotion.report.text import DASH
 
 PAPERS = {"A4": "A4", "Letter": "letter"}
 """Sizes of paper, and their names in style sheets."""
-LARGEST_LOGO = 700_000
+MAX_LOGO = 700_000
 """Characters of the logo as a data URI."""
 
 
@@ -60,7 +60,7 @@ def head_of(run: Mapping[str, Any]) -> Head:
         return found.strip() if isinstance(found, str) else ""
 
     logo = run.get("logo")
-    logo = logo if isinstance(logo, str) and logo.startswith("data:image/") and len(logo) <= LARGEST_LOGO else ""
+    logo = logo if isinstance(logo, str) and logo.startswith("data:image/") and len(logo) <= MAX_LOGO else ""
     names = ("laboratory", "address", "accreditation", "customer", "order", "number", "language", "paper")
     until = {name: day for name, each in _pairs(stated, "calibrated_until") if (day := _day(each)) is not None}
     certificates = {name: str(each) for name, each in _pairs(stated, "certificates")}

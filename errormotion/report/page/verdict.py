@@ -17,9 +17,9 @@ from errormotion.tolerances.decision import INSIDE, OPEN, OUTSIDE, WORDS, overal
 
 TONES = {INSIDE: "inside", OUTSIDE: "outside", OPEN: "open"}
 COLOURS = {INSIDE: canvas.GREEN, OUTSIDE: canvas.VERMILLION, OPEN: canvas.ORANGE}
-MOST_BARS = 14
+MAX_BARS = 14
 """Limits in the picture, the deciding ones first; the table contains all."""
-LONGEST_NAME = 34
+MAX_NAME = 34
 """Characters of a name in the picture."""
 WIDEST = 250.0
 """Per cent of the limit; larger values are drawn at the edge."""
@@ -134,14 +134,14 @@ def _sentence(rows: Sequence[Row], decision: int, rule: str, failures: Sequence[
 
 def _picture(rows: Sequence[Row]) -> Figure | None:
     """Return a bar for each limit as a share of it, with the expanded uncertainty and the guard band."""
-    drawn = [row for row in rows if math.isfinite(row.value) and math.isfinite(_scale(row)[1])][:MOST_BARS]
+    drawn = [row for row in rows if math.isfinite(row.value) and math.isfinite(_scale(row)[1])][:MAX_BARS]
     if not drawn:
         return None
     high = 0.23 * len(drawn)
     size = (high + 0.5, canvas.WIDTH)
 
     def paint(figure: Canvas) -> None:
-        left, right = 0.085 * min(max(len(_short(row.name)) for row in drawn), LONGEST_NAME) + 0.1, 1.55
+        left, right = 0.085 * min(max(len(_short(row.name)) for row in drawn), MAX_NAME) + 0.1, 1.55
         axes = figure.add_axes((left / size[1], 0.38 / size[0], (size[1] - left - right) / size[1], high / size[0]))
         places = [_place(row, row.value) for row in drawn]
         reach = min(max(115.0, *(1.08 * abs(each) for each in places)), WIDEST)
@@ -171,7 +171,7 @@ def _picture(rows: Sequence[Row]) -> Figure | None:
         axes.set_xlabel("share of the limit / %")
 
     spans = "; ".join(f"{row.name} {significant(share(row), 3)} %" for row in drawn)
-    more = f" The {MOST_BARS} of {len(rows)} limits that decide are drawn." if len(rows) > len(drawn) else ""
+    more = f" The {MAX_BARS} of {len(rows)} limits that decide are drawn." if len(rows) > len(drawn) else ""
     caption = (
         "Values as a share of their limits (black lines), with expanded uncertainty, k = 2. Green: kept; red: "
         f"exceeded; ochre: not decided. Grey: the guard band of each limit.{more}"
@@ -181,7 +181,7 @@ def _picture(rows: Sequence[Row]) -> Figure | None:
 
 
 def _short(name: str) -> str:
-    return name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
+    return name if len(name) <= MAX_NAME else f"{name[: MAX_NAME - 1]}…"
 
 
 def _scale(row: Row) -> tuple[float, float]:

@@ -22,8 +22,8 @@ from errormotion.report.text import DASH, finite, fixed, integer, listed, percen
 _FAINT, _STILL, _COOLER = "#c3c8d0", "#6f7680", canvas.BLUE
 _WARMER = ("#6f7680", "#B07800", "#D55E00", "#96280a")
 _WIDE, _HIGH = 110.0, 18.0
-_MOST_GAPS = 60
-_SMALLEST_CHANGE = 0.5  # K; smaller changes are not coloured
+_MAX_GAPS = 60
+_MIN_CHANGE = 0.5  # K; smaller changes are not coloured
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def _map(placed: Sequence[Sensor], lost: Sequence[str], key: str, others: tuple[
     parts.append(Lines(np.stack([every, every * (1, 1, 0) + (0, 0, floor)], axis=1), _FAINT, 0.5, dash="2 2"))
     if len(points):
         parts.append(Dots(points, _STILL, 2.2, names))
-    shade = max(largest / len(_WARMER), _SMALLEST_CHANGE)
+    shade = max(largest / len(_WARMER), _MIN_CHANGE)
     for sensor in placed:
         label = (
             f"{sensor.name} {fixed(sensor.change, 1, signed=True)} K" if _known(sensor) else f"{sensor.name} unknown"
@@ -163,8 +163,8 @@ def _map(placed: Sequence[Sensor], lost: Sequence[str], key: str, others: tuple[
         + (
             f"Grey: within {fixed(shade, 1)} K; ochre, orange and dark red: warmer by more than {fixed(shade, 1)}, "
             f"{fixed(2 * shade, 1)} and {fixed(3 * shade, 1)} K; blue: cooler. "
-            if largest >= _SMALLEST_CHANGE
-            else f"All changes are smaller than {fixed(_SMALLEST_CHANGE, 1)} K. "
+            if largest >= _MIN_CHANGE
+            else f"All changes are smaller than {fixed(_MIN_CHANGE, 1)} K. "
         )
         + "Dashed lines lead to the base of the drawing."
         + (f" Grey points: {listed(list(names))}." if len(names) else "")
@@ -235,7 +235,7 @@ def sparkline(curve: Array) -> Markup:
         drawn.append(f"<path d='{path}' fill='none' stroke='{canvas.BLUE}' stroke-width='1.2'/>")
     bars = _runs(x, ~known)
     if bars:
-        path = "".join(f"M{a:.1f} {_HIGH - 1.5:g}H{b:.1f}" for a, b in bars[:_MOST_GAPS])
+        path = "".join(f"M{a:.1f} {_HIGH - 1.5:g}H{b:.1f}" for a, b in bars[:_MAX_GAPS])
         drawn.append(f"<path d='{path}' fill='none' stroke='{UNKNOWN}' stroke-width='2.5'/>")
     last = "the last is unknown" if not known[-1] else f"the last is {fixed(float(values[-1]), 1)} °C"
     return Markup(f"<svg {size} role='img' aria-label='curve; {last}'>{''.join(drawn)}</svg>")

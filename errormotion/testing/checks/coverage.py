@@ -25,7 +25,7 @@ FALSE_ALARM = 1e-3
 FACTOR, POWER = 1.3, 0.95
 #: Largest deviation of a single result from the truth, in standard uncertainties.
 GROSS = 5.0
-FEWEST_SEEDS = 60
+MIN_SEEDS = 60
 
 
 def recovers_truth(subject: MethodSubject) -> str:
@@ -90,7 +90,7 @@ def tested_places(subject: MethodSubject) -> tuple[int, ...]:
 def _samples(subject: MethodSubject, places: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return errors (seed, place, n) and stated covariances (seed, place, n, n), for two checks."""
     freedoms = int(np.isfinite(values(subject.outcome(0)[0])[list(places)]).any(axis=0).sum())
-    seeds = subject.seeds or max(FEWEST_SEEDS, math.ceil(degrees_needed(share=len(places)) / freedoms))
+    seeds = subject.seeds or max(MIN_SEEDS, math.ceil(degrees_needed(share=len(places)) / freedoms))
     errors, covariances = [], []
     for seed in range(seeds):
         result, truth = subject.outcome(seed)

@@ -33,18 +33,18 @@ BUDGET = 6.0
 """Time after which no further mutant is tried, s."""
 LIMIT = 90.0
 """Time limit of the check within the budget, s; a longer check has a limit only for each mutant."""
-MOST_TIME = 0.05
+MAX_TIME = 0.05
 """Processor time of a session with a mutated frame in addition to twice that of the recorded one, s.
 
 A driver that reopens its device after an error works twice, and all work takes longer on a busy computer."""
 REPEATS = 4
 """Number of repetitions of a session above a limit, because other work of the process may have caused it."""
-MOST_MEMORY, MEMORY_PER_BYTE = 4 << 20, 64
+MAX_MEMORY, MEMORY_PER_BYTE = 4 << 20, 64
 """Largest memory of a session with a mutated frame in addition to that of the recorded one: bytes, and bytes for each
 byte of the frame."""
 MEASURED = 20
 """Interval of the sessions whose memory is measured."""
-MOST_GROWTH = 128e6
+MAX_GROWTH = 128e6
 """Growth of the memory of this process over all mutants, byte."""
 TIMEOUT = 0.5
 """Value of the setting, if an instrument has it, s."""
@@ -120,20 +120,20 @@ class Trial:
         require(typed, f"{what}: expected an InstrumentError, found {found.error!r}")
         most = self._subject.time_limit
         require(found.seconds < most, f"{what} took {found.seconds:.1f} s, limit {most:g} s")
-        for _ in range(REPEATS if found.work > 2.0 * self._sound_work + MOST_TIME else 0):
+        for _ in range(REPEATS if found.work > 2.0 * self._sound_work + MAX_TIME else 0):
             found.work = min(found.work, self._replayed().work)
         more = max(found.work - self._sound_work, 0.0)
-        limit = self._sound_work + MOST_TIME
+        limit = self._sound_work + MAX_TIME
         require(
             more <= limit,
             f"{what} took {1e3 * more:.0f} ms of processor time more than the recorded session, limit "
             f"{1e3 * limit:.0f} ms",
         )
         memory = max(found.memory - self._sound_memory, 0.0)
-        most_memory = MOST_MEMORY + MEMORY_PER_BYTE * size
+        most_memory = MAX_MEMORY + MEMORY_PER_BYTE * size
         require(memory <= most_memory, f"{what} took {memory / 1024:.0f} KiB, limit {most_memory / 1024:.0f} KiB")
         grown = _memory() - self._before
-        require(grown < MOST_GROWTH, f"{what}: the memory has grown by {grown / 1e6:.0f} MB")
+        require(grown < MAX_GROWTH, f"{what}: the memory has grown by {grown / 1e6:.0f} MB")
         self.tried, self.refused = self.tried + 1, self.refused + (found.error is not None)
         self._longest, self._work = max(self._longest, found.seconds), max(self._work, more)
         self._memory = max(self._memory, memory)

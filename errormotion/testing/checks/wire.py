@@ -25,7 +25,7 @@ LATE_ANSWERS = (12, 20, 30, 45, 70, 110)
 """Candidates for the number of the late answer; the first one after opening is used."""
 READINGS = 24
 READINGS_AFTER_ERROR = 4
-MOST_FAILURES = 12
+MAX_FAILURES = 12
 PAUSE = 0.1
 """After a failed reading, s."""
 TIME_BETWEEN_READINGS = 120.0
@@ -95,7 +95,7 @@ def _readings(subject: InstrumentSubject, fault: str) -> list[Reading]:
     try:
         instrument.open()
         right, failures = 0, 0
-        while failures <= MOST_FAILURES and right < (READINGS_AFTER_ERROR if failures else READINGS):
+        while failures <= MAX_FAILURES and right < (READINGS_AFTER_ERROR if failures else READINGS):
             _vary(subject, len(found))
             try:
                 found.append(tuple(numbers(instrument.read())))

@@ -19,7 +19,7 @@ from errormotion.twin import kernels
 #: Rings of points in the aperture: radius as a share of that of the aperture, number of points, weight of each.
 _RINGS = ((0.0, 1, 1.0), (0.55, 6, 1.2), (0.9, 12, 1.0))
 #: Smallest cosine between surface normal and received beam with light at the receiver.
-_SMALLEST_COSINE = 0.02
+_MIN_COSINE = 0.02
 #: Number of waves of a speckle field.
 _WAVES = 256
 
@@ -70,7 +70,7 @@ class Optics:
         tilts = np.asarray(q, dtype=float)
         steep = np.hypot(tilts[..., 0], tilts[..., 1])
         with np.errstate(invalid="ignore"):
-            seen = (steep <= np.tan(self.steepest)) & (self._receiver_cosine(tilts, steep) > _SMALLEST_COSINE)
+            seen = (steep <= np.tan(self.steepest)) & (self._receiver_cosine(tilts, steep) > _MIN_COSINE)
         shift = self._light_centre(np.where(seen[..., None], tilts, 0.0)) - self._light_centre(np.zeros(2))
         return np.where(seen, self.scale + self.defocus * shift, np.nan)
 

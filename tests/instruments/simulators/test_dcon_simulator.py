@@ -11,7 +11,7 @@ from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments import simulators
-from errormotion.instruments.simulators.thermometer.dcon import LONGEST_LINE, SimulatedDcon
+from errormotion.instruments.simulators.thermometer.dcon import MAX_LINE, SimulatedDcon
 from errormotion.instruments.simulators.thermometer.dcon_module import SPANS, Module, format_reading, sum_of_characters
 from errormotion.instruments.transports import parse_address
 
@@ -308,8 +308,8 @@ def test_requests_may_be_split_or_joined(module):
 
 def test_a_line_without_end_is_bounded(module):
     ask = module()
-    assert ask.silent(b"#01" * LONGEST_LINE) == b""
-    assert len(ask.device._buffer) <= LONGEST_LINE
+    assert ask.silent(b"#01" * MAX_LINE) == b""
+    assert len(ask.device._buffer) <= MAX_LINE
     assert ask.silent(b"#01\r") == b""  # still the same line
     assert ask(b"$01M\r") == b"!017018\r"
 

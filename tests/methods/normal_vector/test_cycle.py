@@ -122,7 +122,7 @@ def test_late_cycle_starts_immediately_and_earlier_ones_are_omitted(interval, co
     assert cycle.cycles(chosen) == count + 1
     found = cycle.due(chosen, number, number * interval + late)
     assert found >= number
-    assert found * interval <= number * interval + late + cycle.SHORTEST_STEP
+    assert found * interval <= number * interval + late + cycle.MIN_STEP
     assert number * interval + late < (found + 1) * interval
     assert cycle.following(chosen, found * interval) == found + 1
 
@@ -143,7 +143,7 @@ def test_warm_up_follows_the_schedule(begin, length, events, moves) -> None:
     schedule = [{"at": float(at), "spindle_speed": float(speed)} for at, speed in sorted(events)]
     chosen = settings(schedule=schedule, moves=moves)
     steps = cycle.warm_up_steps(chosen, begin, begin + length, (0.5, 0.5, 0.9))
-    assert math.fsum(step.seconds for step in steps) == pytest.approx(length, abs=2 * cycle.SHORTEST_STEP)
+    assert math.fsum(step.seconds for step in steps) == pytest.approx(length, abs=2 * cycle.MIN_STEP)
     now = begin
     for step in steps:
         assert step.spindle_speed == cycle.speed_at(chosen, now)[0]

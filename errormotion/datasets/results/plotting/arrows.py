@@ -17,7 +17,7 @@ TRIPLES = (("EX", "EY", "EZ"), ("EA", "EB", "EC"))
 LONGEST = 0.18
 """Length of the longest arrow as a fraction of the diagonal of the targets."""
 
-MOST_NAMED = 30
+MAX_NAMED = 30
 """Largest number of targets whose names are written."""
 
 _LENGTHS = LinearSegmentedColormap.from_list("lengths", ["#6BAED6", "#0072B2", "#7A3E9D", "#D55E00", "#6B2A00"])
@@ -46,7 +46,7 @@ def draw(axes: Any, ds: xr.Dataset, freedoms: tuple[str, ...], unit: str, band: 
     if not known.all():
         axes.scatter(*places[~known].T, s=24, color="#888888", marker="x", depthshade=False)
     texts = scale_of(ds, ds.em.dims[0]).texts or [str(number) for number in range(1, len(places) + 1)]
-    if len(texts) <= MOST_NAMED:
+    if len(texts) <= MAX_NAMED:
         for place, text in zip(places, texts, strict=True):
             axes.text(*place, f" {short(text)}", fontsize=7, color="#555555", parse_math=False)
     axes.set_xlabel("x / mm")

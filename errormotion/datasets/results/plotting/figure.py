@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from errormotion.datasets.results.plotting import arrows, curves, maps
-from errormotion.datasets.results.plotting.scales import MOST_LINES, UNITS, over, scale_of
+from errormotion.datasets.results.plotting.scales import MAX_LINES, UNITS, over, scale_of
 from errormotion.datasets.results.tables import chosen
 from errormotion.errors import DatasetError
 
@@ -115,7 +115,7 @@ def _form(ds: xr.Dataset, names: list[str], form: str, given: Sequence[Axes] | N
     flat = given is not None and any(axes.name != "3d" for axes in given)
     if spatial and triples and not flat and dims[0] == "target":
         return "arrows"
-    if len(dims) == 2 and min(ds.sizes[dim] for dim in dims) > MOST_LINES:
+    if len(dims) == 2 and min(ds.sizes[dim] for dim in dims) > MAX_LINES:
         return "map"
     return "curves"
 

@@ -25,13 +25,13 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#B5558A", "#3291C8", "#B07800", "#2
 
 MARKERS = "os^Dv<>P"
 
-MOST_LINES = 8
+MAX_LINES = 8
 """Largest number of curves; more are drawn as a map."""
 
-MOST_LABELS = 16
+MAX_LABELS = 16
 """Largest number of texts of an axis."""
 
-LONGEST_LABEL = 24
+MAX_LABEL = 24
 """Characters."""
 
 
@@ -88,7 +88,7 @@ def mark(axis: Axis, scale: Scale) -> None:
     """Label an axis, with the names of single objects if they fit."""
     axis.set_label_text(scale.label)
     if scale.texts:
-        step = -(-len(scale.texts) // MOST_LABELS)
+        step = -(-len(scale.texts) // MAX_LABELS)
         axis.set_ticks(scale.values[::step].tolist(), scale.texts[::step], parse_math=False)
         if isinstance(axis, XAxis) and sum(map(len, scale.texts[::step])) > 50:
             axis.set_tick_params(rotation=30)
@@ -99,7 +99,7 @@ def mark(axis: Axis, scale: Scale) -> None:
 def short(text: object) -> str:
     """Return a text that is short enough for a drawing."""
     words = " ".join(str(text).split())
-    return words if len(words) <= LONGEST_LABEL else words[: LONGEST_LABEL - 3] + "..."
+    return words if len(words) <= MAX_LABEL else words[: MAX_LABEL - 3] + "..."
 
 
 def legend(axes: Axes, title: str = "") -> None:

@@ -12,9 +12,9 @@ from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.plugins import Identity
 
 LINE_END = b"\n"
-LONGEST_LINE = 1 << 16
+MAX_LINE = 1 << 16
 """Longest line of the bridge, and of a request, bytes."""
-MOST_DIGITS = 300
+MAX_DIGITS = 300
 """Largest number of digits of a whole number."""
 PROTOCOL = 2
 PART = 1 << 12
@@ -75,8 +75,8 @@ def encode_request(number: int, op: str, arguments: Mapping[str, Any]) -> bytes:
         request = json.dumps({"id": number, "op": op, **arguments}, allow_nan=False).encode() + LINE_END
     except ValueError:
         raise InstrumentError(f"Expected finite numbers; found {dict(arguments)}") from None
-    if len(request) > LONGEST_LINE:
-        raise InstrumentError(f"Expected a request of at most {LONGEST_LINE} bytes; '{op}' has {len(request)}")
+    if len(request) > MAX_LINE:
+        raise InstrumentError(f"Expected a request of at most {MAX_LINE} bytes; '{op}' has {len(request)}")
     return request
 
 
@@ -207,7 +207,7 @@ def decode_touch(result: Any) -> dict[str, Any]:
 
 def _whole(text: str) -> int:
     """Return a whole number; ValueError beyond the range of a float."""
-    if len(text) > MOST_DIGITS:
+    if len(text) > MAX_DIGITS:
         raise ValueError(f"a whole number of {len(text)} digits")
     return int(text)
 

@@ -295,7 +295,7 @@ class LinuxCNC(Driver):
         while True:
             try:
                 message = codec.decode(
-                    line.read_until(codec.LINE_END, limit=codec.LONGEST_LINE, timeout=self.settings.timeout)
+                    line.read_until(codec.LINE_END, limit=codec.MAX_LINE, timeout=self.settings.timeout)
                 )
             except InstrumentTimeoutError:
                 raise InstrumentTimeoutError(

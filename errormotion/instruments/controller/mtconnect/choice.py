@@ -20,7 +20,7 @@ _FEED_UNITS = ("", "MILLIMETER/SECOND", "MILLIMETER/MINUTE", "METER/SECOND", "IN
 _SPEED_UNITS = ("", "REVOLUTION/MINUTE", "REVOLUTION/SECOND")
 """Units of a feed and of a spindle speed. In percent they are overrides; per revolution or in degrees, other
 quantities."""
-_MOST_NAMED = 8  # largest number of data items in a message
+_MAX_NAMED = 8  # largest number of data items in a message
 _RANKS: Mapping[str, int] = {"MACHINE": 0, "": 1, "WORK": 3}
 """Ranks of coordinate systems; those of other types, such as BASE, precede WORK."""
 
@@ -144,7 +144,7 @@ def _add(
             best = min((_rank(item) for item in found), default=0)
             found = [item for item in found if _rank(item) == best]
             if len(found) > 1:
-                names = ", ".join(f"{item.id} ({item.component} {item.component_name})" for item in found[:_MOST_NAMED])
+                names = ", ".join(f"{item.id} ({item.component} {item.component_name})" for item in found[:_MAX_NAMED])
                 choice.unclear[key] = (
                     f"Several data items report '{key}': {names}. It is unknown until the settings state which one: "
                     f'items = {{ "{key}" = "{found[0].id}" }}'

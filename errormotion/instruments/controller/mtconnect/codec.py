@@ -16,8 +16,8 @@ from errormotion.instruments.controller.mtconnect.xml import Element, parse_tree
 
 UNAVAILABLE = "UNAVAILABLE"
 _OBJECT, _WORK = "OBJECT", "WORK"
-_MOST_DIGITS = 20  # of a sequence number or instance id: 64 bit
-_MOST_TIME = 64  # characters
+_MAX_DIGITS = 20  # of a sequence number or instance id: 64 bit
+_MAX_TIME = 64  # characters
 _NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]{1,4})?", re.ASCII)
 LEVELS = ("Normal", "Warning", "Fault", "Unavailable")
 """Elements of a condition."""
@@ -213,7 +213,7 @@ def _whole(element: Element, name: str, default: int | None = None) -> int:
     text = element.get(name)
     if not text and default is not None:
         return default
-    if not (text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS):
+    if not (text.isascii() and text.isdigit() and len(text) <= _MAX_DIGITS):
         raise ProtocolError(f"<{element.name}>: expected a number '{name}'; found '{text[:40]}'")
     return int(text)
 
@@ -226,7 +226,7 @@ def parse_time(text: str) -> float:
     ProtocolError
         The text is not such a time.
     """
-    if len(text) > _MOST_TIME:
+    if len(text) > _MAX_TIME:
         raise ProtocolError(f"Expected a time such as 2025-03-01T12:00:00Z; found '{text[:40]}'")
     try:
         time = datetime.fromisoformat(text.partition("@")[0].strip())

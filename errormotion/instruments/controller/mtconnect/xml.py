@@ -13,10 +13,10 @@ from errormotion.errors import ProtocolError
 
 LONGEST = 16 << 20
 """Longest document, bytes."""
-MOST_DEPTH = 64
-MOST_ELEMENTS = 200_000
-MOST_ATTRIBUTES = 64  # largest number of attributes of one element
-MOST_NAME = 256  # characters of a name, and of a name in an attribute
+MAX_DEPTH = 64
+MAX_ELEMENTS = 200_000
+MAX_ATTRIBUTES = 64  # largest number of attributes of one element
+MAX_NAME = 256  # characters of a name, and of a name in an attribute
 _PIECE = 1 << 20  # bytes parsed at once
 
 
@@ -91,16 +91,14 @@ class _Builder:
 
     def start(self, name: str, attributes: dict[str, str]) -> None:
         self._count += 1
-        if self._count > MOST_ELEMENTS:
-            raise ProtocolError(f"Expected a document of at most {MOST_ELEMENTS} elements")
-        if len(self._open) >= MOST_DEPTH:
-            raise ProtocolError(f"Expected elements nested at most {MOST_DEPTH} deep; found <{name[:40]}> below that")
-        if len(attributes) > MOST_ATTRIBUTES:
-            raise ProtocolError(
-                f"<{name[:40]}>: expected at most {MOST_ATTRIBUTES} attributes; found {len(attributes)}"
-            )
-        if len(name) > MOST_NAME or any(len(key) > MOST_NAME for key in attributes):
-            raise ProtocolError(f"<{name[:40]}>: expected names of at most {MOST_NAME} characters")
+        if self._count > MAX_ELEMENTS:
+            raise ProtocolError(f"Expected a document of at most {MAX_ELEMENTS} elements")
+        if len(self._open) >= MAX_DEPTH:
+            raise ProtocolError(f"Expected elements nested at most {MAX_DEPTH} deep; found <{name[:40]}> below that")
+        if len(attributes) > MAX_ATTRIBUTES:
+            raise ProtocolError(f"<{name[:40]}>: expected at most {MAX_ATTRIBUTES} attributes; found {len(attributes)}")
+        if len(name) > MAX_NAME or any(len(key) > MAX_NAME for key in attributes):
+            raise ProtocolError(f"<{name[:40]}>: expected names of at most {MAX_NAME} characters")
         plain = {
             key: value for key, value in attributes.items() if ":" not in key
         }  # attributes of MTConnect have no prefix

@@ -19,11 +19,11 @@ from errormotion.errors import ProtocolError
 PING = b"* PING\n"
 UNAVAILABLE = "UNAVAILABLE"
 LEVELS = ("NORMAL", "WARNING", "FAULT", UNAVAILABLE)
-MOST_LINE_BYTES = 65536
-MOST_ASSET_BYTES = 1 << 20
-MOST_FIELDS = 4096
-MOST_MILLISECONDS = 86_400_000  # longest heartbeat: a day
-_MOST_TIME = 64  # characters
+MAX_LINE_BYTES = 65536
+MAX_ASSET_BYTES = 1 << 20
+MAX_FIELDS = 4096
+MAX_MILLISECONDS = 86_400_000  # longest heartbeat: a day
+_MAX_TIME = 64  # characters
 _MULTILINE = "--multiline--"
 _NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]{1,4})?", re.ASCII)
 _TIME = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}[T ][0-9:.]+(Z|[+-][0-9]{2}:?[0-9]{2})?", re.ASCII)
@@ -104,20 +104,20 @@ class Lines:
         self._check(self._searched)
 
     def _check(self, size: int) -> None:
-        if size > MOST_LINE_BYTES:
+        if size > MAX_LINE_BYTES:
             start = bytes(self._buffer[:40])
             self.clear()
-            raise ProtocolError(f"Expected lines of at most {MOST_LINE_BYTES} bytes; found {size}, near {start!r}")
+            raise ProtocolError(f"Expected lines of at most {MAX_LINE_BYTES} bytes; found {size}, near {start!r}")
 
     def _skips(self, line: bytes) -> bool:
         if self._asset_end:
             self._asset_bytes += len(line) + 1
             if line == self._asset_end:
                 self._asset_end = b""
-            elif self._asset_bytes > MOST_ASSET_BYTES:
+            elif self._asset_bytes > MAX_ASSET_BYTES:
                 end = self._asset_end[:60]
                 self.clear()
-                raise ProtocolError(f"Expected the end {end!r} of an asset within {MOST_ASSET_BYTES} bytes")
+                raise ProtocolError(f"Expected the end {end!r} of an asset within {MAX_ASSET_BYTES} bytes")
             return True
         if b"|@ASSET@|" in line:
             mark = line.rpartition(b"|")[2]
@@ -155,11 +155,11 @@ def split_fields(text: str) -> list[str]:
     Raises
     ------
     ProtocolError
-        The line has more than `MOST_FIELDS` fields.
+        The line has more than `MAX_FIELDS` fields.
     """
-    parts = text.split("|", MOST_FIELDS + 1)
-    if len(parts) > MOST_FIELDS:
-        raise ProtocolError(f"Expected at most {MOST_FIELDS} fields; the line starts '{text[:60]}'")
+    parts = text.split("|", MAX_FIELDS + 1)
+    if len(parts) > MAX_FIELDS:
+        raise ProtocolError(f"Expected at most {MAX_FIELDS} fields; the line starts '{text[:60]}'")
     found: list[str] = []
     quoted: list[str] = []
     for part in parts:
@@ -187,10 +187,10 @@ def parse_time(text: str) -> float:
         The text is not a time.
     """
     word = text.partition("@")[0].strip()
-    if not word or (_NUMBER.fullmatch(word) and len(word) <= _MOST_TIME):
+    if not word or (_NUMBER.fullmatch(word) and len(word) <= _MAX_TIME):
         return math.nan
     try:
-        if len(word) > _MOST_TIME or not _TIME.fullmatch(word):
+        if len(word) > _MAX_TIME or not _TIME.fullmatch(word):
             raise ValueError
         time = datetime.fromisoformat(word)
         return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
@@ -260,4 +260,4 @@ def pong(command: Command) -> float | None:
     """Return the heartbeat of ``* PONG``, s; None for another command, or without a number."""
     if command.name != "PONG" or not _MILLISECONDS.fullmatch(command.value):
         return None
-    return min(int(command.value), MOST_MILLISECONDS) / 1000
+    return min(int(command.value), MAX_MILLISECONDS) / 1000

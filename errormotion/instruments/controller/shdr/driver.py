@@ -35,7 +35,7 @@ from errormotion.instruments.transports import Transport
 from errormotion.instruments.transports.reconnecting import ReconnectingTransport, open_reconnecting
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
-MOST_COMMANDS = 100  # largest number of statements of an adapter about itself
+MAX_COMMANDS = 100  # largest number of statements of an adapter about itself
 QUIET = 0.1  # s without data after which an adapter has sent the present values
 _MODES = {"AUTOMATIC": "automatic", "SEMI_AUTOMATIC": "automatic", "MANUAL": "manual", "MANUAL_DATA_INPUT": "mdi"}
 _TEXTS = ("mode", "program", "execution", "estop", "availability")
@@ -239,7 +239,7 @@ class Shdr(Driver):
         if period is not None:
             self.heartbeat = period or math.inf
             return True
-        if len(self._about) < MOST_COMMANDS:
+        if len(self._about) < MAX_COMMANDS:
             self._about[command.name[:100]] = command.value[:1000]
         return False
 

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from errormotion.errors import ProtocolError
 from errormotion.instruments.controller.shdr.codec import UNAVAILABLE, Observed, parse_numbers
 
-MOST_KEYS = 10_000
-MOST_CONDITIONS = 1000
+MAX_KEYS = 10_000
+MAX_CONDITIONS = 1000
 
 
 class Memory:
@@ -41,17 +41,17 @@ class Memory:
         Raises
         ------
         ProtocolError
-            There are more than `MOST_KEYS` values or `MOST_CONDITIONS` conditions.
+            There are more than `MAX_KEYS` values or `MAX_CONDITIONS` conditions.
         """
         if not math.isnan(observed.time):
             self.started = observed.time if math.isnan(self.started) else self.started
             self.newest = observed.time if math.isnan(self.newest) else max(self.newest, observed.time)
         if observed.level:
             self._condition(observed)
-        elif observed.key in self.values or len(self.values) < MOST_KEYS:
+        elif observed.key in self.values or len(self.values) < MAX_KEYS:
             self.values[observed.key] = observed
         else:
-            raise ProtocolError(f"Expected at most {MOST_KEYS} keys; found '{observed.key[:40]}' in addition")
+            raise ProtocolError(f"Expected at most {MAX_KEYS} keys; found '{observed.key[:40]}' in addition")
 
     def text(self, key: str) -> str:
         """Return a value; empty if it is unknown."""
@@ -87,7 +87,7 @@ class Memory:
             ended = [each for each in self.conditions if each[0] == observed.key and observed.code in ("", each[1])]
             for each in ended:
                 del self.conditions[each]
-        elif len(self.conditions) < MOST_CONDITIONS or (observed.key, observed.code) in self.conditions:
+        elif len(self.conditions) < MAX_CONDITIONS or (observed.key, observed.code) in self.conditions:
             self.conditions[observed.key, observed.code] = observed
         else:
-            raise ProtocolError(f"Expected at most {MOST_CONDITIONS} conditions at once")
+            raise ProtocolError(f"Expected at most {MAX_CONDITIONS} conditions at once")

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 from errormotion.errors import ProtocolError
 
 LINE_END = b"\r\n"
-LONGEST_REPLY = 4096
+MAX_REPLY = 4096
 """Bytes, line end included; a reply with three lengths has about 100."""
 PICOMETRE = 1e-12  # m
 API = 2
@@ -94,10 +94,10 @@ def reply(line: bytes) -> Reply:
     Raises
     ------
     ProtocolError
-        Not a reply of an IDS3010, or longer than ``LONGEST_REPLY``.
+        Not a reply of an IDS3010, or longer than ``MAX_REPLY``.
     """
-    if len(line) > LONGEST_REPLY:
-        raise ProtocolError(f"A reply of {len(line)} bytes; expected at most {LONGEST_REPLY}")
+    if len(line) > MAX_REPLY:
+        raise ProtocolError(f"A reply of {len(line)} bytes; expected at most {MAX_REPLY}")
     try:
         found = json.loads(line, parse_constant=_refuse)
     except (ValueError, RecursionError):

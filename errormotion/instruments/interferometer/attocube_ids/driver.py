@@ -82,7 +82,7 @@ class AttocubeIds(Driver):
                 left = deadline - time.monotonic()
                 if left <= 0.0:
                     raise InstrumentTimeoutError(f"{self.address}: no answer to '{method}' within {limit:g} s")
-                found = codec.reply(line.read_until(codec.LINE_END, limit=codec.LONGEST_REPLY, timeout=left))
+                found = codec.reply(line.read_until(codec.LINE_END, limit=codec.MAX_REPLY, timeout=left))
                 if found.number == self._number or (found.number is None and found.refusal):
                     break
         if found.refusal:

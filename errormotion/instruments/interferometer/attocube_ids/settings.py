@@ -13,7 +13,7 @@ from errormotion.plugins import PluginSettings
 AXES = 3
 AVERAGE_STEP = 40e-9
 """Averaging time for the parameter 0, s; each step doubles it."""
-LARGEST_AVERAGE = 24
+MAX_AVERAGE = 24
 
 
 class AngleChannel(PluginSettings):
@@ -73,7 +73,7 @@ class IdsSettings(PluginSettings):
         """Parameter of the low pass with the longest averaging time up to ``averaging``; None: unchanged."""
         if self.averaging is None:
             return None
-        return min(max(math.floor(math.log2(self.averaging / AVERAGE_STEP) + 1e-9), 0), LARGEST_AVERAGE)
+        return min(max(math.floor(math.log2(self.averaging / AVERAGE_STEP) + 1e-9), 0), MAX_AVERAGE)
 
 
 def axis_name(axis: int) -> str:

@@ -10,9 +10,9 @@ from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.laser_tracker.leica_geocom import codes
 
 LINE_END = b"\r\n"
-LONGEST_REPLY = 1024
+MAX_REPLY = 1024
 """Bytes, line end included."""
-LARGEST_TRANSACTION = 7
+MAX_TRANSACTION = 7
 """Transaction numbers are 1 to this; a reply to a request without a number has 0."""
 
 _REPLY = re.compile(r"%R1P,(\d{1,5})(?:,(\d{1,5}))?:(\d{1,5})(?:,(.*))?", re.ASCII | re.DOTALL)
@@ -104,10 +104,10 @@ def reply(line: bytes) -> Reply:
     Raises
     ------
     ProtocolError
-        The line is not a GeoCOM reply, or is longer than ``LONGEST_REPLY``.
+        The line is not a GeoCOM reply, or is longer than ``MAX_REPLY``.
     """
-    if len(line) > LONGEST_REPLY:
-        raise ProtocolError(f"A GeoCOM reply of {len(line)} bytes; expected at most {LONGEST_REPLY}")
+    if len(line) > MAX_REPLY:
+        raise ProtocolError(f"A GeoCOM reply of {len(line)} bytes; expected at most {MAX_REPLY}")
     text = line.decode("latin-1").rstrip("\r\n").lstrip("\n")
     found = _REPLY.fullmatch(text)
     if found is None:

@@ -75,7 +75,7 @@ class LeicaGeoCom(Driver):
     def _call(self, call: int, *parameters: int | float, limit: float | None = None) -> codec.Reply:
         """Return the reply to one call, whatever its return code; late replies to earlier requests are discarded."""
         limit = self.settings.timeout if limit is None else limit
-        self._transaction = self._transaction % codec.LARGEST_TRANSACTION + 1
+        self._transaction = self._transaction % codec.MAX_TRANSACTION + 1
         number = self._transaction
         try:
             with self.exchange() as line:
@@ -88,7 +88,7 @@ class LeicaGeoCom(Driver):
                             f"{self.address}: no answer to GeoCOM call {codes.name(call)} within {limit:g} s"
                         )
                     found = codec.reply(
-                        line.read_until(codec.LINE_END, limit=codec.LONGEST_REPLY, timeout=min(left, limit))
+                        line.read_until(codec.LINE_END, limit=codec.MAX_REPLY, timeout=min(left, limit))
                     )
                     if found.transaction == number:
                         break

@@ -182,7 +182,7 @@ HEADER_WORDS = 6
 TRIGGER_WORD, ENCODER_WORD = 1, 2
 INTENSITY = 0x40  # bit of the kind
 HEIGHT_BITS, INTENSITY_BITS, WORD_BITS = 20, 10, 32
-SMALLEST_HEIGHT = -(1 << 19) + 4  # smaller numbers are codes of points without height
+MIN_HEIGHT = -(1 << 19) + 4  # smaller numbers are codes of points without height
 MAX_POINTS = 3200
 MAX_PROFILE_BYTES = 4 * (HEADER_WORDS + MAX_POINTS * (HEIGHT_BITS + INTENSITY_BITS) // WORD_BITS + 1)
 """Longest profile of a stream."""

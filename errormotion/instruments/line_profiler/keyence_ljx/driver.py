@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 STREAM = "stream"
 BLOCK_SECONDS = 0.1
 QUEUE_SECONDS = 0.5
-SMALLEST_QUEUE = 64
+MIN_QUEUE = 64
 BATCH_PROFILES = 64
 """Number of profiles unpacked at once; their packed data fit into the processor's cache."""
 QUIET_INTERVAL = 0.3
@@ -278,7 +278,7 @@ class KeyenceLJX(Driver):
         unpack = HeightDecoder(layout)
         unpack.warm_up()
         follow = StreamDecoder(layout, late_notice=self._notice_pending)
-        limit = max(SMALLEST_QUEUE, 2 * size, round(QUEUE_SECONDS * self.rate))
+        limit = max(MIN_QUEUE, 2 * size, round(QUEUE_SECONDS * self.rate))
         lines: ManyLines = self.transport  # type: ignore[assignment]
         timeout = self.settings.timeout
         self._reader = reader = Reader(lines.line(STREAM), follow, name=self.name, limit=limit, overrun=LOST)

@@ -9,15 +9,15 @@ import numpy as np
 
 from errormotion.instruments.line_profiler.keyence_ljx.codec import (
     HEADER_WORDS,
+    MIN_HEIGHT,
     NOTIFY,
     SENTINELS,
-    SMALLEST_HEIGHT,
     TRIGGER_WORD,
 )
 
 Array = np.ndarray[Any, Any]
 
-LOWEST = SMALLEST_HEIGHT - SENTINELS
+LOWEST = MIN_HEIGHT - SENTINELS
 MAX_GAP_PROFILES = 1 << 16
 """Largest number of lost profiles; a larger jump of the trigger count is an error."""
 MAX_FILLED_PROFILES = 64
@@ -136,10 +136,10 @@ def unpack_heights(profiles: Array, unit: float, reasons: Array, heights: Array,
             value = (value ^ 0x80000) - 0x80000
             out[i] = value * unit
             lowest = min(lowest, np.int32(value))
-        if lowest < SMALLEST_HEIGHT:
+        if lowest < MIN_HEIGHT:
             for i in range(points):
                 value = np.int64(np.rint(out[i] / unit))
-                if value < SMALLEST_HEIGHT:
+                if value < MIN_HEIGHT:
                     out[i] = np.nan
                     counts[value - LOWEST] += 1
 
@@ -199,7 +199,7 @@ def pack(raws: Array, intensities: Array, trigger: int, encoder: int, words: Arr
     Parameters
     ----------
     raws : ndarray, int32, (point,)
-        Heights in steps; codes of points without height are below ``SMALLEST_HEIGHT``.
+        Heights in steps; codes of points without height are below ``MIN_HEIGHT``.
     intensities : ndarray, uint16, (point,) or (0,)
     trigger, encoder : int
         Counts; their lower 32 bits are written.

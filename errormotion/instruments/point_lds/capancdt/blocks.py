@@ -25,7 +25,7 @@ from errormotion.instruments.point_lds.counted import GARBLED, LOST, CountedRead
 
 HEADER = struct.Struct("<4sIIQIHHI")
 CHANNELS = 32
-LONGEST_GAP = 100_000
+MAX_GAP = 100_000
 """Largest number of readings that can be lost at once; a larger jump of the counter is an error."""
 
 FULL_SCALE = 0xFFFFFF
@@ -97,5 +97,5 @@ def readings_of(number: int, channel: Channel) -> CountedReadings:
         REASONS,
         lambda raws: scale(raws, channel.offset, channel.measuring_range),
         lambda block: column(block, number),
-        longest_gap=LONGEST_GAP,
+        longest_gap=MAX_GAP,
     )

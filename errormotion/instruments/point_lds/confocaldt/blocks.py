@@ -21,7 +21,7 @@ from errormotion.instruments.point_lds.blocks import BYTES_OF_VALUE, MAX_BLOCK_B
 from errormotion.instruments.point_lds.counted import GARBLED, LOST, CountedReadings
 
 HEADER = struct.Struct("<4sIIIIHHI")
-LONGEST_GAP = 1_000_000
+MAX_GAP = 1_000_000
 """Largest number of readings that can be lost at once; a larger jump of the counter is an error."""
 
 MEASURED, DISTANCE_1 = 1 << 18, 1 << 19
@@ -89,4 +89,4 @@ def scale(raws: Array) -> tuple[Array, Array]:
 
 def readings() -> CountedReadings:
     """Return an empty collection of readings."""
-    return CountedReadings(REASONS, scale, lambda block: np.asarray(block.values[:, 0]), longest_gap=LONGEST_GAP)
+    return CountedReadings(REASONS, scale, lambda block: np.asarray(block.values[:, 0]), longest_gap=MAX_GAP)

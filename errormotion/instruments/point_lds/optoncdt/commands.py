@@ -16,9 +16,9 @@ from errormotion.errors import InstrumentError, ProtocolError
 
 PROMPT = b"->"
 LINE_END = b"\r\n"
-LONGEST_ANSWER = 1 << 15
+MAX_ANSWER = 1 << 15
 """Bytes of text; the longest answers, HELP and PRINT, have about a hundred lines."""
-MOST_LINES = 2048
+MAX_LINES = 2048
 """Lines of an answer."""
 
 DONE = "ok"
@@ -46,11 +46,11 @@ def parse_answer(command: str, text: bytes) -> list[str]:
     ProtocolError
         The answer is longer than any answer that the manuals describe.
     """
-    if len(text) > LONGEST_ANSWER:
-        raise ProtocolError(f"The answer to '{command}' has {len(text)} bytes; expected {LONGEST_ANSWER} at most")
+    if len(text) > MAX_ANSWER:
+        raise ProtocolError(f"The answer to '{command}' has {len(text)} bytes; expected {MAX_ANSWER} at most")
     words = text.translate(None, _UNPRINTABLE).decode("ascii").replace(PROMPT.decode(), "\n")
-    if words.count("\n") + words.count("\r") > 2 * MOST_LINES:
-        raise ProtocolError(f"The answer to '{command}' has more than {MOST_LINES} lines")
+    if words.count("\n") + words.count("\r") > 2 * MAX_LINES:
+        raise ProtocolError(f"The answer to '{command}' has more than {MAX_LINES} lines")
     lines = [_without_echo(command, line.strip()) for line in words.splitlines()]
     for line in lines:
         found = _ERROR.search(line.partition(":")[0])

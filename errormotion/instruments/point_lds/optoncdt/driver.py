@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 Sync = Literal["NONE", "MASTER", "SLAVE"]
 BLOCK_SECONDS = 0.5
 QUEUE_SECONDS = 2.0
-SMALLEST_QUEUE = 4096
+MIN_QUEUE = 4096
 Array = np.ndarray[Any, Any]
 
 
@@ -265,7 +265,7 @@ class OptoNCDT(Driver):
             from_zero=sync != "NONE",
         )
         decoder.warm_up()
-        limit = max(SMALLEST_QUEUE, 2 * block, round(QUEUE_SECONDS * self.rate))
+        limit = max(MIN_QUEUE, 2 * block, round(QUEUE_SECONDS * self.rate))
         self._reader = Reader(self.transport, decoder, name=self.name, limit=limit, overrun=OVERRUN, prompt=PROMPT)
         self._dialogue.reader = self._reader
         try:

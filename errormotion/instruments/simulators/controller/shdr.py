@@ -53,7 +53,7 @@ HEARTBEAT = 10000
 """Heartbeat stated in ``* PONG``, ms."""
 POLL_INTERVAL = 0.02
 """Interval between two readings of the machine, s."""
-LONGEST_LINE = 1024
+MAX_LINE = 1024
 """Longest line of an agent, bytes."""
 _COMMANDS = ("shdrVersion: 2.0", "adapterVersion: 1.0", "mtconnectVersion: 2.0")
 _NATIVE = {("MILLIMETER/SECOND", "MILLIMETER/MINUTE"): 60.0}
@@ -199,7 +199,7 @@ class SimulatedAdapter:
 
     def _on_data(self, data: bytes) -> None:
         *lines, self._received = (self._received + data).split(b"\n")
-        self._received = self._received[-LONGEST_LINE:]
+        self._received = self._received[-MAX_LINE:]
         for line in lines:
             if line.strip() == b"* PING" and self._heartbeat:
                 self._pinged = (self._server.connection, time.monotonic())

@@ -137,7 +137,7 @@ class SimulatedLJX(SimulatedDevice):
         self._buffer += data
         while len(self._buffer) >= 4:
             size = struct.unpack_from("<I", self._buffer)[0] + 4
-            if size > wire.LARGEST_REQUEST:
+            if size > wire.MAX_REQUEST:
                 self._buffer = b""
                 self._server.disconnect()
                 return

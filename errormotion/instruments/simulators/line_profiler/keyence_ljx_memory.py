@@ -10,7 +10,7 @@ import numpy as np
 
 Array = np.ndarray[Any, Any]
 
-MOST_PROFILES = 2048
+MAX_PROFILES = 2048
 """Profiles kept; the oldest ones are dropped. Fewer than in the device, so that a simulator takes at most 25 MB."""
 
 
@@ -97,7 +97,7 @@ class Memory:
     def add(self, rows: Array) -> None:
         """Add profiles to the newest batch; drop the oldest ones beyond the limit."""
         (self.newest or self.open_batch()).add(rows)
-        excess = sum(batch.kept for batch in self.batches) - MOST_PROFILES
+        excess = sum(batch.kept for batch in self.batches) - MAX_PROFILES
         while excess > 0:
             oldest = self.batches[0]
             dropped = min(excess, oldest.kept)

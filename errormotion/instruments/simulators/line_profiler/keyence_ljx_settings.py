@@ -14,13 +14,13 @@ ALL = 0xFF
 """Category: the whole block of a type."""
 SIZES = {ENVIRONMENT: 60, COMMON: 20}
 PROGRAM_SIZE = 10980
-LARGEST_ITEM = 64
+MAX_ITEM = 64
 """Bytes kept of one item; assumed."""
 TRIGGER_MODE, SAMPLING, BATCH, BATCH_POINTS = (0, 0x01), (0, 0x02), (0, 0x03), (0, 0x0A)
 """Category and item in a program. The item that switches batches on is assumed."""
 TRIGGER_MODES = ("continuous", "external", "encoder")
 EXTERNAL = 1
-MOST_BATCH_POINTS = 42000
+MAX_BATCH_POINTS = 42000
 
 Target = tuple[int, int, int, bytes]
 """Type, category, item, and four bytes that specify the item."""
@@ -59,7 +59,7 @@ class Settings:
         if level > SAVED or not _exists(target) or not _allowed(target, data):
             return False
         for each in self._levels[: level + 1]:
-            each[target] = data[: _size(target) or LARGEST_ITEM].rstrip(b"\0")
+            each[target] = data[: _size(target) or MAX_ITEM].rstrip(b"\0")
         return True
 
     def initialise(self, level: int, program: int) -> None:
@@ -112,5 +112,5 @@ def _allowed(target: Target, data: bytes) -> bool:
         case (0, 0x03):
             return data[0] <= 1
         case (0, 0x0A):
-            return 1 <= value <= MOST_BATCH_POINTS
+            return 1 <= value <= MAX_BATCH_POINTS
     return True

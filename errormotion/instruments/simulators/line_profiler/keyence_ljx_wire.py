@@ -21,9 +21,9 @@ MAX_POINTS = 3200
 """Points of a profile."""
 PROGRAMS = 16
 """Programs 0..15."""
-LARGEST_DATA = 20 * 1024
+MAX_DATA = 20 * 1024
 """Bytes of data in the largest request, that of a setting."""
-LARGEST_REQUEST = 16 + 16 + LARGEST_DATA
+MAX_REQUEST = 16 + 16 + MAX_DATA
 """Bytes of the longest request; a longer one ends the connection."""
 PREFIX = bytes.fromhex("0300F000")
 """Bytes 4..7 of a request to an LJ-X; the LJ-V7 has 01 at their start."""
@@ -33,7 +33,7 @@ ONE_PROFILE = 0x01
 """Bits of the kind of a profile other than 0x60 are the number of profiles: one."""
 NO_HEIGHT = -(1 << 19) + 1
 """Raw 0x80001, invalid."""
-SMALLEST_HEIGHT = -(1 << 19) + 4
+MIN_HEIGHT = -(1 << 19) + 4
 """Steps: 0x80000 to 0x80003 are codes."""
 STOPPED, BATCH_ENDED = 0x00000001, 0x00010000
 """Notices: a part in the low 16 bits ends the transmission; bit 16 is the end of a batch."""
@@ -176,7 +176,7 @@ def _words(fields: Array) -> Array:
 def quantised(heights: Array, unit: float) -> Array:
     """Return heights in steps of ``unit``, int32; the code for 'invalid' if missing or out of range."""
     steps = np.rint(heights / unit)
-    fits = (steps >= SMALLEST_HEIGHT) & (steps < 1 << 19)  # False for NaN
+    fits = (steps >= MIN_HEIGHT) & (steps < 1 << 19)  # False for NaN
     return np.where(fits, steps, NO_HEIGHT).astype(np.int32)
 
 

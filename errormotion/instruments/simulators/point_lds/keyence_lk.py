@@ -18,7 +18,7 @@ STILL = 1.2345e-3
 """Reading of a head that is not mounted on the machine, m."""
 SIGNS = {"near": -1.0, "far": 1.0}
 """Sign of the value of a reading that increases with the distance, by the side on which values are positive."""
-MOST_WAITING = 1024
+MAX_WAITING = 1024
 """Largest number of bytes kept of an incomplete command."""
 
 
@@ -78,7 +78,7 @@ class SimulatedKeyenceLK(SimulatedDevice):
 
     def _on_data(self, data: bytes) -> None:
         super()._on_data(data)
-        self._buffer = self._buffer[:MOST_WAITING]
+        self._buffer = self._buffer[:MAX_WAITING]
 
     def answer(self, request: bytes) -> bytes:
         """Return the answer to one request; a line feed after the previous carriage return is ignored."""

@@ -9,7 +9,7 @@ from errormotion.instruments.simulators.point_lds import keyence_lk_grammar as g
 from errormotion.instruments.simulators.point_lds.keyence_lk_grammar import Controller, Mistake, Setting
 
 GENERAL, COMMUNICATION = "R0", "Q0"
-MOST_STORED = 65536
+MAX_STORED = 65536
 """Capacity of the data storage in values; the device stores 1.2 million."""
 
 
@@ -78,7 +78,7 @@ class Commands:
         return self._commands[word](words)
 
     def _require_mode(self, mode: str, text: str) -> None:
-        if len(text) > grammar.MOST_BYTES:
+        if len(text) > grammar.MAX_BYTES:
             raise MistakeError(Mistake.LENGTH)
         if self._mode != mode:
             raise MistakeError(Mistake.STATE)
@@ -312,7 +312,7 @@ class Commands:
             if not grammar.fits(form, value):
                 signed = form.startswith("[+-]")
                 raise MistakeError(Mistake.LENGTH if signed and len(value) != 7 else Mistake.RANGE)
-        if setting.name == grammar.STORAGE and int(values[0]) > MOST_STORED:
+        if setting.name == grammar.STORAGE and int(values[0]) > MAX_STORED:
             raise MistakeError(Mistake.RANGE)
         self._written[setting.name, setting.part, number] = values
         if number and int(number) == self._output:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 LINE_END = b"\r"
-MOST_BYTES = 64
+MAX_BYTES = 64
 """Longest command, bytes; a longer one is a length error."""
 
 HEADS: Mapping[str, float] = {

@@ -33,7 +33,7 @@ from errormotion.instruments.simulators.thermometer.canopen_objects import (
 from errormotion.instruments.simulators.thermometer.canopen_slave import (
     FIRST_TPDO,
     INVALID,
-    MOST_MAPPED,
+    MAX_MAPPED,
     PREDEFINED_TPDOS,
     STOPPED,
     Slave,
@@ -53,7 +53,7 @@ LOWEST, HIGHEST = (
     853.498,
 )  # degC, limits of a Pt100 input; a broken one reads the upper, a shorted one the lower
 ZERO = int.from_bytes(b"zero", "little")  # signature of the autozero
-MOST_DIGITS = 3
+MAX_DIGITS = 3
 VALUES = {"float": (0x6130, "f32"), "int16": (0x7130, "i16"), "int32": (0x9130, "i32")}
 FIRST_SDO_ANSWER = 0x580  # COB-ID without the node
 BROKEN_SENSOR = (0x5030, 0x21)  # emergency code (JUMO); error register: generic and device profile
@@ -115,7 +115,7 @@ class SimulatedCanopen:
         try:
             self._inputs = Inputs(self.world.machine, address)
             n = len(self._inputs.names)
-            self._digits = [address.whole("digits", 1, MOST_DIGITS)] * n
+            self._digits = [address.whole("digits", 1, MAX_DIGITS)] * n
             self._offsets = [0.0] * n
             tpdos = [] if pdo == "none" else self._tpdos(node, pdo, address.whole("event_timer", 50, 65535))
             self._slave = Slave(
@@ -175,7 +175,7 @@ class SimulatedCanopen:
         groups = [mapped[k : k + 64 // size] for k in range(0, n, 64 // size)]
         if self._status == "array":
             states = [0x6150 << 16 | (k + 1) << 8 | 8 for k in range(n)]
-            groups += [states[k : k + MOST_MAPPED] for k in range(0, n, MOST_MAPPED)]
+            groups += [states[k : k + MAX_MAPPED] for k in range(0, n, MAX_MAPPED)]
         elif self._status == "single":
             groups.append([0x6150 << 16 | 8])
         found = []
@@ -187,7 +187,7 @@ class SimulatedCanopen:
                     cob_id | (INVALID if pdo == "off" else 0),
                     1 if pdo == "sync" else 255,
                     event_timer if pdo == "timer" else 0,
-                    group + [0] * (MOST_MAPPED - len(group)),
+                    group + [0] * (MAX_MAPPED - len(group)),
                     len(group),
                 )
             )
@@ -225,7 +225,7 @@ class SimulatedCanopen:
         self._offsets[channel] = -self._inputs.temperatures(self.world.time, self._rng)[channel]
 
     def _set_digits(self, channel: int, value: int) -> None:
-        if value > MOST_DIGITS:
+        if value > MAX_DIGITS:
             raise Refused(VALUE_OUT_OF_RANGE)
         self._digits[channel] = value
 

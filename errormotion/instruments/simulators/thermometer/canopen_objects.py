@@ -23,7 +23,7 @@ WRONG_STATE = 0x08000022
 NO_DATA = 0x08000024
 
 FORMATS = {"u8": "<B", "u16": "<H", "u32": "<I", "i16": "<h", "i32": "<i", "f32": "<f"}
-LONGEST_OBJECT = 256  # bytes; longer data of a client are refused
+MAX_OBJECT = 256  # bytes; longer data of a client are refused
 
 
 class Refused(Exception):  # noqa: N818 - a refusal is not a failure
@@ -180,7 +180,7 @@ class SdoServer:
         if request[0] & 2:
             size = 4 - (request[0] >> 2 & 3) if sized else self._natural_size()
             self._dictionary.write(*self._object, request[4 : 4 + size])
-        elif sized and count > LONGEST_OBJECT:
+        elif sized and count > MAX_OBJECT:
             raise Refused(TOO_LONG)
         else:
             self._download, self._expected = bytearray(), count if sized else -1
@@ -191,7 +191,7 @@ class SdoServer:
             raise Refused(UNKNOWN_COMMAND)
         toggle = self._alternate(request)
         self._download += request[1 : 8 - (request[0] >> 1 & 7)]
-        if len(self._download) > LONGEST_OBJECT:
+        if len(self._download) > MAX_OBJECT:
             raise Refused(TOO_LONG)
         if request[0] & 1:
             data, self._download = bytes(self._download), None

@@ -26,7 +26,7 @@ SYNC = 0x80
 INVALID, NO_REMOTE, FRAME_29_BIT = 1 << 31, 1 << 30, 1 << 29
 FIRST_TPDO = 0x180  # COB-ID of TPDO 1 without the node; the others follow at intervals of 0x100
 PREDEFINED_TPDOS = 4
-MOST_MAPPED = 8  # objects of a TPDO
+MAX_MAPPED = 8  # objects of a TPDO
 OLDEST_ERRORS = 10  # entries of 0x1003
 
 
@@ -211,7 +211,7 @@ class Slave:
         add(index, 3, Entry("u16", lambda: tpdo.inhibit, partial(self._set_inhibit, tpdo)))
         add(index, 5, Entry("u16", lambda: tpdo.event_timer, partial(self._set_timer, tpdo)))
         add(0x1A00 + number, 0, Entry("u8", lambda: tpdo.used, partial(self._set_used, tpdo)))
-        for k in range(MOST_MAPPED):
+        for k in range(MAX_MAPPED):
             add(0x1A00 + number, k + 1, Entry("u32", partial(_mapped, tpdo, k), partial(self._map, tpdo, k)))
 
     def _error(self, k: int) -> int:
@@ -257,7 +257,7 @@ class Slave:
     def _set_used(self, tpdo: Tpdo, value: int) -> None:
         if tpdo.valid:
             raise Refused(WRONG_STATE)
-        if value > MOST_MAPPED:
+        if value > MAX_MAPPED:
             raise Refused(VALUE_OUT_OF_RANGE)
         if sum(mapped & 0xFF for mapped in tpdo.mapping[:value]) > 64:
             raise Refused(PDO_TOO_LONG)

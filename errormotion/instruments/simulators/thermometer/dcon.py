@@ -15,7 +15,7 @@ from errormotion.instruments.simulators.thermometer.dcon_module import (
 from errormotion.instruments.simulators.thermometer.temperatures import Inputs, Unplugging
 from errormotion.instruments.transports import Address
 
-LONGEST_LINE = 64
+MAX_LINE = 64
 """Longest request, bytes; a longer one is discarded up to the next line."""
 FORMATS = ("engineering", "percent", "hexadecimal")
 TYPE_T = 0x10
@@ -104,9 +104,9 @@ class SimulatedDcon(SimulatedDevice):
         self._buffer += data
         while LINE_END in self._buffer:
             request, _, self._buffer = self._buffer.partition(LINE_END)
-            answer = b"" if self._discarding or len(request) > LONGEST_LINE else self.answer(request)
+            answer = b"" if self._discarding or len(request) > MAX_LINE else self.answer(request)
             self._discarding = False
             if answer:
                 self.reply(answer)
-        if len(self._buffer) > LONGEST_LINE:
+        if len(self._buffer) > MAX_LINE:
             self._buffer, self._discarding = b"", True

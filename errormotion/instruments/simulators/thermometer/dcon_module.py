@@ -23,8 +23,8 @@ FORMAT_BITS, CHECKSUM_BIT, FILTER_BIT = 0x03, 0x40, 0x80
 ENABLED_BIT, TIMED_OUT_BIT = 0x80, 0x04  # of the module status
 SEEBECK = 40.6e-3  # mV/K, type T at room temperature
 CJC_STEP = 0.01  # degC, one count of the offset
-LARGEST_CJC_OFFSET = 0x1000
-LONGEST_NAME = 6
+MAX_CJC_OFFSET = 0x1000
+MAX_NAME = 6
 WATCHDOG_STEP = 0.1  # s
 
 Model = Literal["7018", "4018"]
@@ -291,13 +291,13 @@ class Module:
         return self._own
 
     def _set_offset(self, parameter: str) -> str | None:
-        if not re.fullmatch("[+-][0-9A-F]{4}", parameter) or int(parameter[1:], 16) > LARGEST_CJC_OFFSET:
+        if not re.fullmatch("[+-][0-9A-F]{4}", parameter) or int(parameter[1:], 16) > MAX_CJC_OFFSET:
             return None
         self._offset = int(parameter, 16) * CJC_STEP
         return self._own
 
     def _set_name(self, parameter: str) -> str | None:
-        if not 0 < len(parameter) <= LONGEST_NAME or not (parameter.isascii() and parameter.isprintable()):
+        if not 0 < len(parameter) <= MAX_NAME or not (parameter.isascii() and parameter.isprintable()):
             return None
         self._name = parameter
         return self._own

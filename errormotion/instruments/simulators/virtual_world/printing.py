@@ -15,7 +15,7 @@ from typing import Literal
 
 from errormotion.errors import InstrumentError
 
-MOST_DIGITS = 8  # largest number of digits, before and after the point together
+MAX_DIGITS = 8  # largest number of digits, before and after the point together
 
 Control = Literal["haas", "fanuc"]
 Zeros = Literal["blank", "none"]
@@ -85,8 +85,8 @@ def parse_block(template: str, value_of: Callable[[str], float]) -> Block:
 
 def _number(found: re.Match[str], value_of: Callable[[str], float]) -> Number:
     whole, decimals = int(found[2]), int(found[3])
-    if not 0 < whole + decimals <= MOST_DIGITS:
-        raise InstrumentError(f"'{found[0]}': expected 1 to {MOST_DIGITS} digits in all; found {whole + decimals}")
+    if not 0 < whole + decimals <= MAX_DIGITS:
+        raise InstrumentError(f"'{found[0]}': expected 1 to {MAX_DIGITS} digits in all; found {whole + decimals}")
     return Number(value_of(found[1]), whole, decimals)
 
 

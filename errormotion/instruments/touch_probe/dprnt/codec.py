@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from errormotion.errors import ProtocolError
 
-LONGEST_LINE = 256
+MAX_LINE = 256
 """Longest line, bytes; three positions, a time and a label have about 80."""
 _NUMBER = r"[-+]?+\s*+(?:\d++\.?+\d*+|\.\d++)"
 PATTERN = (
@@ -81,10 +81,10 @@ def parse_line(text: str, pattern: re.Pattern[str], *, length: float = MM, time:
     Raises
     ------
     ProtocolError
-        The line is longer than `LONGEST_LINE`, or does not match the pattern.
+        The line is longer than `MAX_LINE`, or does not match the pattern.
     """
-    if len(text) > LONGEST_LINE:
-        raise ProtocolError(f"Expected a line of at most {LONGEST_LINE} characters; found {len(text)}: '{text[:60]}'")
+    if len(text) > MAX_LINE:
+        raise ProtocolError(f"Expected a line of at most {MAX_LINE} characters; found {len(text)}: '{text[:60]}'")
     found = pattern.fullmatch(text.strip())
     if found is None:
         raise ProtocolError(f"Expected a line such as 'N12 X12.345 Y-3.210 Z100.000'; found '{text[:60]}'")

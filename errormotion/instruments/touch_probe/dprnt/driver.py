@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.driver import Driver
-from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, Line, from_iso_code, parse_line, text_of
+from errormotion.instruments.touch_probe.dprnt.codec import MAX_LINE, Line, from_iso_code, parse_line, text_of
 from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, touch_of
 from errormotion.instruments.touch_probe.dprnt.settings import DprntSettings
 from errormotion.instruments.touch_probe.probe import Probe, corrected, refuse_unmapped
@@ -158,7 +158,7 @@ class Dprnt(Probe, Driver):
         line_end = _LINE_ENDS[code][self.settings.line_end]
         while True:
             try:
-                raw = self.transport.read_until(line_end, limit=LONGEST_LINE, timeout=max(end - time.monotonic(), 0.0))
+                raw = self.transport.read_until(line_end, limit=MAX_LINE, timeout=max(end - time.monotonic(), 0.0))
                 text = text_of(from_iso_code(raw) if code == "iso" else raw)
                 if text:
                     units = _LENGTHS[self.settings.length_unit], _TIMES[self.settings.time_unit]

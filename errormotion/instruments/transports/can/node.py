@@ -20,7 +20,7 @@ from errormotion.instruments.transports.can.pdo import (
     COMMUNICATION,
     EVENT_TIMER,
     MAPPING,
-    MOST_ENTRIES,
+    MAX_ENTRIES,
     SYNC,
     SYNC_IDENTIFIER,
     TRANSMISSION,
@@ -31,7 +31,7 @@ from errormotion.instruments.transports.can.pdo import (
 from errormotion.instruments.transports.can.sdo import SdoClient, SdoRefusal
 from errormotion.instruments.transports.lost import Reopened
 
-MOST_PDOS = 8
+MAX_PDOS = 8
 """Number of transmit PDOs that are examined: the four standard ones and further ones."""
 START = 1
 """Command of the network management to enter OPERATIONAL."""
@@ -154,14 +154,14 @@ class CanNode(Transport):
     def transmit_pdos(self) -> list[TransmitPdo]:
         """Return the PDOs that the node sends, by its object dictionary; errors as for `upload`."""
         found: list[TransmitPdo] = []
-        for number in range(MOST_PDOS):
+        for number in range(MAX_PDOS):
             try:
                 identifier = decode_identifier(self.unsigned(COMMUNICATION + number, COB_ID))
                 if identifier is None:
                     continue
                 transmission = self.unsigned(COMMUNICATION + number, TRANSMISSION, 1)
                 entries = self.unsigned(MAPPING + number, size=1)
-                if entries > MOST_ENTRIES:
+                if entries > MAX_ENTRIES:
                     continue
                 mapped = decode_mapping([self.unsigned(MAPPING + number, 1 + i) for i in range(entries)])
             except SdoRefusal:  # no such PDO

@@ -17,11 +17,11 @@ SYNC = 0x80
 """Identifier of SYNC, if a node does not state it."""
 COB_ID, TRANSMISSION, INHIBIT, EVENT_TIMER = 1, 2, 3, 5
 """Subindices of the communication objects."""
-MOST_ENTRIES = 64
+MAX_ENTRIES = 64
 """Largest number of objects of a PDO; larger numbers mean other types of PDO."""
 FRAME_BITS = 64
 _INVALID, _EXTENDED = 1 << 31, 1 << 29
-_LARGEST_CYCLIC = 240
+_MAX_CYCLIC = 240
 _EVENT = (254, 255)
 
 
@@ -82,7 +82,7 @@ class TransmitPdo:
     @property
     def cyclic(self) -> bool:
         """Whether it is sent at every n-th SYNC."""
-        return 1 <= self.transmission <= _LARGEST_CYCLIC
+        return 1 <= self.transmission <= _MAX_CYCLIC
 
     @property
     def timed(self) -> bool:

@@ -19,11 +19,11 @@ from itertools import cycle
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 
 FRAME_BYTES = 8
-LONGEST_TRANSFER = 1024
+MAX_TRANSFER = 1024
 """Longest entry that is read, bytes."""
-LONGEST_TIME = 10
+MAX_TIME = 10
 """Longest duration of a transfer in segments, as a multiple of the time limit for one answer."""
-MOST_STRAY = 64
+MAX_STRAY = 64
 """Largest number of frames that are ignored while the client waits for an answer."""
 BARRIERS = ((0x1001, 0), (0x1018, 1), (0x1000, 0))
 """Entries that every node has (error register, vendor, device type)."""
@@ -203,7 +203,7 @@ class SdoClient:
         was_settled, self._settled = self._settled, False
         self._send(upload_request(index, subindex), self._forget)
         end = time.monotonic() + self.timeout
-        for _ in range(MOST_STRAY):
+        for _ in range(MAX_STRAY):
             try:
                 reply = upload_reply(self._next(end), index, subindex)
             except SdoRefusal:
@@ -218,25 +218,25 @@ class SdoClient:
                 break
             self.late += 1
         else:
-            raise ProtocolError(f"{MOST_STRAY} answers to other requests")
+            raise ProtocolError(f"{MAX_STRAY} answers to other requests")
         data = reply if isinstance(reply, bytes) else self._segments(index, subindex, reply)
         self._settled = True
         return data
 
     def _segments(self, index: int, subindex: int, size: int) -> bytes:
         """Return the data that follow in segments."""
-        if size > LONGEST_TRANSFER:
-            raise self._ended(index, subindex, f"expected at most {LONGEST_TRANSFER} bytes; the node announced {size}")
+        if size > MAX_TRANSFER:
+            raise self._ended(index, subindex, f"expected at most {MAX_TRANSFER} bytes; the node announced {size}")
         data, toggle = b"", 0
-        last = time.monotonic() + LONGEST_TIME * self.timeout
+        last = time.monotonic() + MAX_TIME * self.timeout
         while True:
             self._send(segment_request(toggle), None)
             found = segment_reply(self._next(min(last, time.monotonic() + self.timeout)), toggle)
             if found is None:
                 raise self._ended(index, subindex, "received a segment of another transfer")
             data += found[0]
-            if len(data) > LONGEST_TRANSFER:
-                raise self._ended(index, subindex, f"received more than {LONGEST_TRANSFER} bytes")
+            if len(data) > MAX_TRANSFER:
+                raise self._ended(index, subindex, f"received more than {MAX_TRANSFER} bytes")
             if found[1]:
                 break
             if not found[0]:

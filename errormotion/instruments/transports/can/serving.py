@@ -13,7 +13,7 @@ import can
 
 from errormotion.instruments.transports.can.bus import BUS_OFF
 
-LONGEST_WAIT = 0.05  # s, between two checks of the clock
+MAX_WAIT = 0.05  # s, between two checks of the clock
 _channels = itertools.count(1)
 
 
@@ -84,9 +84,9 @@ class CanServer:
         while not self._ended.is_set():
             wait = self._due(time.monotonic()) - time.monotonic()
             try:
-                message = self._bus.recv(min(max(wait, 0.0), LONGEST_WAIT))
+                message = self._bus.recv(min(max(wait, 0.0), MAX_WAIT))
             except can.CanError:
-                self._ended.wait(LONGEST_WAIT)
+                self._ended.wait(MAX_WAIT)
                 continue
             if message is None or message.is_error_frame or message.is_extended_id or self._ended.is_set():
                 continue

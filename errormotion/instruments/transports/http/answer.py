@@ -13,10 +13,10 @@ from collections.abc import Callable, Mapping
 
 from errormotion.errors import InstrumentTimeoutError, ProtocolError
 
-MOST_LINE_BYTES = 8192
-MOST_PART_LINE_BYTES = 4096
-MOST_HEAD_LINES = 100
-_MOST_INTERIM_ANSWERS = 5  # 1xx, before the final one
+MAX_LINE_BYTES = 8192
+MAX_PART_LINE_BYTES = 4096
+MAX_HEAD_LINES = 100
+_MAX_INTERIM_ANSWERS = 5  # 1xx, before the final one
 _STATUS_LINE = re.compile(r"HTTP/1\.([01]) ([1-5][0-9][0-9])(?: .*)?")
 _CHUNK_SIZE = re.compile(rb"([0-9A-Fa-f]{1,8})[ \t]*(?:;.*)?")
 
@@ -77,14 +77,14 @@ class Input:
         start = 0
         while (end := self._buffer.find(b"\n", start)) < 0:
             start = len(self._buffer)
-            if start > MOST_LINE_BYTES:
-                raise ProtocolError(f"{self._url}: a line longer than {MOST_LINE_BYTES} bytes: {self._start()}")
+            if start > MAX_LINE_BYTES:
+                raise ProtocolError(f"{self._url}: a line longer than {MAX_LINE_BYTES} bytes: {self._start()}")
             if not self.fill():
                 if self._buffer:
                     raise ProtocolError(f"{self._url}: the connection ended within a line: {self._start()}")
                 return None
-        if end > MOST_LINE_BYTES:
-            raise ProtocolError(f"{self._url}: a line longer than {MOST_LINE_BYTES} bytes: {self._start()}")
+        if end > MAX_LINE_BYTES:
+            raise ProtocolError(f"{self._url}: a line longer than {MAX_LINE_BYTES} bytes: {self._start()}")
         return self.some(end + 1).rstrip(b"\r\n")
 
     def some(self, most: int) -> bytes:
@@ -126,7 +126,7 @@ class Head:
 
     def __init__(self, source: Input, url: str) -> None:
         self._source, self._url = source, url
-        for _ in range(_MOST_INTERIM_ANSWERS + 1):
+        for _ in range(_MAX_INTERIM_ANSWERS + 1):
             version, self.status = self._status_line()
             self.headers: Mapping[str, str] = self._fields()
             if self.status >= 200:
@@ -227,10 +227,10 @@ def header_fields(next_line: Callable[[], bytes | None], url: str) -> dict[str, 
     Raises
     ------
     ProtocolError
-        There are more than `MOST_HEAD_LINES` lines or two different lengths, or the connection ended.
+        There are more than `MAX_HEAD_LINES` lines or two different lengths, or the connection ended.
     """
     found: dict[str, str] = {}
-    for _ in range(MOST_HEAD_LINES + 1):
+    for _ in range(MAX_HEAD_LINES + 1):
         line = next_line()
         if line is None:
             raise ProtocolError(f"{url}: the connection ended within the head of an answer or part")
@@ -241,7 +241,7 @@ def header_fields(next_line: Callable[[], bytes | None], url: str) -> dict[str, 
         if key == "content-length" and found.get(key, text) != text:
             raise ProtocolError(f"{url}: two lengths of the body, '{found[key][:20]}' and '{text[:20]}'")
         found[key] = text
-    raise ProtocolError(f"{url}: a head of more than {MOST_HEAD_LINES} lines")
+    raise ProtocolError(f"{url}: a head of more than {MAX_HEAD_LINES} lines")
 
 
 class Lines:
@@ -256,11 +256,11 @@ class Lines:
         start = 0
         while (end := self._buffer.find(b"\n", start)) < 0:
             start = len(self._buffer)
-            if start > MOST_PART_LINE_BYTES:
+            if start > MAX_PART_LINE_BYTES:
                 raise ProtocolError(
                     f"{self._url}: expected a header line of a part; found {bytes(self._buffer[:80])!r}"
                 )
-            if not self._more(MOST_PART_LINE_BYTES):
+            if not self._more(MAX_PART_LINE_BYTES):
                 return None  # an incomplete line is ignored
         line = bytes(self._buffer[:end]).rstrip(b"\r")
         del self._buffer[: end + 1]
@@ -269,7 +269,7 @@ class Lines:
     def block(self, size: int) -> bytes | None:
         """Return exactly ``size`` bytes; None if the body ends before."""
         while len(self._buffer) < size:
-            if not self._more(max(MOST_PART_LINE_BYTES, size - len(self._buffer))):
+            if not self._more(max(MAX_PART_LINE_BYTES, size - len(self._buffer))):
                 return None
         data = bytes(self._buffer[:size])
         del self._buffer[:size]

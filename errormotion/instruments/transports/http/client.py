@@ -26,9 +26,9 @@ from errormotion.instruments.transports.tcp import TcpTransport
 PORT = 80
 MAX_BODY_BYTES = 16 << 20
 """Default size limit of a body, bytes."""
-_MOST_BLANK_LINES = 16
+_MAX_BLANK_LINES = 16
 """Largest number of blank lines between two parts of a stream."""
-_MOST_DIGITS = 12
+_MAX_DIGITS = 12
 """Largest number of digits of the size of a part."""
 _ANSWER_TIMEOUTS = 10.0
 """Time limit for a complete answer, as a multiple of the time limit without data."""
@@ -158,7 +158,7 @@ class HttpTransport(Transport):
     def _part(self, source: Input, lines: Lines, boundary: bytes, limit: int) -> bytes | None:
         """Return the next part of a stream; None at its end."""
         source.deadline = math.inf  # between two parts only the time limit without data applies
-        for _ in range(_MOST_BLANK_LINES + 1):  # blank lines after the preceding part
+        for _ in range(_MAX_BLANK_LINES + 1):  # blank lines after the preceding part
             line = lines.line()
             if line != b"":
                 break
@@ -170,7 +170,7 @@ class HttpTransport(Transport):
             )
         source.deadline = self._deadline()
         text = header_fields(lines.line, self.url).get("content-length", "")
-        size = int(text) if text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS else None
+        size = int(text) if text.isascii() and text.isdigit() and len(text) <= _MAX_DIGITS else None
         if size is None or size > limit:
             raise ProtocolError(f"{self.url}: expected a part of 0 to {limit} bytes; found {size}")
         return lines.block(size)

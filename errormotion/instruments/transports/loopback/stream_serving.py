@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from errormotion.instruments.transports.loopback.serving import TcpServer
 
-MOST_CONNECTIONS = 16
+MAX_CONNECTIONS = 16
 """Largest number of open connections; beyond it the oldest one is closed."""
 
 
@@ -38,7 +38,7 @@ class NewestConnectionServer(TcpServer):
                 self._lines.append(line)
                 self._connected.set()
                 self._wake_write.send(b"+")
-            for line in self._lines[:-MOST_CONNECTIONS]:
+            for line in self._lines[:-MAX_CONNECTIONS]:
                 _shut(line)
             return bool(self._lines)
 

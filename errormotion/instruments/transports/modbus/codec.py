@@ -23,10 +23,10 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "gateway target device failed to respond",
 }
-LONGEST_FRAME: Mapping[str, int] = {"tcp": 260, "rtu": 256}
+MAX_FRAME: Mapping[str, int] = {"tcp": 260, "rtu": 256}
 """Bytes of the longest frame by framing."""
 WRITE_ONE, WRITE_SEVERAL = 6, 16
-MOST_WRITTEN = 123
+MAX_WRITTEN = 123
 """Largest number of registers in one request of function 16."""
 _HEAD = 7  # bytes of an MBAP header
 _MAX_MBAP_LENGTH = 254  # bytes after its length field
@@ -60,7 +60,7 @@ def encode_write(
     count = len(values)
     if function == WRITE_ONE and count == 1:
         pdu = struct.pack(">BHH", function, register, values[0])
-    elif function == WRITE_SEVERAL and 1 <= count <= MOST_WRITTEN:
+    elif function == WRITE_SEVERAL and 1 <= count <= MAX_WRITTEN:
         pdu = struct.pack(f">BHHB{count}H", function, register, count, 2 * count, *values)
     else:
         raise ValueError(f"function {function} does not write {count} registers")

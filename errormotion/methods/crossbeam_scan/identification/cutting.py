@@ -34,7 +34,7 @@ END_SHARE = 0.01
 """Largest accepted share of a scan's length that is missing at each end."""
 DISORDER_SHARE = 0.05
 """Largest accepted share of lines with a position before that of the previous line."""
-FEWEST_LINES = 16
+MIN_LINES = 16
 FINEST_PITCH = 1e-6
 """Smallest plausible distance of two lines, m; a smaller one is caused by a wrong encoder_pitch."""
 
@@ -158,7 +158,7 @@ class _Record:
         step = float(np.median(np.abs(np.diff(known)))) if known.size > 1 else np.nan
         where = ", ".join(f"{y:g}" for y in self._positions)
         pitch = float(self._raw["encoder_pitch"])
-        if inside.any() and not (step < FINEST_PITCH or step > self._length / FEWEST_LINES):
+        if inside.any() and not (step < FINEST_PITCH or step > self._length / MIN_LINES):
             return
         found = (
             f"{step * 1e6:.3g} um from line to line"
@@ -223,7 +223,7 @@ class _Record:
         return order, y[order]
 
     def _check_complete(self, y: Array, cycle: int) -> None:
-        if y.size < FEWEST_LINES:
+        if y.size < MIN_LINES:
             raise MethodError(self._missing(cycle, f"the scan has {y.size} lines only"))
         pitch = float(np.median(np.diff(y)))
         low, high = -self._length / 2, self._length / 2

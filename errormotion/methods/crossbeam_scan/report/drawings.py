@@ -22,7 +22,7 @@ from errormotion.report.drawings import maps as crossbeam_maps
 from errormotion.report.fields import field, unit_of
 from errormotion.report.text import finite, fixed
 
-_MOST_CURVES = 10  # in one panel
+_MAX_CURVES = 10  # in one panel
 _ROW, _GAP, _FOOT, _HEAD = 1.42, 0.42, 0.46, 0.26  # inch: panels, room between them, below and above
 _LEFT, _BETWEEN, _END = 0.52, 0.45, 0.08  # inch
 _BAR, _LEGEND = 0.48, 0.3  # inch: colour bar with its numbers, a line of the legend
@@ -144,10 +144,10 @@ def _some(picks: Sequence[int], all_of_them: Sequence[int]) -> str:
 
 
 def _picked(indices: Sequence[int]) -> list[int]:
-    """Return at most `_MOST_CURVES` of the indices, including the first and the last."""
+    """Return at most `_MAX_CURVES` of the indices, including the first and the last."""
     if not len(indices):
         return []
-    return [int(indices[k]) for k in np.unique(np.linspace(0, len(indices) - 1, _MOST_CURVES).round().astype(int))]
+    return [int(indices[k]) for k in np.unique(np.linspace(0, len(indices) - 1, _MAX_CURVES).round().astype(int))]
 
 
 def _ordered(n: int) -> list[str]:

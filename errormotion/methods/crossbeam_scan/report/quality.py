@@ -13,7 +13,7 @@ from errormotion.report.document import Block, Cell, Table, Text, estimate, or_d
 from errormotion.report.fields import field, remarks, unit_of
 from errormotion.report.text import DASH, finite, fixed, integer, listed, significant
 
-_MOST_ROWS = 240  # of single registrations; if there are more, each cycle is one row
+_MAX_ROWS = 240  # of single registrations; if there are more, each cycle is one row
 _NOTE = (
     "Predicted: the bound that follows from the slopes of the surface and the noise stated for the sensor. By "
     "registration: the uncertainty of the registration with the noise and the jitter found in the scans. Both are "
@@ -51,7 +51,7 @@ def blocks(seen: Campaign) -> list[Block]:
     found.append(Text(f"{words}.", "plain" if done == planned else "warning"))
     if done and not np.isfinite(_numbers(seen)[seen.known]).any():
         return [*found, Text("The result does not contain data on the quality of the registrations.", "note")]
-    found.append(_by_scan(seen) if planned <= _MOST_ROWS else _by_cycle(seen))
+    found.append(_by_scan(seen) if planned <= _MAX_ROWS else _by_cycle(seen))
     drift = _drift(seen)
     return [*found, drift] if drift is not None else found
 

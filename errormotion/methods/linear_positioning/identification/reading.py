@@ -15,7 +15,7 @@ from errormotion.kinematics.iso import DOF, LINEAR_AXES, direction_of, iso_names
 from errormotion.methods.linear_positioning.schema import APPROACHES
 from errormotion.methods.linear_positioning.settings import Settings
 
-FEWEST_TARGETS = 3
+MIN_TARGETS = 3
 """Needed to distinguish a drift proportional to the position from the scatter of the readings."""
 
 
@@ -149,8 +149,8 @@ def freedoms_of(raw: xr.Dataset, axis: str) -> tuple[str, ...]:
 def _check_positions(position: Array) -> None:
     if not np.isfinite(position).all():
         raise MethodError("target_position: expected a position of each target; found NaN")
-    if position.size < FEWEST_TARGETS:
-        raise MethodError(f"target_position: expected {FEWEST_TARGETS} targets or more; found {position.size}")
+    if position.size < MIN_TARGETS:
+        raise MethodError(f"target_position: expected {MIN_TARGETS} targets or more; found {position.size}")
     if np.unique(position).size < position.size:
         raise MethodError("target_position: expected different positions; found one of them twice")
 

@@ -25,7 +25,7 @@ from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
 DRIFTS = ("offset", "slope")
-FEWEST_RUNS = 4
+MIN_RUNS = 4
 """For which the variance of the drift has a Student factor, v / (v - 2) with v = n - 1 above 2."""
 SIGNIFICANT = 1e-3
 """Probability in Bartlett's test of equal variances below which each target has its own variance."""
@@ -108,9 +108,9 @@ def scatter(
     stated_drift = np.array([0.0 if drift is None else drift**2 / len(approaches), 0.0])
     if runs == 1 or kind == "stated":
         return _stated(x, z, stated, drift, stated_drift)
-    if drift is None and runs < FEWEST_RUNS:
+    if drift is None and runs < MIN_RUNS:
         raise MethodError(
-            f"Expected {FEWEST_RUNS} runs or more, or the drift during one run (setting uncertainty.drift); found "
+            f"Expected {MIN_RUNS} runs or more, or the drift during one run (setting uncertainty.drift); found "
             f"{runs} runs: the drift from run to run cannot be estimated."
         )
     residual, coefficient, g = _lines(x, Z)
@@ -121,7 +121,7 @@ def scatter(
     half_difference = (coefficient[0] - coefficient[1]) / 2.0 if both else np.zeros_like(half_sum)
     noise = mean_own * g / len(approaches)
     common, opposite = (_mean_square(part) for part in (half_sum, half_difference))
-    if runs >= FEWEST_RUNS:
+    if runs >= MIN_RUNS:
         student = (runs - 1) / (runs - 3)
         common_mean, opposite_mean = (np.maximum(student * part - noise, 0.0) for part in (common, opposite))
     else:
@@ -135,7 +135,7 @@ def scatter(
         common_mean=np.maximum(common_mean, stated_drift),
         opposite_mean=np.maximum(opposite_mean, stated_drift) if both else np.zeros(2),
         pooled=pooled,
-        freedom=runs - 1 if runs >= FEWEST_RUNS else 0,
+        freedom=runs - 1 if runs >= MIN_RUNS else 0,
         noise=noise,
     )
 
@@ -199,7 +199,7 @@ def _own(residual: Array, kind: str) -> tuple[Array, float, bool]:
     own_freedom = share * (float(np.median(n[n > 0])) - 1.0)
     if own_freedom <= 2:
         raise MethodError(
-            f"Variances by target: expected more than {FEWEST_RUNS} runs; found {int(n.max())}. Use scatter 'pooled'."
+            f"Variances by target: expected more than {MIN_RUNS} runs; found {int(n.max())}. Use scatter 'pooled'."
         )
     return np.where(n > 0, each, np.nan), own_freedom / (own_freedom - 2), False
 

@@ -24,7 +24,7 @@ Position = tuple[float, float, float]
 
 TIP_RADIUS = 3e-3
 """Radius of the tip if neither the settings nor the probe state it, m."""
-SHORTEST_STEP = 1e-3
+MIN_STEP = 1e-3
 """Shorter waits and moves are omitted, s."""
 EARLY_START = 0.1
 """Largest advance of a cycle, in intervals: a printed cycle starts with its first touch."""
@@ -217,16 +217,16 @@ def warm_up_steps(settings: Settings, start: float, end: float, here: Position |
     """
     steps: list[Step] = []
     now, number = start, 0
-    while end - now > SHORTEST_STEP:
+    while end - now > MIN_STEP:
         speed, until = speed_at(settings, now)
         until = min(until, end)
         if settings.moves:
             target = settings.moves[number % len(settings.moves)]
             seconds = math.dist(target, target if here is None else here) / settings.moves_feed
-            if here is None or (seconds <= SHORTEST_STEP and len(set(settings.moves)) > 1):
+            if here is None or (seconds <= MIN_STEP and len(set(settings.moves)) > 1):
                 number, here = number + 1, target
                 continue
-            if SHORTEST_STEP < seconds <= end - now:
+            if MIN_STEP < seconds <= end - now:
                 steps.append(Step("move", target, settings.moves_feed, seconds, speed))
                 number, here, now = number + 1, target, now + seconds
                 continue
@@ -255,7 +255,7 @@ def due(settings: Settings, number: int, now: float) -> int:
 
     A late cycle starts immediately; it is omitted if its successor is due as well.
     """
-    return max(number, int((now + SHORTEST_STEP) // settings.interval))
+    return max(number, int((now + MIN_STEP) // settings.interval))
 
 
 def following(settings: Settings, last: float) -> int:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LARGEST_DELAY = 1.0
+MAX_DELAY = 1.0
 """Delay of a cycle above which a warning is logged, s."""
 LAST_LINES_TIMEOUT = 2.0
 """Time after the end of a program within which its last printed lines arrive, s."""
@@ -86,7 +86,7 @@ def _driven(machine: Warming, measure: Measure, record: Record) -> Iterator[xr.D
         while (number := _due(settings, number, machine.now)) < cycle.cycles(settings):
             machine.warm_until(number * settings.interval)
             start, history = machine.now, machine.history()
-            if start - number * settings.interval > LARGEST_DELAY:
+            if start - number * settings.interval > MAX_DELAY:
                 log.warning("cycle %d starts %.0f s late", number, start - number * settings.interval)
             record.start_cycle()
             contacts: list[Contact] = []

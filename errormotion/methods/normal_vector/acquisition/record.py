@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 NOT_MADE = TOUCH_FLAGS.index("not made")
-FEWEST_TOUCHES = 3
+MIN_TOUCHES = 3
 """Smallest number of good touches of each ball in the cold cycle."""
 RUN_ATTRIBUTES = ("start", "cold_cycle_seconds", "clock_origin")
 """Attributes common to all cycles: UTC and machine clock at the start of the cold cycle, and its duration."""
@@ -116,11 +116,11 @@ class Record:
         insufficient = [
             f"{name} ({', '.join(f'{count} {flag}' for flag, count in flags[ball].items())})"
             for ball, name in enumerate(touching.names(self.settings))
-            if flags[ball]["good"] < FEWEST_TOUCHES
+            if flags[ball]["good"] < MIN_TOUCHES
         ]
         if insufficient:
             raise InstrumentError(
-                f"The cold cycle has too few good touches of {'; '.join(insufficient)}; expected {FEWEST_TOUCHES} or "
+                f"The cold cycle has too few good touches of {'; '.join(insufficient)}; expected {MIN_TOUCHES} or "
                 "more of each, since it is the reference of all others. Check the positions of the balls (settings)."
             )
 

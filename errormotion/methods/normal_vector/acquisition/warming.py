@@ -73,11 +73,11 @@ class Warming:
 
     def warm_until(self, time: float) -> None:
         """Warm up until a time since the start of the cold cycle, s; does nothing before the cold cycle."""
-        if self.warm_from is None or time - self.now < cycle.SHORTEST_STEP:
+        if self.warm_from is None or time - self.now < cycle.MIN_STEP:
             return
         self.change_tool(self.settings.to_warm_up)
         moves = 0
-        while time - (now := self.now) >= cycle.SHORTEST_STEP:
+        while time - (now := self.now) >= cycle.MIN_STEP:
             speed, change = cycle.speed_at(self.settings, now - self.warm_from)
             self.turn(speed)
             moves = self._one_step(moves, min(time, change + self.warm_from) - now, time - now)
@@ -90,11 +90,11 @@ class Warming:
             target = self.settings.moves[moves % len(self.settings.moves)]
             distance = math.dist(target, self.control.state()["commanded_position"])
             seconds = distance / self.settings.moves_feed
-            if cycle.SHORTEST_STEP < seconds <= remaining:
+            if cycle.MIN_STEP < seconds <= remaining:
                 self.control.move_to(target, self.settings.moves_feed)
                 self._path += distance
                 return moves + 1
-            if seconds <= cycle.SHORTEST_STEP and len(set(self.settings.moves)) > 1:
+            if seconds <= cycle.MIN_STEP and len(set(self.settings.moves)) > 1:
                 return moves + 1
         self.control.elapse(min(until_change, STATE_INTERVAL))
         return moves
@@ -127,7 +127,7 @@ class Warming:
         """Return mean spindle speed (1/min) and mean feed (m/s) since the last call."""
         now = self.now
         seconds = now - self._since
-        means = (self._turned / seconds, self._path / seconds) if seconds > cycle.SHORTEST_STEP else (0.0, 0.0)
+        means = (self._turned / seconds, self._path / seconds) if seconds > cycle.MIN_STEP else (0.0, 0.0)
         self._since, self._turned, self._path = now, 0.0, 0.0
         return means
 
@@ -166,7 +166,7 @@ class Warming:
         recorded_origin, cold = float(done.attrs["clock_origin"]), float(done.attrs["cold_cycle_seconds"])
         if not self.control.identify().simulated:
             self.origin = clock - age(done)
-        elif clock - recorded_origin >= _ends(done)[-1] - cycle.SHORTEST_STEP:
+        elif clock - recorded_origin >= _ends(done)[-1] - cycle.MIN_STEP:
             self.origin = recorded_origin  # the same virtual machine, still running
         else:
             log.info("the virtual machine repeats %d cycles", done.sizes["time"])

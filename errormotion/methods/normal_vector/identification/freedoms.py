@@ -22,7 +22,7 @@ from errormotion.kinematics.iso import DOF
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-FEWEST_BALLS = 3
+MIN_BALLS = 3
 FLAT = 1e-3
 """Largest deviation of balls that count as lying in one line or at one height, relative to their spread."""
 
@@ -84,9 +84,9 @@ def spread(centres: Array) -> float:
 
 def check_layout(centres: Array, names: Sequence[str], tool_axes: str) -> None:
     """Raise MethodError if balls at centres (ball, 3), m, leave errors undetermined that balls can determine."""
-    if len(centres) < FEWEST_BALLS:
+    if len(centres) < MIN_BALLS:
         raise MethodError(
-            f"Expected {FEWEST_BALLS} balls or more on the table, preferably four; found {len(centres)} "
+            f"Expected {MIN_BALLS} balls or more on the table, preferably four; found {len(centres)} "
             f"({', '.join(names) or 'none'}). Set up more balls: they are needed to determine the rotations."
         )
     motion = Motion(tool_axes, centres.mean(axis=0))

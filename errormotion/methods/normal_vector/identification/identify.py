@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 FALSE_ALARM = 1e-3
 """Probability at which touches with the stated noise are reported as noisier."""
 QUANTILE = 0.975
-SMALLEST_SOURCE = 1e-4
+MIN_SOURCE = 1e-4
 """Smallest variance of a common source, relative to the largest one, that is stated separately."""
 
 
@@ -241,7 +241,7 @@ def _sources(estimate: Estimate) -> Array:
     F = np.where(u[..., None] > 0, estimate.shared / np.where(u > 0, u, 1.0)[..., None], 0.0)
     F = np.nan_to_num(F).reshape(-1, F.shape[2])
     values, vectors = np.linalg.eigh(F.T @ F)
-    vectors = vectors[:, values > SMALLEST_SOURCE * max(values[-1], 1e-300)][:, ::-1]
+    vectors = vectors[:, values > MIN_SOURCE * max(values[-1], 1e-300)][:, ::-1]
     return np.moveaxis(estimate.shared @ vectors, 2, 0)
 
 

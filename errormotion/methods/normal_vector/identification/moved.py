@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 FALSE_ALARM = 1e-3
 """Probability at which valid data are excluded."""
-MOST_ITERATIONS = 60
+MAX_ITERATIONS = 60
 AMBIGUITY = 12.0
 """Difference in chi-square from the best gain below which another ball may be the one that moved."""
 OUTLIER_PREFERENCE = 0.95
@@ -94,7 +94,7 @@ def clean(
         The cold cycle, or all others, do not determine the motion.
     """
     wrong, moves = np.zeros(seen.valid.shape, dtype=bool), list[Move]()
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         used = _used(seen, motion)
         found = fit(seen.cycles(used), motion, interpolate=interpolate)
         suspect = _suspect(seen.cycles(used), found, stated, smallest_move) if robust else None
@@ -111,7 +111,7 @@ def clean(
             wrong |= excluded
         seen = seen.without(excluded)
     raise MethodError(
-        f"More than {MOST_ITERATIONS} exclusions of outliers would be needed. Check the mounting of the balls and the "
+        f"More than {MAX_ITERATIONS} exclusions of outliers would be needed. Check the mounting of the balls and the "
         "repeatability of the probe; robust = false gives the residuals."
     )
 

@@ -31,7 +31,7 @@ REDUNDANCY = 4
 """Smallest number of touches beyond the number of unknowns."""
 _ITERATIONS = 20
 _OUTLIER = 5.0  # distance from the other touches, in robust standard deviations
-_MOST_OUTLIERS = 0.1  # fraction of the touches
+_MAX_OUTLIERS = 0.1  # fraction of the touches
 _OVAL = 0.27  # rms of the surface of an ellipsoid over the sphere for one peak to valley
 _SINGULAR = 1e-6  # smallest singular value of the design relative to the largest one
 
@@ -122,7 +122,7 @@ def fit_pretravel(touch: ArrayLike, settings: PretravelSettings) -> PretravelMap
         candidates = _candidates(points[used], contact, settings.highest)
         best = min(candidates, key=lambda each: each.cross_validated)
         worst = _worst(best.left_out_residual)
-        if worst is None or used.sum() <= math.ceil((1 - _MOST_OUTLIERS) * len(points)):
+        if worst is None or used.sum() <= math.ceil((1 - _MAX_OUTLIERS) * len(points)):
             break
         used[np.flatnonzero(used)[worst]] = False
     degrees, orders = terms_up_to(best.highest)

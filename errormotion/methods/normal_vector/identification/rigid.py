@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 CONVERGED = 1e-12
 """Change of the twist, m and rad, at which the iteration ends: far below any noise, above the rounding at 4 m."""
-MOST_ITERATIONS = 25
+MAX_ITERATIONS = 25
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def fit(seen: Observations, motion: Motion, *, interpolate: bool = True) -> Rigi
     time = mean_time(seen) if interpolate else seen.cycle_time
     to_knots = knot_weights(time, seen.time, interpolate)
     twist, anchor = np.zeros((k, 6)), seen.spheres[0] if seen.touched else None
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         previous = twist
         twist, solved, parts = _step(seen, motion, to_knots, twist, anchor)
         change = np.abs(twist - previous).max()
@@ -160,7 +160,7 @@ def fit(seen: Observations, motion: Motion, *, interpolate: bool = True) -> Rigi
             anchor = _spheres(true, seen.valid, anchor)[0]
     else:
         raise MethodError(
-            f"The fit has not converged after {MOST_ITERATIONS} iterations (last change {change:.2g} m or rad). Check "
+            f"The fit has not converged after {MAX_ITERATIONS} iterations (last change {change:.2g} m or rad). Check "
             "that the balls have the same order in every cycle, and that positions are in m."
         )
     return _result(seen, motion, twist, solved, parts, anchor, time)

@@ -12,7 +12,7 @@ from errormotion.arrays import Array
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.identification.rigid import Observations
 
-MOST_ITERATIONS = 12
+MAX_ITERATIONS = 12
 SINGULAR = 1e-6
 """Smallest eigenvalue relative to the largest one below which a matrix counts as singular."""
 
@@ -47,7 +47,7 @@ def centres(seen: Observations, anchor: Array, reach: Array) -> Centres:
         return Centres(centre, _inverse(weight))
     centre = np.broadcast_to(anchor, (len(seen.position), *anchor.shape)).copy()
     cofactor = np.full((*centre.shape, 3), np.nan)
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         away = seen.position - centre[:, :, None]
         length = np.linalg.norm(away, axis=-1)
         normal = away / np.where(length > 0, length, 1.0)[..., None]

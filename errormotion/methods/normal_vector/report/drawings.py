@@ -17,9 +17,9 @@ from errormotion.report.text import SECOND_OF_ARC, UM, finite, fixed, integer, l
 _LONGEST = 0.22  # drawn length of the longest displacement, relative to the diagonal of the balls
 _FAINT, _SOFT = "#c3c8d0", "#6f7680"
 _SHADES = ("#a9c8e4", "#6f9fce", "#2f6fb0", "#12386b")  # quarters of the record, earliest first
-_MOST_CYCLES = 240  # drawn for each ball
-_MOST_DOTS = 600  # residuals drawn for each ball
-_MOST_BALLS = 8  # panels of residuals
+_MAX_CYCLES = 240  # drawn for each ball
+_MAX_DOTS = 600  # residuals drawn for each ball
+_MAX_BALLS = 8  # panels of residuals
 
 
 def balls(seen: Probing, key: str) -> Block:
@@ -109,7 +109,7 @@ def _paths(seen: Probing, cold: np.ndarray, factor: int) -> tuple[list[np.ndarra
     start, span = seen.time[0], max(float(np.ptp(seen.time)), 1e-9)
     for i in range(len(seen.balls)):
         known = np.flatnonzero(seen.well_known[:, i])
-        known = known[np.unique(np.linspace(0, known.size - 1, _MOST_CYCLES).astype(int))] if known.size else known
+        known = known[np.unique(np.linspace(0, known.size - 1, _MAX_CYCLES).astype(int))] if known.size else known
         position = cold[i] + factor * seen.displacement[known, i]
         for a, b, k in zip(position, position[1:], known[1:], strict=False):
             step = np.stack([a, b])
@@ -126,7 +126,7 @@ def residuals(seen: Probing, key: str) -> Block:
     given = np.isfinite(seen.residual)
     if not given.any():
         return Text("The result contains no residuals.", "note")
-    shown = list(range(min(len(seen.balls), _MOST_BALLS)))
+    shown = list(range(min(len(seen.balls), _MAX_BALLS)))
     kept = given & seen.used
     top = 1e6 * finite(np.max, np.abs(seen.residual[kept])) if kept.any() else 1.0
     top = 1.15 * max(top, 2.2e6 * seen.noise if np.isfinite(seen.noise) else 0.0, 1e-3)
@@ -147,7 +147,7 @@ def residuals(seen: Probing, key: str) -> Block:
     marks = ((0, "red bars at the bottom: missing"), (1, "crosses: outliers"), (2, "squares: the ball had moved"))
     words = [word for k, word in marks if out[k]] + (["triangles: cycle not determined"] if out[3] else [])
     legend = f" {'; '.join(words).capitalize()}; at the upper edge if the residual is unknown." if words else ""
-    fewer = f" The first {_MOST_BALLS} of {len(seen.balls)} balls are drawn." if len(seen.balls) > _MOST_BALLS else ""
+    fewer = f" The first {_MAX_BALLS} of {len(seen.balls)} balls are drawn." if len(seen.balls) > _MAX_BALLS else ""
     band = " Band: twice the noise of a touch." if np.isfinite(seen.noise) else ""
     caption = f"Residuals of the {seen.what} by ball over time: measured minus fitted distance.{band}{legend}{fewer}"
     rms = 1e6 * float(np.sqrt(finite(np.mean, seen.residual[kept] ** 2)))
@@ -161,7 +161,7 @@ def _residuals_of(axes: Axes, seen: Probing, ball: int, time: np.ndarray, top: f
     across = time[:, None] + 0.5 * step * ((np.arange(m) + 0.5) / m - 0.5)
     y, kind = 1e6 * seen.residual[:, ball], seen.left_out[:, ball]
     used = np.argwhere(np.isfinite(y) & (kind == 0))
-    used = used[:: -(-len(used) // _MOST_DOTS)] if len(used) > _MOST_DOTS else used
+    used = used[:: -(-len(used) // _MAX_DOTS)] if len(used) > _MAX_DOTS else used
     axes.plot(across[tuple(used.T)], y[tuple(used.T)], ".", color=canvas.BLUE, markersize=3.2, markeredgewidth=0)
     for what, look, colour in (
         (WRONG, "x", canvas.BLACK),

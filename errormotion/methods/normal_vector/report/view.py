@@ -22,7 +22,7 @@ def is_normal_vector(errors: xr.Dataset) -> bool:
     return errors.attrs.get("method") == "normal_vector" and errors["EX"].dims == ("time",)
 
 
-LARGEST_UNCERTAINTY = 5.0
+MAX_UNCERTAINTY = 5.0
 """Uncertainty of a centre, relative to the median of all, above which it is not drawn."""
 
 
@@ -87,7 +87,7 @@ class Probing:
         """Centres with usual uncertainty, (t, ball): with missing touches a centre can be nearly undetermined."""
         worst = np.max(self.centre_u, axis=2) if self.centre_u.size else np.empty(self.displacement.shape[:2])
         known = worst[np.isfinite(worst)]
-        limit = LARGEST_UNCERTAINTY * float(np.median(known)) if known.size else np.inf
+        limit = MAX_UNCERTAINTY * float(np.median(known)) if known.size else np.inf
         measured = np.isfinite(self.displacement).all(axis=2)
         return np.asarray(measured & ~(worst > limit))
 

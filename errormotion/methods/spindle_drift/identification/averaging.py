@@ -36,7 +36,7 @@ _BLOCK = 1 << 17
 """Samples of windows of several lengths that are added up at a time, as numbers of double precision: a megabyte."""
 COMPILED_SIZE = 1 << 32
 """Values from which on the compiled sums are faster, the time to load them included."""
-_LEAST_WINDOW = 0.5
+_MIN_WINDOW = 0.5
 """Share of the last window below which it is ignored: run-out does not average away in a part of it."""
 
 
@@ -219,7 +219,7 @@ class Averager:
         """Return the last window, if it is long enough to average out the run-out."""
         if self._first is not None:
             return _samples_as_windows(*self._first)
-        if not self._samples or self._samples < _LEAST_WINDOW * self._full:
+        if not self._samples or self._samples < _MIN_WINDOW * self._full:
             return self._none()
         last = self._averages(
             self._sum[:, None], self._count[:, None], np.array([self._time]), np.array([self._samples])

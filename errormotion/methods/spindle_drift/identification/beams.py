@@ -31,7 +31,7 @@ UNKNOWNS = 5
 """Origin (3) and the two components of the direction across the beam."""
 _OUTLIER = 6.0
 """Robust standard deviations from which on a reading is an outlier; outliers are ignored and reported."""
-_LEAST_USED = 0.7
+_MIN_USED = 0.7
 """Smallest share of the readings that must not be outliers."""
 
 
@@ -118,9 +118,9 @@ def likelihood_fit(
         if not outlier.any():
             break
         used = used & ~outlier
-        if used.sum() < _LEAST_USED * valid.sum():
+        if used.sum() < _MIN_USED * valid.sum():
             raise MethodError(
-                f"Beam {name}: more than {1 - _LEAST_USED:.0%} of the readings do not fit any beam. Check that the "
+                f"Beam {name}: more than {1 - _MIN_USED:.0%} of the readings do not fit any beam. Check that the "
                 "sphere "
                 "centres belong to the readings."
             )

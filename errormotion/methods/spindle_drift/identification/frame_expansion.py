@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.settings import Settings
 
 
-_MOST_PARTS = 48
+_MAX_PARTS = 48
 """Largest number of parts of a record in each of which the mean noise of the temperature is a source."""
 
 
@@ -159,7 +159,7 @@ def smoothing_sources(
 
     White noise of the measured temperatures has the covariance ``noise^2 S S'`` after smoothing: instants within the
     length of the smoothing share it, more distant ones do not. The noise is split exactly into its means over parts of
-    the record, half as long as the smoothing or longer (at most ``_MOST_PARTS``), each one draw, and the rest. Of the
+    the record, half as long as the smoothing or longer (at most ``_MAX_PARTS``), each one draw, and the rest. Of the
     rest, what the reference state shares with every instant is one more draw. What remains at each instant is shared
     over less than a part or the length of the smoothing, and is stated as independent from instant to instant.
 
@@ -172,7 +172,7 @@ def smoothing_sources(
     """
     if not noise > 0:
         return [], np.zeros(time.size)
-    parts = int(np.clip(np.ceil(np.ptp(time) / max(0.5 * smoothing.length, 1e-9)), 1, _MOST_PARTS))
+    parts = int(np.clip(np.ceil(np.ptp(time) / max(0.5 * smoothing.length, 1e-9)), 1, _MAX_PARTS))
     part = np.minimum(((time - time[0]) / max(float(np.ptp(time)), 1e-9) * parts).astype(int), parts - 1)
     rest = smoothing.weights(np.bincount(reference, minlength=time.size) / reference.size)
     rows = []

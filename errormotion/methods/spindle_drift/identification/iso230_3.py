@@ -41,7 +41,7 @@ LABELS = {"level": ["L1", "L2"], "lateral": ["x", "y"], "quantity": list(QUANTIT
 HOUR = 3600.0
 _SLOPE_SPAN = 600.0
 """Interval before the end of running over which the end slope is taken, s."""
-_LEAST_CHANGE = 0.2
+_MIN_CHANGE = 0.2
 """Smallest change of temperature for a value per kelvin, K."""
 
 
@@ -175,7 +175,7 @@ def evaluate(
             value[k, 7], uncertainty[k, 7], influence[:, k, 7] = found
         if change is not None:
             warm = running[np.isfinite(change[running])]
-            if warm.size > 10 and np.ptp(change[warm]) > _LEAST_CHANGE:
+            if warm.size > 10 and np.ptp(change[warm]) > _MIN_CHANGE:
                 found = series.weighted(k, warm, _slope_weights(change[warm]))
                 value[k, 8], uncertainty[k, 8], influence[:, k, 8] = found
     test = "ETVE (spindle still)" if still else "rotating spindle" if turning else "spindle speed not recorded"

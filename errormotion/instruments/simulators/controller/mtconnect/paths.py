@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element
 _STEP = re.compile(r"(//?)(\*|[A-Za-z_][\w.:-]*)")
 _TEST = re.compile(r"""\s*@([A-Za-z_][\w:-]*)\s*=\s*(?:"([^"]*)"|'([^']*)')\s*""")
 _WORD = re.compile(r"(and|or)\b")
-LONGEST_PATH = 4096
+MAX_PATH = 4096
 
 Test = Callable[[Element], bool]
 
@@ -26,7 +26,7 @@ def select(root: Element, path: str) -> list[Element]:
     PathError
         The path cannot be read.
     """
-    if len(path) > LONGEST_PATH:
+    if len(path) > MAX_PATH:
         raise PathError(path)
     found: dict[int, Element] = {}
     for alternative in path.split("|"):

@@ -26,7 +26,7 @@ NAMESPACE = "SinumerikVarProvider"
 INDEX = 2
 """Index of the namespace of the variables."""
 R_PARAMETERS = 100
-LONGEST_ID = 200
+MAX_ID = 200
 """Largest number of characters of an id."""
 _ID = re.compile(r"(/\w+/\w+/\w+)(?:\[u(\d{1,4})(?:, ?(\d{1,4})(?:, ?(#?)(\d{1,4}))?)?\])?", re.ASCII)
 _MODES = {"manual": 0, "mdi": 1, "automatic": 2}
@@ -100,7 +100,7 @@ def add(space: Space, machine: Machine) -> None:
 def value(machine: Machine, node: ua.NodeId) -> ua.DataValue | None:
     """Return the value of a variable by its id; None if the id is not that of a variable."""
     identifier = node.Identifier
-    if node.NamespaceIndex != INDEX or not isinstance(identifier, str) or len(identifier) > LONGEST_ID:
+    if node.NamespaceIndex != INDEX or not isinstance(identifier, str) or len(identifier) > MAX_ID:
         return None
     found = _ID.fullmatch(identifier)
     if found is None or found[1] not in VARIABLES:

@@ -51,7 +51,7 @@ class Block:
     check: Check = field(default=lambda _: Status.OK)
 
 
-MOST_POINTS = 10_000_000  # (a)
+MAX_POINTS = 10_000_000  # (a)
 SHORTEST, LONGEST = 500, 100_000  # ms, of a stationary measurement (a)
 
 
@@ -70,7 +70,7 @@ def blocks(*, newest: bool) -> dict[int, Block]:
 
     points = [0, 0, 0]
     sphere = [0.01, 50, 0, 0.0]
-    sphere_check = together(within(0, 1e-6, 100.0), within(1, 0, MOST_POINTS), flags(2), within(3, 0.0, 100.0))
+    sphere_check = together(within(0, 1e-6, 100.0), within(1, 0, MAX_POINTS), flags(2), within(3, 0.0, 100.0))
     named: dict[str, Block] = {
         "SetTemperatureRange": Block("GetTemperatureRange", Event.TEMPERATURE_RANGE, [1], among(0, 3)),
         "SetStationOrientationParams": Block("GetStationOrientationParams", Event.ORIENTATION, [0.0] * 6),
@@ -88,13 +88,13 @@ def blocks(*, newest: bool) -> dict[int, Block]:
             "GetContinuousTimeModeParams",
             Event.CONTINUOUS_TIME,
             [10, *points],
-            together(within(0, 1, 99_999), within(1, 0, MOST_POINTS), region(2)),
+            together(within(0, 1, 99_999), within(1, 0, MAX_POINTS), region(2)),
         ),
         "SetContinuousDistanceModeParams": Block(
             "GetContinuousDistanceModeParams",
             Event.CONTINUOUS_DISTANCE,
             [0.01, *points],
-            together(within(0, 1e-6, 100.0), within(1, 0, MOST_POINTS), region(2)),
+            together(within(0, 1e-6, 100.0), within(1, 0, MAX_POINTS), region(2)),
         ),
         "SetSphereCenterModeParams": Block(
             "GetSphereCenterModeParams", Event.SPHERE_CENTRE, list(sphere), sphere_check
@@ -106,7 +106,7 @@ def blocks(*, newest: bool) -> dict[int, Block]:
             "GetGridModeParams",
             Event.GRID,
             [(0.01, 0.01, 0.01), *points],
-            together(within(1, 0, MOST_POINTS), region(2)),
+            together(within(1, 0, MAX_POINTS), region(2)),
         ),
         "SetSearchParams": Block(
             "GetSearchParams", Event.SEARCH, [0.05, 10_000], together(within(0, 1e-6, 10.0), within(1, 1, 10**7))

@@ -27,7 +27,7 @@ DURATIONS = {3: 0.8, 6: 0.3, 7: 0.3, 8: 0.3, 9: 0.15, 13: 7.0}
 DURATION = 2.4
 EXCHANGE = 0.05
 """Duration of a call without waiting, s."""
-LONGEST_WAIT = 60_000
+MAX_WAIT = 60_000
 """Longest waiting time of a call, ms, whatever is requested (assumed)."""
 ACCURACY = 2.4e-6
 """Stated standard deviation of angles and inclinations, rad."""
@@ -94,7 +94,7 @@ class Measuring:
             return self._distance
         if self._ready is None:
             return self._distance
-        limit = max(min(milliseconds, LONGEST_WAIT) / 1000.0, EXCHANGE)
+        limit = max(min(milliseconds, MAX_WAIT) / 1000.0, EXCHANGE)
         missing = max(0.0, self._ready - self.world.time)
         self._pass(min(missing, limit))
         if missing > limit and not self.world.streaming:
@@ -141,7 +141,7 @@ class Measuring:
             self.TMC_DoMeasure({2: DEFAULT, 3: TRACK, 4: RAPID}[mode], 1)
         if mode == 1:
             return (*self.telescope.direction(), 0.0)
-        found = self._measured(LONGEST_WAIT, 1)
+        found = self._measured(MAX_WAIT, 1)
         if self.warning == Code.TMC_DIST_ERROR:
             raise RefusedError(Code.TMC_DIST_ERROR)
         return found
@@ -159,7 +159,7 @@ class Measuring:
         """Return directions and a distance that is measured at once, by tracking."""
         if self._ready is None or not self._continuous:
             self.TMC_DoMeasure(RAPID, 1)
-        return self._measured(LONGEST_WAIT, 1)
+        return self._measured(MAX_WAIT, 1)
 
     def EDM_IsContMeasActive(self, kind: int) -> int:
         """Whether a continuous measurement is running: of a signal (1), frequency (2), distances (3) or any (4)."""

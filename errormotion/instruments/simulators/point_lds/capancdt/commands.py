@@ -23,7 +23,7 @@ FIRMWARE = 8010079
 SENSOR_ORDER_NUMBER = 6610051
 AVERAGING_NUMBERS = range(2, 9)
 LINEARISATION_POINTS = 10
-LEAST_PORT, HIGHEST_PORT = 1024, 65535
+MIN_PORT, MAX_PORT = 1024, 65535
 
 _WHOLE = re.compile(r"\d{1,9}")
 _CHANNEL = re.compile(r"([1-4])")
@@ -259,7 +259,7 @@ def _data_port(controller: Controller, text: str) -> str:
 
 
 def _set_data_port(_: Controller, text: str) -> str:
-    _whole(text, LEAST_PORT, HIGHEST_PORT)
+    _whole(text, MIN_PORT, MAX_PORT)
     return OK
 
 

@@ -33,7 +33,7 @@ Array = np.ndarray[Any, Any]
 LINE_END = b"\r\n"
 ENDS = b"\r\n"
 GREETING = "DT6220"
-LONGEST_COMMAND = 255
+MAX_COMMAND = 255
 TIME_LIMIT = 10.0
 """Time limit for the end of a command after its last character, s."""
 ANSWER_DELAY = 0.02
@@ -129,7 +129,7 @@ class SimulatedCapaNCDT(DataPortDevice):
             if character == b"$":
                 self._buffer = character  # preceding characters are ignored
             elif self._buffer:
-                self._buffer = (self._buffer + character)[: LONGEST_COMMAND + 1]
+                self._buffer = (self._buffer + character)[: MAX_COMMAND + 1]
         if self._buffer.startswith(b"$"):
             self._timer = threading.Timer(self._time_limit, self._time_out)
             self._timer.daemon = True

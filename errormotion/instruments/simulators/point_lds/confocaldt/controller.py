@@ -22,7 +22,7 @@ from errormotion.instruments.simulators.point_lds.confocaldt.values import (
     states,
 )
 from errormotion.instruments.simulators.point_lds.data_port import BeamStream, DataPortDevice
-from errormotion.instruments.simulators.point_lds.optoncdt.console import LINE_END, LONGEST_PARAMETER, ConsoleDevice
+from errormotion.instruments.simulators.point_lds.optoncdt.console import LINE_END, MAX_PARAMETER, ConsoleDevice
 from errormotion.instruments.simulators.point_lds.optoncdt.grammar import RefusalError
 from errormotion.instruments.transports import Address
 
@@ -58,7 +58,7 @@ class SimulatedConfocal(ConsoleDevice, DataPortDevice):
 
     _commands = COMMANDS
     _errors = ERRORS
-    longest_parameter = LONGEST_PARAMETER
+    longest_parameter = MAX_PARAMETER
 
     def __init__(self, address: Address) -> None:
         self._stream: _Values | None = None

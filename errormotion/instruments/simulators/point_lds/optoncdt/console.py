@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.device import SimulatedDevice
-from errormotion.instruments.simulators.point_lds.optoncdt.grammar import LONGEST_LINE, Command, RefusalError, split
+from errormotion.instruments.simulators.point_lds.optoncdt.grammar import MAX_LINE, Command, RefusalError, split
 from errormotion.instruments.transports import Address
 
 LINE_END = b"\n"
 PROMPT = b"->"
-LONGEST_PARAMETER = 31
+MAX_PARAMETER = 31
 
 
 class ConsoleDevice(SimulatedDevice):
@@ -23,7 +23,7 @@ class ConsoleDevice(SimulatedDevice):
 
     _commands: Mapping[str, Command]
     _errors: Mapping[str, str]
-    longest_parameter = LONGEST_LINE
+    longest_parameter = MAX_LINE
 
     def _set_up_console(self, address: Address) -> None:
         self._password = address.params.get("password", "000")
@@ -48,7 +48,7 @@ class ConsoleDevice(SimulatedDevice):
 
     def _on_data(self, data: bytes) -> None:
         super()._on_data(data)
-        if len(self._buffer) > LONGEST_LINE:  # without a line end
+        if len(self._buffer) > MAX_LINE:  # without a line end
             self._buffer = b""
             self.reply(self._errors["long"].encode() + b"\r\n" + PROMPT)
 
@@ -63,7 +63,7 @@ class ConsoleDevice(SimulatedDevice):
 
     def _text(self, line: str) -> str:
         errors = self._errors
-        if len(line) > LONGEST_LINE:
+        if len(line) > MAX_LINE:
             return errors["long"]
         if not (line.isascii() and line.isprintable()):
             return errors.get("character", errors["command"])
@@ -116,6 +116,6 @@ class ConsoleDevice(SimulatedDevice):
             raise RefusalError("access")
         if new != again:
             raise RefusalError("passwords")
-        if len(new) > LONGEST_PARAMETER:
+        if len(new) > MAX_PARAMETER:
             raise RefusalError("long")
         self._password = new

@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-LONGEST_LINE = 255
+MAX_LINE = 255
 """Characters of a command line; assumption."""
 
 _WORD = re.compile(r'"([^"]*)"|(\S+)')

@@ -58,7 +58,7 @@ class Settings(BaseModel):
     order: int | None = Field(
         default=None,
         ge=0,
-        le=inclination_surface.HIGHEST_ORDER,
+        le=inclination_surface.MAX_ORDER,
         description="order of the polynomial; default: chosen from the data",
     )
     mirror: bool | None = Field(
@@ -129,7 +129,7 @@ def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.boo
     different = len(np.unique(np.round(q, 6), axis=0))
     fits = [
         order
-        for order in range(inclination_surface.HIGHEST_ORDER + 1)
+        for order in range(inclination_surface.MAX_ORDER + 1)
         if len(inclination_surface.degrees_to(order, bool(settings.mirror))) < different
     ]
     if different < _MIN_TILTS:

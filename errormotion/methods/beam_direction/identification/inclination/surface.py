@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import terms
 
-HIGHEST_ORDER = 12
+MAX_ORDER = 12
 EXTRA_DEGREES = 3
 """Degrees in the fit above the highest order."""
 
@@ -116,7 +116,7 @@ def fit_surface(
         Whether k is even in x2; default: if its predictions are no worse, and there are settings on both sides.
     """
     both_sides = bool((x[:, 1] > _ON_LINE).any() and (x[:, 1] < -_ON_LINE).any())
-    last = HIGHEST_ORDER + EXTRA_DEGREES if order is None else order
+    last = MAX_ORDER + EXTRA_DEGREES if order is None else order
     problem = _Problem.of(x, slope, variance, degrees_to(last, both_sides if mirror is None else mirror))
     points, weights = problem.thinned().grid()
     prediction = problem.predict(points[0])

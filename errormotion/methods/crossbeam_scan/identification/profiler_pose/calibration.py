@@ -30,7 +30,7 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose.edges impor
 
 #: a, b, g (rad), dx, dy, dz (m)
 PARAMETERS = ("a", "b", "g", "dx", "dy", "dz")
-_FEWEST_LINES = 10
+_MIN_LINES = 10
 #: Smallest accepted |cos| of the angle of an edge point, seen from the centre: other lines cross the rim too obliquely.
 OBLIQUE = 0.35
 #: Half differences and half sums of the edges' radii beyond this many standard deviations are excluded. The scatter of
@@ -218,7 +218,7 @@ class _Fit:
         used = self._rim(p, pose(*p[:6]))[2] > OBLIQUE
         fitted = used
         for _ in range(4):
-            if (lines := int(used.sum())) < _FEWEST_LINES:
+            if (lines := int(used.sum())) < _MIN_LINES:
                 raise MethodError(f"Ten lines across the pocket must fit one circle; {lines} do.")
             solution = least_squares(self._residuals, p / _UNIT, args=(used,), method="lm")
             p, fitted = solution.x * _UNIT, used

@@ -29,7 +29,7 @@ LARGEST = 1.0
 """Largest size of an artefact, m; larger numbers are taken for millimetres."""
 COMPILED_FROM = 60_000_000
 """Points of a campaign from which loops are compiled: less than these take less time than to compile them."""
-FEWEST_BLOCKS = 8
+MIN_BLOCKS = 8
 BESIDE_HOLE = 3.0
 """Factor on the variance of blocks next to a hole, because the filled heights are not measured."""
 THIN = 4
@@ -157,15 +157,15 @@ def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike, scans: int = 1) -> Bl
             "give z[row, column] with one y for every profile and one x for every point of a profile"
         )
     rows, columns = z.shape[0] // ROWS, z.shape[1] // COLUMNS
-    if min(rows, columns) < FEWEST_BLOCKS:
+    if min(rows, columns) < MIN_BLOCKS:
         raise MethodError(
-            f"expected at least {FEWEST_BLOCKS * ROWS} profiles of {FEWEST_BLOCKS * COLUMNS} points, found "
+            f"expected at least {MIN_BLOCKS * ROWS} profiles of {MIN_BLOCKS * COLUMNS} points, found "
             f"{z.shape[0]} of {z.shape[1]}; scan a longer piece of the artefact"
         )
     xc, dx = _centres("x", x, columns, COLUMNS, 0.01)
     yc, dy = _centres("y", y, rows, ROWS, 1.0)
     scales = _block_scales(z, dx[0], dy, max(1, rows * columns // _SAMPLED))
-    if scales.size < FEWEST_BLOCKS:
+    if scales.size < MIN_BLOCKS:
         raise MethodError(
             f"expected a surface, found heights in {np.isfinite(z).mean():.1%} of the points and nowhere "
             f"{FEWEST} of {POINTS} neighbours together; check the sensor's range and exposure"
@@ -214,7 +214,7 @@ def _deblurred(
     mean, sx, sy, gain = out[0], out[1], out[2], out[5]
     pitch_x, pitch_y = x[1] - x[0], y[1] - y[0]
     known = np.isfinite(mean)
-    if np.count_nonzero(known) < FEWEST_BLOCKS:
+    if np.count_nonzero(known) < MIN_BLOCKS:
         raise MethodError(
             "expected a smooth surface, found none: no plane explains the blocks of 16 x 4 points; "
             "check that heights are in metres and that the scan is of the artefact"

@@ -22,7 +22,7 @@ MOTIONS[[0, 1, 2], [0, 1, 2], 0] = 1.0
 MOTIONS[[3, 4, 5], [2, 0, 1], [2, 3, 1]] = 1.0
 MOTIONS[[3, 4, 5], [1, 2, 0], [3, 1, 2]] = -1.0
 
-LEAST_SLOPE = 2e-3
+MIN_SLOPE = 2e-3
 """A motion that changes the heights by less than this share of its size (root mean square) is not determined."""
 _SHAPES = {1: "a surface of revolution or of straight rulings", 2: "a cylinder", 3: "a plane or a sphere"}
 
@@ -80,7 +80,7 @@ class Moments:
 def undetermined(information: Array, scale: Array, blocks: int) -> tuple[Array, Array]:
     """Return eigenvalues and scaled vectors (columns) of the motions that an information leaves undetermined."""
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale) / blocks)
-    return values, vectors[:, values < LEAST_SLOPE**2]
+    return values, vectors[:, values < MIN_SLOPE**2]
 
 
 def freedoms(information: Array, blocks: int, noise: Array | None = None, radius: float | None = None) -> Freedoms:

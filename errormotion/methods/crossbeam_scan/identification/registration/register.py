@@ -33,11 +33,11 @@ Backend = Literal["height_map", "open3d_plane", "paper"]
 
 GATE = 5.0
 """Blocks with residuals beyond this many robust standard deviations are excluded as outliers."""
-LARGEST_SHIFT, LARGEST_TURN = 4e-3, 0.1
+MAX_SHIFT, MAX_TURN = 4e-3, 0.1
 """Largest motion, m and rad: twice the range of the start."""
-LEAST_OVERLAP = 0.5
+MIN_OVERLAP = 0.5
 """Share of the warm blocks that must overlap the cold surface."""
-LARGEST_MISFIT = 0.02
+MAX_MISFIT = 0.02
 """Residuals beyond this share of the relief indicate two different artefacts."""
 NOISY = 10.0
 """Information is used beyond this many times the expected contribution of noise of the slopes."""
@@ -189,7 +189,7 @@ def _start(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
             f"expected two scans of one position, found the cold one at {_extent(cold)} and the warm one at "
             f"{_extent(warm)}; start both at the same position, and count positions from the same zero"
         )
-    if not start.scale < noise and not start.scale < LARGEST_MISFIT * (relief := _relief(cold)):
+    if not start.scale < noise and not start.scale < MAX_MISFIT * (relief := _relief(cold)):
         raise MethodError(
             f"expected two scans of one artefact moved by at most 2 mm and 0.05 rad, found surfaces that stay "
             f"{start.scale * 1e6:.1f} um apart (relief {relief * 1e6:.0f} um) after registration; "
@@ -197,14 +197,14 @@ def _start(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
         )
     M = start.state.matrix
     shift, turn = M[:, :3] @ cold.centre + M[:, 3] - cold.centre, start.state.turn
-    if np.hypot(*shift[:2]) > LARGEST_SHIFT or turn > LARGEST_TURN:
+    if np.hypot(*shift[:2]) > MAX_SHIFT or turn > MAX_TURN:
         raise MethodError(
             f"expected a motion of at most 2 mm and 0.05 rad, found {np.hypot(*shift[:2]) * 1e3:.2f} mm across and "
             f"{turn:.3f} rad; start both scans at the same position of the artefact"
         )
-    if start.overlap < LEAST_OVERLAP:
+    if start.overlap < MIN_OVERLAP:
         raise MethodError(
-            f"expected at least {LEAST_OVERLAP:.0%} of the warm scan to lie on the cold one, found {start.overlap:.0%}"
+            f"expected at least {MIN_OVERLAP:.0%} of the warm scan to lie on the cold one, found {start.overlap:.0%}"
             "; scan the same piece of the artefact"
         )
     return start
