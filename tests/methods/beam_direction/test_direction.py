@@ -202,8 +202,8 @@ def test_bound_refuses_planes_that_do_not_determine_the_direction():
 
 
 def test_stated_uncertainty_is_correct_with_one_less_accurate_plane():
-    # The third plane has a tenth of the stroke: its gradient is ten times as uncertain, and counts less.
-    short = STAGE / 10
+    # The third plane has a fortieth of the stroke; if it counted as the others, the mean would be about 8.
+    short = STAGE / 40
     stages = [STAGE, STAGE, short]
     basis = across(U)
     limit = basis @ bound(stages, THREE, U, NOISE) @ basis.T
