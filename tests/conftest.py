@@ -36,8 +36,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Use three workers for each processor: many tests wait for a device that is late, silent or slow on purpose."""
-    return 3 * (os.cpu_count() or 1)
+    """Use two workers for each processor: many tests wait for a device that is late, silent or slow on purpose.
+
+    Slow tests compute more; without them a third worker is of use.
+    """
+    return (3 if config.option.markexpr == "not slow" else 2) * (os.cpu_count() or 1)
 
 
 class _ByFile(LoadFileScheduling):  # type: ignore[misc]

@@ -41,8 +41,11 @@ def undisturbed(kinds: Kinds) -> Path:
 def test_run_survives(kinds: Kinds, kind: str) -> None:
     if kind in ("disk", "clock_between") and not kinds.shimmed:
         pytest.skip("no C compiler makes disk and clocks fail")
-    result = getattr(kinds, kind)(0)
-    assert result.faults == []
+    for number in range(4):  # a busy computer may kill a run only after its end, when there is nothing to resume
+        result = getattr(kinds, kind)(number)
+        assert result.faults == []
+        if result.different is not None:
+            break
     assert result.different == []
 
 
