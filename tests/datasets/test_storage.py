@@ -233,6 +233,14 @@ def test_a_limit_of_the_system_is_reported(errors, tmp_path) -> None:
     assert names(tmp_path) == []
 
 
+def test_a_truncated_chunk_is_named(tmp_path) -> None:
+    path = save(xr.Dataset({"values": ("x", np.arange(1000.0))}), tmp_path / "raw.zarr")
+    [chunk] = (file for file in (path / "values" / "c").rglob("*") if file.is_file())
+    os.truncate(chunk, 3)
+    with pytest.raises(DatasetError, match=r"'values': c/0: expected a chunk .* truncated or damaged: copy the folder"):
+        load(path)
+
+
 def test_chunks_written_after_a_failed_one_do_not_create_the_folder_again(tmp_path) -> None:
     resource = pytest.importorskip("resource", reason="limits of a process are a matter of Unix")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -222,8 +222,12 @@ def _wrong_chunks(folder: Path, metadata: Mapping[str, Any], size: int) -> Itera
         with open(file, "rb") as chunk:
             head = chunk.read(18)
         stated = _blosc_size(head) if packed == "blosc" else _zstd_size(head)
-        if stated is None or stated > largest:
-            yield f"{Path(file).relative_to(folder)}: expected a chunk of at most {largest} bytes; it states {stated}"
+        name = Path(file).relative_to(folder)
+        if stated is None:
+            yield f"{name}: expected a chunk that states its size; it is truncated or damaged: copy the folder again"
+            return
+        if stated > largest:
+            yield f"{name}: expected a chunk of at most {largest} bytes; it states {stated}"
             return
 
 
