@@ -10,7 +10,8 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -137,6 +138,16 @@ class Machine:
         before = json.loads(announced.read_text())["pid"]
         os.kill(before, signal.SIGKILL)
         until(lambda: announced.exists() and json.loads(announced.read_text())["pid"] != before)
+
+    @contextmanager
+    def suspended_bridge(self) -> Iterator[None]:
+        """Stop the bridge for a while."""
+        pid = json.loads((self.process.folder / "announced.json").read_text())["pid"]
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            os.kill(pid, signal.SIGCONT)
 
     def rest(self) -> None:
         """Switch on, at the start, without an offset."""

@@ -405,7 +405,7 @@ class Offsets:
             self.hal.set_p("errormotion-sign.in0", str(int(not self._get("errormotion-sign.in0"))))
 
     def hold(self) -> None:
-        """Hold the offset for the next half second, while a thread is cut."""
+        """Hold the offset for the next 3 s, while a thread is cut."""
         self.hal.set_p("errormotion-thread.in", str(int(not self._get("errormotion-thread.in"))))
 
     def spindle_leads(self) -> bool:

@@ -79,7 +79,7 @@ proc errormotion_guard {} {
         setp errormotion-$each.retriggerable 1
     }
     setp errormotion-alive.width [errormotion_setting WATCHDOG]
-    setp errormotion-thread.width 0.5
+    setp errormotion-thread.width 3
     net errormotion-sign errormotion-sign.out => errormotion-alive.in
     net errormotion-is-alive errormotion-alive.out => errormotion-fresh.in0
     errormotion_join_pin motion.motion-enabled errormotion-on.in0
@@ -95,7 +95,7 @@ proc errormotion_guard {} {
     net errormotion-is-asked errormotion-asked.out => errormotion-fresh.in1
     net errormotion-is-fresh errormotion-fresh.out => errormotion-ready.in0
 
-    # Hold while the machine probes (motion type 5), while a thread is cut (and 0.5 s after the last change of
+    # Hold while the machine probes (motion type 5), while a thread is cut (and 3 s after the last change of
     # errormotion-thread.in, by the bridge), and while the pin HOLD is true; only while the machine is on.
     errormotion_join_pin motion.motion-type errormotion-motion.sel
     net errormotion-probes errormotion-motion.out5 => errormotion-hold-1.in0
