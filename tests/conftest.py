@@ -36,19 +36,38 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Use two workers for each processor: many tests wait for a device that is late, silent or slow on purpose.
+    """Use three workers for each processor: two that compute, and one for tests that wait for devices."""
+    return 3 * (os.cpu_count() or 1)
 
-    Slow tests compute more; without them a third worker is of use.
-    """
-    return (3 if config.option.markexpr == "not slow" else 2) * (os.cpu_count() or 1)
+
+WAITING = (
+    *("linuxcnc", "test_builtin_instruments", "test_virtual_probing"),
+    *("tests/instruments/", "test_wire_checks", "tests/faults/"),
+)
+"""Parts of the names of files whose tests mostly wait for a device that is late, silent or slow; the longest first."""
+
+
+def _waiting(file: str) -> int:
+    return next((k for k, name in enumerate(WAITING) if name in file), len(WAITING))
 
 
 class _ByFile(LoadFileScheduling):  # type: ignore[misc]
-    """Gives whole files to the workers, and all tests that start LinuxCNC to one: a computer runs one at a time."""
+    """Gives whole files to the workers, and all tests that start LinuxCNC to one: a computer runs one at a time.
+
+    Every third worker takes files that wait, the others files that compute; a worker that has no more of its own takes
+    any. The processors are busy, and no test waits long for one.
+    """
 
     def _split_scope(self, nodeid: str) -> str:
         file: str = super()._split_scope(nodeid)
         return "linuxcnc" if "linuxcnc" in file or "[linuxcnc" in nodeid else file
+
+    def _assign_work_unit(self, node: Any) -> None:
+        waits = int(node.gateway.id.removeprefix("gw")) % 3 == 2
+        own = next((file for file in self.workqueue if (_waiting(file) < len(WAITING)) == waits), None)
+        if own is not None:
+            self.workqueue.move_to_end(own, last=False)
+        super()._assign_work_unit(node)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
@@ -56,19 +75,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
     return _ByFile(config, log)
 
 
-LONGEST = ("linuxcnc", "test_builtin_instruments", "test_virtual_probing", "test_wire_checks", "test_docs")
-"""Names of the files that take longest, with or without slow tests: a minute and more, most of it waiting."""
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the longest files, then those of slow tests, so that no worker has a long file at the end."""
+    """Begin with the longest of the files that wait, and with slow tests: no worker has a long file at the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-
-    def place(item: pytest.Item) -> tuple[int, bool]:
-        file = item.nodeid.partition("::")[0]
-        return next((k for k, name in enumerate(LONGEST) if name in file), len(LONGEST)), item.path not in slow
-
-    items.sort(key=place)
+    items.sort(key=lambda item: (_waiting(item.nodeid.partition("::")[0]), item.path not in slow))
 
 
 def pytest_collection_finish() -> None:
