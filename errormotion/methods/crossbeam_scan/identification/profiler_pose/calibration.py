@@ -183,7 +183,8 @@ class _Scan:
 
     edges: Array
     stage: Array  # (n, 3) of the lines of the edges
-    plate: Array  # z of the plate at x = 0, per line
+    level: float  # z of the plate at x = 0, and its standard uncertainty
+    level_u: float
     lift: float
     tilt: Tilt
 
@@ -194,7 +195,8 @@ def _scan(x: Array, height: Array, stage: Array) -> _Scan:
     # The carriage moves straight and the plate is level: the height of the rim is the mean over all lines.
     z = heights.mean() + plate.slope * rim.x
     positions = np.stack([rim.x, np.zeros_like(z), z], axis=-1)
-    return _Scan(positions, stage[rim.line], heights, float(stage[0, 2]), plate)
+    level, level_u = float(heights.mean()), float(heights.std(ddof=1) / np.sqrt(heights.size))
+    return _Scan(positions, stage[rim.line], level, level_u, float(stage[0, 2]), plate)
 
 
 class _Fit:
@@ -220,7 +222,7 @@ class _Fit:
         for _ in range(4):
             if (lines := int(used.sum())) < _MIN_LINES:
                 raise MethodError(f"Ten lines across the pocket must fit one circle; {lines} do.")
-            solution = least_squares(self._residuals, p / _UNIT, args=(used,), method="lm")
+            solution = least_squares(self._residuals, p / _UNIT, jac=self._jacobian, args=(used,), method="lm")
             p, fitted = solution.x * _UNIT, used
             used = self._weigh(p, used)
         lines = int(fitted.sum())
@@ -233,30 +235,43 @@ class _Fit:
         return np.array([0.0, b, 0.0, *-middle, self.pocket.radius])
 
     def _rim(self, p: Array, H: RigidTransform) -> tuple[Array, Array, Array, Array]:
-        """Return half sum and half difference of the radii less r, m, and |cos|, |sin| of the edges, (n,) each."""
-        P = H.apply(self.edges.reshape(-1, 3)).reshape(self.edges.shape) + self.shift
-        R = np.hypot(P[..., 0], P[..., 1])
-        cos, sin = np.abs(P[..., 0] / R).min(axis=1), np.abs((P[..., 1] / R).mean(axis=1))
-        return R.mean(axis=1) - p[6], (R[:, 1] - R[:, 0]) / 2, cos, sin
+        """Return half sum and half difference of the radii less r, m, and |cos|, |sin| of the edges, (..., n) each."""
+        x, z, rows = self.edges[..., 0], self.edges[..., 2], H.as_matrix()[..., None, None]
+        X, Y = (
+            rows[..., k, 0, :, :] * x + rows[..., k, 2, :, :] * z + rows[..., k, 3, :, :] + self.shift[..., k]
+            for k in (0, 1)
+        )
+        radius = np.hypot(X, Y)
+        (left, right), (cos, other_cos), (sin, other_sin) = (
+            np.moveaxis(values, -1, 0) for values in (radius, np.abs(X / radius), Y / radius)
+        )
+        half_sum = (left + right) / 2 - p[..., 6, None]
+        return half_sum, (right - left) / 2, np.minimum(cos, other_cos), np.abs((sin + other_sin) / 2)
 
     def _residuals(self, scaled: Array, used: NDArray[np.bool_]) -> Array:
-        """Return all residuals divided by their standard deviations."""
+        """Return all residuals (..., n) divided by their standard deviations, for scaled parameters (..., 7)."""
         p = scaled * _UNIT
-        H = pose(*p[:6])
+        H = pose(*np.moveaxis(p[..., :6], -1, 0))
         half_sum, half_difference, cos, sin = self._rim(p, H)
         size = cos * self.size_x / np.sqrt(2)
-        rows = [(half_sum / np.hypot(size, sin * self.size_y))[used], (half_difference / size)[used]]
-        rows.append(np.array([(p[6] - self.pocket.radius) / max(self.pocket.radius_uncertainty, 1e-9)]))
+        rows = [(half_sum / np.hypot(size, sin * self.size_y))[..., used], (half_difference / size)[..., used]]
+        misses = [(p[..., 6] - self.pocket.radius) / max(self.pocket.radius_uncertainty, 1e-9)]
         R = H.rotation.as_matrix()
         for scan in self.scans:
-            Z = R[2, 2] * scan.plate.mean() + H.translation[2] + scan.lift - self.centre[2]  # at x = 0
-            size_Z = scan.plate.std(ddof=1) / np.sqrt(scan.plate.size)
-            slope = -R[2, 0] / R[2, 2]
-            misses = Z / max(size_Z, 1e-9), (scan.tilt.slope - slope) / max(scan.tilt.uncertainty, 1e-9)
-            rows.append(np.array(misses))
+            Z = R[..., 2, 2] * scan.level + p[..., 5] + scan.lift - self.centre[2]  # at x = 0
+            slope = -R[..., 2, 0] / R[..., 2, 2]
+            misses += [Z / max(scan.level_u, 1e-9), (scan.tilt.slope - slope) / max(scan.tilt.uncertainty, 1e-9)]
+        rows.append(np.stack(misses, axis=-1))
         if self.angle_prior is not None:
-            rows.append(p[:3] / self.angle_prior)
-        return np.concatenate(rows)
+            rows.append(p[..., :3] / self.angle_prior)
+        return np.concatenate(rows, axis=-1)
+
+    def _jacobian(self, scaled: Array, used: NDArray[np.bool_]) -> Array:
+        """Return the derivatives (n, 7) of the residuals: differences for all parameters at once."""
+        step = np.copysign(np.sqrt(np.finfo(float).eps) * np.maximum(np.abs(scaled), 1.0), scaled)
+        ends = scaled + np.diag(step)
+        here, *there = self._residuals(np.stack([scaled, *ends]), used)
+        return np.asarray((np.stack(there) - here).T / (np.diag(ends) - scaled))
 
     def _weigh(self, p: Array, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Estimate both scatters from the residuals; return the lines within `CLIP`."""

@@ -82,7 +82,7 @@ def identify_pose(raw: xr.Dataset, settings: Settings, method: str, version: str
 
 
 def _deviation(pose: RigidTransform, nominal: RigidTransform) -> np.ndarray:
-    """Return the twist (6,) from the nominal pose to another, at the nominal position."""
+    """Return the twist (..., 6) from the nominal pose to another, at the nominal position."""
     return displacement(pose * nominal.inv(), nominal.translation)
 
 
@@ -93,5 +93,5 @@ def _sensitivity(p: np.ndarray, nominal: RigidTransform) -> np.ndarray:
     rotation vector, so that an angle known to 20 urad affects one that is known to 0.1 urad.
     """
     steps = 1e-6 * np.eye(6)
-    ends = [[_deviation(calibration.pose(*(p + sign * step)), nominal) for sign in (1, -1)] for step in steps]
-    return np.array([(up - down) / 2e-6 for up, down in ends])
+    up, down = (_deviation(calibration.pose(*ends.T), nominal) for ends in (p + steps, p - steps))
+    return np.asarray((up - down) / 2e-6)
