@@ -3,6 +3,8 @@
 import re
 from typing import Any
 
+from docutils import nodes
+from sphinx import addnodes
 from sphinx.application import Sphinx
 
 import errormotion
@@ -41,6 +43,35 @@ def _escape_second_dims(*event: Any) -> None:
         lines[i] = "``".join(parts)
 
 
+def _make_navigation_of_titles(app: Sphinx, *event: Any) -> None:
+    """Let Sphinx copy only titles into the navigation of each page, not all objects, which it removes again."""
+    context = event[2]
+    if "toctree" not in context:
+        return
+    env, toctree = app.env, context["toctree"]
+    if not hasattr(env, "titles_only"):
+        env.titles_only = {name: _title_only(contents) for name, contents in env.tocs.items()}
+
+    def titles(**options: Any) -> str:
+        env.tocs, whole = env.titles_only, env.tocs
+        try:
+            return toctree(**options)
+        finally:
+            env.tocs = whole
+
+    context["toctree"] = titles
+
+
+def _title_only(contents: nodes.bullet_list) -> nodes.bullet_list:
+    if any(contents.findall(addnodes.toctree)):
+        return contents
+    title = contents.deepcopy()
+    for sections in list(title.children[0].findall(nodes.bullet_list)):
+        sections.parent.remove(sections)
+    return title
+
+
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     app.connect("autodoc-process-docstring", _escape_second_dims)
+    app.connect("html-page-context", _make_navigation_of_titles, priority=400)  # before the theme's
