@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 
@@ -139,17 +139,21 @@ class ThermalNetwork:
         """Return the temperature rise due to the spindle's heat at times t (n,), s; K, shape (n, body)."""
         return _combine(heated(t) * self._heat, self._modes)
 
-    def air_response(self, t: ArrayLike, ambient: Ambient) -> Array:
-        """Return each body's temperature in the steady state of a machine at standstill, degC, shape (n, body)."""
+    def transfer(self, ambient: Ambient) -> NDArray[np.complex128]:
+        """Return the waves of the bodies' temperatures for waves of the air of 1 K, shape (body, wave)."""
+        return np.asarray(self._modes @ (self._air[:, None] / (self.rates[:, None] + 1j * ambient.omega)), complex)
+
+    def air_response(self, t: ArrayLike, ambient: Ambient, transfer: NDArray[np.complex128] | None = None) -> Array:
+        """Return each body's temperature in the steady state of a machine at standstill, degC, shape (n, body).
+
+        ``transfer`` is that of the ambient air, if it is known.
+        """
         t = np.asarray(t, dtype=float)
-        transfer = self._modes @ (self._air[:, None] / (self.rates[:, None] + 1j * ambient.omega))  # body, wave
+        transfer = self.transfer(ambient) if transfer is None else transfer
         wave = ambient.amplitude * np.exp(1j * (ambient.omega * t[:, None] + ambient.phase))
         return ambient.mean + _combine(wave.imag, transfer.real) + _combine(wave.real, transfer.imag)
 
 
 def _combine(values: Array, weights: Array) -> Array:
     """Return values @ weights.T, (n, k) and (m, k), in an order of summation that does not depend on n."""
-    out = np.zeros((values.shape[0], weights.shape[0]))
-    for value, weight in zip(values.T[:, :, None], weights.T, strict=True):
-        out += value * weight
-    return out
+    return np.asarray(np.multiply(values.T[:, :, None], weights.T[:, None], order="C").sum(axis=0))

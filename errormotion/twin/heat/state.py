@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.twin.heat.network import Ambient, LagResponse, ThermalNetwork
@@ -63,7 +63,13 @@ class ThermalState:
 
     def bodies(self, t: ArrayLike) -> Array:
         """Return the bodies' temperatures at times t, degC, shape (n, body)."""
-        return self.network.air_response(t, self.ambient) + self.network.heating(t, self._heated)
+        air = self.network.air_response(t, self.ambient, self._transfer)
+        return air + self.network.heating(t, self._heated)
+
+    @cached_property
+    def _transfer(self) -> NDArray[np.complex128]:
+        """Response of the network to the air."""
+        return self.network.transfer(self.ambient)
 
     @cached_property
     def _heated(self) -> LagResponse:

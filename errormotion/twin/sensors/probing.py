@@ -33,6 +33,8 @@ BALLS = 4
 TEMPERATURE_NOISE = 0.02
 #: Distance of the tip from a ball at which the probe is released, m.
 RELEASE = 3e-6
+#: Distance from which on a path passes a ball without a trip: far above all errors of the machine, m.
+PASSING = 10e-3
 
 _TRIGGER, _THERMOMETER = 60, 61
 _SETTLED = 1e-15  # m
@@ -205,6 +207,10 @@ class ProbeMeasurements:
 
     def released(self, p: ArrayLike, t: float, *, balls: Balls | None = None) -> bool:
         """Return whether a tripped probe is released with the tip at a commanded position p (3,), m."""
+        balls_there = self.balls if balls is None else balls
+        offset = balls_there.centre - np.asarray(p, dtype=float)
+        if (np.sqrt((offset**2).sum(axis=1)) > balls_there.radius + self.probe.tip_radius + PASSING).all():
+            return True
         return bool(self.probe_gap(p, t, balls=balls)[0] > RELEASE)
 
     def contact(
@@ -250,13 +256,17 @@ class ProbeMeasurements:
             return first.copy(), 0.0
         if length == 0:
             return None, 0.0
-        count = len(balls)
-        direction = np.tile((last - first) / length, (count, 1))
+        heading = (last - first) / length
+        ball = self._near_path(balls, first, heading, length)
+        count = ball.size
+        if count == 0:
+            return None, length
+        direction = np.tile(heading, (count, 1))
         scatter = np.full(count, self.probe.noise * self._trigger(first, last, t) if noise else 0.0)
         times = np.full(count, float(t))
         path = np.full(count, np.nan)
         for _ in range(3):  # with a feed, the time of the contact depends on its position
-            path = self._path_to_trip(first, direction, np.arange(count), balls, self._error_at(times), scatter)
+            path = self._path_to_trip(first, direction, ball, balls, self._error_at(times), scatter)
             if not feed or not np.isfinite(path).any():
                 break
             times = t + np.where(np.isfinite(path), path, 0.0) / feed
@@ -298,6 +308,14 @@ class ProbeMeasurements:
         """
         distance = self._path_to_trip(start, direction, ball, balls, self._error_at(t), scatter, shift)
         return np.asarray(start + distance[:, None] * direction)
+
+    def _near_path(self, balls: Balls, start: Array, heading: Array, length: float) -> NDArray[np.intp]:
+        """Return the numbers of the balls on which the probe can trip on a path."""
+        offset = balls.centre - start
+        ahead = (offset * heading).sum(axis=1)
+        aside = np.sqrt(((offset - ahead[:, None] * heading) ** 2).sum(axis=1))
+        reach = balls.radius + self.probe.tip_radius + PASSING
+        return np.flatnonzero((aside <= reach) & (ahead >= -PASSING) & (ahead - reach <= length))
 
     def _reach(self, balls: Balls, ball: NDArray[np.intp], normal: Array) -> Array:
         """Return the distance of the tip's centre from that of a ball when the probe trips, m."""
