@@ -215,35 +215,41 @@ class SensorStream:
 
     def _blocks(self, raws: Array) -> Array:
         """Return the values of each measurement, shape (measurement, value)."""
-        counters = self._counters
-        numbers = counters.measured + np.arange(raws.size)
-        seconds = counters.seconds + np.arange(raws.size) / self.rate
-        stamps = np.floor(seconds * 1e6 / self._output.microseconds + 1e-6)
-        stamps = stamps.astype(np.int64) & (1 << 32) - 1
-        columns = []
-        for name in self._output.names:
-            match name:
-                case "DIST1":
-                    columns.append(raws)
-                case "COUNTER":
-                    columns.append(numbers & (1 << BITS) - 1)
-                case "TIMESTAMP":
-                    columns.append(stamps & (1 << BITS) - 1)
-                case "TIMESTAMP_LO":
-                    columns.append(stamps & 0xFFFF)
-                case "TIMESTAMP_HI":
-                    columns.append(stamps >> 16)
-                case "STATE":
-                    columns.append(np.where(raws < FIRST_ERROR, _GREEN, _NO_PEAK_BIT | _GREEN << 1))
-                case "DIST_RAW":
-                    columns.append(np.where(raws < FIRST_ERROR, raws * 4, 0))
-                case "MIN" | "MAX" | "PEAK2PEAK":
-                    columns.append(self._statistic(name, raws))
-                case _:
-                    columns.append(np.full(raws.size, _CONSTANTS[name]))
-        if {"MIN", "MAX", "PEAK2PEAK"} & set(self._output.names):
+        names, counters = self._output.names, self._counters
+        blocks = np.empty((raws.size, len(names)), dtype=np.int64)
+        for column, name in zip(blocks.T, names, strict=True):
+            column[:] = self._values(name, raws)
+        if {"MIN", "MAX", "PEAK2PEAK"} & set(names):
             counters.low, counters.high = int(self._lows(raws)[-1]), int(self._highs(raws)[-1])
-        return np.stack(columns, axis=1) if columns else np.empty((raws.size, 0), dtype=np.int64)
+        return blocks
+
+    def _values(self, name: str, raws: Array) -> Any:
+        """Return one value of each measurement, or the value of all."""
+        match name:
+            case "DIST1":
+                return raws
+            case "COUNTER":
+                return self._counters.measured + np.arange(raws.size) & (1 << BITS) - 1
+            case "TIMESTAMP":
+                return self._stamps(raws.size) & (1 << BITS) - 1
+            case "TIMESTAMP_LO":
+                return self._stamps(raws.size) & 0xFFFF
+            case "TIMESTAMP_HI":
+                return self._stamps(raws.size) >> 16
+            case "STATE":
+                return np.where(raws < FIRST_ERROR, _GREEN, _NO_PEAK_BIT | _GREEN << 1)
+            case "DIST_RAW":
+                return np.where(raws < FIRST_ERROR, raws * 4, 0)
+            case "MIN" | "MAX" | "PEAK2PEAK":
+                return self._statistic(name, raws)
+            case _:
+                return _CONSTANTS[name]
+
+    def _stamps(self, count: int) -> Array:
+        """Return the time stamps of the next measurements."""
+        seconds = self._counters.seconds + np.arange(count) / self.rate
+        stamps = np.floor(seconds * 1e6 / self._output.microseconds + 1e-6)
+        return np.asarray(stamps.astype(np.int64) & (1 << 32) - 1)
 
     def _lows(self, raws: Array) -> Array:
         return np.minimum.accumulate(np.minimum(raws, self._counters.low))

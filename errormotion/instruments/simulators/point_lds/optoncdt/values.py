@@ -32,13 +32,15 @@ BITS_ON_WIRE = 30
 
 def raw_distances(distances: Array, measuring_range: float, largest: int) -> Array:
     """Return the raw values of distances from the start of the range, m; error values if missing."""
-    parts = np.asarray(distances) / measuring_range
+    steps = np.asarray(distances) / measuring_range
+    steps += RESERVE
+    steps *= STEPS
+    raws = np.rint(steps, out=steps)
+    if raws.size and raws.min() >= 0 and raws.max() <= largest:
+        return raws.astype(np.int64)
     with np.errstate(invalid="ignore"):
-        raws = np.rint((parts + RESERVE) * STEPS)
-        if ((raws >= 0) & (raws <= largest)).all():
-            return raws.astype(np.int64)
-        raws = np.where(raws < 0, BEFORE_RANGE, np.where(raws > largest, BEHIND_RANGE, raws))
-    return np.where(np.isnan(parts), NO_PEAK, raws).astype(np.int64)
+        found = np.where(raws < 0, BEFORE_RANGE, np.where(raws > largest, BEHIND_RANGE, raws))
+    return np.where(np.isnan(raws), NO_PEAK, found).astype(np.int64)
 
 
 def mastered(raws: Array, distances: Array, reference: float, master: float, measuring_range: float) -> Array:
