@@ -200,7 +200,7 @@ class RawStore:
             "must_understand": False,
             "metadata": self._static | {name: column.metadata(self.count) for name, column in self._arrays.items()},
         }
-        replace_text(self.path / "zarr.json", json.dumps(root, indent=1))
+        replace_text(self.path / "zarr.json", json.dumps(root))  # indented, it would take ten times as long
         self.committed = self.count
 
     @property
@@ -388,16 +388,22 @@ def _encode(variable: xr.Variable, packing: Mapping[str, Any]) -> np.ndarray | N
         return np.asarray(encode_cf_variable(xr.Variable(variable.dims, values)).values)
     scale, offset, fill = packing["scale_factor"], packing["add_offset"], packing["_FillValue"]
     limits = np.iinfo(packing["dtype"])
-    steps = (values - offset) / scale
+    steps = values - offset
+    steps /= scale
     whole = np.rint(steps)
-    missing = np.isnan(values)
+    missing = np.isnan(steps)
+    some = bool(missing.any())
     with np.errstate(invalid="ignore"):
+        steps -= whole
         # 1e-6 of a step is far above the rounding of float64 (and that of 16 bit steps), far below half a step
-        good = (np.abs(steps - whole) < 1e-6) & (whole >= limits.min) & (whole <= limits.max) & (whole != fill)
-    if not np.all(good | missing):
-        return None
-    whole[missing] = fill
-    packed: np.ndarray = whole.astype(packing["dtype"])
+        good = np.abs(steps, out=steps) < 1e-6
+        good &= whole >= limits.min
+        good &= whole <= limits.max
+        good &= whole != fill
+    if some:
+        good |= missing
+        whole[missing] = fill
+    packed: np.ndarray | None = whole.astype(packing["dtype"]) if good.all() else None
     return packed
 
 
