@@ -186,9 +186,9 @@ def judged(seed, step=None):
 
 def test_campaigns_without_motion_report_no_artefact():
     # one false alarm in a hundred campaigns is what is asked for
-    assert sum(judged(seed).wrong.any() for seed in range(25)) <= 1
+    assert not any(judged(seed).wrong.any() for seed in range(12))
 
 
 def test_moved_artefacts_are_found_on_every_machine():
-    hits = [judged(seed, [0, 0, 5e-6, 0, 20e-6, 0]).wrong for seed in range(15)]
-    assert sum(wrong[4:, 3].all() and wrong.sum() == 2 for wrong in hits) >= 14
+    hits = [judged(seed, [0, 0, 5e-6, 0, 20e-6, 0]).wrong for seed in range(8)]
+    assert all(wrong[4:, 3].all() and wrong.sum() == 2 for wrong in hits)

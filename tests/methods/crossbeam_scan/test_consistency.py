@@ -122,12 +122,12 @@ def test_step_is_measured_with_its_covariance():
     assert 6 / 4 < np.mean(score) < 8
 
 
-@pytest.mark.slow
-def test_campaigns_without_motion_raise_no_alarm():
+def test_campaigns_without_motion_raise_hardly_an_alarm_even_if_many_are_allowed():
     cycles, places = CYCLES[[0, 3, 6, 8]], PLACES[:6]
-    alarms = sum(bool(moved(cycles, places, *campaign(seed, cycles, places)[:2])) for seed in range(200))
-    # 2 expected at 1 percent; 6 or more come once in 60 runs of an exact test, and this one is on the safe side
-    assert alarms <= 5
+    campaigns = (campaign(seed, cycles, places)[:2] for seed in range(40))
+    alarms = sum(bool(moved(cycles, places, *each, false_alarm=0.2)) for each in campaigns)
+    # an exact test would raise 8; this one is on the safe side
+    assert alarms <= 3
 
 
 def test_rough_guide_is_not_taken_for_moved_artefacts():
