@@ -30,7 +30,7 @@ from errormotion.plugins.contracts import (
 from errormotion.plugins.kind_registry import contract
 from errormotion.plugins.lazy import lazy, load_object
 from errormotion.plugins.readings import Environment, FrameGeometry, Measurement, Profiles, Scan
-from errormotion.plugins.redrawing import Redraw, Redrawing
+from errormotion.plugins.redrawing import Redraw, Redrawing, replaced
 from errormotion.plugins.registry import (
     GROUPS,
     Group,
@@ -89,4 +89,5 @@ __all__ = [
     "owner_of_method",
     "owner_of_schema",
     "refresh",
+    "replaced",
 ]

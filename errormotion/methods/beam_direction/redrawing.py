@@ -14,7 +14,7 @@ from errormotion.methods.beam_direction.identification.compensation import CALIB
 from errormotion.methods.beam_direction.identification.planes import determine
 from errormotion.methods.beam_direction.identification.slopes import MAX_CORRELATED, correlation_factor
 from errormotion.methods.beam_direction.settings import Settings
-from errormotion.plugins import Redraw, Redrawing
+from errormotion.plugins import Redraw, Redrawing, replaced
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -48,11 +48,13 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     distance = np.asarray(raw["distance"].transpose("plane", "reading").values, dtype=float)
     used = errors["left_out"].transpose("plane", "reading").values == 0
     bar = [name for name in raw.variables if str(name).startswith("bar_")]
-    reduced = _with(raw.drop_vars(bar).load(), np.where(used, distance, np.nan))
+    clean = (("plane", "reading"), np.where(used, distance, np.nan), raw["distance"].attrs)
+    reduced = raw.drop_vars(bar).load().assign(distance=clean)
     trial = TrialSettings(**{name: getattr(settings, name) for name in type(settings).model_fields})
     trial = trial.model_copy(update={"robust": False, "noise": "stated", "extrapolate": True})
     sources = {"readings": _readings(beam)}
     if beam.origin is not None and beam.data.point_uncertainty > 0:
+        reduced["plane_point"] = raw["plane_point"].transpose("plane", "direction").load()
         sources["known points of the planes"] = _points(beam)
     if beam.sensor is not None:
         trial = trial.model_copy(update={"calibration": beam.sensor.calibration})
@@ -62,10 +64,6 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     elif settings.layout.scale_uncertainty > 0:
         sources[SCALE] = _scale(settings.layout.scale_uncertainty, beam.converged.mid_range)
     return Redrawing(reduced, trial, sources)
-
-
-def _with(raw: xr.Dataset, distance: Array) -> xr.Dataset:
-    return raw.assign(distance=(("plane", "reading"), distance, raw["distance"].attrs))
 
 
 def _readings(beam: Determined) -> Redraw:
@@ -80,11 +78,11 @@ def _readings(beam: Determined) -> Redraw:
     white = size * float(np.hypot(data.noise, data.speckle))
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        changed = np.array(raw["distance"].transpose("plane", "reading").values, dtype=float)
+        changed = np.array(raw.variables["distance"].values, dtype=float)
         for row, (known, L) in zip(changed, factors, strict=True):
             z = generator.normal(size=known.size)
             row[known] += white * z if L is None else size * (L @ z)
-        return _with(raw, changed), settings
+        return replaced(raw, {"distance": changed}), settings
 
     return Redraw(draw, own=True)
 
@@ -95,9 +93,8 @@ def _points(beam: Determined) -> Redraw:
     normals = beam.converged.planes.normals
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        point = raw["plane_point"].transpose("plane", "direction")
         shift = size * generator.normal(size=len(normals))[:, None] * normals
-        return raw.assign(plane_point=point.copy(data=point.values + shift)), settings
+        return replaced(raw, {"plane_point": raw.variables["plane_point"].values + shift}), settings
 
     return Redraw(draw, own=True)
 
@@ -120,8 +117,7 @@ def _triangulation(sensor: Sensor, beam: Array) -> Redraw:
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         turn = Rotation.from_rotvec(beam * sensor.normal_uncertainty * generator.normal())
-        normal = raw["triangulation_normal"]
-        return raw.assign(triangulation_normal=normal.copy(data=turn.apply(normal.values))), settings
+        return replaced(raw, {"triangulation_normal": turn.apply(raw["triangulation_normal"].values)}), settings
 
     return Redraw(draw, groups=(TRIANGULATION,))
 
@@ -130,7 +126,8 @@ def _scale(relative: float, mid_range: float) -> Redraw:
     """Return the draw of the scale of the sensor about its mid-range."""
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        distance = raw["distance"].transpose("plane", "reading").values
-        return _with(raw, mid_range + (distance - mid_range) * (1.0 + relative * generator.normal())), settings
+        distance = raw.variables["distance"].values
+        scaled = mid_range + (distance - mid_range) * (1.0 + relative * generator.normal())
+        return replaced(raw, {"distance": scaled}), settings
 
     return Redraw(draw, groups=(SCALE,))

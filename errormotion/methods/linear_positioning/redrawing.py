@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.methods.linear_positioning.diagonals.redrawing import draw_effects, redraw_diagonals
+from errormotion.methods.linear_positioning.diagonals.redrawing import draw_effects, ordered, redraw_diagonals
 from errormotion.methods.linear_positioning.identification import budget, moving
 from errormotion.methods.linear_positioning.identification.identify import Evaluated, evaluate
 from errormotion.methods.linear_positioning.identification.reading import labels, length_uncertainty
-from errormotion.methods.linear_positioning.schema import APPROACHES
-from errormotion.plugins import Redraw, Redrawing
+from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS
+from errormotion.plugins import Redraw, Redrawing, replaced
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,7 +39,7 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     groups = dict.fromkeys(source.group for source in evaluated.sources if source.group != budget.END)
     sources = {"readings": Redraw(_readings(evaluated), groups=(budget.END,), own=True)}
     sources |= {group: Redraw(_shared(evaluated, group), groups=(group,)) for group in groups}
-    return Redrawing(raw.load(), settings.model_copy(update={"trials": 0}), sources)
+    return Redrawing(ordered(raw, "deviation", READINGS), settings.model_copy(update={"trials": 0}), sources)
 
 
 def _moving(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
@@ -57,8 +57,7 @@ def _moving(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawin
     )
 
     def changed(raw: xr.Dataset, change: Array) -> xr.Dataset:
-        deviation = raw.variables["end_deviation"].transpose(*dims)
-        return raw.assign(end_deviation=deviation.copy(data=deviation.values + change))
+        return replaced(raw, {"end_deviation": raw.variables["end_deviation"].values + change})
 
     def readings(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         return changed(raw, noise * generator.normal(size=shape) * ~cold[:, None]), settings
@@ -74,7 +73,7 @@ def _moving(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawin
         moving.COLD: Redraw(cold_state, groups=(moving.COLD,)),
         moving.LENGTH: Redraw(lengths, groups=(moving.LENGTH,)),
     }
-    return Redrawing(raw.load(), settings, sources)
+    return Redrawing(ordered(raw, "end_deviation", dims), settings, sources)
 
 
 def _readings(evaluated: Evaluated) -> _Draw:
@@ -108,6 +107,5 @@ class _Draw:
         change = np.broadcast_to(self._change(generator), self._shape)
         approaches = [APPROACHES.index(label) for label in labels(raw, "approach")]
         rank = np.argsort(np.argsort(raw["target_position"].values))
-        by_label = np.nan_to_num(change)[:, approaches][..., rank]
-        deviation = raw.variables["deviation"].transpose("freedom", "approach", "run", "target")
-        return raw.assign(deviation=deviation.copy(data=deviation.values + by_label[:, :, None, :])), settings
+        by_label = np.nan_to_num(change)[:, None, approaches][..., rank]
+        return replaced(raw, {"deviation": raw.variables["deviation"].values + by_label}), settings

@@ -12,7 +12,7 @@ import numpy as np
 
 from errormotion.methods.multilateration.identification.expansion import air_scale, scale_strain
 from errormotion.methods.multilateration.identification.uncertainty import READINGS, REPEATABILITY, UNEXPLAINED
-from errormotion.plugins import Redraw, Redrawing
+from errormotion.plugins import Redraw, Redrawing, replaced
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -28,7 +28,8 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     """Return the readings without outliers, and their sources: noise and repeatability, scales, expansion."""
     d = _displacement(raw)
     known = (errors["left_out"].transpose("station", "target").values == 0) & np.isfinite(errors["EX"].values)
-    reduced = _with(raw.load(), np.where(known, d, np.nan))
+    measured = raw["displacement"].attrs
+    reduced = raw.load().assign(displacement=(("station", "target"), np.where(known, d, np.nan), measured))
     reduced["displacement_noise"] = (raw["displacement_noise"] * DRAWN_NOISE).assign_attrs(
         raw["displacement_noise"].attrs
     )
@@ -54,11 +55,11 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
 
 
 def _displacement(raw: xr.Dataset) -> Array:
-    return np.array(raw["displacement"].transpose("station", "target").values, dtype=np.float64)
+    return np.array(raw.variables["displacement"].transpose("station", "target").values, dtype=np.float64)
 
 
 def _with(raw: xr.Dataset, displacement: Array) -> xr.Dataset:
-    return raw.assign(displacement=(("station", "target"), displacement, raw["displacement"].attrs))
+    return replaced(raw, {"displacement": displacement})
 
 
 def _readings(noise: float) -> Redraw:
@@ -97,9 +98,8 @@ def _expansion(expansion: Expansion) -> Redraw:
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         coefficient = expansion.coefficient + expansion.coefficient_uncertainty * generator.normal()
         shift = expansion.temperature_uncertainty * generator.normal(size=3)
-        temperature = raw["scale_temperature"]
-        moved = temperature.copy(data=temperature.values + shift)
+        moved = raw.variables["scale_temperature"].values + shift
         changed = expansion.model_copy(update={"coefficient": coefficient})
-        return raw.assign(scale_temperature=moved), settings.model_copy(update={"expansion": changed})
+        return replaced(raw, {"scale_temperature": moved}), settings.model_copy(update={"expansion": changed})
 
     return Redraw(draw, groups=("scales",))

@@ -8,7 +8,7 @@ import numpy as np
 
 from errormotion.methods.normal_vector.identification.identify import fitted
 from errormotion.methods.normal_vector.identification.reading import read
-from errormotion.plugins import Redraw, Redrawing
+from errormotion.plugins import Redraw, Redrawing, replaced
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -25,7 +25,7 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     used = used[..., None] if touched else used.all(axis=-1, keepdims=True)
     order = (*dims, "direction") if touched else dims
     values = np.asarray(raw.variables[name].transpose(*order).values, dtype=float)
-    reduced = _with(raw.load(), name, order, np.where(used, values, np.nan))
+    reduced = raw.load().assign({name: (order, np.where(used, values, np.nan), raw.variables[name].attrs)})
     stated = settings.model_copy(
         update={"robust": False, "functional_point": tuple(map(float, errors.attrs["functional_point"]))}
     )
@@ -34,18 +34,13 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     if not np.isfinite(data.noise):
         fit = fitted(data, settings)[2].fit
         noise, freedom = float(np.sqrt(fit.chi2 / fit.freedom)), fit.freedom
-    return Redrawing(reduced, stated, {"touches": _noise(noise, freedom, name, order, reduced, values, errors)})
-
-
-def _with(raw: xr.Dataset, name: str, dims: tuple[str, ...], values: Array) -> xr.Dataset:
-    return raw.assign({name: (dims, values, raw.variables[name].attrs)})
+    return Redrawing(reduced, stated, {"touches": _noise(noise, freedom, name, reduced, values, errors)})
 
 
 def _noise(
     noise: float,
     freedom: int | None,
     name: str,
-    dims: tuple[str, ...],
     raw: xr.Dataset,
     values: Array,
     errors: xr.Dataset,
@@ -68,6 +63,6 @@ def _noise(
     def draw(changed: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         size = noise if freedom is None else noise * float(np.sqrt(freedom / generator.chisquare(freedom)))
         shift = factor @ generator.normal(0.0, size, (*factor.shape[:-2], factor.shape[-1], 1))
-        return _with(changed, name, dims, changed.variables[name].values + shift[..., 0]), settings
+        return replaced(changed, {name: changed.variables[name].values + shift[..., 0]}), settings
 
     return Redraw(draw, groups=("cold reference",), own=True)

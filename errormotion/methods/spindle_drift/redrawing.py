@@ -14,7 +14,8 @@ from errormotion.methods.spindle_drift.identification.frame_expansion import Fra
 from errormotion.methods.spindle_drift.identification.record import average_record, noise, run_out_at_rest, sensors
 from errormotion.methods.spindle_drift.identification.uncertainty import REFERENCE
 from errormotion.methods.spindle_drift.schema import CHANNELS
-from errormotion.plugins import Redraw, Redrawing
+from errormotion.methods.spindle_drift.settings import TrialSettings
+from errormotion.plugins import Redraw, Redrawing, replaced
 
 if TYPE_CHECKING:
     from errormotion.arrays import Array
@@ -86,7 +87,7 @@ def _means(raw: xr.Dataset, record: Record, mean: Array) -> xr.Dataset:
 
 def _shifted(raw: xr.Dataset, name: str, change: Array) -> xr.Dataset:
     """Return raw data with a change added to a variable, whose order of dimensions it has."""
-    return raw.assign({name: raw[name].copy(data=raw[name].values + change)})
+    return replaced(raw, {name: raw.variables[name].values + change})
 
 
 def _readings(sigma: Array) -> Redraw:
@@ -106,11 +107,10 @@ def _beams(covariance: Array, which: str, group: str) -> Redraw:
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         change = np.einsum("cij,cj->ci", factor, generator.normal(size=factor.shape[:2]))
-        raw = raw.assign({name: raw[name].transpose("channel", "direction") for name in (origin, direction)})
-        turned = raw[direction].values + change[:, 3:]
+        turned = raw.variables[direction].values + change[:, 3:]
         turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-        raw = raw.assign({direction: raw[direction].copy(data=turned)})
-        return _shifted(raw, origin, change[:, :3]), settings
+        moved = raw.variables[origin].values + change[:, :3]
+        return replaced(raw, {origin: moved, direction: turned}), settings
 
     return Redraw(draw, groups=(group,))
 
@@ -133,9 +133,8 @@ def _changes(changes: Array) -> Redraw:
 
 def _frame_expansion(relative: float) -> Redraw:
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        expansion = raw["frame_expansion"]
         factor = 1.0 + relative * generator.normal()
-        return raw.assign(frame_expansion=expansion.copy(data=expansion.values * factor)), settings
+        return replaced(raw, {"frame_expansion": raw.variables["frame_expansion"].values * factor}), settings
 
     return Redraw(draw, groups=("frame expansion",))
 
@@ -144,10 +143,9 @@ def _frame_temperature(warming: FrameWarming, index: int) -> Redraw:
     """Return the temperature of the frame: the noise of each mean, smoothed like the temperature."""
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        temperature = raw["temperature"].transpose("time", "sensor")
-        changed = temperature.values.copy()
+        changed = raw.variables["temperature"].values.copy()
         changed[:, index] += warming.smoothing(warming.noise * generator.normal(size=len(changed)))
-        return raw.assign(temperature=temperature.copy(data=changed)), settings
+        return replaced(raw, {"temperature": changed}), settings
 
     return Redraw(draw, groups=("frame temperature",), own=True)
 
@@ -159,7 +157,8 @@ def _unseen_rotation(errors: xr.Dataset) -> Redraw:
 
     def act(result: xr.Dataset, generator: np.random.Generator) -> xr.Dataset:
         change = np.tensordot(generator.normal(size=len(effect)), effect, axes=1)
-        return result.assign({name: result[name] + change[:, k] for k, name in enumerate(result.em.names)})
+        moved = {name: result.variables[name].values + change[:, k] for k, name in enumerate(result.em.names)}
+        return replaced(result, moved)
 
     return Redraw(act=act, groups=(UNSEEN,))
 
@@ -169,4 +168,5 @@ def _detection(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redra
     steps = segmented(raw, settings, []) if "scan" in raw.variables else raw
     steps = steps.load().assign(distance=steps["distance"].transpose("channel", "profile", "step"))
     noise = errors["noise"].sel(beam=[str(name) for name in raw["channel"].values]).values[:, None, None]
-    return Redrawing(steps, settings, {"readings": _readings(np.broadcast_to(noise, steps["distance"].shape))})
+    trial = TrialSettings(**{name: getattr(settings, name) for name in type(settings).model_fields})
+    return Redrawing(steps, trial, {"readings": _readings(np.broadcast_to(noise, steps["distance"].shape))})

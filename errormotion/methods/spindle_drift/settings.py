@@ -124,3 +124,7 @@ class Settings(PluginSettings):
 
     # Planning
     layout: Layout = Field(default_factory=Layout, description="set-up of a plan")
+
+
+class TrialSettings(Settings):
+    """Settings of one trial of the Monte Carlo method, without comparisons that have no effect on the errors."""

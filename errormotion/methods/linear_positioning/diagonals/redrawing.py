@@ -10,7 +10,7 @@ from errormotion.methods.linear_positioning.diagonals.identification import eval
 from errormotion.methods.linear_positioning.identification import budget
 from errormotion.methods.linear_positioning.identification.reading import labels
 from errormotion.methods.linear_positioning.schema import APPROACHES, STOPS
-from errormotion.plugins import Redraw, Redrawing
+from errormotion.plugins import Redraw, Redrawing, replaced
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -40,7 +40,12 @@ def redraw_diagonals(raw: xr.Dataset, settings: Settings) -> Redrawing:
         return Redraw(draw, groups=(group,))
 
     sources = {"readings": Redraw(readings, own=True)} | {group: shared(group) for group in dict.fromkeys(groups)}
-    return Redrawing(raw.load(), settings.model_copy(update={"trials": 0}), sources)
+    return Redrawing(ordered(raw, "diagonal_deviation", STOPS), settings.model_copy(update={"trials": 0}), sources)
+
+
+def ordered(raw: xr.Dataset, name: str, dims: tuple[str, ...]) -> xr.Dataset:
+    """Return raw data in memory, with the dimensions of one variable in this order."""
+    return raw.load().assign({name: raw.variables[name].transpose(*dims)})
 
 
 def draw_effects(effects: Array, group: str, generator: np.random.Generator) -> Array:
@@ -57,5 +62,4 @@ def _changed(raw: xr.Dataset, change: Array) -> xr.Dataset:
     """Add a change (diagonal, approach, stop), approaches forward and backward, to the readings of all runs."""
     shape = (change.shape[0], len(APPROACHES), change.shape[2])
     by_label = np.broadcast_to(change, shape)[:, [APPROACHES.index(label) for label in labels(raw, "approach")]]
-    deviation = raw.variables["diagonal_deviation"].transpose(*STOPS)
-    return raw.assign(diagonal_deviation=deviation.copy(data=deviation.values + by_label[:, None]))
+    return replaced(raw, {"diagonal_deviation": raw.variables["diagonal_deviation"].values + by_label[:, None]})

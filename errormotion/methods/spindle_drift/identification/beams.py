@@ -255,10 +255,11 @@ def _arc(s: Array, readings: Array, radius: float) -> tuple[float, float]:
         root = np.sqrt(np.maximum(R * R - (s - s0) ** 2, 1e-12 * R * R))
         return np.stack([(s0 - s) / root, np.ones(len(s)), 1.0 - R / root], axis=1) * (1e6 * unit)
 
-    from scipy.optimize import least_squares
+    from scipy.optimize import leastsq
 
-    found = least_squares(misfit, start / unit, slopes, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    s0, y0, _ = found.x * unit
+    # The full output has no warning of tolerances that rounding does not allow.
+    found = leastsq(misfit, start / unit, Dfun=slopes, full_output=True, ftol=1e-14, xtol=1e-14, gtol=1e-14, maxfev=300)
+    s0, y0, _ = found[0] * unit
     return float(s0), float(y0)
 
 

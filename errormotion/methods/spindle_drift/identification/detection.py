@@ -15,6 +15,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.beams import beam_errors
 from errormotion.methods.spindle_drift.identification.beams import Beam, circles_and_line, likelihood_fit
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds, segment_steps
+from errormotion.methods.spindle_drift.settings import TrialSettings
 
 if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.settings import Settings
@@ -50,9 +51,10 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
     for i, name in enumerate(names):
         beam = likelihood_fit(distance[i], centre[i], radius, origin0[i], direction0[i], name)
         found.append(beam)
-        clean = distance[i].copy()
-        clean[tuple(beam.left_out.T)] = np.nan
-        paper_origin[i], paper_direction[i] = circles_and_line(clean, centre[i], scan[i], radius, direction0[i])
+        if not isinstance(settings, TrialSettings):
+            clean = distance[i].copy()
+            clean[tuple(beam.left_out.T)] = np.nan
+            paper_origin[i], paper_direction[i] = circles_and_line(clean, centre[i], scan[i], radius, direction0[i])
         missing = int(np.isnan(distance[i]).sum())
         if missing:
             notes.append(f"{name}: {missing} of {distance[i].size} readings are missing (NaN).")

@@ -150,13 +150,18 @@ def evaluate(
     still = spindle_speed is not None and not turning
     end = running_end if running_end is not None else _end_of_running(time, spindle_speed, turning)
     hottest, change = _thermometer(temperature, sensors, sensor, time <= end)
+    known = np.isfinite(series.value) & (time >= -1e-9)
+    divided: dict[tuple[int, bytes], list[Index]] = {}  # most quantities are known at the same instants
     for k in range(len(QUANTITIES)):
-        known = np.isfinite(series.value[k]) & (time >= -1e-9)
         for column, until in ((0, HOUR), (2, end), (4, time[-1])):
-            inside = np.flatnonzero(known & (time <= until + 1e-6))
-            if inside.size < 2 or time[-1] < until - 1.5 * step:
+            place = (column, known[k].tobytes())
+            if place not in divided:
+                inside = np.flatnonzero(known[k] & (time <= until + 1e-6))
+                complete = inside.size >= 2 and time[-1] >= until - 1.5 * step
+                divided[place] = [reference, *_blocks(inside, time, average)] if complete else []
+            blocks = divided[place]
+            if not blocks:
                 continue
-            blocks = [reference, *_blocks(inside, time, average)]
             means = np.array([series.value[k, block].mean() for block in blocks])
             top, bottom = blocks[means.argmax()], blocks[means.argmin()]
             value[k, column], uncertainty[k, column], influence[:, k, column] = (
@@ -165,9 +170,9 @@ def evaluate(
             if time[blocks[-1][-1]] >= until - max(1.5 * step, average):
                 # The errors are zero in the reference state: the value at the end is the difference.
                 weights = np.full(blocks[-1].size, 1.0 / blocks[-1].size)
-                place = (k, column + 1)
-                value[place], uncertainty[place], influence[:, *place] = series.weighted(k, blocks[-1], weights)
-        running = np.flatnonzero(known & (time <= end))
+                found = series.weighted(k, blocks[-1], weights)
+                value[k, column + 1], uncertainty[k, column + 1], influence[:, k, column + 1] = found
+        running = np.flatnonzero(known[k] & (time <= end))
         value[k, 6] = _time_constant(time[running], series.value[k, running])
         tail = running[time[running] >= end - _SLOPE_SPAN]
         if tail.size > 10 and np.ptp(time[tail]) > 0.9 * _SLOPE_SPAN:
