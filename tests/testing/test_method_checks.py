@@ -1,6 +1,7 @@
 """A correct method passes the kit, and each broken one fails exactly the check for its fault."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -106,6 +107,13 @@ def design(origin, beam, point):
 
 def make(seed):
     """Return raw data of a body with a drift of some um and urad, and its true errors."""
+    raw, errors = made(seed)
+    return raw.copy(deep=True), errors
+
+
+@cache
+def made(seed):
+    """Return the same, not to be changed: all methods measure the same bodies."""
     rng = np.random.default_rng(seed)
     place = np.random.default_rng(7)  # the same set-up each time
     origin = place.uniform(-0.5, 0.5, (8, 3))
@@ -325,11 +333,12 @@ BROKEN = [
     ("round_trip", ReadsMemoryOnly),
     ("plan", PlansOneFreedom),
 ]
+STATISTICAL = ("recovers_truth", "coverage", "differences", "sources_as_stated")
 
 
 @pytest.mark.parametrize(("check", "plugin"), BROKEN, ids=lambda value: getattr(value, "__name__", value))
 def test_a_broken_method_fails_exactly_its_check(check, plugin):
-    results = run_checks(replace(SOUND, plugin=plugin, seeds=20))
+    results = run_checks(replace(SOUND, plugin=plugin, seeds=20 if check in STATISTICAL else 8))
     failed = {result.name: result.message for result in results if not result.ok}
     assert failed.keys() == {check}
 

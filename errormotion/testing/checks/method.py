@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Hashable, Iterable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -63,25 +64,25 @@ def motions_stated(subject: MethodSubject) -> str:
     plugin = subject.plugin
     if hasattr(plugin, "motions"):
         return "motions are stated"
-    name = plugin.info.id
+    name, source = plugin.info.id, Path(str(sys.modules[plugin.__module__].__file__))
     require(not hasattr(plugin, "programs"), f"'{name}' writes NC programs and does not state its motions ('motions')")
     moving = {each for each in kind_registry.kinds() if kind_registry.kind_changes_machine(each)}
-    found = sorted(moving & (set(plugin.needs.instruments) | _texts_of(plugin)))
+    found = sorted(moving & (set(plugin.needs.instruments) | _texts_of(source)))
     named = " and ".join(found)
     require(not found, f"'{name}' uses a {named} and does not state its motions ('motions'); [] for no motion")
     return "no instrument with motions is used"
 
 
-def _texts_of(plugin: Any) -> set[str]:
-    """Return the texts in the source of a plugin's package, or of its module if it is in no package."""
-    source = Path(str(sys.modules[plugin.__module__].__file__))
+@lru_cache(maxsize=4)
+def _texts_of(source: Path) -> frozenset[str]:
+    """Return the texts in the package of a source file, or in the file if it is in no package."""
     in_package = (source.parent / "__init__.py").exists()
     found: set[str] = set()
     for path in source.parent.rglob("*.py") if in_package else [source]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.add(node.value)
-    return found
+    return frozenset(found)
 
 
 @METHOD_CHECKS.add()
