@@ -1,6 +1,7 @@
 """Measuring scans: with a control, with an operator, with profilers that fall silent, and on the virtual gantry."""
 
 import json
+import os
 import threading
 import time
 from datetime import UTC, datetime, timedelta
@@ -33,6 +34,14 @@ LEAD_IN = 1.7
 SETTINGS = Settings(
     positions=(0.3, 0.45), warm_up=(420.0, 900.0, 1800.0), cold_repeats=1, profiler_pose=PoseSettings(dz=-0.17)
 )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _unsynced():
+    """Files of these tests need not survive a power failure."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
 
 
 class Machine:
@@ -133,7 +142,7 @@ def store(chunks, path, *, append=False):
     """Return chunks as read from disk."""
     chunks = iter(chunks)
     first = next(chunks)
-    raw = RawStore(path, "line") if append else RawStore.create(path, first, "line", 1000)
+    raw = RawStore(path, "line") if append else RawStore.create(path, first, "line", 4000)
     try:
         raw.append(first)
         for chunk in chunks:
