@@ -25,6 +25,7 @@ from errormotion.methods.linear_positioning.identification.reading import labels
 from errormotion.methods.linear_positioning.identification.standard import FIGURES
 from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, SCHEMA, STOPS
 from errormotion.methods.linear_positioning.settings import Settings, Side
+from errormotion.plugins import replaced
 
 if TYPE_CHECKING:
     from errormotion.plugins import MethodInfo
@@ -122,15 +123,34 @@ def evaluate_diagonals(
     points = np.asarray(raw["stop_point"].transpose("diagonal", "stop", "direction").values, dtype=float)
     if "direction" in raw.coords:
         points = points[..., [labels(raw, "direction").index(axis) for axis in "xyz"]]
+    readings = raw["diagonal_deviation"].transpose(*STOPS).values
+    stated = [each for each in ("length_uncertainty", "alignment_uncertainty") if each in raw]
+    axis = xr.Dataset(
+        {
+            "deviation": (READINGS, readings[:1]),
+            "target_position": ("target", points[0, :, 0], {"units": "m"}),
+            **{each: raw.variables[each] for each in stated},
+        },
+        {"freedom": ["EXX"], "approach": labels(raw, "approach")},
+        {"schema": SCHEMA, "axis": "X"},
+    )
+    without_expansion = settings.model_copy(
+        update={
+            "machine": Side(),
+            "workpiece": Side(expansion=0.0, expansion_uncertainty=0.0),
+            "functional_point": (0.0, 0.0, 0.0),
+        }
+    )
     return [
-        _evaluate(name, raw.isel(diagonal=k, drop=True), points[k], settings, notes, planned)
-        for k, name in enumerate(names)
+        _evaluate(name, replaced(axis, {"deviation": read[None]}), stops, without_expansion, notes, planned)
+        for name, read, stops in zip(names, readings, points, strict=True)
     ]
 
 
 def _evaluate(
-    name: str, raw: xr.Dataset, points: Array, settings: Settings, notes: list[str], planned: bool
+    name: str, axis: xr.Dataset, points: Array, settings: Settings, notes: list[str], planned: bool
 ) -> EvaluatedDiagonal:
+    """Return a diagonal with its readings as those of an axis, whose positions follow from the stops (stop, 3)."""
     span = points[-1] - points[0]
     length = float(np.linalg.norm(span))
     if not (np.isfinite(points).all() and length > 0.0):
@@ -145,26 +165,9 @@ def _evaluate(
             f"stop_point of {name}: expected positions on a line, in order; found one {off * 1e6:.1f} um off the line, "
             "or out of order"
         )
-    stated = [each for each in ("length_uncertainty", "alignment_uncertainty") if each in raw]
-    axis = xr.Dataset(
-        {
-            "deviation": (READINGS, raw["diagonal_deviation"].transpose(*STOPS[1:]).values[None]),
-            "target_position": ("target", distance, {"units": "m"}),
-            **{each: raw[each] for each in stated},
-        },
-        {"freedom": ["EXX"], "approach": labels(raw, "approach")},
-        {"schema": SCHEMA, "axis": "X"},
-    )
-    without_expansion = settings.model_copy(
-        update={
-            "machine": Side(),
-            "workpiece": Side(expansion=0.0, expansion_uncertainty=0.0),
-            "functional_point": (0.0, 0.0, 0.0),
-        }
-    )
     remarks: list[str] = []
     try:
-        evaluated = evaluate(axis, without_expansion, remarks, planned=planned)
+        evaluated = evaluate(replaced(axis, {"target_position": distance}), settings, remarks, planned=planned)
     except MethodError as error:
         raise MethodError(f"Diagonal {name}: {error}") from None
     notes += [f"Diagonal {name}: {remark}" for remark in remarks if "readings are missing" in remark]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -224,15 +225,23 @@ def _from_good_readings(
         d, u = _selected(reading[j], weight[j], target, centre, MAX_READINGS)
         if len(d) < 5:
             return False
-        x = _linear(d, u)
-        # Negative distances: the sign may be reversed.
-        if not x[3] + np.median(d) >= 0.0:
-            return False
-        x, scale = _refined(x, d, u)
+        x, scale = _of_good_readings(d.tobytes(), u.tobytes())
         if not scale < max_scale:
             return False
         position[j], dead_path[j] = x[:3] + centre, x[3]
     return True
+
+
+@lru_cache(maxsize=32)
+def _of_good_readings(reading: bytes, target: bytes) -> tuple[Array, float]:
+    """Return (U, L) and robust scale, m, from the bytes of readings (k,) and targets (k, 3), if the sign is correct.
+
+    A search of a station that moved starts with the same readings of all other stations.
+    """
+    d, u = np.frombuffer(reading), np.frombuffer(target).reshape(-1, 3)
+    x = _linear(d, u)
+    # Negative distances: the sign may be reversed.
+    return _refined(x, d, u) if x[3] + np.median(d) >= 0.0 else (x, np.inf)
 
 
 def _scale(r: Array) -> float:
