@@ -157,6 +157,7 @@ def test_an_undetermined_freedom_is_a_dash_with_its_reason(page):
     assert "Not observed by this test: EC (ECC)" in page.text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_missing_iso_value_has_a_reason(read, make_drift):
     text = read(make_drift(400, minutes=30.0, temperature=False, speed=False)).text
     assert "the record is 30.0 min long, shorter than 60 min" in text

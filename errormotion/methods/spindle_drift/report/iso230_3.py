@@ -22,12 +22,16 @@ def value_of(errors: xr.Dataset, quantity: str, measure: str) -> tuple[float, fl
     """Return one ISO 230-3 value and its standard uncertainty in SI; NaN where the dataset does not contain it."""
     if "iso_value" not in errors:
         return math.nan, math.nan
-    table = errors["iso_value"]
-    if quantity not in table["quantity"].values or measure not in table["measure"].values:
-        return math.nan, math.nan
-    selected = {"quantity": quantity, "measure": measure}
-    value = float(table.sel(selected))
-    uncertainty = float(errors["iso_uncertainty"].sel(selected)) if "iso_uncertainty" in errors else math.nan
+    place = {}
+    for dim, label in (("quantity", quantity), ("measure", measure)):
+        places = np.flatnonzero(errors[dim].values == label)
+        if not places.size:
+            return math.nan, math.nan
+        place[dim] = places[0]
+    value, uncertainty = (
+        float(errors.variables[name].isel(place)) if name in errors else math.nan
+        for name in ("iso_value", "iso_uncertainty")
+    )
     return value, uncertainty
 
 
@@ -43,7 +47,7 @@ def cell(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event] 
     made = estimate(
         value / size,
         2 * uncertainty / size,
-        reason=why_not(errors, quantity, measure),
+        reason="" if math.isfinite(value) else why_not(errors, quantity, measure),
         signed=not measure.startswith(("range", "time")),
     )
     if math.isfinite(value) and contains_step(errors, quantity, measure, done):
@@ -53,13 +57,15 @@ def cell(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event] 
 
 def contains_step(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event]) -> bool:
     """Return whether the quantity's compensation was switched within the interval of a measure."""
-    time, stop = minutes_of(errors), end_of_running(errors)
-    if not (time.size and done):
+    switched = [event.minute for event in done if quantity[0] in event.axes]
+    time = minutes_of(errors)
+    if not (time.size and switched):
         return False
+    stop = end_of_running(errors)
     running = time[stop] if stop is not None else time[-1]
     start = running - _SLOPE_INTERVAL if measure == "end_slope" else time[0]
     end = time[0] + 60 if measure.endswith("60min") else time[-1] if measure.endswith("total") else running
-    return any(start < event.minute <= end and quantity[0] in event.axes for event in done)
+    return any(start < minute <= end for minute in switched)
 
 
 def why_not(errors: xr.Dataset, quantity: str, measure: str) -> str:
