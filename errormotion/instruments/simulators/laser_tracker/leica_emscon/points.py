@@ -119,7 +119,7 @@ class PointStream:
             if device.fault.kind == "disconnect" and first + POINTS_A_PACKET > device.fault.at:
                 device.disconnect()
                 return
-            self._wait(started, first + POINTS_A_PACKET, idle=self._mode != BY_TIME and not found)
+            self._wait(started, first + POINTS_A_PACKET, idle=not found)
 
     def _wait(self, started: float, samples: int, *, idle: bool) -> None:
         pace = self._device.world.pace
