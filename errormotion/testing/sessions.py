@@ -97,6 +97,8 @@ def leaves(reading: Any) -> Iterator[Any]:
             yield from leaves(value)
     elif isinstance(reading, Samples):
         yield from reading.values.ravel()
+    elif isinstance(reading, np.ndarray) and reading.dtype.kind in "biuf":
+        yield from reading.ravel().tolist()
     elif isinstance(reading, np.ndarray | list | tuple):
         for value in np.ravel(reading) if isinstance(reading, np.ndarray) else reading:
             yield from leaves(value)

@@ -183,6 +183,6 @@ class TestNodeThatSends(InstrumentConformance):
         "sim://cframe/node?seed=3&open=0&shorted=1&pdo=timer&event_timer=10",
         settings={"timeout": 0.7, "transfer": "pdo"},
         name="node_that_sends",
-        mutants=100,
+        mutants=40,
         dead_address="can://virtual/nobody?node=5",
     )

@@ -4,5 +4,5 @@ from errormotion.testing import InstrumentConformance, InstrumentSubject
 
 class TestKit(InstrumentConformance):
     subject = InstrumentSubject(
-        KeyenceLJX, "sim://cframe/profiler?seed=3&points=397&intensity=1", name="odd", mutants=100
+        KeyenceLJX, "sim://cframe/profiler?seed=3&points=397&intensity=1", name="odd", mutants=40
     )

@@ -12,5 +12,5 @@ class TestKit(InstrumentConformance):
         f"sim://cframe/lk?seed=3&wire=pty&readings=-9.9999,1,9.5,nan,-12,12,0,{DIFFERENT}",
         settings={"timeout": 0.5},
         name="pty",
-        mutants=100,
+        mutants=40,
     )

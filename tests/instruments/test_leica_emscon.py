@@ -28,7 +28,7 @@ class TestKit(InstrumentConformance):
         settings={"reflector": "Cat's eye", "meteo": "manual", "timeout": 0.5, "busy_timeout": 0.3},
         vary=simulators.in_steps("gantry", 2),
         name="gantry",
-        mutants=100,
+        mutants=40,
     )
 
 

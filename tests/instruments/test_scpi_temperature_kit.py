@@ -21,7 +21,7 @@ class TestThermocouples(InstrumentConformance):
         "sim://cframe/couples?seed=3&wire=pty&open=1",
         settings={"timeout": 0.7, "sensors": ("TC K",)},
         name="couples",
-        mutants=100,
+        mutants=40,
         dead_address="serial:///dev/no_such_line",
     )
 

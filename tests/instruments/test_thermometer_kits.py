@@ -13,7 +13,7 @@ class TestAdam(InstrumentConformance):
         "sim://cframe/adam?seed=3&noise=1&map=adam-6018&thermocouples=K",
         settings={"map": "adam-6018", "thermocouples": ("K",), "timeout": 0.7},
         name="adam",
-        mutants=100,
+        mutants=40,
         dead_address="modbus+tcp://127.0.0.1:9?unit=1",
     )
 
@@ -26,7 +26,7 @@ class TestLogger(InstrumentConformance):
         "sim://cframe/logger?seed=3&noise=1&map=logger-16&wire=pty&open=1",
         settings={"map": "logger-16", "timeout": 0.7},
         name="logger",
-        mutants=100,
+        mutants=40,
         dead_address="modbus+rtu:///dev/no_such_line?unit=1",
     )
 
@@ -39,6 +39,6 @@ class TestNode(InstrumentConformance):
         "sim://cframe/node?seed=3&open=0&shorted=1",
         settings={"timeout": 0.7},
         name="node",
-        mutants=100,
+        mutants=40,
         dead_address="can://virtual/nobody?node=5",
     )

@@ -10,7 +10,7 @@ from errormotion.testing.run import checks_for, subjects_of
 
 ALONE = {"linuxcnc"}  # only one LinuxCNC can run on a computer: the tests of LinuxCNC include the kit
 OURS = [plugin.id for plugin in plugins.available("instruments") if plugin.distribution.startswith("errormotion ")]
-MUTANTS = 100  # tests/instruments/test_mutated_frames.py reads further mutants, without a session for each
+MUTANTS = 40  # tests/instruments/test_mutated_frames.py reads further ones, without a session for each
 SUBJECTS = [
     replace(subject, mutants=min(subject.mutants, MUTANTS))
     for plugin_id in OURS

@@ -117,7 +117,7 @@ class TakesAnySize(Dial):
 
     def read(self) -> float:
         value = super().read()
-        return value if abs(value) < 1.0 else float(np.ones(int(min(abs(value), 1e8))).sum())
+        return value if abs(value) < 1.0 else float(np.ones(int(min(abs(value), 2e7))).sum())
 
 
 class NeedsTime(Dial):
