@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import kstest
+from scipy.stats import chi2, kstest
 from typer.testing import CliRunner
 
 from errormotion import datasets, plugins
@@ -104,15 +104,17 @@ def test_targets_of_a_tracker_give_the_true_errors_of_the_axes(kind, axis_name):
 @pytest.mark.slow
 @pytest.mark.parametrize("chain", [CFRAME, GANTRY])
 def test_an_axis_agrees_with_the_volume_of_the_same_machine(chain):
-    rng, p, en = np.random.default_rng(1), [], []
+    rng, p, en, square, degrees = np.random.default_rng(1), [], [], 0.0, 0
     point = (0.1, -0.2, 0.3)
-    for _ in range(40):
+    for _ in range(20):
         c = motions(rng)
         given = {"axis": axis(c, rng, point=point), "volume": volume(c, chain, rng, own_point=point)}
         found = compare(given, causes=False)
         p.append(found["p"].item())
+        square, degrees = square + found["chi2"].item(), degrees + found["degrees"].item()
         en.append(found["en"].values[np.isfinite(found["en"].values)])
     assert 0.93 <= np.mean(np.abs(en) <= 1) <= 0.98
+    assert 0.01 < chi2.sf(square, degrees) < 0.99  # uncertainties that are wrong by a tenth would fail
     assert kstest(p, "uniform").pvalue > 1e-3  # the probability of a false alarm
 
 

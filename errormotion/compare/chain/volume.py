@@ -267,9 +267,12 @@ def _half_of_inverse(N: Array, prior: Array) -> tuple[Array, float]:
     scale = 1 / np.sqrt(np.diag(N) + prior)
     scaled = N * scale[:, None] * scale
     np.fill_diagonal(scaled, 1.0 + ROUNDING)
-    factor = linalg.cholesky(scaled, lower=True, overwrite_a=True, check_finite=False)
-    found: Array = linalg.lapack.dtrtri(factor, lower=1)[0] * scale
-    return found, 2 * float(np.log(np.diag(factor) / scale).sum())
+    # in the order of LAPACK, and in place: copies would take half of the time
+    factor = linalg.cholesky(scaled.T, lower=True, overwrite_a=True, check_finite=False)
+    log_det = 2 * float(np.log(np.diag(factor) / scale).sum())
+    found: Array = linalg.lapack.dtrtri(factor, lower=1, overwrite_c=1)[0]
+    found *= scale
+    return found, log_det
 
 
 def _group(error: int) -> int:
