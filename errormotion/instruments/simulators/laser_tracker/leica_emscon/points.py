@@ -24,7 +24,7 @@ BY_TIME, BY_DISTANCE, GRID = 1, 2, 3
 SAMPLING = 1
 """Sampling interval of the position for points by distance, ms."""
 IDLE_WAIT = 0.005
-"""Real time between two samples of a reflector that has not moved far enough, s."""
+"""Real time between two packets without points: the reflector has not moved far enough, or the beam is broken, s."""
 
 
 class PointStream:
