@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from errormotion.errors import InstrumentTimeoutError
+from errormotion.instruments.simulators import world
 from errormotion.instruments.thermometer.dcon import DconTemperature
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
@@ -119,6 +120,7 @@ def test_live_values_and_a_disconnected_sensor(
         tmp_path / "runs", bench=bench, interval=0.5, port=int(served.address.rstrip("/").rpartition(":")[2])
     )
     page.wait_for_selector("body:not(.lost) .tiles li.answers >> nth=1")
+    served.stop()
 
 
 def _shows_the_same(page: Any, address: str) -> None:
@@ -148,12 +150,14 @@ def _shows_the_same(page: Any, address: str) -> None:
 
 def test_the_emergency_stop_of_a_controller_is_shown(page: Any, serving: Callable[..., Any], tmp_path: Path) -> None:
     bench = tmp_path / "bench.toml"
-    stopped = "controller?seed=3&clock=60&fault=estop&fault_at=30"
-    bench.write_text(BENCH.replace("{markup}", "").replace("controller?seed=3&clock=60", stopped))
-    page.goto(serving(tmp_path / "runs", bench=bench, interval=0.5).address)
+    bench.write_text(BENCH.replace("{markup}", "").replace("seed=3", "seed=13"))
+    served = serving(tmp_path / "runs", bench=bench, interval=0.5)
+    page.goto(served.address)
     page.wait_for_selector(".tiles li.answers:has-text('control')")
     assert page.inner_text("#alarms") == ""
+    world("cframe", seed=13).press_estop()
     sync_api.expect(page.locator("#alarms")).to_have_text("Alarm: emergency stop")
+    served.stop()
 
 
 def test_two_results_are_compared(

@@ -1,5 +1,6 @@
 """The page Measure in Chromium: a campaign from its form to its report, also after the end of the dashboard."""
 
+import json
 import os
 import re
 import socket
@@ -126,6 +127,8 @@ def test_a_campaign_is_corrected_planned_run_stopped_resumed_and_continues_after
     page.wait_for_selector("#live[data-drawn] canvas")
     accessible()
     page.click(".process button:text-is('Stop')")
+    page.wait_for_selector("#ended .process:has(.interrupted)")
+    assert json.loads(next((tmp_path / "runs").glob("*/run.json")).read_text())["status"] == "interrupted"
     page.click("#ended .process:has(.interrupted) button:text-is('Resume')")
     page.wait_for_selector(".process.alive")
     page.expected_errors = ("403", "ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_EMPTY_RESPONSE")
