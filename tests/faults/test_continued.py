@@ -14,12 +14,18 @@ from errormotion import plugins
 from errormotion.campaign import runner
 from errormotion.campaign.files import load_campaign
 from errormotion.instruments.simulators import reset
+from errormotion.methods.spindle_drift.acquisition import drift
 
 SHORTER = {
-    "spindle_drift": [('"16 min"', '"8 min"'), ('"14 min"', '"6 min"')],
-    "crossbeam_scan": [('"7 min", "15 min", "30 min"', '"7 min"')],
+    "beam_direction": [("speckle =", "readings = 12\nspeckle =")],
+    "spindle_drift": [("steps = 21", "steps = 11"), ('"16 min"', '"3 min"'), ('"14 min"', '"2 min"')],
+    "crossbeam_scan": [('"140 um"', '"140 um"\ncold_repeats = 0'), ('"7 min", "15 min", "30 min"', '"7 min"')],
+    "multilateration": [("[4, 3, 3]", "[2, 2, 2]")],
+    "normal_vector": [('"50 min"', '"30 min"'), ('"30 min", spindle', '"20 min", spindle')],
 }
 """The interruption follows the second delivery; one or more must remain."""
+SAMPLES = 1 << 16
+"""Of a delivery of the drift."""
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +45,7 @@ def campaigns(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_continued_run_has_the_raw_data_of_an_undisturbed_one(
     campaigns: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:
+    monkeypatch.setattr(drift, "CHUNK_SAMPLES", SAMPLES)
     plan = load_campaign(campaigns[method])
     inputs = {name for test in plan.tests for name in test.inputs.values()}
     identify = runner._Session._identify
