@@ -19,8 +19,9 @@ def freeform(X, Y):
         kx, ky = 2 * np.pi / lx, 2 * np.pi / ly
         angle = kx * X + ky * Y + phase
         z += a * np.sin(angle)
-        zx += a * kx * np.cos(angle)
-        zy += a * ky * np.cos(angle)
+        slope = a * np.cos(angle)
+        zx += kx * slope
+        zy += ky * slope
     bump = 0.8e-3 * np.exp(-((X - 3e-3) ** 2 + (Y - 4e-3) ** 2) / (2 * 5e-3**2))
     return z + bump, zx - bump * (X - 3e-3) / 5e-3**2, zy - bump * (Y - 4e-3) / 5e-3**2
 
@@ -67,14 +68,14 @@ class Scanner:
 
 def intersections(surface, x, y, M):
     """Heights z (row, column) so that M (x, y, z) is on the surface, for y (row, 1), by Newton's method."""
-    x = x[None, :]
-    z = surface(*np.broadcast_arrays(x, y))[0]
+    x, z, tilt = x[None, :], np.zeros((y.size, x.size)), np.hypot(M[0, 2], M[1, 2])
     for _ in range(30):
         X, Y, Z = (M[i, 0] * x + M[i, 1] * y + M[i, 2] * z + M[i, 3] for i in range(3))
         S, Sx, Sy = surface(X, Y)
         step = (Z - S) / (M[2, 2] - Sx * M[0, 2] - Sy * M[1, 2])
         z -= step
-        if np.max(np.abs(step)) < 1e-9:  # it squares with every step
+        # X and Y change by the tilt times the step: with curvatures up to 200 / m, the next step is less than 4 pm.
+        if tilt * np.max(np.abs(step)) < 2e-7:
             break
     return z
 

@@ -132,7 +132,7 @@ def test_result_moves_to_another_point(scanner):
 
 @pytest.mark.parametrize(("noisy_cold", "share"), [(1.0, 0.5), (3.0, 0.9)])
 def test_warm_scans_of_one_cold_scan_share_its_noise(make_scanner, noisy_cold, share):
-    scanner = make_scanner(rows=200, columns=800)
+    scanner = make_scanner(rows=100, columns=400)
     heights = scanner.true_heights(), scanner.true_heights(poses.displaced(TWIST))
     errors, stated = [], []
     for seed in range(40):

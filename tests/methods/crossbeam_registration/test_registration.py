@@ -70,7 +70,8 @@ def test_pose_is_how_the_profiler_moved(scanner, freedom):
 
 
 @pytest.mark.slow
-def test_errors_are_at_the_bound_and_the_covariance_says_so(scanner):
+def test_errors_are_at_the_bound_and_the_covariance_says_so(make_scanner):
+    scanner = make_scanner(rows=200, columns=800)
     results = [found for family in (7, 11) for found in pairs(scanner, TWIST, 60, family=family)]
     bound = scanner.bound()
     # The mean of 120 values of chi2(6) / 6 scatters by sqrt(2 / 6 / 120) = 0.053; three of it.

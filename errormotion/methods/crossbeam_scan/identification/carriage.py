@@ -41,20 +41,18 @@ class Rig:
     pose_covariance: Array | None
     lever_uncertainty: Array
 
-    def changed(self) -> list[tuple[tuple[RigidTransform, Array], ...]]:
-        """Return (pose, lever) changed by plus and by minus one standard uncertainty of each of `chain.SOURCES`.
+    def changed(self) -> tuple[RigidTransform, Array]:
+        """Return poses (18,) and levers (18, 3) changed by plus, then by minus one standard uncertainty of each source.
 
-        A source without uncertainty changes nothing: its entry is empty.
+        The sources are `chain.SOURCES`; one without uncertainty changes nothing.
         """
-        p = calibration.parameters(self.pose)
-        out: list[tuple[tuple[RigidTransform, Array], ...]] = []
-        for row in chain.root(self.pose_covariance):
-            steps = (row, -row) if row.any() else ()
-            out.append(tuple((calibration.pose(*(p + step)), self.lever) for step in steps))
-        for axis, u in enumerate(self.lever_uncertainty):
-            step = u * np.eye(3)[axis]
-            out.append(((self.pose, self.lever + step), (self.pose, self.lever - step)) if u else ())
-        return out
+        steps = np.zeros((len(chain.SOURCES), 9))
+        steps[:6, :6], steps[6:, 6:] = chain.root(self.pose_covariance), np.diag(self.lever_uncertainty)
+        steps = np.concatenate([steps, -steps])
+        changed = calibration.pose(*(calibration.parameters(self.pose) + steps[:, :6]).T)
+        poses = RigidTransform.concatenate([changed, self.pose])
+        moved = steps[:, :6].any(axis=1)
+        return poses[np.where(moved, np.arange(len(steps)), len(steps))], self.lever + steps[:, 6:]
 
 
 @dataclass(frozen=True)
@@ -110,11 +108,12 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
     y = np.asarray(positions, dtype=float)
     cycles, artefacts = found.cold_share.shape
     W, A = strain.from_maps(rig.pose), chain.carriage_adjoint(rig.pose, rig.lever)
-    changed = [[_to_carriage(*rig_) for rig_ in pair] for pair in rig.changed()]
+    poses, levers = rig.changed()
+    to_twist, to_carriage = strain.from_maps(poses)[:, :6], chain.carriage_adjoint(poses, levers)
     e = np.full((cycles, artefacts, 6), np.nan)
     C = np.full((cycles, artefacts, 6, 6), np.nan)
     drift = np.full((cycles, artefacts, 3), np.nan)
-    influence = np.full((len(changed), cycles, artefacts, 6), np.nan)
+    influence = np.full((len(chain.SOURCES), cycles, artefacts, 6), np.nan)
     assumed = np.zeros((2, artefacts, cycles, artefacts, 6))
     for c in range(cycles):
         known = np.isfinite(found.twist[c, :, 0])
@@ -130,11 +129,8 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
         e[c, used], C[c, used], gain = guided.twist, guided.covariance, guided.gain
         assumed[:, used[:, None], c, used] = transform(guided.assumed.reshape(2, used.size, used.size, 6), A)
         drift[c, used] = seen[:, 6:]
-        influence[:, c, used] = 0.0
-        for s, pair in enumerate(changed):
-            if pair:
-                plus, minus = (_errors(maps, gain, *matrices) for matrices in pair)
-                influence[s, c, used] = (plus - minus) / 2
+        plus, minus = np.split(_errors(maps, gain, to_twist, to_carriage), 2)
+        influence[:, c, used] = (plus - minus) / 2
     covariance = transform_covariance(C, A)
     cold = _cold_influence(covariance, found)
     names = [f"cold scan {k + 1}, part {i + 1}" for k in range(artefacts) for i in range(6)]
@@ -162,14 +158,15 @@ def _guided(
     return strain.guided(twist, covariance, positions, to_carriage, guide)
 
 
-def _to_carriage(pose: RigidTransform, lever: Array) -> tuple[Array, Array]:
-    """Return the matrices from registrations to twists (6, 9), and from these to twists of the carriage (6, 6)."""
-    return strain.from_maps(pose)[:6], chain.carriage_adjoint(pose, lever)
-
-
 def _errors(maps: Array, gain: Array, to_twist: Array, to_carriage: Array) -> Array:
-    """Return the errors (n, 6) of registrations (n, 9) for another pose and lever, with the same gain."""
-    return transform((gain @ (maps @ to_twist.T).ravel()).reshape(-1, 6), to_carriage)
+    """Return the errors (m, n, 6) of registrations (n, 9) for m other poses and levers, with the same gain.
+
+    ``to_twist`` (m, 6, 9) are the matrices from registrations to twists, ``to_carriage`` (m, 6, 6) those from twists to
+    errors of the carriage.
+    """
+    twists = maps @ to_twist.mT
+    guided = (gain @ twists.reshape(len(twists), -1, 1)).reshape(twists.shape)
+    return np.asarray(guided @ to_carriage.mT)
 
 
 def _cold_influence(covariance: Array, found: Registrations) -> Array:

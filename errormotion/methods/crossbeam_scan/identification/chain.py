@@ -54,7 +54,7 @@ class CarriageErrors:
 
 
 def feed_direction(profiler_pose: RigidTransform) -> Array:
-    """Return the direction of the feed (Y of the machine) in the profiler's frame, (3,)."""
+    """Return the direction of the feed (Y of the machine) in the profiler's frame, (..., 3)."""
     return np.asarray(profiler_pose.rotation.inv().apply([0.0, 1.0, 0.0]))
 
 
@@ -109,7 +109,7 @@ def carriage_errors(
 
 
 def carriage_adjoint(profiler_pose: RigidTransform, lever: ArrayLike) -> Array:
-    """Return the matrix (6, 6) that converts twists in the profiler's frame to twists of the carriage."""
+    """Return the matrix (..., 6, 6) that converts twists in the profiler's frame to twists of the carriage."""
     shift = np.asarray(lever, dtype=float)
     return adjoint(shift=-shift) @ adjoint_of(profiler_pose)
 

@@ -68,15 +68,15 @@ class Guided:
 
 
 def from_maps(profiler_pose: RigidTransform) -> Array:
-    """Return the matrix (9, 9) that converts (T_Q, R_Q, c) at the map's origin to (T, r, g)."""
+    """Return the matrix (..., 9, 9) that converts (T_Q, R_Q, c) at the map's origin to (T, r, g)."""
     f = feed_direction(profiler_pose)
-    B = np.eye(3)
-    B[:, 1] = f
-    W = np.zeros((9, 9))
-    W[:3, :3] = W[6:, 6:] = B
-    W[3:6, 3:6] = np.diag([f[1], 1.0, f[1]])
-    W[4, 5] = -f[2]
-    W[6:, 3:6] = B @ -cross_matrix(np.array([0.0, 1.0, 0.0]))
+    B = np.zeros((*f.shape, 3)) + np.eye(3)
+    B[..., 1] = f
+    W = np.zeros((*f.shape[:-1], 9, 9))
+    W[..., :3, :3] = W[..., 6:, 6:] = B
+    W[..., 3, 3] = W[..., 5, 5] = f[..., 1]
+    W[..., 4, 4], W[..., 4, 5] = 1.0, -f[..., 2]
+    W[..., 6:, 3:6] = B @ -cross_matrix(np.array([0.0, 1.0, 0.0]))
     return W
 
 
