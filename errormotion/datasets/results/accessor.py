@@ -101,9 +101,8 @@ class ErrorMotion:
         DataArray, (..., dof)
             m and rad; NaN where unknown.
         """
-        values = np.stack([self._ds[name].values for name in DOF], axis=-1)
         coords = {**self._coords(), "dof": list(DOF)}
-        return xr.DataArray(values, dims=(*self.dims, "dof"), coords=coords, name="twist")
+        return xr.DataArray(self._stacked(DOF), dims=(*self.dims, "dof"), coords=coords, name="twist")
 
     def estimates(self) -> xr.DataArray:
         """Return the estimates: the six freedoms, or the deviation as the only ``dof``.
@@ -113,7 +112,7 @@ class ErrorMotion:
         DataArray, (..., dof)
             m and rad; NaN where unknown.
         """
-        values = np.stack([self._ds[name].values for name in self.names], axis=-1)
+        values = self._stacked(self.names)
         return xr.DataArray(values, dims=(*self.dims, "dof"), coords=self._coords("dof"), name="estimates")
 
     def covariance(self) -> xr.DataArray:
@@ -372,19 +371,22 @@ class ErrorMotion:
                 f"{' and '.join(wrong)}. Identify them at the other functional point"
             )
 
+    def _stacked(self, names: Sequence[str]) -> Array:
+        return np.stack([self._ds.variables[name].values for name in names], axis=-1)
+
     def _values(self) -> Array:
-        return np.asarray(self.estimates().values, dtype=float)
+        return np.asarray(self._stacked(self.names), dtype=float)
 
     def _covariance(self) -> Array:
         if self.names == DOF:
-            return np.asarray(self._ds["covariance"].values, dtype=float)
-        return np.asarray(self._ds["deviation_variance"].values, dtype=float)[..., None, None]
+            return np.asarray(self._ds.variables["covariance"].values, dtype=float)
+        return np.asarray(self._ds.variables["deviation_variance"].values, dtype=float)[..., None, None]
 
     def _influence(self) -> Array:
         if self.names == DOF and "influence" in self._ds.variables:
-            return np.asarray(self._ds["influence"].values, dtype=float)
+            return np.asarray(self._ds.variables["influence"].values, dtype=float)
         if self.names != DOF and "deviation_influence" in self._ds.variables:
-            return np.asarray(self._ds["deviation_influence"].values, dtype=float)[..., None]
+            return np.asarray(self._ds.variables["deviation_influence"].values, dtype=float)[..., None]
         return np.zeros((0, *self._values().shape))
 
     def _independent(self) -> Array:
@@ -415,16 +417,15 @@ class ErrorMotion:
 
     def _transformed(self, A: Array) -> xr.Dataset:
         """Return a copy with twist, covariance, influence and sensitivity transformed by a 6x6 matrix."""
-        ds = self._ds.copy()
-        E = twists.transform(self.twist().values, A)
-        for k, name in enumerate(DOF):
-            ds[name] = ds[name].copy(data=E[..., k].copy())
-        ds["covariance"] = ds["covariance"].copy(data=twists.transform_covariance(ds["covariance"].values, A))
-        if "influence" in ds.variables:
-            ds["influence"] = ds["influence"].copy(data=twists.transform(ds["influence"].values, A))
-        if "sensitivity" in ds.variables:  # h . E = h' . E'
-            ds["sensitivity"] = ds["sensitivity"].copy(data=ds["sensitivity"].values @ np.linalg.inv(A))
-        return ds
+        old = self._ds.variables
+        E = twists.transform(self._stacked(DOF), A)
+        new = {name: E[..., k].copy() for k, name in enumerate(DOF)}
+        new["covariance"] = twists.transform_covariance(old["covariance"].values, A)
+        if "influence" in old:
+            new["influence"] = twists.transform(old["influence"].values, A)
+        if "sensitivity" in old:  # h . E = h' . E'
+            new["sensitivity"] = old["sensitivity"].values @ np.linalg.inv(A)
+        return self._ds.assign({name: old[name].copy(data=values) for name, values in new.items()})
 
 
 def _point(point: ArrayLike) -> Array:
