@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from errormotion.arrays import Array
 from errormotion.errors import BenchError, MethodError
 from errormotion.methods.normal_vector.schema import SCHEMA
+from errormotion.plugins import replaced
 from errormotion.twin import Event, VirtualMachine
 from errormotion.twin.artefacts.balls import Balls, Probe
 
@@ -74,8 +75,8 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         point = np.round((centre - machine.probe_error(centre, np.zeros(balls))).mean(axis=0), 4)
     steps = int((settings.interval * (count - 1) + cycle) / TRUTH_STEP) + 4
     truth = machine.truth_probing(cycle / 2 + TRUTH_STEP * np.arange(steps), point)
-    over_time = [array for array in truth.data_vars.values() if array.dims == ("time",)]
-    return data, truth.assign({array.name: array.copy(data=array.values - array.values[0]) for array in over_time})
+    over_time = {str(name): array.values for name, array in truth.data_vars.items() if array.dims == ("time",)}
+    return data, replaced(truth, {name: values - values[0] for name, values in over_time.items()})
 
 
 def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:

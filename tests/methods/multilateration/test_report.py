@@ -74,8 +74,10 @@ def words(html):
 
 @pytest.fixture(scope="module")
 def html(tmp_path_factory):
+    """Return the page of a result whose first station has a name with markup."""
     errors, raw = measured()
-    return page(errors, tmp_path_factory.mktemp("report"), raw=raw)
+    names = ["<b>&'S1", *errors["station"].values[1:].tolist()]
+    return page(errors.assign_coords(station=names), tmp_path_factory.mktemp("report"), raw=raw)
 
 
 def test_all_sections_are_in_order(html):
@@ -208,11 +210,9 @@ def test_excluded_target_is_listed(tmp_path):
     assert "the wrong one is not determined: T006." in words(page(errors, tmp_path))
 
 
-def test_names_with_markup_are_escaped(tmp_path):
-    errors = measured()[0]
-    names = ["<b>&'S1", *errors["station"].values[1:].tolist()]
-    html = page(errors.assign_coords(station=names), tmp_path)
+def test_names_with_markup_are_escaped(html):
     assert "<b>&'" not in html
+    assert "&lt;b&gt;&amp;&#39;S1" in html
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -313,8 +313,8 @@ def test_each_rest_is_an_independent_draw_and_a_resting_reference_affects_all_ot
 
 def test_errors_of_the_smoothed_frame_temperature_are_correlated(machine, method):
     """Means over half a minute share their smoothed temperature: their difference over seeds is what is stated."""
-    t = np.arange(0, 800.0, 2.0)
-    late, later = (t > 300) & (t <= 330), (t > 700) & (t <= 730)
+    t = np.arange(0, 420.0, 2.0)
+    late, later = (t > 150) & (t <= 180), (t > 350) & (t <= 380)
     weights = later / later.sum() - late / late.sum()
     found, stated = [], []
     raw = simulation.raw_drift(machine, t, seed=0, expansion=True)
