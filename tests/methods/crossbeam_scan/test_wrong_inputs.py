@@ -28,6 +28,12 @@ def scan(gantry, times=TIMES, places=PLACES, *, seed=1, lines=LINES, artefact=No
     )
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _remembering(remembering):
+    with remembering():
+        yield
+
+
 @pytest.fixture(scope="module")
 def whole(gantry):
     """Scans without a fault."""
