@@ -71,11 +71,12 @@ def holed() -> InclinationCalibration:
     beta=st.floats(0.0, 2 * np.pi),
     mid=st.sampled_from([0.0, 1e-3]),
 )
-def test_compensation_removes_the_error(depth: float, alpha: float, beta: float, mid: float) -> None:
-    known = calibration()
+def test_compensation_removes_the_error(
+    good: InclinationCalibration, depth: float, alpha: float, beta: float, mid: float
+) -> None:
     q = tilt_vector(alpha, beta)
-    k, _ = known.slope(q)
-    found = known.compensate(mid + depth + depth * k, q, mid_range=mid)
+    k, _ = good.slope(q)
+    found = good.compensate(mid + depth + depth * k, q, mid_range=mid)
     assert found.value == pytest.approx(mid + depth, abs=1e-15)
 
 

@@ -38,8 +38,8 @@ def reader(tmp_path: Path) -> Callable[..., Callable[[bytes], object]]:
 @pytest.mark.parametrize(("log", "mapping"), [(LOG, MAP), (DRIFT, DRIFT_MAP)], ids=["any schema", "drift"])
 def test_damaged_logs_and_maps(reader, log: str, mapping: str, which: str) -> None:
     data = (log if which == "log.csv" else mapping).encode()
-    refused = mutants.check(reader(log, mapping, which), data, seed=1, number=mutants.count(250))
-    assert refused > 100  # of changes to a file of this kind most are mistakes
+    refused = mutants.check(reader(log, mapping, which), data, seed=1, number=mutants.count(120))
+    assert refused > 48  # of changes to a file of this kind most are mistakes
 
 
 def test_damaged_readings(tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ def test_damaged_readings(tmp_path: Path) -> None:
         (tmp_path / "readings.csv").write_bytes(data)
         return load(tmp_path / "readings.csv")
 
-    assert mutants.check(read, READINGS.encode(), seed=2, number=mutants.count(500)) > 200
+    assert mutants.check(read, READINGS.encode(), seed=2, number=mutants.count(250)) > 100
 
 
 def test_damaged_units_and_quantities() -> None:

@@ -42,7 +42,7 @@ def test_an_error_dataset_is_unchanged_by_storage(errors, tmp_path, suffix) -> N
 
 @both
 def test_a_long_record_is_compressed_and_only_influences_are_rounded(errors, tmp_path, suffix) -> None:
-    ds = errors(n=20_000)
+    ds = errors(n=10_000)
     path = save(ds, tmp_path / f"errors{suffix}")
     back = load(path)
     for name, variable in ds.variables.items():
