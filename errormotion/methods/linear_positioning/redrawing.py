@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.methods.linear_positioning.diagonals.redrawing import draw_effects, ordered, redraw_diagonals
+from errormotion.methods.linear_positioning.diagonals.redrawing import draw_effects, of_trial, ordered, redraw_diagonals
 from errormotion.methods.linear_positioning.identification import budget, moving
 from errormotion.methods.linear_positioning.identification.identify import Evaluated, evaluate
 from errormotion.methods.linear_positioning.identification.reading import labels, length_uncertainty
@@ -27,10 +27,7 @@ if TYPE_CHECKING:
 
 
 def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
-    """Return the readings, and the draws of their sources: scatter, drift, instrument, alignment, expansion.
-
-    The figures of redrawn readings are not used: they are found without bias and uncertainty.
-    """
+    """Return the readings, and the draws of their sources: scatter, drift, instrument, alignment, expansion."""
     if "end_deviation" in raw:
         return _moving(raw, settings, errors)
     if "diagonal_deviation" in raw:
@@ -39,7 +36,7 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     groups = dict.fromkeys(source.group for source in evaluated.sources if source.group != budget.END)
     sources = {"readings": Redraw(_readings(evaluated), groups=(budget.END,), own=True)}
     sources |= {group: Redraw(_shared(evaluated, group), groups=(group,)) for group in groups}
-    return Redrawing(ordered(raw, "deviation", READINGS), settings.model_copy(update={"trials": 0}), sources)
+    return Redrawing(ordered(raw, "deviation", READINGS), of_trial(settings), sources)
 
 
 def _moving(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:

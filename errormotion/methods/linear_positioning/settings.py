@@ -210,3 +210,7 @@ class Settings(PluginSettings):
         if self.settle > self.dwell:
             raise ValueError(f"settle: expected at most the dwell, {self.dwell:g} s; found {self.settle:g} s")
         return self
+
+
+class TrialSettings(Settings):
+    """Settings of one trial of the Monte Carlo method, without statistics and figures, which trials do not use."""

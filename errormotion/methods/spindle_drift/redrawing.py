@@ -68,7 +68,7 @@ def _drift(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing
             sources["frame temperature"] = _frame_temperature(warming, index)
     if settings.unseen_rotation > 0:
         sources[UNSEEN] = _unseen_rotation(errors)
-    return Redrawing(reduced, settings.model_copy(update=stated), sources)
+    return Redrawing(reduced, _of_trial(settings).model_copy(update=stated), sources)
 
 
 def _means(raw: xr.Dataset, record: Record, mean: Array) -> xr.Dataset:
@@ -168,5 +168,9 @@ def _detection(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redra
     steps = segmented(raw, settings, []) if "scan" in raw.variables else raw
     steps = steps.load().assign(distance=steps["distance"].transpose("channel", "profile", "step"))
     noise = errors["noise"].sel(beam=[str(name) for name in raw["channel"].values]).values[:, None, None]
-    trial = TrialSettings(**{name: getattr(settings, name) for name in type(settings).model_fields})
-    return Redrawing(steps, trial, {"readings": _readings(np.broadcast_to(noise, steps["distance"].shape))})
+    sources = {"readings": _readings(np.broadcast_to(noise, steps["distance"].shape))}
+    return Redrawing(steps, _of_trial(settings), sources)
+
+
+def _of_trial(settings: Settings) -> TrialSettings:
+    return TrialSettings(**{name: getattr(settings, name) for name in type(settings).model_fields})

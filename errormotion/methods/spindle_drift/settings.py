@@ -127,4 +127,4 @@ class Settings(PluginSettings):
 
 
 class TrialSettings(Settings):
-    """Settings of one trial of the Monte Carlo method, without comparisons that have no effect on the errors."""
+    """Settings of one trial of the Monte Carlo method, without results that have no effect on the errors."""

@@ -24,7 +24,7 @@ from errormotion.methods.linear_positioning.identification.identify import Evalu
 from errormotion.methods.linear_positioning.identification.reading import labels, point_of
 from errormotion.methods.linear_positioning.identification.standard import FIGURES
 from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, SCHEMA, STOPS
-from errormotion.methods.linear_positioning.settings import Settings, Side
+from errormotion.methods.linear_positioning.settings import Settings, Side, TrialSettings
 from errormotion.plugins import replaced
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def identify_diagonals(raw: xr.Dataset, settings: Settings, info: MethodInfo, *,
         sources=sources,
         source_groups=groups,
         source_ids=certified(raw.attrs, {budget.LENGTH: ("tracker", "scale")} if budget.LENGTH in sources else {}),
-        extras=_extras(diagonals, square, settings),
+        extras={} if isinstance(settings, TrialSettings) else _extras(diagonals, square, settings),
         start=start_of(raw),
         measured=raw.attrs,
     )

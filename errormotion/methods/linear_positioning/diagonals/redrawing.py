@@ -10,6 +10,7 @@ from errormotion.methods.linear_positioning.diagonals.identification import eval
 from errormotion.methods.linear_positioning.identification import budget
 from errormotion.methods.linear_positioning.identification.reading import labels
 from errormotion.methods.linear_positioning.schema import APPROACHES, STOPS
+from errormotion.methods.linear_positioning.settings import TrialSettings
 from errormotion.plugins import Redraw, Redrawing, replaced
 
 if TYPE_CHECKING:
@@ -20,10 +21,7 @@ if TYPE_CHECKING:
 
 
 def redraw_diagonals(raw: xr.Dataset, settings: Settings) -> Redrawing:
-    """Return the readings, and the draws of their sources: scatter, drift, scale, alignment.
-
-    The figures of redrawn readings are not used: they are found without bias and uncertainty.
-    """
+    """Return the readings, and the draws of their sources: scatter, drift, scale, alignment."""
     diagonals = evaluate_diagonals(raw, settings, [])
     _, groups, effects = shared_sources(diagonals)
     size = np.array([each.evaluated.scatter_of_means()[0] for each in diagonals])  # (diagonal, approach, stop)
@@ -40,7 +38,12 @@ def redraw_diagonals(raw: xr.Dataset, settings: Settings) -> Redrawing:
         return Redraw(draw, groups=(group,))
 
     sources = {"readings": Redraw(readings, own=True)} | {group: shared(group) for group in dict.fromkeys(groups)}
-    return Redrawing(ordered(raw, "diagonal_deviation", STOPS), settings.model_copy(update={"trials": 0}), sources)
+    return Redrawing(ordered(raw, "diagonal_deviation", STOPS), of_trial(settings), sources)
+
+
+def of_trial(settings: Settings) -> TrialSettings:
+    """Return the settings of a trial."""
+    return TrialSettings(**{name: getattr(settings, name) for name in type(settings).model_fields})
 
 
 def ordered(raw: xr.Dataset, name: str, dims: tuple[str, ...]) -> xr.Dataset:

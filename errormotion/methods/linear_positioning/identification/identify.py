@@ -19,7 +19,7 @@ from errormotion.methods.linear_positioning.identification.reading import Readin
 from errormotion.methods.linear_positioning.identification.scatter import Scatter, scatter
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, MEANINGS
 from errormotion.methods.linear_positioning.schema import APPROACHES
-from errormotion.methods.linear_positioning.settings import LIMITS, Settings
+from errormotion.methods.linear_positioning.settings import LIMITS, Settings, TrialSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -97,7 +97,8 @@ def identify(raw: xr.Dataset, settings: Settings, info: MethodInfo) -> xr.Datase
     notes: list[str] = []
     evaluated = evaluate(raw, settings, notes)
     origin = provenance.make(settings, raw, None, steps=_steps(evaluated))
-    errors = build(evaluated, raw, info, origin, _extras(evaluated, settings))
+    extras = {} if isinstance(settings, TrialSettings) else _extras(evaluated, settings)
+    errors = build(evaluated, raw, info, origin, extras)
     return errors.assign_attrs(notes=notes or [""], **stated_limits(settings))
 
 

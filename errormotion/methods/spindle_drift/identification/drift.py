@@ -43,6 +43,7 @@ from errormotion.methods.spindle_drift.identification.uncertainty import (
     twist,
 )
 from errormotion.methods.spindle_drift.schema import CHANNELS
+from errormotion.methods.spindle_drift.settings import TrialSettings
 
 CERTIFIED = {"bar radius": ("bar", "radius"), "frame expansion": ("frame", "coefficient of expansion")}
 """Sources that are one draw in all measurements with one certificate."""
@@ -115,17 +116,19 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         )
     zero = float(averages.time[reference].mean())
     time = averages.time - zero
-    results = iso230_3.evaluate(
-        iso230_3.quantities(errors, independent, influence, bar.levels - point[2], then.E[0] - point),
-        time,
-        temperature=record.temperature,
-        sensors=sensors(raw) if record.temperature is not None else (),
-        spindle_speed=record.spindle_speed,
-        running_end=None if settings.running_end is None else settings.running_end - zero,
-        sensor=settings.iso_temperature,
-        average=settings.iso_average,
-        reference=reference,
-    )
+    results = None
+    if not isinstance(settings, TrialSettings):
+        results = iso230_3.evaluate(
+            iso230_3.quantities(errors, independent, influence, bar.levels - point[2], then.E[0] - point),
+            time,
+            temperature=record.temperature,
+            sensors=sensors(raw) if record.temperature is not None else (),
+            spindle_speed=record.spindle_speed,
+            running_end=None if settings.running_end is None else settings.running_end - zero,
+            sensor=settings.iso_temperature,
+            average=settings.iso_average,
+            reference=reference,
+        )
     names = [(s.name, s.group) for s in sources] + [(name, group) for name, group, _ in effects]
     unseen = np.cross(then.a[0], point - then.E[0]) * settings.unseen_rotation
     if np.linalg.norm(unseen) > 0:
@@ -160,13 +163,15 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         influence=influence,
         sources=[name for name, _ in names],
         source_groups=[group for _, group in names],
-        extras=_extras(raw, averages, mean, state, bar) | results.as_extras(len(influence)),
+        extras={} if results is None else _extras(raw, averages, mean, state, bar) | results.as_extras(len(influence)),
         start=start_of(raw, zero),
         source_ids={s.name: s.identity for s in sources if s.identity}
         | certified(raw.attrs, {name: CERTIFIED[name] for name, _ in names if name in CERTIFIED}),
         reference_sources=[s.name for s in sources if s.group == REFERENCE],
         reference_interval=(float(time[reference[0]]), float(time[reference[-1]])),
     )
+    if results is None:
+        return ds
     return ds.assign_attrs(
         notes=list(notes) or [""],
         reference_time=zero,
