@@ -157,27 +157,25 @@ def turn(angle):
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_simulated_error_is_detected_and_named(name):
     rng = np.random.default_rng(5)
-    first = 0
-    for _ in range(5):
+    for _ in range(3):
         found = compare(two(rng, **PLANTED[name]))
         assert found["p"].item() < 0.001
-        first += name in (found["cause"].values[0, 0], *found["alike"].values[0, 0].split("; "))
-    assert first >= 4, found["cause"].values[0].tolist()
+        assert name in (found["cause"].values[0, 0], *found["alike"].values[0, 0].split("; "))
 
 
 @pytest.mark.slow
 def test_the_size_of_a_mistake_is_estimated_with_its_uncertainty():
     rng = np.random.default_rng(6)
-    inside = 0
-    for _ in range(30):
+    scores = []
+    for _ in range(15):
         found = compare(two(rng, functional_point=(0.0, 0.0, 0.03)))
         size = {
             str(n): (v, u)
             for n, v, u in zip(*(found[k].values[0, 0] for k in ("size_name", "size", "size_u")), strict=True)
         }
         value, u = size["Z (m)"]
-        inside += abs(abs(value) - 0.03) <= 2 * u
-    assert inside >= 25
+        scores.append((abs(value) - 0.03) / u)
+    assert 0.01 < chi2.sf(np.square(scores).sum(), 15) < 0.99
 
 
 def test_a_difference_without_known_cause_is_reported():
@@ -300,8 +298,8 @@ def test_an_error_is_detected_as_often_as_its_non_centrality_predicts():
     degrees, squares = int(exact["degrees"].item()), exact["chi2"].item()
     predicted = ncx2.sf(chi2.isf(0.05, degrees), degrees, squares)
     assert 0.8 < predicted < 0.97
-    found = np.mean([compare(two(rng, **changed), causes=False)["p"].item() < 0.05 for _ in range(40)])
-    assert abs(found - predicted) < 4 * np.sqrt(predicted * (1 - predicted) / 40)
+    found = np.mean([compare(two(rng, **changed), causes=False)["p"].item() < 0.05 for _ in range(25)])
+    assert abs(found - predicted) < 3 * np.sqrt(predicted * (1 - predicted) / 25)
 
 
 def test_causes_with_scores_that_are_close_are_named_together():
