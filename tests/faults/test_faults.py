@@ -17,7 +17,7 @@ from errormotion.campaign.folder import list_runs
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "virtual_beam" / "campaign.toml"
 METHOD, TEST = "beam_direction", "beam"
-LIMIT = 12_000
+LIMIT = 8_000
 """Of the size of a file: enough for run.json at the start, not for the whole run, bytes."""
 
 
@@ -64,14 +64,12 @@ def test_jumps_and_orders_that_are_not_in_the_audit_log_are_found(tmp_path: Path
 
 @pytest.mark.slow
 @pytest.mark.timeout(120)
-def test_run_on_a_full_disk_ends_with_a_sentence_and_finishes_with_space(
-    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_on_a_full_disk_ends_with_a_sentence_and_finishes_with_space(tmp_path: Path, undisturbed: Path) -> None:
     log = tmp_path / "errormotion" / "errormotion.log"  # of the commands: the same disk is full for it
     log.parent.mkdir()
     log.write_bytes(b"\n" * LIMIT)
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    ended = trials.finish(trials.start(["run", EXAMPLE, "--runs", tmp_path / "runs"], tmp_path / "journal", LIMIT))
+    words, state = ["run", EXAMPLE, "--runs", tmp_path / "runs"], {"XDG_STATE_HOME": str(tmp_path)}
+    ended = trials.finish(fault_processes.Forked(words, tmp_path / "journal", LIMIT, environment=state))
     assert ended.faults == []
     assert ended.code not in (0, trials.INTERNAL_ERROR)
     assert os.strerror(errno.EFBIG) in ended.message

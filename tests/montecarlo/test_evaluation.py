@@ -24,7 +24,7 @@ from errormotion.report.document import Source
 
 pytestmark = pytest.mark.usefixtures("translated")
 
-TRIALS = 40
+TRIALS, FEW = 40, 8
 NOISE, OFFSET = 0.5e-6, 0.9e-6  # m
 TIMES = [0.0, 60.0, 120.0]
 
@@ -120,20 +120,21 @@ def test_threads_return_identical_results_and_leave_no_trials(measured, found, t
 
 
 @pytest.mark.slow
-def test_processes_and_a_cluster_return_identical_results(tmp_path):
+def test_processes_and_a_cluster_return_identical_results(tmp_path, monkeypatch):
     from distributed import LocalCluster
 
+    monkeypatch.setattr(evaluation, "MIN_TRIALS", FEW)
     subject = plugins.get("methods", "beam_direction").conformance()[0]
     raw, settings = subject.make(0)[0], subject.effective_settings()
     path = datasets.save(raw, tmp_path / "raw.nc")
     given = path, subject.plugin, settings, subject.identify(raw)
-    found = _evaluate(given, tmp_path / "zero", scheduler="sync")
-    assert _evaluate(given, tmp_path / "one", scheduler="processes", workers=1).identical(found)
+    found = _evaluate(given, tmp_path / "zero", scheduler="sync", trials=FEW)
+    assert _evaluate(given, tmp_path / "one", scheduler="processes", workers=1, trials=FEW).identical(found)
     with LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
     ) as cluster:
         assert cluster.scheduler_address.startswith("tcp://")
-        assert _evaluate(given, tmp_path / "two", scheduler=cluster.scheduler_address).identical(found)
+        assert _evaluate(given, tmp_path / "two", scheduler=cluster.scheduler_address, trials=FEW).identical(found)
 
 
 def test_trials_continue_until_the_tolerance_is_reached(measured, tmp_path, monkeypatch):

@@ -113,6 +113,8 @@ class Forked:
         No file may exceed this size, bytes; 0 for no limit.
     disk : Disk, optional
     clock : Clock, optional
+    environment : dict of str to str, optional
+        Further variables of its environment.
     """
 
     def __init__(
@@ -122,11 +124,12 @@ class Forked:
         file_limit: int = 0,
         disk: Disk | None = None,
         clock: Clock | None = None,
+        environment: dict[str, str] | None = None,
     ) -> None:
         self._output = journal.with_name(f"{journal.name}.{os.urandom(4).hex()}")
         words = [str(word) for word in arguments]
         clocks = (str(clock.file), clock.started) if clock else None
-        keywords = {"file_limit": file_limit, "disk": disk, "clocks": clocks}
+        keywords = {"file_limit": file_limit, "disk": disk, "clocks": clocks, "environment": environment or {}}
         self._process = _context.Process(target=_work, args=(words, str(journal), str(self._output)), kwargs=keywords)
         with _one_at_a_time:
             self._process.start()
@@ -178,9 +181,11 @@ def _work(
     file_limit: int,
     disk: Disk | None,
     clocks: tuple[str, str] | None,
+    environment: dict[str, str],
 ) -> None:
     """Run the command line in this process."""
     os.setsid()
+    os.environ.update(environment)
     for number, end in ((1, ".out"), (2, ".err")):
         os.dup2(os.open(output + end, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,7 +1,7 @@
 """Runs that are ended by a fault: the command line in a process of its own, killed at an instant, and continued.
 
 The child writes a line for each dataset that a method delivers to the recorder; what was delivered and is not on disk
-after the kill is the loss. This file is the child's programme as well: ``fault_trials.py JOURNAL LIMIT ARGUMENTS...``.
+after the kill is the loss.
 """
 
 from __future__ import annotations
@@ -60,21 +60,6 @@ class Ended:
     samples: int = 0
     stage: str = ""
     faults: list[str] = field(default_factory=list)
-
-
-def start(arguments: list[Any], journal: Path, file_limit: int = 0) -> subprocess.Popen[str]:
-    """Start the command line in a process group of its own; no file may exceed ``file_limit`` bytes, 0 for no limit."""
-    words = [sys.executable, __file__, journal, file_limit, *arguments]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        [str(word) for word in words],
-        env=environment,
-        text=True,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
 
 
 def finish(process: Process) -> Ended:
@@ -231,7 +216,3 @@ def summary(runs: Path) -> dict[str, list[tuple[str, float]]]:
         times = [datetime.fromisoformat(step["time"]).timestamp() for step in folder.data["steps"]]
         table[str(folder.data["test"])] = list(zip(STAGES, np.diff(times).tolist(), strict=False))
     return table
-
-
-if __name__ == "__main__":
-    command(sys.argv[1], int(sys.argv[2]), sys.argv[3:])
