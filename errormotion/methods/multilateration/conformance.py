@@ -7,6 +7,7 @@ import xarray as xr
 
 from errormotion.methods.multilateration import simulation
 from errormotion.methods.multilateration.method import Multilateration
+from errormotion.methods.multilateration.settings import Layout
 from errormotion.plugins import MethodSubject
 from errormotion.twin import VirtualMachine
 
@@ -15,11 +16,14 @@ TRACKER_SCALE = 0.5e-6
 
 
 def subjects() -> tuple[MethodSubject, ...]:
-    """Return the subjects of the kit."""
+    """Return the subjects of the kit. Their plan moves one station along Z only: a short search."""
+    first, *others = Layout().stations
+    places = [(first, (*first[:2], first[2] + 0.2)), *zip(others, others, strict=True)]
+    boxes = [{"low": low, "high": high} for low, high in places]
     subject = MethodSubject(
         Multilateration,
         tracker_readings,
-        settings={"scale_uncertainty": TRACKER_SCALE, "planning": {"minimise": "mean"}},
+        settings={"scale_uncertainty": TRACKER_SCALE, "planning": {"minimise": "mean", "boxes": boxes}},
         raw_vectors={"target_nominal": "point", "station_nominal": "point", "reflector": "point"},
         optional=("station_nominal", "reflector", "reading_time"),
         measured=("displacement",),
