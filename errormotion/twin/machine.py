@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import xarray as xr
@@ -75,8 +76,6 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         Temperatures and thermal errors under the current schedule.
     geometry : GeometricErrors
         The geometric errors of all axes.
-    crossbeam : Crossbeam
-        Thermal errors of the Y axis of the gantry, and the line profiler in its spindle.
     point_sensor, sine_gauge, check_bar
         A point sensor on the stage, and its targets.
     """
@@ -98,7 +97,7 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         self.bar = bars.seeded_bar(self._rng("bar"), len(self.frame.channels))
         self.state: ThermalState = seeded_state(tables, self._rng("heat"), self._schedule(()))
         self.geometry: GeometricErrors = seeded_errors(self._rng("geometry"), self.description)
-        self.crossbeam: Crossbeam = seeded_crossbeam(self._rng("crossbeam"), tables.travel.get("Y", (0.0, 0.0)))
+        self._along_crossbeam = tables.travel.get("Y", (0.0, 0.0))
         self._set_up_point_sensor(self._rng("point_sensor"))
         self._set_up_probing(self._rng("probing"))
         self._sensing = self._sense()
@@ -108,6 +107,11 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
 
     def _rng(self, part: str) -> np.random.Generator:
         return np.random.default_rng([abs(self.seed), int(self.seed < 0), _PART[part]])
+
+    @cached_property
+    def crossbeam(self) -> Crossbeam:
+        """Thermal errors of the Y axis of the gantry, and the line profiler in its spindle; made when it is used."""
+        return seeded_crossbeam(self._rng("crossbeam"), self._along_crossbeam)
 
     def _schedule(self, events: Sequence[Event]) -> Schedule:
         return Schedule(tuple(events), self.top_speed / 60 / SPIN_UP_TIME, self.top_speed)

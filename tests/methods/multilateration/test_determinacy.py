@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.network import descent
 from errormotion.methods.multilateration.network.diagnosis.determinacy import swapped_stations
 from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
 from errormotion.methods.multilateration.network.solver import solve
@@ -110,7 +111,8 @@ def test_a_target_at_a_station_and_extreme_noise_are_refused():
 
 
 @pytest.mark.slow
-def test_any_stations_result_in_a_network_or_a_method_error():
+def test_any_stations_result_in_a_network_or_a_method_error(monkeypatch):
+    monkeypatch.setattr(descent, "PASSES", 60)  # most of these never converge
     rng, refused = np.random.default_rng(0), 0
     for k in range(60):
         station = rng.normal(size=(4, 3)) * 10.0 ** rng.uniform(-8, 3, (4, 1))
