@@ -1,9 +1,9 @@
-"""NetCDF-4 files: those of `errormotion` are read by h5py, all others and what is written by h5netcdf.
+"""NetCDF-4 files: those of `errormotion` are read and written by h5py, all others by h5netcdf.
 
 h5netcdf looks up a variable by its path for each of its properties, 35 to 40 times for each variable that is read or
-written. For the small variables of an error dataset this takes most of the time. Files are therefore written with each
-object looked up once, and read without h5netcdf where all dimensions, values and attributes have the form that
-h5netcdf has given them: numbers of this computer, or texts of free length.
+written. For the small variables of an error dataset this takes most of the time. Files are therefore read and written
+without h5netcdf where all dimensions, values and attributes have the form that h5netcdf gives them: numbers of this
+computer, or texts of free length. Written files have the content and the order of those that h5netcdf writes.
 """
 
 from __future__ import annotations
@@ -78,6 +78,7 @@ _HIDDEN = {"CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "_Netcdf4Dimid",
 """Attributes that state dimensions."""
 _OF_FILE = {"_NCProperties", "_nc3_strict"}
 _RENAMED = "_nc4_non_coord_"
+"""Before the name of a variable that a dimension has as well, of which it is not the coordinate."""
 _NO_VALUES = b"This is a netCDF dimension but not a netCDF variable"
 
 
@@ -121,13 +122,13 @@ class _Store(AbstractDataStore):
 
     def _read(self, file: h5py.File, path: str) -> None:
         found = {name: file[name] for name in file}
-        if not all(isinstance(each, h5py.Dataset) and not name.startswith(_RENAMED) for name, each in found.items()):
+        if not all(isinstance(each, h5py.Dataset) for each in found.values()):
             raise _UnusualError
         scales = {name: each for name, each in found.items() if h5py.h5ds.is_scale(each.id)}
         dims = {int(_numbers(each, "_Netcdf4Dimid", ())): name for name, each in scales.items()}
         self._attributes = _attributes(file, _OF_FILE)
         self._variables = {
-            name: self._variable(name, each, dims, path)
+            name.removeprefix(_RENAMED): self._variable(name, each, dims, path)
             for name, each in found.items()
             if name not in scales or not bytes(each.attrs.get("NAME", b"")).startswith(_NO_VALUES)
         }
@@ -213,9 +214,107 @@ def open_netcdf(path: Path) -> xr.Dataset:
     return ds
 
 
+class _Composed(H5NetCDFStore):
+    """A file of h5py that xarray writes, with the form that h5netcdf gives it: the links to dimensions come last.
+
+    Raises
+    ------
+    _UnusualError
+        The dataset has something that only h5netcdf writes.
+    """
+
+    def __init__(self, file: h5py.File) -> None:
+        self._file, self.format = file, "NETCDF4"
+        self._numbers: dict[Any, int] = {}
+        self._scales: dict[Any, h5py.Dataset] = {}
+        self._written: dict[Any, tuple[h5py.Dataset, tuple[Any, ...]]] = {}
+
+    def set_attribute(self, key: str, value: Any) -> None:
+        _set_attribute(self._file, key, value)
+
+    def set_dimensions(self, variables: Mapping[Any, xr.Variable], unlimited_dims: Any = None) -> None:  # noqa: ARG002
+        sizes = {dim: size for variable in variables.values() for dim, size in variable.sizes.items()}
+        self._numbers = {dim: number for number, dim in enumerate(sizes)}
+        for dim, size in sizes.items():
+            named = variables[dim].dims if dim in variables else ()
+            if size == 0 or (named[:1] == (dim,) and len(named) > 1):
+                raise _UnusualError
+            if named != (dim,):
+                self._scales[dim] = scale = self._file.create_dataset(dim, (size,), ">f4", track_order=True)
+                scale.attrs.create("_Netcdf4Dimid", self._numbers[dim], dtype=np.int32)
+                h5py.h5ds.set_scale(scale.id, _NO_VALUES + f".{size:10}".encode())
+
+    def prepare_variable(self, name: str, variable: xr.Variable, *_: Any, **__: Any) -> tuple[Any, Any]:
+        options = {_OPTIONS.get(key, key): value for key, value in variable.encoding.items()}
+        if options.pop("zlib", False):
+            options["compression"] = "gzip"
+        text = (variable.dtype.metadata or {}).get("element_type") is str
+        if set(options) - _KNOWN or "/" in name or not (text or _is_number(variable.dtype)):
+            raise _UnusualError
+        attributes = dict(variable.attrs)
+        fill = attributes.pop("_FillValue", None)
+        name = _RENAMED + name if name in self._scales else name
+        written = self._file.create_dataset(
+            name,
+            variable.shape,
+            h5py.string_dtype() if text else variable.dtype,
+            fillvalue=fill,
+            track_order=True,
+            **(options if variable.shape else {}),
+        )
+        if fill is not None:
+            _set_attribute(written, "_FillValue", fill if text else variable.dtype.type(fill))
+        for key, value in attributes.items():
+            _set_attribute(written, key, value)
+        self._written[name] = written, variable.dims
+        return written, variable.data
+
+    def link(self) -> None:
+        """Link all variables to their dimensions, and state the programs that wrote the file."""
+        for name, (written, _) in self._written.items():
+            if name in self._numbers:
+                self._scales[name] = written
+                h5py.h5ds.set_scale(written.id, str(name).encode())
+        for name, (written, dims) in self._written.items():
+            numbers = [self._numbers[dim] for dim in dims]
+            if numbers:
+                written.attrs.create("_Netcdf4Dimid", numbers[0], dtype=np.int32)
+                written.attrs.create("_Netcdf4Coordinates", numbers, dtype=np.int32)
+            for axis, dim in enumerate(dims if name not in self._numbers else ()):
+                h5py.h5ds.attach_scale(written.id, self._scales[dim].id, axis)
+        programs = f"version=2,h5netcdf={h5netcdf.__version__},hdf5={h5py.version.hdf5_version},h5py={h5py.__version__}"
+        self._file.attrs["_NCProperties"] = np.array(programs, h5py.string_dtype("ascii", len(programs)))
+
+
+_OPTIONS = {"complevel": "compression_opts", "chunksizes": "chunks"}
+"""Encodings of xarray with another name in h5py."""
+_KNOWN = {"compression", "compression_opts", "chunks", "shuffle"}
+
+
+def _is_number(dtype: np.dtype[Any]) -> bool:
+    """Whether a type of numbers is one of NetCDF, in the byte order of this computer."""
+    return dtype.isnative and (dtype.kind in "iu" or dtype in (np.float32, np.float64))
+
+
+def _set_attribute(owner: h5py.File | h5py.Dataset, key: str, value: Any) -> None:
+    """Write an attribute; a single number is an array with one value."""
+    dtype = np.asarray(value).dtype
+    if key in _HIDDEN or key in _OF_FILE or not (dtype.kind == "U" or _is_number(dtype)):
+        raise _UnusualError
+    owner.attrs[key] = np.atleast_1d(value) if np.isscalar(value) and dtype.kind != "U" else value
+
+
 def compose_netcdf(ds: xr.Dataset, encoding: Mapping[Any, dict[str, Any]]) -> bytes:
     """Return the bytes of a NetCDF-4 file."""
     composed = io.BytesIO()  # kept here: Python 3.13 refuses to close a buffer whose content is in use
+    try:
+        with h5py.File(composed, "w", track_order=True) as file:
+            direct = _Composed(file)
+            ds.dump_to_store(direct, encoding=encoding)
+            direct.link()
+        return composed.getvalue()
+    except _UnusualError:
+        composed = io.BytesIO()
     store = H5NetCDFStore(File(composed, "w"), mode="w")
     try:
         ds.dump_to_store(store, encoding=encoding)
