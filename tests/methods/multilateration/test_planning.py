@@ -50,9 +50,9 @@ def test_expected_uncertainty_is_the_scatter_of_measurements():
     target, U = layout.grid(settings.layout)[1], np.array(CLOSE)
     rng = np.random.default_rng(2)
     d = np.linalg.norm(target - U[:, None], axis=-1)
-    runs = [solve(d + 1e-6 * rng.normal(size=d.shape), target, U, noise=1e-6, robust=False).target for _ in range(300)]
+    runs = [solve(d + 1e-6 * rng.normal(size=d.shape), target, U, noise=1e-6, robust=False).target for _ in range(150)]
     scatter = np.sqrt(((np.array(runs) - target) ** 2).sum(axis=-1).mean(axis=0))
-    # 300 runs: some 5 % of a standard deviation, and 27 targets that share their stations. Beyond the linear
+    # 150 runs: some 5 % of a standard deviation, and 27 targets that share their stations. Beyond the linear
     # prediction comes what a close layout bends.
     assert np.abs(scatter / ds["target_uncertainty"].values - 1).max() < 0.2
     variance = np.trace(ds["covariance"].values[:, :3, :3], axis1=1, axis2=2)
