@@ -89,28 +89,28 @@ def figures(found: Statistics) -> Array:
     or both directions, ``R`` the largest repeatability, ``M`` the range of the mean bidirectional deviations, ``B`` the
     largest reversal error, ``B_mean`` its mean over the targets, with its sign.
     """
-    upper, lower = found.mean + 2.0 * found.s, found.mean - 2.0 * found.s
-    one = _largest(upper) - _smallest(lower)  # (..., approach)
-    systematic = _largest(found.mean) - _smallest(found.mean)
-    repeatability = _largest(found.unidirectional_repeatability)
+    upper, lower = _largest(found.mean + 2.0 * found.s), _smallest(found.mean - 2.0 * found.s)  # (..., approach)
+    highest, lowest = _largest(found.mean), _smallest(found.mean)
+    one, systematic = upper - lower, highest - lowest
+    repeatability, reversal = _largest(found.unidirectional_repeatability), found.reversal
     both_known = np.isfinite(systematic).all(axis=-1)
 
     def both(high: Array, low: Array) -> Array:
         return np.where(both_known, high.max(axis=-1) - low.min(axis=-1), np.nan)
 
     columns = [
-        both(_largest(upper), _smallest(lower)),
+        both(upper, lower),
         one[..., 0],
         one[..., 1],
-        both(_largest(found.mean), _smallest(found.mean)),
+        both(highest, lowest),
         systematic[..., 0],
         systematic[..., 1],
         _largest(found.repeatability),
         repeatability[..., 0],
         repeatability[..., 1],
         _largest(found.bidirectional) - _smallest(found.bidirectional),
-        _largest(np.abs(found.reversal)),
-        _mean(found.reversal),
+        _largest(np.abs(reversal)),
+        _mean(reversal),
     ]
     return np.stack(columns, axis=-1)
 
