@@ -13,13 +13,17 @@ from errormotion.instruments.simulators import reset
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "one_machine"
 SHORTER = {
-    'procedure = "beam_detection"': 'procedure = "beam_detection"\nsteps = 21\nscan_length = "1.6 mm"',
-    'duration = "181 min"': 'duration = "13 min"',
-    'duration = "183 min"': 'duration = "15 min"',
-    'warm_up = ["7 min", "30 min", "60 min", "120 min", "180 min"]': 'warm_up = ["9 min"]',
-    'positions = ["-600 mm", "-200 mm", "200 mm", "600 mm"]': 'positions = ["-200 mm", "200 mm"]',
+    'procedure = "beam_detection"': 'procedure = "beam_detection"\nsteps = 21\nscan_length = "1.6 mm"\ndwell = "0.7 s"',
+    'duration = "181 min"': 'duration = "8 min"',
+    'duration = "183 min"\ninterval = "7 min"': 'duration = "10 min"\ninterval = "4 min"',
+    'warm_up = ["7 min", "30 min", "60 min", "120 min", "180 min"]': 'warm_up = ["6 min"]',
+    'positions = ["-600 mm", "-200 mm", "200 mm", "600 mm"]': (
+        'positions = ["-200 mm", "200 mm"]\nline_pitch = "140 um"\ncold_repeats = 0'
+    ),
     "count = [4, 3, 3]": "count = [3, 3, 3]",
 }
+POINTS = "points=800&pitch=25e-6", "points=400&pitch=50e-6"
+"""Of a line of the profiler, in the example and here."""
 
 
 def test_the_example_is_a_valid_campaign_on_one_machine() -> None:
@@ -39,7 +43,9 @@ def test_all_methods_agree_with_each_other_and_with_the_truth(tmp_path: Path) ->
         assert long in text
         text = text.replace(long, short)
     (tmp_path / "campaign.toml").write_text(text)
-    (tmp_path / "bench.toml").write_text((EXAMPLE / "bench.toml").read_text())
+    bench = (EXAMPLE / "bench.toml").read_text()
+    assert POINTS[0] in bench
+    (tmp_path / "bench.toml").write_text(bench.replace(*POINTS))
     try:
         runner.run(load_campaign(tmp_path / "campaign.toml"), runs=tmp_path / "runs")
     finally:
