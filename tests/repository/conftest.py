@@ -8,7 +8,8 @@
 ``make demo``, the first command of two pages, runs once: both use its output and a copy of its files. A call of
 ``errormotion`` runs in this process, which has already loaded its libraries, to save seconds for each command. Other
 commands run in a shell, as do all commands of the README. The reports of how-to guides, which these do not show, have
-empty figures: they are filled, but not printed. The pages are distributed to workers by files of tests.
+empty figures: they are filled, but not printed. Plans of how-to guides, whose numbers these do not state, are searched
+with a fifth of the evaluations. The pages are distributed to workers by files of tests.
 """
 
 import doctest
@@ -37,11 +38,15 @@ from sybil.region import Region
 
 from errormotion.cli.app import app
 from errormotion.instruments import simulators
+from errormotion.methods.beam_direction.planning import design
+from errormotion.methods.multilateration.planning import layout
 
 ROOT = Path(__file__).parents[2]
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 SLOW = ("README.md", "docs/tutorial/", "docs/how-to/")
 """Pages that measure on virtual machines, one to twenty seconds each."""
+SEARCHES = ((design, "_MAX_EVALUATIONS"), (layout, "_TRIED"), (layout, "_GLOBAL"), (layout, "_LOCAL"))
+"""Numbers of evaluations of the searches for the best plan."""
 
 
 def _line_of_make(command: str) -> str:
@@ -197,6 +202,8 @@ def run_examples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[P
         names: dict[str, Any] = {}
         if page.parent.name == "how-to":
             monkeypatch.setattr(Figure, "savefig", _only_into_files)
+            for module, name in SEARCHES:
+                monkeypatch.setattr(module, name, getattr(module, name) // 5)
         for one in (page, *continuations(page)):
             document = parse(one)
             document.namespace = names
