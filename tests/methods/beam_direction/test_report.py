@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import DOF, build_errors, provenance
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.methods.beam_direction import simulation
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.methods.beam_direction.method import BeamDirection
@@ -27,9 +28,10 @@ NOISE = 0.4e-6
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse_maps():
-    """Draw the maps of the calibration with fewer cells."""
+    """Draw the maps of the calibration, which is read once, with fewer cells."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(surface, "_STEPS", 21)
+        patch.setattr(InclinationCalibration, "load", cache(InclinationCalibration.load))
         yield
 
 
