@@ -20,19 +20,6 @@ EXAMPLE = ROOT / "examples" / "ballbar_distribution"
 FIGURES = ("G(CCW) XY", "G(CW) XY", "G(b) XY", "H XY", "Fmax XY", "Fmin XY", "D XY")
 
 
-def run(*arguments, folder, site, code=0):
-    """Return the output of a command in a separate interpreter with the distribution on its path."""
-    done = subprocess.run(
-        [sys.executable, *map(str, arguments)],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": f"{site}{os.pathsep}{ROOT}", "PYTHONDONTWRITEBYTECODE": "1", "COLUMNS": "200"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == code, done.stdout + done.stderr
-    return done.stdout
-
-
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
     """Install a copy of the distribution into a folder without network; return a function that runs `errormotion`."""
@@ -63,17 +50,17 @@ def installed(tmp_path_factory):
 @pytest.fixture(scope="module")
 def measured(installed):
     """Write simulated raw data, their truth, and the same readings as a CSV file."""
-    script = (
-        "from errormotion import datasets, plugins; from ballbar_test.simulation import simulate\n"
-        "Ballbar = plugins.get('methods', 'ballbar')\n"
-        "raw, truth = Ballbar.simulate(Ballbar.Settings(), 3)\n"
-        "datasets.save(raw, 'raw.nc'); datasets.save(truth, 'truth.nc')\n"
-    )
-    run("-c", script, folder=installed.work, site=installed.site)
-    raw = datasets.load(installed.work / "raw.nc")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(installed.site)
+        from ballbar_test.method import Ballbar
+
+        raw, truth = Ballbar.simulate(Ballbar.Settings(), 3)
+        for name in [each for each in sys.modules if each.partition(".")[0] == "ballbar_test"]:
+            del sys.modules[name]
+    datasets.save(raw, installed.work / "raw.nc")
+    datasets.save(truth, installed.work / "truth.nc")
     (installed.work / "readings.csv").write_text(as_csv(raw))
     (installed.work / "log.txt").write_text(as_log(raw))
-    raw.close()
     return installed.work
 
 
