@@ -338,17 +338,25 @@ def _resolve(root: ElementTree.Element) -> None:
 
 
 def _lowered(path: str, down: float) -> str:
-    """Return path data moved down."""
-    return re.sub(_PAIR, lambda found: f"{found[1]} {float(found[2]) + down:.6f}", path)
+    """Return path data moved down: every second number is an ordinate."""
+    tokens = path.split()
+    for k in [k for k, each in enumerate(tokens) if not each.isalpha()][1::2]:
+        tokens[k] = f"{float(tokens[k]) + down:.6f}"
+    return " ".join(tokens)
 
 
 _REFERENCE = re.compile(r"(?:^|url\()#([^)\n]+)", re.MULTILINE)
-_PAIR = re.compile(r"(-?[\d.]+(?:e-?\d+)?)\s+(-?[\d.]+(?:e-?\d+)?)")
 
 
 def _short(path: str) -> str:
     """Return path data with a resolution of 0.01 points."""
-    return " ".join(f"{float(each):.2f}".rstrip("0").rstrip(".") if "." in each else each for each in path.split())
+    tokens = path.split()
+    places = [k for k, each in enumerate(tokens) if "." in each]
+    # all at once, since a long curve has thousands
+    rounded = "%.2f " * len(places) % tuple([float(tokens[k]) for k in places])
+    for k, each in zip(places, rounded.split(), strict=True):
+        tokens[k] = each.rstrip("0").rstrip(".")
+    return " ".join(tokens)
 
 
 def _font(text: str) -> str:
