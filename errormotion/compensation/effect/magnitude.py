@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -102,10 +103,22 @@ class Curve:
             np.array([F @ (D**k * y) for k in range(3)]),
         )
 
-    @property
+    @cached_property
     def expected(self) -> float:
         """Expected square of values with a true magnitude of 0: tr V."""
-        return float(self.noise[0] + np.trace(self.inner[0]))
+        return float(self.noise[0] + self.traces[0])
+
+    @cached_property
+    def traces(self) -> tuple[float, float, float]:
+        """Traces of the matrices of ``inner``."""
+        first, second, third = (float(np.trace(each)) for each in self.inner)
+        return first, second, third
+
+    @cached_property
+    def spectrum(self) -> tuple[Array, Array]:
+        """Eigenvalues and eigenvectors of FF'."""
+        values, vectors = np.linalg.eigh(self.inner[0])
+        return values, vectors
 
     @property
     def true_square(self) -> float:
@@ -154,15 +167,22 @@ def displaced(weighted: Sequence[tuple[float, Curve]], target: float) -> list[Te
     """
     factors = [math.sqrt(max(1 - c.noise[0] / c.square, 0.0)) if c.square > 0 else 0.0 for _, c in weighted]
     start = sum(w * s**2 * c.square for (w, c), s in zip(weighted, factors, strict=True)) - target
-    L, Q = np.linalg.eigh(sum(w * c.inner[0] for w, c in weighted))
+    if len(weighted) == 1:
+        ((w, curve),) = weighted
+        L, Q = w * curve.spectrum[0], curve.spectrum[1]
+    else:
+        L, Q = np.linalg.eigh(sum(w * c.inner[0] for w, c in weighted))
     g = Q.T @ sum(w * s * c.along[0] for (w, c), s in zip(weighted, factors, strict=True))
     if not len(L) or not np.abs(L).max() > 0:
         return None
     L = np.where(np.abs(L) > ROUNDING * np.abs(L).max(), L, 0.0)
     g = np.where(np.abs(g) > ROUNDING * np.abs(g).max(), g, 0.0)
 
+    squares = g**2
+
     def excess(x: float) -> float:
-        return start + float((g**2 * x * (2 - x * L) / (1 - x * L) ** 2).sum())
+        part = x * L
+        return start + float(np.add.reduce(squares * x * (2 - part) / (1 - part) ** 2))
 
     end = L[-1] if start < 0 else L[0]
     most = (1 - 1e-9) / end if end * start < 0 else -1e9 / L[-1] if start > 0 and L[-1] > 0 else 0.0
@@ -183,8 +203,8 @@ def below(q: float, terms: Sequence[Term]) -> float:
         w, curve = term.weight, term.curve
         _, d2, d3 = curve.noise
         k1 += w * (curve.expected + term.true_square)
-        k2 += 2 * w**2 * (d2 + 2 * np.trace(curve.inner[1])) + 4 * w**2 * term.weighted(1)
-        k3 += 8 * w**3 * (d3 + 3 * np.trace(curve.inner[2]))
+        k2 += 2 * w**2 * (d2 + 2 * curve.traces[1]) + 4 * w**2 * term.weighted(1)
+        k3 += 8 * w**3 * (d3 + 3 * curve.traces[2])
         k3 += 24 * w * (w**2 * term.weighted(2) + 2 * w * (term.along(1) @ g) + g @ curve.inner[0] @ g)
     k2 += 2 * float(np.trace(inner @ inner)) + 4 * float(g @ g)
     k3 += 8 * float(3 * np.trace(powered @ inner) + np.trace(inner @ inner @ inner))
