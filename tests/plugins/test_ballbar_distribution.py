@@ -1,7 +1,6 @@
 """A method in a separate distribution: from raw data to report by the command line."""
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -37,13 +36,14 @@ def installed(tmp_path_factory):
 
     with Commands([site, ROOT]) as commands:
 
-        def command(*arguments, code=0):
+        def command(*arguments, cwd=work, code=0):
             """Return the output of a command in a process forked from one with this path."""
-            done = commands.run(*arguments, cwd=work, environment={"COLUMNS": "200"})
+            environment = {"COLUMNS": "200", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+            done = commands.run(*arguments, cwd=cwd, environment=environment)
             assert done.returncode == code, done.stdout + done.stderr
             return done.stdout
 
-        command.work, command.site = work, site
+        command.work, command.site, command.source = work, site, source
         yield command
 
 
@@ -191,19 +191,7 @@ def test_it_passes_the_kit(installed):
 
 
 @pytest.mark.slow
-def test_its_own_tests_pass():
+def test_its_own_tests_pass(installed):
     """Without the kit, which is run by the command above."""
-    arguments = ["-q", "-c", "pyproject.toml", "--rootdir", ".", "-p", "no:cacheprovider", "-k", "not TestBallbar"]
-    environment = {
-        "PYTHONPATH": f"{EXAMPLE}{os.pathsep}{ROOT}",
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
-    }
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", *arguments, "tests"],
-        cwd=EXAMPLE,
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout
+    arguments = ("-q", "-c", "pyproject.toml", "--rootdir", ".", "-p", "no:cacheprovider", "-k", "not TestBallbar")
+    assert "passed" in installed("pytest", *arguments, "tests", cwd=installed.source)

@@ -1,35 +1,33 @@
 """``errormotion plugins new`` writes a distribution whose tests pass."""
 
-import os
-import subprocess
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from command_line import CliRunner
+from forked_commands import Commands
 
 from errormotion.cli.app import app
 from errormotion.cli.commands.plugins.new import id_of
 from errormotion.errors import PluginError
 
 
+@pytest.fixture(scope="module")
+def commands() -> Iterator[Commands]:
+    with Commands() as commands:
+        yield commands
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "name"), [("instrument", "LX9 gauge"), ("method", "dial drift"), ("compensator", "XC control")]
 )
-def test_the_tests_of_a_new_plugin_pass(what: str, name: str, tmp_path: Path) -> None:
+def test_the_tests_of_a_new_plugin_pass(what: str, name: str, commands: Commands, tmp_path: Path) -> None:
     folder = tmp_path / "new"
     result = CliRunner().invoke(app, ["plugins", "new", what, name, "--out", str(folder)])
     assert result.exit_code == 0, result.output
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"],
-        cwd=folder,
-        env=os.environ
-        | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    arguments = ("-q", "-o", "pythonpath=.", "-p", "no:cacheprovider", "tests")
+    done = commands.run("pytest", *arguments, cwd=folder, environment={"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"})
     assert done.returncode == 0, done.stdout
 
 

@@ -1,6 +1,7 @@
 """Commands of errormotion in processes of their own, forked from one that has imported the package.
 
-A process then takes the time of its work, and not that of the imports, which is 1 to 2 s of processor time.
+A process then takes the time of its work, and not that of the imports, which is 1 to 2 s of processor time. The command
+``pytest`` runs tests of a plugin.
 """
 
 from __future__ import annotations
@@ -178,7 +179,12 @@ def _main() -> None:
         os.close(each)
     os.chdir(request["cwd"])
     os.environ |= request["environment"]
-    sys.argv = ["errormotion", *request["arguments"]]
+    command, *options = request["arguments"]
+    if command == "pytest":
+        import pytest
+
+        sys.exit(pytest.main(options))
+    sys.argv = ["errormotion", command, *options]
     main()
 
 
