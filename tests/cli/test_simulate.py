@@ -3,15 +3,14 @@
 import json
 import signal
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from command_line import CliRunner
+from forked_commands import Command, Commands
 
 from errormotion import plugins
 from errormotion.campaign.files import parse_bench
@@ -28,18 +27,23 @@ from errormotion.plugins import get
 WAIT = 60  # s
 
 
-@contextmanager
-def device(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
-    """Start the command in a separate process; return its output."""
-    command = [sys.executable, "-m", "errormotion", "simulate", *arguments, "--json"]
+@pytest.fixture(scope="module")
+def commands() -> Iterator[Commands]:
     # A shell that starts the tests in the background has SIGINT ignored, and so would its children.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        started = Commands()
     finally:
         signal.signal(signal.SIGINT, before)
-    with started as process:
-        assert process.stdout is not None
+    with started as commands:
+        yield commands
+
+
+@contextmanager
+def device(commands: Commands, *arguments: Any) -> Iterator[tuple[Command, dict[str, Any]]]:
+    """Start the command in a separate process; return its output."""
+    process = commands.start("simulate", *arguments, "--json")
+    with closing(process):
         try:
             text = ""
             while not text.rstrip().endswith("\n}"):
@@ -48,7 +52,7 @@ def device(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, A
                 text += line
             yield process, json.loads(text)
         finally:
-            process.kill()
+            process.send_signal(signal.SIGKILL)
 
 
 def free_port() -> int:
@@ -56,9 +60,9 @@ def free_port() -> int:
         return int(server.getsockname()[1])
 
 
-def test_a_simulated_device_serves_several_clients_in_turn() -> None:
+def test_a_simulated_device_serves_several_clients_in_turn(commands: Commands) -> None:
     port = free_port()
-    with device("dcon_temperature", "--port", str(port), "--set", "noise=0") as (process, printed):
+    with device(commands, "dcon_temperature", "--port", port, "--set", "noise=0") as (process, printed):
         assert printed["url"] == f"tcp://127.0.0.1:{port}"
         readings = []
         for _ in range(3):
@@ -69,24 +73,26 @@ def test_a_simulated_device_serves_several_clients_in_turn() -> None:
                 line.sendall(b"#0")  # half a request, which the next client must not complete
         assert readings[0] == pytest.approx(readings[2], abs=0.1)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(WAIT) == 0
+        process.communicate(timeout=WAIT)
+        assert process.returncode == 0
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", port), timeout=1.0)
 
 
-def test_a_fault_is_one_of_the_device() -> None:
-    with device("dcon_temperature", "--fault", "silence", "--set", "fault_at=4") as (process, printed):
+def test_a_fault_is_one_of_the_device(commands: Commands) -> None:
+    with device(commands, "dcon_temperature", "--fault", "silence", "--set", "fault_at=4") as (process, printed):
         with DconTemperature(printed["url"], DconSettings(timeout=0.3)) as thermometer:
             thermometer.read()
             with pytest.raises(InstrumentTimeoutError):
                 thermometer.read()
         process.send_signal(signal.SIGINT)
-        assert process.wait(WAIT) == 0
+        process.communicate(timeout=WAIT)
+        assert process.returncode == 0
 
 
-def test_all_lines_of_a_device_are_printed() -> None:
+def test_all_lines_of_a_device_are_printed(commands: Commands) -> None:
     port = free_port()
-    with device("keyence_ljx", "--port", str(port)) as (_, printed):
+    with device(commands, "keyence_ljx", "--port", port) as (_, printed):
         assert printed["url"] == f"tcp://127.0.0.1:{port}"
         assert printed["lines"] == {"stream": f"tcp://127.0.0.1:{port + 1}"}
         with KeyenceLJX(printed["address"]) as profiler:
