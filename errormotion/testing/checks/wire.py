@@ -21,7 +21,7 @@ from errormotion.testing.kit import require
 from errormotion.testing.sessions import numbers
 
 LATE = "late"
-LATE_ANSWERS = (12, 20, 30, 45, 70, 110)
+LATE_ANSWERS: tuple[int, ...] = (12, 20, 30, 45, 70, 110)
 """Candidates for the number of the late answer; the first one after opening is used."""
 READINGS = 24
 READINGS_AFTER_ERROR = 4
@@ -68,24 +68,26 @@ def late_answers(subject: InstrumentSubject) -> str:
     else:
         limit = 1.0
     sound = _readings(subject, "")
-    seen = [
-        _require_in_step(sound, _late_readings(subject, when), how, repeats=subject.repeats)
-        for when, how in ((f"&late_by={1.5 * limit:g}", "half a time limit late"), ("", "late until the next answer"))
-    ]
+    seen, candidates = [], LATE_ANSWERS
+    for when, how in ((f"&late_by={1.5 * limit:g}", "half a time limit late"), ("", "late until the next answer")):
+        late, candidates = _late_readings(subject, when, candidates)
+        seen.append(_require_in_step(sound, late, how, repeats=subject.repeats))
     return "; ".join(seen)
 
 
 Reading = tuple[float, ...] | Exception
 
 
-def _late_readings(subject: InstrumentSubject, when: str) -> list[Reading]:
-    """Return readings of which one answer is late, after the instrument was opened."""
+def _late_readings(
+    subject: InstrumentSubject, when: str, candidates: tuple[int, ...]
+) -> tuple[list[Reading], tuple[int, ...]]:
+    """Return readings with a late answer after the instrument was opened, and the candidates from this answer on."""
     found: list[Reading] = []
-    for number in LATE_ANSWERS:
+    for k, number in enumerate(candidates):
         found = _readings(subject, f"{LATE}&fault_at={number}{when}")
         if not isinstance(found[0], Exception):
-            break
-    return found
+            return found, candidates[k:]
+    return found, candidates[-1:]
 
 
 def _readings(subject: InstrumentSubject, fault: str) -> list[Reading]:
