@@ -3,13 +3,14 @@
 import json
 import os
 import signal
-import subprocess
-import sys
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import CliRunner
+from forked_commands import Commands
 
 from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import load_bench
@@ -91,32 +92,31 @@ def test_the_name_of_the_machine_must_be_right(place: Path) -> None:
     assert "the machine of bench.toml is 'Mill 5'. Nothing was written." in result.output
 
 
+@pytest.fixture(scope="module")
+def commands() -> Iterator[Commands]:
+    with Commands() as commands:
+        yield commands
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("signals", [1, 2], ids=["once", "twice"])
-def test_ctrl_c_ramps_to_zero_a_second_one_ends_at_once(place: Path, signals: int) -> None:
+def test_ctrl_c_ramps_to_zero_a_second_one_ends_at_once(commands: Commands, place: Path, signals: int) -> None:
     text = BENCH.replace('slew = "20 um/s"', f'slew = "{20 if signals == 1 else 0.01} um/s"')
     (place / "bench.toml").write_text(text, encoding="utf-8")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "errormotion", *command("--arm", MACHINE, "--json")],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )
-    assert process.stdout is not None
-    following = (json.loads(line) for line in process.stdout)
-    least = 1e-6 if signals == 1 else 10e-9  # ten periods to ramp to zero
-    assert any(row["state"] == "following" and max(map(abs, row["offset"])) > least for row in following)
-    process.send_signal(signal.SIGINT)
-    if signals == 2:
-        assert any(row["state"] == "ramping" for row in following)
+    environment = {"XDG_STATE_HOME": os.environ["XDG_STATE_HOME"]}
+    process = commands.start(*command("--arm", MACHINE, "--json"), cwd=place, environment=environment)
+    with closing(process):
+        following = (json.loads(line) for line in process.stdout)
+        least = 1e-6 if signals == 1 else 10e-9  # ten periods to ramp to zero
+        assert any(row["state"] == "following" and max(map(abs, row["offset"])) > least for row in following)
         process.send_signal(signal.SIGINT)
-    rest = [row["state"] for row in following]
-    assert process.wait(100) == 0, process.stderr.read() if process.stderr else ""
+        if signals == 2:
+            assert any(row["state"] == "ramping" for row in following)
+            process.send_signal(signal.SIGINT)
+        rest = [row["state"] for row in following]
+        _, complaints = process.communicate(timeout=100)
+    assert process.returncode == 0, complaints
     assert (rest[-1:] == ["off"]) == (signals == 1)
-    process.stdout.close()
-    if process.stderr is not None:
-        process.stderr.close()
 
 
 def test_another_command_shows_it_and_ramps_it_to_zero(place: Path) -> None:
