@@ -5,7 +5,9 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from command_line import CliRunner
+from undrawn import undrawn  # noqa: F401 - a fixture
 
 from errormotion.cli.app import app
 from errormotion.datasets.files.runfile import read_run
@@ -13,6 +15,7 @@ from errormotion.datasets.files.runfile import read_run
 LOGO = b"\x89PNG\r\n\x1a\nlogo"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_of_a_run_has_its_head_and_logo(lab: None, write: Callable[..., Path], tmp_path: Path) -> None:
     (tmp_path / "logo.png").write_bytes(LOGO)
     bench = '[laboratory]\nname = "Room <2>"\nlogo = "logo.png"\n[calibrated_until]\nbar = 2020-01-31\n'

@@ -7,6 +7,7 @@ from html import unescape
 import numpy as np
 import pytest
 import xarray as xr
+from undrawn import undrawn  # noqa: F401 - a fixture
 
 from errormotion.campaign.monitor import log as monitor_log
 from errormotion.campaign.monitor.plugin import MonitorLog
@@ -121,12 +122,14 @@ def test_working_parameters_are_those_of_the_log(html):
     assert found["Position X"][1] == "−200.0"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_log_without_a_controller_states_it(tmp_path):
     text = words(write_report(log(controller=False), tmp_path / "r.html").read_text(encoding="utf-8"))
     assert "The bench had no controller" in text
     assert "Spindle speed" not in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_rows_that_were_not_written_are_a_gap(tmp_path):
     whole = log()
     part = whole.isel(time=np.r_[0:100, 150:200])
@@ -171,6 +174,7 @@ def test_figures_are_those_of_the_page(html):
     assert f"{found['highest temperature of spindle'][0]:.1f} °C" in words(html)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_log_of_one_row_and_of_none_have_a_page(tmp_path):
     assert "1 rows" in words(write_report(log().isel(time=[0]), tmp_path / "r.html").read_text(encoding="utf-8"))
     assert monitor_log.read_log(log().isel(time=[])).rows == 0

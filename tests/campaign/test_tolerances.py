@@ -7,12 +7,15 @@ from typing import Any
 
 import pytest
 from command_line import CliRunner, Result
+from undrawn import undrawn  # noqa: F401 - a fixture
 
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.app import app
 from errormotion.errors import BenchError, RunError
+
+pytestmark = pytest.mark.usefixtures("undrawn")
 
 TEST = 'name = "a"\nsettings = {{ count = 11 }}\n[tolerances]\nfreedoms = {{ EX = "{}" }}\n'
 """The last of 11 samples is EX = 10 um with U = 0.2 um."""

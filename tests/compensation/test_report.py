@@ -6,6 +6,7 @@ from html import unescape
 
 import numpy as np
 import pytest
+from undrawn import undrawn  # noqa: F401 - a fixture
 
 from errormotion.compensation.thermal_model import Settings, check, fit
 from errormotion.compensation.thermal_model.report import write_model_report
@@ -131,6 +132,7 @@ def test_error_that_was_not_measured_is_not_compared(model, warm_ups, tmp_path):
     assert row[2].startswith("—")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_prediction_is_shown_as_not_measured(model, warm_ups, tmp_path):
     predicted = model.predict(warm_ups[2])
     html = write_report(predicted, tmp_path / "r.html").read_text(encoding="utf-8")
@@ -160,6 +162,7 @@ def test_prediction_beyond_training_is_reported_and_shaded(model, warm_ups, tmp_
     assert all(note in text for note in json_notes)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_time_without_an_input_has_no_prediction(model, warm_ups, tmp_path):
     part = warm_ups[2].copy(deep=True)
     values = part["temperature"].values.copy()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from typer.testing import CliRunner
+from undrawn import undrawn  # noqa: F401 - a fixture
 
 from errormotion import datasets
 from errormotion.cli.app import app
@@ -205,6 +206,7 @@ def test_a_history_that_violates_its_schema_is_an_error(
     assert expected in first
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_history_without_steps_and_notes_is_stored(tmp_path: Path, call: Callable[..., Any]) -> None:
     for k in range(2):
         values = {"EX": 1e-6, "EZ": 1e-6 * k}
@@ -283,6 +285,7 @@ def test_values_of_several_components_have_a_remark(tmp_path: Path, call: Callab
     assert "several functional points" in notes
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_of_a_run_shows_its_notes(lab: Path, tmp_path: Path) -> None:
     text = write_run_report(lab / "run-03", tmp_path / "r.html").read_text()
     assert "Notes on this run" in text
