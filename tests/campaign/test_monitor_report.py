@@ -180,6 +180,7 @@ def test_log_of_one_row_and_of_none_have_a_page(tmp_path):
     assert monitor_log.read_log(log().isel(time=[])).rows == 0
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_page_of_the_run_folder_of_a_monitor_is_written(tmp_path):
     folder = tmp_path / "20260302T081500Z-monitor-ab12"
     folder.mkdir()
