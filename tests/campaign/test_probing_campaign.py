@@ -64,7 +64,7 @@ balls = [{balls}]
 touches = 4
 order = "forward"
 duration = "{minutes} min"
-interval = "20 min"
+interval = "{interval} min"
 schedule = [{{ at = "0 s", spindle_speed = "12000 /min" }}]
 tool_axes = "{axes}"
 {settings}
@@ -81,7 +81,8 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
 
     def write(
         kind: str = "gantry",
-        minutes: int = 40,
+        minutes: int = 20,
+        interval: int = 10,
         balls: int = 3,
         settings: str = "",
         driver: str = "controller_probe",
@@ -95,7 +96,9 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
         wires |= {"driver": driver, "wire": "controller" if active else "printer"}
         wires |= {"more": PROBE if active else 'timeout = "1 s"\nstart_timeout = "1 s"'}
         (tmp_path / "bench.toml").write_text(BENCH.format(kind=kind, **wires))
-        text = CAMPAIGN.format(balls=stated, minutes=minutes, axes=machine.tool_axes, settings=settings)
+        text = CAMPAIGN.format(
+            balls=stated, minutes=minutes, interval=interval, axes=machine.tool_axes, settings=settings
+        )
         (tmp_path / "campaign.toml").write_text(text)
         return load_campaign(tmp_path / "campaign.toml"), tmp_path / "runs"
 
@@ -158,7 +161,7 @@ IN_SECOND_CYCLE = 5 * TOUCHES + 20
 @pytest.mark.parametrize(("kind", "unseen"), [("gantry", ""), ("cframe", "EC")])
 def test_a_campaign_determines_the_true_errors(lab: Lab, kind: str, unseen: str) -> None:
     machine = here(kind).machine
-    plan, runs = lab(kind)
+    plan, runs = lab(kind, minutes=40, interval=20)
     (run,) = runner.run(plan, runs=runs)
     raw, errors = raw_of(run), datasets.load(run.errors)
     datasets.validate(errors)
@@ -176,7 +179,7 @@ def test_a_campaign_determines_the_true_errors(lab: Lab, kind: str, unseen: str)
 
 def test_a_displaced_ball_is_named(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     virtual = here()
-    plan, runs = lab(minutes=60, balls=4)
+    plan, runs = lab(minutes=30, balls=4)
 
     def push() -> None:
         virtual.balls = virtual.balls.moved(1, (40e-6, -30e-6, 0.0))
@@ -184,7 +187,7 @@ def test_a_displaced_ball_is_named(lab: Lab, monkeypatch: pytest.MonkeyPatch) ->
     breaks_at(monkeypatch, "spindle", 4, push)  # turned off, on, off; on again: the warm-up before the third cycle
     (run,) = runner.run(plan, runs=runs)
     errors = datasets.load(run.errors)
-    assert "Ball B2 moved before cycle 2 (2400 s)" in str(errors.attrs["notes"])
+    assert "Ball B2 moved before cycle 2 (1200 s)" in str(errors.attrs["notes"])
     # Every cycle shares the cold one's errors: by chance 18 such numbers pass 3 sigma in one run of thirty, 4 in 900.
     assert np.abs(off(errors, virtual.machine)).max() < 4
 
@@ -224,7 +227,7 @@ def test_an_error_in_a_cycle_stops_the_machine_and_the_next_cycle_follows_after_
         operator.reset()
         (run,) = runner.resume(plan, runs=runs)
         raw = raw_of(run)
-        np.testing.assert_allclose(raw["time"].values, [0.0, 1200.0, 2400.0], atol=1e-3)
+        np.testing.assert_allclose(raw["time"].values, [0.0, 600.0, 1200.0], atol=1e-3)
         assert (raw["touch_flag"].values[2] == 0).all()
         # its time went on with the machine's clock, so that its heat is that of the truth
         assert np.nanmax(np.abs(off(datasets.load(run.errors), virtual.machine))) < 3
@@ -238,7 +241,7 @@ def test_an_alarm_during_the_warm_up_stops_the_spindle(lab: Lab, monkeypatch: py
             runner.run(plan, runs=runs)
         state = operator.state()
         assert state["commanded_spindle_speed"] == 0
-        assert state["time"] < 600  # noticed within seconds, not at the next cycle
+        assert state["time"] < 300  # noticed within seconds, not at the next cycle
     assert raw_of(one_run(runs)).sizes["time"] == 1
 
 
@@ -284,7 +287,7 @@ def test_a_connection_lost_while_the_spindle_rotates_is_reopened_to_stop_it(lab:
     with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as operator:
         with pytest.raises(RunError, match="connection"):
             runner.run(plan, runs=runs)
-        assert 0 < operator.state()["time"] < 1200
+        assert 0 < operator.state()["time"] < 600
         assert operator.state()["commanded_spindle_speed"] == 0
     assert raw_of(one_run(runs)).sizes["time"] == 1
 
@@ -339,7 +342,7 @@ def test_an_interrupted_run_with_programs_has_the_data_of_an_uninterrupted_one(
 def test_a_killed_process_loses_only_its_present_cycle(
     lab: Lab, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan, runs = lab(minutes=60, probe="&fault=silence&fault_at=250")  # in the third cycle, which waits for its end
+    plan, runs = lab(minutes=30, probe="&fault=silence&fault_at=250")  # in the third cycle, which waits for its end
     process = command("run", plan.folder / "campaign.toml", "--runs", runs, "--no-report")
     cycles = 0
     while process.poll() is None and cycles < 2:
@@ -354,7 +357,7 @@ def test_a_killed_process_loses_only_its_present_cycle(
     monkeypatch.setattr(SimulatedDevice, "_silent", lambda _: False)
     (run,) = runner.resume(runs=runs)
     raw = raw_of(run)
-    np.testing.assert_allclose(raw["time"].values, 1200.0 * np.arange(4), atol=1e-3)
+    np.testing.assert_allclose(raw["time"].values, 600.0 * np.arange(4), atol=1e-3)
     np.testing.assert_array_equal(raw["touch_time"].values[:2], before["touch_time"].values)
     assert np.abs(off(datasets.load(run.errors), machine)).max() < 4
 
@@ -388,7 +391,7 @@ def test_an_alarm_while_a_program_runs_ends_the_run_without_false_data(
 
     def alarm_in_second(self: VirtualController, seconds: float) -> None:
         elapse(self, seconds)
-        if len(programs) == 2 and virtual.time > 1310:  # behind the second of three balls
+        if len(programs) == 2 and virtual.time > 710:  # behind the second of three balls
             virtual.raise_alarm("servo alarm")
 
     monkeypatch.setattr(VirtualController, "run_program", counted)
@@ -396,7 +399,7 @@ def test_an_alarm_while_a_program_runs_ends_the_run_without_false_data(
     with pytest.raises(RunError, match="in alarm: servo alarm; this occurred while its program was executed"):
         runner.run(plan, runs=runs)
     assert not virtual.running
-    assert virtual.time < 1320
+    assert virtual.time < 720
     raw = raw_of(one_run(runs))
     assert (raw["touch_flag"].values[0] == 0).all()
     assert (np.diff(raw["touch_time"].values[raw["touch_flag"].values == 0]) > 0).all()  # no line is taken twice
@@ -437,7 +440,7 @@ def test_without_a_control_on_the_bench_the_operator_starts_the_warm_up_program(
     assert asked[0].startswith("Start the program warm_up.nc on the machine")
     raw, errors = raw_of(run), datasets.load(run.errors)
     assert (raw["touch_flag"].values == 0).all()
-    np.testing.assert_allclose(raw["time"].values, [0.0, 1200.0, 2400.0], atol=45)
+    np.testing.assert_allclose(raw["time"].values, [0.0, 600.0, 1200.0], atol=45)
     # Times count from first touch to first touch; warm cycles begin with the way from the last ball, 3 m at 5 m/min.
     times = errors["time"].values + float(raw.attrs["clock_origin"])
     truth = machine.truth_probing(times, errors.attrs["functional_point"])
