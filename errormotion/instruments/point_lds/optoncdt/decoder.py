@@ -45,6 +45,7 @@ class StreamDecoder:
         self._highest = highest
         self._counter = counter
         self._counter_first = counter_first
+        self._look_ahead = int(kernels.look_ahead(counter, counter_first))
         self._rest = b""
         self._waiting = np.empty(0, dtype=np.uint32)  # values that the following ones have to confirm
         self._after_text = False
@@ -66,8 +67,7 @@ class StreamDecoder:
         used, n_values, n_text, self._after_text = kernels.split(buffer, values, text, self._after_text)
         self._rest = buffer[used:].tobytes()
         found = np.concatenate([self._waiting, values[:n_values]])
-        waiting = int(kernels.look_ahead(self._counter, self._counter_first))
-        self._waiting = found[max(found.size - waiting, 0) :]
+        self._waiting = found[max(found.size - self._look_ahead, 0) :]
         raws = np.empty(found.size + 1, dtype=np.int32)
         numbers = np.empty(found.size + 1, dtype=np.int64)
         count = kernels.assemble(found, self._counter, self._counter_first, self._state, raws, numbers)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.point_lds.optoncdt.console import LINE_END, ConsoleDevice
 from errormotion.instruments.simulators.point_lds.optoncdt.grammar import RefusalError
@@ -14,6 +16,7 @@ from errormotion.instruments.simulators.point_lds.optoncdt.stream import (
     SensorStream,
     depth_of,
 )
+from errormotion.instruments.simulators.point_lds.optoncdt.values import encode
 from errormotion.instruments.transports import Address
 
 _NO_BEAM = "E300 No such beam in the frame of this machine"
@@ -64,6 +67,7 @@ class SimulatedOptoNCDT(ConsoleDevice):
         self._range = address.number("range", frame if self._model_name == "ILD2300" else self._model.range) * 1e-3
         self._baudrate = address.number("baudrate", 0.0)
         self._errors = self._model.errors
+        encode(np.zeros((1, 1)))  # compiled now, so that the first samples are not delayed
         self._counters = Counters(measured=_FIRST_COUNT)
         self._set_up_console(address)
         self._boot()
