@@ -6,6 +6,7 @@ import pytest
 
 pytest_plugins = "pytester"
 
+WITHOUT = ("-p", "no:dash", "-p", "no:zarr")  # plugins, as for all tests
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
 SKIPPED = """
 import pytest
@@ -28,7 +29,7 @@ def suite(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytest.
 
 def test_a_skip_fails_in_ci(suite: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CI", "true")
-    result = suite.runpytest("-p", "no:dash")
+    result = suite.runpytest(*WITHOUT)
     result.assert_outcomes(passed=1, failed=1, errors=1, xfailed=1)
     result.stdout.fnmatch_lines(["*no such instrument here*", "*nothing is skipped*"])
 
@@ -36,11 +37,11 @@ def test_a_skip_fails_in_ci(suite: pytest.Pytester, monkeypatch: pytest.MonkeyPa
 def test_a_module_that_skips_itself_fails_in_ci(suite: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CI", "true")
     suite.makepyfile(test_module="import pytest\npytest.importorskip('no_such_module')\n")
-    result = suite.runpytest("-p", "no:dash", "test_module.py")
+    result = suite.runpytest(*WITHOUT, "test_module.py")
     result.assert_outcomes(errors=1)
 
 
 @pytest.mark.parametrize("value", ["", "false"])
 def test_a_skip_stays_a_skip_elsewhere(suite: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     monkeypatch.setenv("CI", value)
-    suite.runpytest("-p", "no:dash").assert_outcomes(passed=1, skipped=2, xfailed=1)
+    suite.runpytest(*WITHOUT).assert_outcomes(passed=1, skipped=2, xfailed=1)
