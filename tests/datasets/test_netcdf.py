@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from errormotion.datasets.storage import netcdf
 from errormotion.datasets.storage.compression import encoding
 from errormotion.datasets.storage.disk import storable
 from errormotion.datasets.storage.netcdf import compose_netcdf, open_netcdf
@@ -124,6 +125,30 @@ def _other_byte_order(file: h5py.File) -> None:
 
 def _without_identifiers(file: h5py.File) -> None:
     del file["long"].attrs["_Netcdf4Coordinates"]
+
+
+def test_usual_datasets_are_written_without_h5netcdf(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(netcdf, "H5NetCDFStore", None)
+    ready = storable(example("usual"))
+    assert compose_netcdf(ready, encoding(ready))
+
+
+def test_arrays_of_dask_are_written(tmp_path: Path) -> None:
+    ds = xr.Dataset({"v": (("t", "s"), np.arange(12.0).reshape(4, 3)), "n": ("t", [1, 2, 3, 4])})
+    (tmp_path / "some.nc").write_bytes(compose_netcdf(ds.chunk({"t": 2}), {}))
+    with open_netcdf(tmp_path / "some.nc") as found:
+        xr.testing.assert_equal(found.load(), ds)
+
+
+def test_a_dimension_that_no_file_can_have_is_refused() -> None:
+    with pytest.raises(ValueError, match="Forward slashes"):
+        compose_netcdf(xr.Dataset({"v": ("m/s", [1.0, 2.0])}), {})
+
+
+@pytest.mark.parametrize(("dtype", "fill"), [("u1", -1), ("i2", 100_000), ("f8", "nan"), ("f4", -9)])
+def test_fill_values_are_those_of_xarray(dtype: str, fill: object) -> None:
+    ds = xr.Dataset({"v": ("t", np.array([1, 2], dtype), {"_FillValue": fill})})
+    assert content(compose_netcdf(ds, {})) == content(by_xarray(ds, {}))
 
 
 @pytest.mark.parametrize("change", [_group, _fixed_text, _other_byte_order, _without_identifiers])

@@ -237,7 +237,7 @@ class _Composed(H5NetCDFStore):
         self._numbers = {dim: number for number, dim in enumerate(sizes)}
         for dim, size in sizes.items():
             named = variables[dim].dims if dim in variables else ()
-            if size == 0 or (named[:1] == (dim,) and len(named) > 1):
+            if not isinstance(dim, str) or "/" in dim or size == 0 or (named[:1] == (dim,) and len(named) > 1):
                 raise _UnusualError
             if named != (dim,):
                 self._scales[dim] = scale = self._file.create_dataset(dim, (size,), ">f4", track_order=True)
@@ -249,10 +249,15 @@ class _Composed(H5NetCDFStore):
         if options.pop("zlib", False):
             options["compression"] = "gzip"
         text = (variable.dtype.metadata or {}).get("element_type") is str
-        if set(options) - _KNOWN or "/" in name or not (text or _is_number(variable.dtype)):
+        if set(variable.encoding) - _KNOWN or "/" in name or not (text or _is_number(variable.dtype)):
             raise _UnusualError
         attributes = dict(variable.attrs)
         fill = attributes.pop("_FillValue", None)
+        if not (fill is None or text):
+            try:
+                fill = variable.dtype.type(fill)
+            except (OverflowError, TypeError, ValueError):
+                raise _UnusualError from None
         name = _RENAMED + name if name in self._scales else name
         written = self._file.create_dataset(
             name,
@@ -263,7 +268,7 @@ class _Composed(H5NetCDFStore):
             **(options if variable.shape else {}),
         )
         if fill is not None:
-            _set_attribute(written, "_FillValue", fill if text else variable.dtype.type(fill))
+            _set_attribute(written, "_FillValue", fill)
         for key, value in attributes.items():
             _set_attribute(written, key, value)
         self._written[name] = written, variable.dims
@@ -288,7 +293,7 @@ class _Composed(H5NetCDFStore):
 
 _OPTIONS = {"complevel": "compression_opts", "chunksizes": "chunks"}
 """Encodings of xarray with another name in h5py."""
-_KNOWN = {"compression", "compression_opts", "chunks", "shuffle"}
+_KNOWN = {*_OPTIONS, "zlib", "shuffle"}
 
 
 def _is_number(dtype: np.dtype[Any]) -> bool:
@@ -306,6 +311,7 @@ def _set_attribute(owner: h5py.File | h5py.Dataset, key: str, value: Any) -> Non
 
 def compose_netcdf(ds: xr.Dataset, encoding: Mapping[Any, dict[str, Any]]) -> bytes:
     """Return the bytes of a NetCDF-4 file."""
+    ds = ds.compute()  # arrays of dask would be omitted
     composed = io.BytesIO()  # kept here: Python 3.13 refuses to close a buffer whose content is in use
     try:
         with h5py.File(composed, "w", track_order=True) as file:

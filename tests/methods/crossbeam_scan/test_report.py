@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 from markupsafe import Markup
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.methods.crossbeam_scan import simulation
@@ -203,8 +204,9 @@ def painted(page, monkeypatch):
 
     def draw(paint, _, height, width=canvas.WIDTH):
         with canvas.style():
-            paint(Figure(figsize=(width, height)))
-        return Markup("<svg></svg>")
+            figure = Figure(figsize=(width, height))
+            paint(figure)
+        return Markup("<svg>{}</svg>").format(" ".join(each.get_text() for each in figure.findobj(Text)))
 
     monkeypatch.setattr(canvas, "draw", draw)
     return page
