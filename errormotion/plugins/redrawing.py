@@ -64,7 +64,8 @@ class Redrawing:
 def replaced(dataset: xr.Dataset, values: Mapping[str, ArrayLike]) -> xr.Dataset:
     """Return a dataset with other values of some variables, in the order of their dimensions.
 
-    Nothing is aligned, which would take a third of the time of many trials.
+    The values are plain arrays, without labels and masks, of variables that are no dimension coordinates. Nothing is
+    aligned, which would take a third of the time of many trials.
     """
     changed = dataset.copy()
     for name, array in values.items():
