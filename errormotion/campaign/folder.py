@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from errormotion.datasets.files.runfile import SCHEMA, read_run
 from errormotion.datasets.files.writing import sync
@@ -31,6 +31,10 @@ CHECK_DURATION = 0.2
 """Longest time for which `is_locked` holds a lock, s; a lock held longer means that another process uses the run."""
 
 log = logging.getLogger(__name__)
+
+
+Status = Literal["running", "finished", "interrupted", "failed"]
+"""State of a run."""
 
 
 def new_entries(bench: BenchPlan) -> dict[str, Any]:
@@ -164,7 +168,7 @@ class RunFolder:
         """
         self.data = read_run(self.path)
 
-    def save(self, **changes: Any) -> None:
+    def save(self, *, status: Status | None = None, **changes: Any) -> None:
         """Change fields of ``run.json`` and write the file.
 
         Raises
@@ -176,7 +180,7 @@ class RunFolder:
         """
         if "updated" in self.data and not self.present:
             raise RunError(f"{self.path} is gone: it was moved or deleted during the run")
-        self.data |= changes | {"updated": now()}
+        self.data |= changes | ({} if status is None else {"status": status}) | {"updated": now()}
         replace_text(self.path / "run.json", json.dumps(plain(self.data), indent=1, ensure_ascii=False) + "\n")
 
     def step(self, name: str, outcome: str, **details: Any) -> None:

@@ -25,7 +25,7 @@ from errormotion import datasets
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.claims import claimed
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
-from errormotion.campaign.folder import FolderGoneError, RunFolder, list_runs, new_entries, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, Status, list_runs, new_entries, now
 from errormotion.campaign.sections import head
 from errormotion.campaign.sections.limits import NO_MOTIONS, announcement, steps_of
 from errormotion.campaign.sections.timeline import follower
@@ -46,6 +46,9 @@ from errormotion.tolerances.table import from_run
 
 MAX_RESULTS = 200
 """Largest number of figures of merit in ``run.json``."""
+
+MEASURING = "measuring"
+"""Name of the stage in which the method measures."""
 
 log = logging.getLogger(__name__)
 
@@ -345,7 +348,7 @@ class _Session:
         folder.save()
         folder.take_reserve()
         log.info("acquire", extra={"data": {"test": test.name, "method": method.info.id, "samples": before}})
-        self.progress.stage("measuring", expected)
+        self.progress.stage(MEASURING, expected)
         attrs = {"instruments": json.dumps(provenance.plain(folder.data["instruments"])), "start": now()}
         if bench.description is not None:
             attrs["chain"] = bench.description.moving_chain
@@ -497,7 +500,7 @@ def _failures(folder: RunFolder) -> Iterator[None]:
         ) from error
 
 
-def _mark(folder: RunFolder, status: str, reason: str) -> None:
+def _mark(folder: RunFolder, status: Status, reason: str) -> None:
     """Write the status of a run; if this fails it remains 'running', which can be resumed as well."""
     try:
         folder.save(status=status, reason=reason)

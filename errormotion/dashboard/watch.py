@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,18 +63,21 @@ _FIELD = {"m": ("mm", 1e3), "rad": ("arcsec", 3600 * 180 / math.pi), "degC": ("Â
 log = logging.getLogger(__name__)
 
 
+InstrumentState = Literal["answers", "silent", "waiting", "lent"]
+"""State of an instrument; ``lent`` is in use by another program."""
+
+
 @dataclass(frozen=True)
 class Instrument:
     """One instrument: ``state`` with its start ``since`` and its cause ``why``.
 
-    ``state`` is ``answers``, ``waiting``, ``silent``, or ``lent`` (in use by another program). ``rate`` is the present
-    number of readings per second, ``missed`` the number of rows of the log without a reading.
+    ``rate`` is the present number of readings per second, ``missed`` the number of rows of the log without a reading.
     """
 
     name: str
     kind: str
     model: str
-    state: str
+    state: InstrumentState
     since: datetime
     why: str = ""
     missed: int = 0
@@ -401,7 +404,8 @@ class Watch:
         """Return the state of a source, and store a change; a failed reading counts at once."""
         silent = self._last.silent.get(source.name, "") if self._last is not None else ""
         why = source.error or silent
-        state = "answers" if not why else "silent" if source.answer or self._last is not None else "waiting"
+        heard = source.answer or self._last is not None
+        state: InstrumentState = "answers" if not why else "silent" if heard else "waiting"
         if self._lent is not None:
             state, why = "lent", ""
         before, since = self._since.get(source.name, ("", _now()))

@@ -25,6 +25,13 @@ WORDS: dict[str, dict[int, str]] = {
     "simple": {INSIDE: "within limits", OUTSIDE: "outside limits", OPEN: "not decided"},
     "shared risk": {INSIDE: "within limits", OUTSIDE: "outside limits", OPEN: "not decided"},
 }
+"""The words of each decision; nothing else writes or compares them."""
+_DECISIONS = {word: decision for words in WORDS.values() for decision, word in words.items()}
+
+
+def decision_of(word: str) -> int:
+    """Return the decision that a word of any rule states; OPEN for another word, such as one of an earlier version."""
+    return _DECISIONS.get(word, OPEN)
 
 
 def decide(

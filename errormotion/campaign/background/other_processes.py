@@ -8,7 +8,7 @@ from pathlib import Path
 
 from errormotion.campaign.background.processes import Background
 from errormotion.campaign.folder import RunFolder, is_locked
-from errormotion.campaign.runner import stored_plan
+from errormotion.campaign.runner import MEASURING, stored_plan
 from errormotion.campaign.storage.store import committed_length
 from errormotion.datasets.files.containers import MAX_METADATA
 from errormotion.datasets.files.reading import parse_json, read_bytes
@@ -60,7 +60,7 @@ def _described(folder: RunFolder) -> Background:
         started=str(data["created"]),
         alive=True,
         test=test,
-        stage="measuring" if measuring else "reporting" if last == "identify" else "identifying",
+        stage=MEASURING if measuring else "reporting" if last == "identify" else "identifying",
         number=tests.index(test) if test in tests else 0,
         total=len(tests),
         done=done,

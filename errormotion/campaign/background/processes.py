@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 from uuid import uuid4
 
 from errormotion.campaign.background.detached import printed, spawn
@@ -46,6 +46,10 @@ MAX_STATE = 1 << 20
 STOP_INTERVAL = 30.0
 """Shortest interval between two stop signals to a process, s."""
 _NAME = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}")
+
+
+Ended = Literal["", "finished", "interrupted", "failed", "killed"]
+"""End of a process; empty while it is running."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ class Background:
     machine: str
     started: str
     alive: bool
-    ended: str = ""
+    ended: Ended = ""
     message: str = ""
     test: str = ""
     stage: str = ""
@@ -240,7 +244,7 @@ def _read(folder: Path) -> Background | None:
     process, state = _state(folder / "process.json"), _state(folder / STATUS)
     if not process:
         return None
-    ended = "" if alive else str(state.get("ended") or "killed")
+    ended: Ended = "" if alive else state["ended"] if state.get("ended") in get_args(Ended)[1:] else "killed"
     message = str(state.get("message", ""))
     if ended in ("failed", "killed"):
         message = printed(folder / OUTPUT) or message

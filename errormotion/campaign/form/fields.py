@@ -17,7 +17,7 @@ from pydantic.fields import FieldInfo
 
 from errormotion import plugins
 from errormotion.campaign.files import CampaignPlan, CampaignTable, MistakesError, TestTable, campaign_of
-from errormotion.campaign.form.written import default_of, quantity_of
+from errormotion.campaign.form.written import default_of, has_default, quantity_of
 from errormotion.datasets.files.tomlfile import Key, dotted, options_of, parse_toml
 from errormotion.datasets.files.tomltext import value, value_of, with_table, with_value, without_table
 from errormotion.errors import BenchError, DatasetError, PluginError
@@ -40,7 +40,7 @@ class Field:
     unit : str
         Example of a quantity with its unit, such as ``5 mm``; empty if the value has no unit.
     default : str
-        Value if the key is not stated.
+        Value if the key is not stated; empty if there is none.
     text : str
         Value in the file, as text of a field; empty if the key is not stated.
     choices : tuple of str
@@ -226,7 +226,7 @@ def _field(field: FieldInfo, place: tuple[Key, ...], label: str, stated: Any) ->
         label=label,
         meaning=str(field.description or ""),
         unit="" if quantity is None else quantity.example,
-        default="required" if field.is_required() else default_of(field),
+        default=default_of(field) if has_default(field) else "",
         text=written,
         choices=choices,
         plain=plain,

@@ -19,15 +19,20 @@ _USUAL_UNITS = {
 """Usual units by SI unit; of equally short texts the first one is used."""
 
 
+def has_default(field: FieldInfo) -> bool:
+    """Return whether a setting that is not stated has a value."""
+    return not field.is_required() and field.get_default(call_default_factory=True) not in (None, (), [], {})
+
+
 def default_of(field: FieldInfo) -> str:
     """Return the default of a setting as written in a campaign, with its unit; of a required setting, its kind."""
     quantity = quantity_of(field)
     kind = f" ({quantity.kind})" if quantity is not None else ""
     if field.is_required():
         return f"required{kind}"
-    default = field.get_default(call_default_factory=True)
-    if default in (None, (), [], {}):
+    if not has_default(field):
         return f"-{kind}"
+    default = field.get_default(call_default_factory=True)
     if isinstance(default, BaseModel):
         default = default.model_dump()
     if quantity is not None and isinstance(default, (int, float)) and not isinstance(default, bool):

@@ -24,7 +24,7 @@ import xarray as xr
 
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
-from errormotion.campaign.folder import FolderGoneError, RunFolder, new_entries, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, Status, new_entries, now
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.campaign.monitor.sources import Source
@@ -179,7 +179,8 @@ class Monitor:
         """Write the end of the log to ``run.json``; if this fails as well, the earlier failure is the cause."""
         if failure is not None:
             log.error("the monitor stopped", exc_info=failure)
-        status, reason = ("finished", "") if failure is None else ("failed", cause_of(failure))
+        status: Status = "finished" if failure is None else "failed"
+        reason = "" if failure is None else cause_of(failure)
         self.folder.data["instruments"] = [source.answer.record() for source in self.sources if source.answer]
         self.folder.data["samples"] = {
             "dim": "time",

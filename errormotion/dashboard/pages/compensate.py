@@ -14,6 +14,7 @@ from tornado.web import HTTPError
 
 from errormotion.arrays import Array
 from errormotion.campaign.compensation.following import Status, is_working, read_status, request_stop
+from errormotion.compensation.online.follower import State as States
 from errormotion.dashboard.cache import TimedCache
 from errormotion.dashboard.compensations import Compensations, Start, rows
 from errormotion.dashboard.curves import thin
@@ -24,7 +25,7 @@ from errormotion.errors import CompensationError, ErrormotionError
 
 SPANS = (("10 min", 600), ("1 h", 3600), ("8 h", 28800))
 """Possible time spans of the curves, s."""
-STATES = ("off", "armed", "following", "holding", "ramping", "fault")
+STATES = tuple(States)
 MAX_POINTS = 1000
 """Number of points of a reduced curve."""
 LATE = 3.0

@@ -15,6 +15,7 @@ from errormotion.campaign.background.preliminary import preliminary, samples
 from errormotion.campaign.background.processes import Background
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.form.fields import Form
+from errormotion.campaign.runner import MEASURING
 from errormotion.dashboard.cache import TimedCache
 from errormotion.dashboard.campaigns import Campaigns, hash_of
 from errormotion.dashboard.curves import curves_of
@@ -217,7 +218,8 @@ def _process(runs: Path, each: Background, busy: set[str]) -> dict[str, Any]:
     resumable = not each.alive and bool(open_) and not busy & set(each.tests.values())
     known = {key: None if isinstance(value, float) and not math.isfinite(value) else value
              for key, value in asdict(each).items()}  # fmt: skip
-    return {**known, "note": signs(each.note), "tests": tests, "resume": open_[-1] if resumable else ""}
+    known |= {"note": signs(each.note), "measuring": each.stage == MEASURING}
+    return {**known, "tests": tests, "resume": open_[-1] if resumable else ""}
 
 
 def _status(path: Path) -> str:

@@ -19,6 +19,7 @@ from errormotion.dashboard.lab import Lab, NotFoundError
 from errormotion.dashboard.watch import Watch
 from errormotion.errors import ErrormotionError
 from errormotion.report.text import signs
+from errormotion.tolerances.decision import INSIDE, OUTSIDE, decision_of
 
 T = TypeVar("T")
 
@@ -43,8 +44,13 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["signs"] = signs
+    environment.filters |= {"signs": signs, "mark": _mark}
     return environment
+
+
+def _mark(verdict: str) -> str:
+    """Return the class of the mark of a verdict: ``good``, ``bad`` or ``open``."""
+    return {INSIDE: "good", OUTSIDE: "bad"}.get(decision_of(verdict), "open")
 
 
 @dataclass(frozen=True)

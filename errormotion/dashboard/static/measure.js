@@ -25,11 +25,11 @@ function fieldOf(each, number) {
   let input;
   if (each.choices.length) {
     input = element("select");
-    if (each.default !== "required" || !each.text) input.append(new Option(each.default === "required" ? "" : `${each.default} (default)`, ""));
+    if (!each.required || !each.text) input.append(new Option(each.required ? "" : `${each.default || "none"} (default)`, ""));
     for (const choice of each.choices) input.append(new Option(choice, choice));
   } else {
     input = element(each.text.length > 48 || each.text.startsWith("[") ? "textarea" : "input");
-    input.placeholder = each.default === "-" ? each.unit && `such as ${each.unit}` : each.default;
+    input.placeholder = each.required ? "required" : each.default || (each.unit && `such as ${each.unit}`);
     input.spellcheck = false;
   }
   input.id = id;
@@ -63,7 +63,7 @@ function show(form) {
       card.append(element("legend", group.title));
       for (const each of group.fields) {
         const row = fieldOf(each, number++);
-        (k === 0 || each.text || each.mistakes.length || each.default === "required" ? card : { append: (made) => rest.push(made) }).append(row);
+        (k === 0 || each.text || each.mistakes.length || each.required ? card : { append: (made) => rest.push(made) }).append(row);
       }
       if (rest.length) {
         more.append(element("summary", `${rest.length} further settings`), ...rest);
@@ -284,7 +284,7 @@ async function processes() {
       byId("processes-card").scrollIntoView();
       reveal = "";
     }
-    const now = found.find((each) => each.alive && each.stage === "measuring" && each.tests.length);
+    const now = found.find((each) => each.alive && each.measuring && each.tests.length);
     running = now ? now.tests.find((test) => test.name === now.test)?.run ?? null : null;
     document.body.classList.remove("lost");
   } catch (error) {
