@@ -1,18 +1,27 @@
 // An OPC UA server of the package node-opcua with the published information model for CNC systems (OPC 40502).
-// Usage: node cnc_server.mjs PORT; it prints "up", and ends when its standard input is closed.
+// Usage: node cnc_server.mjs PORT [FOLDER]; it prints "up", and ends when its standard input is closed. With a folder, for
+// its certificates, it accepts signed and encrypted sessions, too, and trusts every certificate that is valid. Beside the
+// model it has nodes for offsets: ns=1;s=Offset.X to Z (Double, mm), Heartbeat, Stop, List, and ReadOnly.
 import { createRequire } from "module";
 
 const require = createRequire(import.meta.url);
 const { OPCUAServer } = require("node-opcua-server");
 const { MessageSecurityMode, SecurityPolicy } = require("node-opcua-secure-channel");
 const { nodesets } = require("node-opcua-nodesets");
-const { DataType } = require("node-opcua-variant");
+const { DataType, VariantArrayType } = require("node-opcua-variant");
+const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
 
+const [port, folder] = process.argv.slice(2);
+const { None, SignAndEncrypt } = MessageSecurityMode;
+const { None: Open, Basic256Sha256, Aes128_Sha256_RsaOaep } = SecurityPolicy;
+const certificates = folder && new OPCUACertificateManager({ rootFolder: folder, automaticallyAcceptUnknownCertificate: true });
+if (certificates) await certificates.initialize();
 const server = new OPCUAServer({
-  port: Number(process.argv[2]),
+  port: Number(port),
   nodeset_filename: [nodesets.standard, nodesets.cnc],
-  securityModes: [MessageSecurityMode.None],
-  securityPolicies: [SecurityPolicy.None],
+  securityModes: folder ? [None, SignAndEncrypt] : [None],
+  securityPolicies: folder ? [Open, Basic256Sha256, Aes128_Sha256_RsaOaep] : [Open],
+  ...(folder ? { serverCertificateManager: certificates, userCertificateManager: certificates } : {}),
 });
 await server.initialize();
 const space = server.engine.addressSpace;
@@ -57,6 +66,19 @@ unit(child(channel, "ActFeedrate"), "H81", "mm/min");
 set(channel, "ActOperationMode", DataType.Int32, 1);
 set(channel, "ActProgramName", DataType.String, "TEST.NC");
 set(channel, "ActProgramStatus", DataType.Int32, 1);
+
+const node = (name, dataType, value, more = {}) => own.addVariable({
+  organizedBy: space.rootFolder.objects, nodeId: `s=${name}`, browseName: name, dataType, value: { dataType, value, ...more },
+  ...(name === "ReadOnly" ? { accessLevel: "CurrentRead", userAccessLevel: "CurrentRead" } : {}),
+});
+for (const axis of "XYZ") node(`Offset.${axis}`, "Double", 0);
+node("Heartbeat", "UInt32", 7);
+node("Stop", "Boolean", false);
+node("ReadOnly", "Double", 0);
+own.addVariable({
+  organizedBy: space.rootFolder.objects, nodeId: "s=List", browseName: "List", dataType: "Double", valueRank: 1,
+  value: { dataType: DataType.Double, arrayType: VariantArrayType.Array, value: new Float64Array([1, 2, 3]) },
+});
 
 await server.start();
 console.log("up");

@@ -18,7 +18,8 @@ from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.compensator.door import ROUNDING, OffsetDoor
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.opc import Credentials, open_session, request
+from errormotion.instruments.transports.opc import open_session, request
+from errormotion.instruments.transports.opc_security import Credentials
 from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo, PluginSettings
 
 SIGNED = {"SByte": 7, "Int16": 15, "Int32": 31, "Int64": 63}
@@ -82,7 +83,7 @@ class OpcUaNodes(Driver):
         id="opcua_nodes",
         kind="compensator",
         summary="Offsets in nodes of an OPC UA server of a PLC or a control, with a heartbeat.",
-        status="simulated_only",
+        status="peer_verified",
         simulator="errormotion.instruments.simulators.compensator.nodes:SimulatedNodes",
     )
     Settings: ClassVar[type[OpcUaNodesSettings]] = OpcUaNodesSettings
@@ -207,18 +208,19 @@ class OpcUaNodes(Driver):
         self._types = [str(each.get("type")) for each in found]
         for node, each, kind in zip(nodes, found, self._types, strict=True):
             allowed = {**SIGNED, **UNSIGNED} if node == settings.heartbeat else (*SIGNED, *FRACTIONS)
-            if each.get("status") != "Good" or not each.get("writable") or kind not in allowed:
+            if each.get("status") != "Good" or not each.get("writable") or kind not in allowed or each.get("array"):
+                array = "array of " if each.get("array") else ""
                 raise InstrumentError(
-                    f"{self.address}: node '{node}': expected a number that can be written; found type {kind[:40]}, "
-                    f"status {str(each.get('status'))[:60]}, writable {each.get('writable')}"
+                    f"{self.address}: node '{node}': expected a number that can be written; found type "
+                    f"{array}{kind[:40]}, status {str(each.get('status'))[:60]}, writable {each.get('writable')}"
                 )
         (beat,) = self._values([settings.heartbeat])
         known = _number(beat)
         self._beats = min(BEATS, 1 << {**SIGNED, **UNSIGNED}[self._types[-1]])
         self._beat = int(known) % self._beats if math.isfinite(known) else 0
         for node, value in zip(settings.read, self._values(settings.read), strict=True):
-            if value.get("status") != "Good":
-                raise InstrumentError(f"{self.address}: node '{node}': the server answers {_status(value)}")
+            if value.get("status") != "Good" or not isinstance(value.get("value"), bool | int | float):
+                raise InstrumentError(f"{self.address}: node '{node}' {_reason(value)}; expected a number")
 
 
 def _number(answer: dict[str, Any]) -> float:
@@ -237,12 +239,18 @@ def _state(answers: dict[str, Any], name: str, node: str) -> str:
         return ""
     value = _number(answers[node])
     if math.isnan(value):
-        return f"{name} is unknown: {node} has the status {_status(answers[node])}"
+        return f"{name} is unknown: {node} {_reason(answers[node])}"
     return f"the server states {name} ({node} is {value:g})" if value else ""
 
 
-def _status(answer: dict[str, Any]) -> str:
-    return str(answer.get("status"))[:60]
+def _reason(answer: dict[str, Any]) -> str:
+    """Return why the value of a node is not a number."""
+    value, status = answer.get("value"), str(answer.get("status"))[:60]
+    if status != "Good":
+        return f"has the status {status}"
+    if isinstance(value, list):
+        return f"has an array of {len(value)} values"
+    return f"has the value {str(value)[:40]}, which is not a number"
 
 
 def _text(answer: dict[str, Any]) -> str:

@@ -6,7 +6,8 @@ the requests and answers of this module, so that they are readable and can be re
     {"read": ["ns=2;s=/Channel/Spindle/actSpeed[u1,1]"]}
     [{"value": 12000.0, "status": "Good", "time": "2026-03-01T12:00:00+00:00"}]
 
-The requests are ``server``, ``browse``, ``read``, ``describe`` (type of a value, and whether it can be written) and
+The requests are ``server``, ``browse``, ``read``, ``describe`` (type of a value, whether it is an array and can be
+written) and
 ``write``, which only compensators send::
 
     {"write": [["ns=2;s=Offset.X", "Double", 0.0021], ["ns=2;s=Heartbeat", "UInt32", 17]]}
@@ -21,7 +22,6 @@ import logging
 import threading
 from collections.abc import Coroutine, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -30,6 +30,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.transports import load_simulator
 from errormotion.instruments.transports.address import OPC, parse_address
 from errormotion.instruments.transports.base import Transport
+from errormotion.instruments.transports.opc_security import Credentials, hint, secure
 from errormotion.instruments.transports.recording import Recorder, RecordingTransport, ReplayTransport
 
 if TYPE_CHECKING:
@@ -50,42 +51,6 @@ MAX_BYTES = 16 << 20
 """Largest message of a server, bytes."""
 
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True)
-class Credentials:
-    """Credentials of a client; all empty: anonymous and unencrypted.
-
-    Attributes
-    ----------
-    security : str
-        ``Policy,Mode,certificate,private key[,server certificate]``, such as
-        ``Basic256Sha256,SignAndEncrypt,client.der,client.pem``.
-    user, password : str
-    """
-
-    security: str = ""
-    user: str = ""
-    password: str = ""
-
-    @classmethod
-    def read(cls, security: str, user: str, password_file: str) -> Credentials:
-        """Return credentials with the password in the first line of a file; an empty name: none.
-
-        Raises
-        ------
-        InstrumentError
-            The file does not exist, or has no line of text.
-        """
-        if not password_file:
-            return cls(security, user)
-        try:
-            password = Path(password_file).read_text(encoding="utf-8").splitlines()[0]
-        except (OSError, IndexError, UnicodeDecodeError) as error:
-            raise InstrumentError(
-                f"password_file '{password_file}': expected a file with the password; {error}"
-            ) from None
-        return cls(security, user, password)
 
 
 class OpcUaTransport(Transport):
@@ -172,7 +137,7 @@ class OpcUaTransport(Transport):
         except InstrumentError:
             raise
         except UaStatusCodeError as error:
-            raise InstrumentError(f"{self.url}: the server refuses: {error}") from None
+            raise InstrumentError(f"{self.url}: the server refuses: {error}{hint(error.code)}") from None
         except (OSError, UaError) as error:
             self._drop()
             reason = str(error) or type(error).__name__
@@ -200,7 +165,7 @@ class OpcUaTransport(Transport):
             client.set_user(self._credentials.user)
             client.set_password(self._credentials.password)
         if self._credentials.security:
-            await client.set_security_string(self._credentials.security)
+            await secure(client, self._credentials.security)
         try:
             await client.connect()
         except BaseException:
@@ -255,7 +220,7 @@ async def _read(client: Client, nodes: Sequence[str]) -> list[dict[str, Any]]:
 
 
 async def _describe(client: Client, nodes: Sequence[str]) -> list[dict[str, Any]]:
-    """Return type and status of the values of nodes, and whether this user can write them."""
+    """Return type and status of the values of nodes, whether they are arrays, and whether this user can write them."""
     from asyncua.ua.attribute_ids import AttributeIds
 
     found = [_node(client, node) for node in nodes]
@@ -264,6 +229,7 @@ async def _describe(client: Client, nodes: Sequence[str]) -> list[dict[str, Any]
     return [
         {
             "type": value.Value.VariantType.name if value.Value is not None else "Null",
+            "array": value.Value is not None and bool(value.Value.is_array),
             "status": _plain(value)["status"],
             "writable": bool(((level.Value.Value if level.Value is not None else 0) or 0) & WRITABLE),
         }

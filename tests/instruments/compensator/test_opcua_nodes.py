@@ -18,12 +18,14 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator import opcua_nodes
 from errormotion.instruments.compensator.opcua_nodes import OpcUaNodes, OpcUaNodesSettings
 from errormotion.instruments.simulators.controller.opcua.space import SmallServer
-from errormotion.instruments.transports.opc import Credentials
+from errormotion.instruments.transports.opc_security import Credentials
 
 LIMIT = 50e-6
 OFFSET = (12.345e-6, -50e-6, 1e-6)
 X, Y, Z = (f"ns=2;s=Offset.{axis}" for axis in "XYZ")
-BEAT, STOP, READ_ONLY, NAME, UNSIGNED = (f"ns=2;s={name}" for name in ("Beat", "Stop", "ReadOnly", "Name", "Unsigned"))
+BEAT, STOP, READ_ONLY, NAME, UNSIGNED, LIST = (
+    f"ns=2;s={name}" for name in ("Beat", "Stop", "ReadOnly", "Name", "Unsigned", "List")
+)
 GIVEN: dict[str, Any] = {"offset": (X, Y, Z), "heartbeat": BEAT, "timeout": 5.0}
 
 
@@ -54,6 +56,7 @@ class Control:
         double, name = ua.VariantType.Double, ua.VariantType.String
         nodes = [(X, 0.0, double), (Y, 0.0, double), (Z, 0.0, double), (BEAT, 7, ua.VariantType.UInt32)]
         nodes += [(STOP, 0, ua.VariantType.Byte), (READ_ONLY, 0.0, double), (NAME, "a", name)]
+        nodes += [(LIST, [1.0, 2.0, 3.0], double)]
         for node, value, kind in [*nodes, (UNSIGNED, 0, ua.VariantType.UInt16)]:
             made = await self.server.nodes.objects.add_variable(ua.NodeId.from_string(node), node[7:], value, kind)
             if node != READ_ONLY:
@@ -184,7 +187,10 @@ def test_integers_are_rounded_within_the_limit(control: Control) -> None:
         ({"offset": (X, Y, "ns=2;s=none")}, "'ns=2;s=none': .*status BadNodeIdUnknown"),
         ({"offset": (X, Y, "nonsense")}, "'nonsense' is not the id of a node"),
         ({"heartbeat": NAME}, "'ns=2;s=Name'"),
-        ({"stop": "ns=2;s=none"}, "'ns=2;s=none': the server answers BadNodeIdUnknown"),
+        ({"stop": "ns=2;s=none"}, "'ns=2;s=none' has the status BadNodeIdUnknown; expected a number"),
+        ({"stop": NAME}, "'ns=2;s=Name' has the value a, which is not a number"),
+        ({"busy": LIST}, "'ns=2;s=List' has an array of 3 values"),
+        ({"offset": (X, Y, LIST)}, "'ns=2;s=List': .*found type array of Double"),
     ],
 )
 def test_nodes_that_cannot_be_used_are_named_when_it_is_opened(

@@ -54,13 +54,13 @@ class Cnc:
     def run(self, work):
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(60)
 
-    def set(self, name, value, *, bad=False):
+    def set(self, name, value, *, bad=False, kind=None):
         node = self.nodes[name]
         if bad:
             data = ua.DataValue(StatusCode=ua.StatusCode(ua.StatusCodes.BadNoCommunication))
             self.run(self.server.write_attribute_value(node.nodeid, data))
         else:
-            self.run(self.server.write_attribute_value(node.nodeid, ua.DataValue(ua.Variant(value))))
+            self.run(self.server.write_attribute_value(node.nodeid, ua.DataValue(ua.Variant(value, kind))))
 
     def stop(self):
         self.run(self.server.stop())
@@ -290,6 +290,46 @@ def test_a_node_that_does_not_exist_is_refused_by_its_key(shared):
         OpcUa(shared(plain_nodes).url, OpcUaSettings(nodes=nodes, units=UNITS)).open()
     with pytest.raises(InstrumentError, match="is not the id of a node"):
         OpcUa(shared(plain_nodes).url, OpcUaSettings(nodes=NODES | {"program": "nonsense"}, units=UNITS)).open()
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        ([1.0, 2.0, 3.0], "an array of 3 values"),
+        ([], "an array of 0 values"),
+        (float("nan"), "the number is nan"),
+    ],
+)
+def test_what_is_not_a_single_number_is_unknown_with_a_reason(shared, value, reason):
+    server = shared(plain_nodes)
+    speed = "/Channel/Spindle/actSpeed[u1,1]"
+    kind = ua.VariantType.Double if isinstance(value, list) else None
+    try:
+        with OpcUa(server.url, OpcUaSettings(nodes=NODES, units=UNITS, running=("3",))) as cnc:
+            assert cnc.state()["reasons"] == {}
+            server.set(speed, value, kind=kind)
+            state = cnc.state()
+    finally:
+        server.set(speed, 3000.0)
+    assert np.isnan(state["spindle_speed"])
+    assert "spindle_speed" in state["unavailable"]
+    assert list(state["reasons"]) == ["spindle_speed"]
+    assert reason in state["reasons"]["spindle_speed"]
+    assert np.isfinite(state["position"]).all()
+
+
+def test_an_array_is_no_text(shared):
+    server = shared(plain_nodes)
+    execution = "/Channel/State/progStatus[u1,1]"
+    try:
+        with OpcUa(server.url, OpcUaSettings(nodes=NODES, units=UNITS, running=("[3]",))) as cnc:
+            server.set(execution, [3], kind=ua.VariantType.Int64)
+            state = cnc.state()
+    finally:
+        server.set(execution, 3)
+    assert state["running"] is False
+    assert "execution" in state["unavailable"]
+    assert state["reasons"]["execution"] == "the node has an array of 1 values; expected a single value"
 
 
 @pytest.mark.slow

@@ -13,7 +13,8 @@ from errormotion.instruments.controller.opcua import model
 from errormotion.instruments.controller.opcua.settings import NUMBERS, TEXTS, OpcUaSettings
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.opc import Credentials, open_session, request
+from errormotion.instruments.transports.opc import open_session, request
+from errormotion.instruments.transports.opc_security import Credentials
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
 
@@ -79,7 +80,8 @@ class OpcUa(Driver):
             clock), ``spindle_speed`` (1/min), ``spindle_load`` (fraction), ``feed`` (m/s), ``mode`` (``manual``,
             ``mdi``, ``automatic``, the text of the server, or empty), ``program``, ``running``, ``estop`` (None if no
             node reports it), ``homed`` (whether all axes are; None if no node reports it), ``enabled`` (None: not
-            read), ``alarms`` (empty: not read), and ``unavailable``: names of unknown values. Unknown numbers are NaN.
+            read), ``alarms`` (empty: not read), ``unavailable``: names of unknown values, and ``reasons``: why, by
+            name of the quantity (``position.X``), for those that have a node. Unknown numbers are NaN.
 
         Raises
         ------
@@ -117,14 +119,19 @@ class OpcUa(Driver):
         state["unavailable"] = [
             *(key for key in ("position", "commanded_position") if any(math.isnan(x) for x in state[key])),
             *(key for key in ("spindle_speed", "spindle_load", "feed") if math.isnan(state[key])),
-            *(key for key in TEXTS if values.get(key, {}).get("value") is None),
+            *(key for key in TEXTS if _scalar(values.get(key)) is None),
         ]
+        state["reasons"] = {
+            key: reason
+            for key, answer in values.items()
+            if not key.startswith(model.HOMED) and (reason := _reason(key, answer))
+        }
         return state
 
     # ------------------------------------------------------------------ values
 
     def _number(self, key: str, answer: Mapping[str, Any] | None) -> float:
-        value = None if answer is None else answer.get("value")
+        value = _scalar(answer)
         if isinstance(value, bool) or not isinstance(value, int | float):
             return math.nan
         try:
@@ -216,6 +223,29 @@ def _all_of(answers: Sequence[Any]) -> bool | None:
     return all(answers)
 
 
-def _text(answer: Mapping[str, Any] | None) -> str:
+def _scalar(answer: Mapping[str, Any] | None) -> Any:
+    """Return the value of a node; None without a node or a good status, and for an array or a structure."""
     value = None if answer is None else answer.get("value")
+    return None if isinstance(value, list | dict) else value
+
+
+def _reason(key: str, answer: Mapping[str, Any]) -> str:
+    """Return why the value of a quantity is unknown; empty if it is known."""
+    value = answer.get("value")
+    if isinstance(value, list):
+        return f"the node has an array of {len(value)} values; expected a single value"
+    if isinstance(value, dict):
+        return "the node has a structure; expected a single value"
+    if value is None:
+        status = str(answer.get("status", "Good"))[:60]
+        return f"the status is {status}" if status != "Good" else "the node has no value, or one of an unknown type"
+    if key in NUMBERS and (isinstance(value, bool) or not isinstance(value, int | float)):
+        return f"expected a number; found {str(value)[:40]!r}"
+    if key in NUMBERS and isinstance(value, float) and not math.isfinite(value):
+        return f"the number is {value}"
+    return ""
+
+
+def _text(answer: Mapping[str, Any] | None) -> str:
+    value = _scalar(answer)
     return "" if value is None else str(value)
