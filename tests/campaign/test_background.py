@@ -3,7 +3,10 @@
 import json
 import math
 import os
+import signal
 import stat
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +17,7 @@ import pytest
 from command_line import CliRunner
 
 from errormotion.campaign import runner
-from errormotion.campaign.background import processes
+from errormotion.campaign.background import processes, signals
 from errormotion.campaign.background.preliminary import preliminary, samples
 from errormotion.campaign.background.publishing import Published
 from errormotion.campaign.files import CampaignPlan
@@ -97,6 +100,74 @@ def test_the_end_states_the_message_of_the_process_or_its_absence(tmp_path: Path
     for order in (lambda: processes.stop(tmp_path, NAME), lambda: processes.answer(tmp_path, NAME, 1)):
         with pytest.raises(RunError):
             order()
+
+
+@contextmanager
+def bystander(*words: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a program that has nothing to do with a folder of runs, with words in its command."""
+    process = subprocess.Popen([sys.executable, "-c", "input()", *words], stdin=subprocess.PIPE)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("began", ["own", "another", None, 7, ""])
+@pytest.mark.parametrize("words", [(), ("-m", "errormotion", "run", "--publish", "elsewhere"), ("--publish", "FOLDER")])
+def test_a_forged_state_stops_no_other_program(tmp_path: Path, began: object, words: tuple[str, ...]) -> None:
+    with living(tmp_path) as folder:
+        named = [word.replace("FOLDER", str(folder.resolve())) for word in words]
+        with bystander(*named) as process:
+            start = signals.started(process.pid) if began == "own" else began
+            forged = {"campaign": "a", "machine": "m", "started": "", "pid": process.pid, "began": start}
+            (folder / "process.json").write_text(json.dumps(forged))
+            with pytest.raises(RunError, match="Nothing was stopped"):
+                processes.stop(tmp_path, NAME)
+            assert process.poll() is None
+        assert not (folder / "stop").exists()
+
+
+@pytest.mark.parametrize("pid", [0, -1, -7, 1, True, 1.5, "1", None, [1], 1 << 31, 1 << 80])
+def test_a_number_of_no_such_process_gets_no_signal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pid: object
+) -> None:
+    sent: list[object] = []
+    for module, name in ((os, "kill"), (os, "killpg"), (signal, "pidfd_send_signal")):
+        monkeypatch.setattr(module, name, lambda *values: sent.append(values), raising=False)
+    with living(tmp_path) as folder:
+        forged = {"campaign": "a", "machine": "m", "started": "", "pid": pid, "began": signals.started(1)}
+        (folder / "process.json").write_text(json.dumps(forged))
+        with pytest.raises(RunError, match="Nothing was stopped"):
+            processes.stop(tmp_path, NAME)
+    assert not sent
+
+
+def test_the_process_of_the_folder_is_stopped_and_not_one_that_has_its_number_later(tmp_path: Path) -> None:
+    with living(tmp_path) as folder:
+        words = [*processes.COMMAND, "--publish", str(folder.resolve()), "campaign.toml"]
+        with bystander(*words) as process:
+            state = {"campaign": "a", "machine": "m", "started": "", "pid": process.pid}
+            began = signals.started(process.pid)
+            (folder / "process.json").write_text(json.dumps({**state, "began": f"{began[:-1]}x"}))
+            with pytest.raises(RunError, match="was started at another time"):
+                processes.stop(tmp_path, NAME)
+            (folder / "process.json").write_text(json.dumps({**state, "began": began}))
+            processes.stop(tmp_path, NAME)
+            assert process.wait(20) == -signal.SIGTERM
+
+
+def test_the_command_of_a_started_process_is_the_one_that_a_stop_looks_for(
+    tmp_path: Path, write: Callable[..., Path], lab: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waiting = tmp_path / "waiting"
+    waiting.write_text(f"#!{sys.executable}\nimport time\ntime.sleep(60)\n")
+    waiting.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(waiting))
+    runs = tmp_path / "runs"
+    name = processes.start(write('name = "a"'), runs)
+    processes.stop(runs, name)
+    wait(lambda: not processes.found(runs)[0].alive)
 
 
 @pytest.mark.parametrize("name", ["", "..", "../..", "20260101T000000Z-0000000g", "20260101T000000Z-00000001"])

@@ -13,7 +13,6 @@ import math
 import os
 import re
 import shutil
-import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 from uuid import uuid4
 
+from errormotion.campaign.background import signals
 from errormotion.campaign.background.detached import printed, spawn
 from errormotion.campaign.background.publishing import ANSWER, STATUS
 from errormotion.campaign.files import load_campaign
@@ -45,6 +45,8 @@ MAX_STATE = 1 << 20
 """Largest size of a state, bytes."""
 STOP_INTERVAL = 30.0
 """Shortest interval between two stop signals to a process, s."""
+COMMAND = ("-m", "errormotion", "run")
+"""First words of the command of a process, after the interpreter and its options; its folder follows."""
 _NAME = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}")
 
 
@@ -165,21 +167,29 @@ def stop(runs: Path, name: str) -> None:
     Raises
     ------
     RunError
-        The process has ended, or belongs to another user.
+        The process has ended, or belongs to another user; or the process with the stated number was not started to
+        measure in this folder: a state that was copied or forged must not end another program.
     """
     process = _one(runs, name)
     folder = runs / FOLDER / name
-    pid = _state(folder / "process.json").get("pid")
-    if not process.alive or not isinstance(pid, int):
+    state = _state(folder / "process.json")
+    if not process.alive:
         raise RunError(f"{process.campaign}: the process has already ended")
     requested = folder / "stop"
     if requested.exists() and time.time() - requested.stat().st_mtime < STOP_INTERVAL:
         return  # a second signal would end it while it closes its instruments
-    requested.touch()
     try:
-        os.kill(pid, signal.SIGTERM)
+        signals.terminate(state.get("pid"), state.get("began"), [*COMMAND, *_publishing(folder)])
+    except ProcessLookupError:
+        raise RunError(f"{process.campaign}: the process has already ended") from None
+    except signals.OtherProcessError as error:
+        raise RunError(
+            f"{folder / 'process.json'}: expected the process that measures in this folder; {error}. Nothing was "
+            "stopped. If the campaign is running, end it by Ctrl-C in its terminal, or by 'kill' with its number"
+        ) from None
     except OSError as error:
         raise RunError(f"{process.campaign}: cannot be stopped: {error.strerror}") from error
+    requested.touch()
 
 
 def _start(runs: Path, campaign: str, machine: str, arguments: list[str]) -> str:
@@ -203,14 +213,21 @@ def _start(runs: Path, campaign: str, machine: str, arguments: list[str]) -> str
 
 def _spawn(folder: Path, runs: Path, state: dict[str, Any], arguments: list[str]) -> None:
     folder.mkdir(mode=0o700)
-    command = ["run", *arguments, "--runs", str(runs.resolve()), "--publish", str(folder.resolve())]
+    command = [*COMMAND[2:], *_publishing(folder), *arguments, "--runs", str(runs.resolve())]
     lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
         child = spawn(command, folder / OUTPUT, inherited=[lock])
-        replace_text(folder / "process.json", json.dumps({**state, "pid": child.pid}))
+        replace_text(
+            folder / "process.json", json.dumps({**state, "pid": child.pid, "began": signals.started(child.pid)})
+        )
     finally:
         os.close(lock)  # the process keeps the lock
+
+
+def _publishing(folder: Path) -> list[str]:
+    """Return the words of a command by which its process publishes its state in a folder."""
+    return ["--publish", str(folder.resolve())]
 
 
 @contextmanager

@@ -17,6 +17,7 @@ import signal
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -130,8 +131,8 @@ class LinuxCNCProcess:
         """End LinuxCNC and all its processes; idempotent."""
         atexit.unregister(self.end)
         if self.running:
-            with suppress(ProcessLookupError, AttributeError):
-                os.kill(self._bridge, signal.SIGTERM)  # LinuxCNC ends with its display
+            if getattr(self, "_bridge", 0) in _parts(self.folder):  # LinuxCNC ends with its display
+                _kill([self._bridge], signal.SIGTERM)
             with suppress(subprocess.TimeoutExpired):
                 self._child.wait(END_TIMEOUT)
         self._kill_the_rest()
@@ -229,11 +230,11 @@ def _parts(of: Path | None = None) -> dict[int, str]:
     return found
 
 
-def _kill(processes: dict[int, str]) -> None:
-    """End processes at once."""
+def _kill(processes: Iterable[int], number: int = signal.SIGKILL) -> None:
+    """Send a signal to processes; by default they end at once."""
     for pid in processes:
         with suppress(ProcessLookupError, PermissionError):
-            os.kill(pid, signal.SIGKILL)
+            os.kill(pid, number)
 
 
 def _remove_memory() -> None:
