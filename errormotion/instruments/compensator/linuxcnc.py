@@ -7,6 +7,7 @@ client at a time.
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,7 +18,7 @@ from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.compensator.door import OffsetDoor
 from errormotion.instruments.controller.linuxcnc import codec
-from errormotion.instruments.controller.linuxcnc.driver import NAME, read_token
+from errormotion.instruments.controller.linuxcnc.driver import SECRET_BYTES, client_name, read_token
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport
 from errormotion.instruments.transports.recording import RecordingTransport, ReplayTransport
@@ -66,6 +67,7 @@ class LinuxCNCOffset(Driver):
         self._door = OffsetDoor(f"{self.info.id} at {address}")
         self._number = 0
         self._may_write = False
+        self._secret = secrets.token_hex(SECRET_BYTES)
 
     @classmethod
     def conformance(cls) -> CompensatorSubject:
@@ -139,7 +141,8 @@ class LinuxCNCOffset(Driver):
 
     def _start_session(self) -> None:
         self._number, self._may_write = 0, False
-        self._hello(self.transport, compensate=False)
+        if not isinstance(self.transport, ReplayTransport):
+            codec.decode_welcome(self._hello(self.transport, compensate=False))
 
     def _state(self) -> codec.Offset:
         found = codec.decode_offset(self._request("offset"))
@@ -151,26 +154,31 @@ class LinuxCNCOffset(Driver):
         return found
 
     def _claim(self, line: Transport) -> None:
-        granted, other = codec.decode_right(self._hello(line, compensate=True))
-        if not granted:
-            why = f"another program has it ({other})" if other else "start the bridge with --compensate"
-            raise InstrumentError(f"{self.address} refuses the right to set offsets: {why}")
+        if not isinstance(line, ReplayTransport):
+            granted, other = codec.decode_right(self._hello(line, compensate=True))
+            if not granted:
+                why = f"another program has it ({other})" if other else "start the bridge with --compensate"
+                raise InstrumentError(f"{self.address} refuses the right to set offsets: {why}")
         self._may_write = True
 
     def _hello(self, line: Transport, *, compensate: bool) -> Any:
+        """Send a first request, which no recording contains, and return its result."""
         token = "" if line.simulated else read_token(self.settings.token_file, self.address)
-        recorded = isinstance(line, RecordingTransport | ReplayTransport)
-        client = NAME if recorded else f"{NAME} {id(self):x}"  # a session is replayed by another object
-        return self._request("hello", token=token, control=False, client=client, compensate=compensate)
+        hello = {"token": token, "secret": self._secret, "session": "offsets", "client": client_name()}
+        within = line.unrecorded if isinstance(line, RecordingTransport) else line
+        return self._exchange(within, 0, "hello", control=False, compensate=compensate, **hello)
 
     def _request(self, op: str, **arguments: Any) -> Any:
         """Return the result of a request; after a failure without an answer the connection is closed."""
         line = self.transport
         self._number += 1
-        request = codec.encode_request(self._number, op, arguments)
+        return self._exchange(line, self._number, op, **arguments)
+
+    def _exchange(self, line: Transport, number: int, op: str, **arguments: Any) -> Any:
+        request = codec.encode_request(number, op, arguments)
         try:
             line.write(request)
-            answer = self._answer(line)
+            answer = self._answer(line, number)
         except InstrumentError:
             self._drop()
             raise
@@ -178,7 +186,7 @@ class LinuxCNCOffset(Driver):
             raise InstrumentError(f"{self.address} refuses '{op.replace('_', ' ')}': {answer.error}")
         return answer.result
 
-    def _answer(self, line: Transport) -> codec.Answer:
+    def _answer(self, line: Transport, number: int) -> codec.Answer:
         try:
             message = codec.decode(line.read_until(codec.LINE_END, limit=codec.MAX_LINE))
         except InstrumentTimeoutError:
@@ -187,8 +195,8 @@ class LinuxCNCOffset(Driver):
             ) from None
         if message.number is None and not getattr(message, "ok", True):
             raise InstrumentError(f"{self.address}: the bridge ends the connection: {getattr(message, 'error', '')}")
-        if message.number != self._number or not isinstance(message, codec.Answer):
-            raise ProtocolError(f"{self.address}: expected the answer to request {self._number}; found {message}")
+        if message.number != number or not isinstance(message, codec.Answer):
+            raise ProtocolError(f"{self.address}: expected the answer to request {number}; found {message}")
         return message
 
 

@@ -95,6 +95,11 @@ class RecordingTransport(Transport):
         self.flow_control = inner.flow_control
         self.simulated = inner.simulated
 
+    @property
+    def unrecorded(self) -> Transport:
+        """The transport within, for frames that no recording may contain, such as a token."""
+        return self._inner
+
     def _send(self, data: bytes) -> None:
         self._recorder.frame("W", data)  # before sending, so that the answer is recorded after it
         self._inner.write(data)

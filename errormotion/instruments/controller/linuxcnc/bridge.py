@@ -11,11 +11,12 @@ unknown values are null. Positions are in machine coordinates (G53), without any
 
 The first request of a connection is ``{"id": 0, "op": "hello", "token": "...", "control": true, "client": "NAME"}``
 with the token from a file that only the user can read. A connection with another first line, or with a line that is not
-a request, is closed. One client (one NAME) at a time controls the machine; the others can read, and stop it. One
-operation at a time moves the machine. An operation or program ends with the connection of its client: if this is lost,
-the bridge aborts the motion. No request can end the bridge. A bridge with ``--compensate`` permits one client, which
-states ``"compensate": true`` in its first request, to set the offset of ``compensation.tcl``; this includes no other
-right.
+a request, is closed. One client at a time controls the machine; the others can read, and stop it. NAME is for messages
+only. Connections that state the same random ``"secret"`` are of one client; with the same ``"session"`` as well, the
+new one replaces the other, which a cut has ended. The bridge sends no secret. One operation at a time moves the
+machine. An operation or program ends with its connection: if this is lost, the bridge aborts the motion. No request can
+end the bridge. A bridge with ``--compensate`` permits one client, which states ``"compensate": true`` in its first
+request, to set the offset of ``compensation.tcl``; this includes no other right.
 """
 
 from __future__ import annotations
@@ -64,8 +65,9 @@ LINES_AT_ONCE = 4  # lines of one client that are processed before those of othe
 CLOSE_TIMEOUT = 1.0  # s for the last answer to be sent
 MAX_TASKS = 16  # requests of one client that are in progress
 MAX_NAME = 64  # characters of an id or a name
+MAX_SECRET = 256  # characters
 MAX_TEXT = 500  # characters of an error text
-MIN_TOKEN = 32  # characters
+MIN_TOKEN = 32  # characters of a token or a secret
 SIGN_INTERVAL = 0.02  # s between two changes of the heartbeat; several servo cycles
 THREAD_INTERVAL = 0.02  # s between two checks whether a thread is cut
 PROBING = 5  # motion.motion-type
@@ -113,6 +115,8 @@ class Client(asyncio.Protocol):
         self.transport: Any = None
         self.greeted = self.control = self.compensate = self.gone = False
         self.name = ""
+        self.secret = b""
+        self.session = ""
         self.since = time.monotonic()
         self.program: list[str] = []  # parts of a program received so far
         self.program_size = 0
@@ -187,6 +191,10 @@ class Client(asyncio.Protocol):
         """Discard the parts of a program."""
         self.program.clear()
         self.program_size = 0
+
+    def is_of(self, other: Client) -> bool:
+        """Whether both connections are of one client: they state the same secret."""
+        return bool(self.secret) and hmac.compare_digest(self.secret, other.secret)
 
     def welcome(self) -> None:
         """Accept the client."""
@@ -559,16 +567,27 @@ class Bridge:
         if not isinstance(arguments.get("compensate", False), bool):
             client.end("expected 'compensate', true or false")
             return
+        secret, session = arguments.get("secret", ""), arguments.get("session", "")
+        if not isinstance(secret, str) or (secret and not MIN_TOKEN <= len(secret) <= MAX_SECRET):
+            client.end(f"expected a random text of {MIN_TOKEN} to {MAX_SECRET} characters as 'secret', or none")
+            return
+        if not isinstance(session, str) or len(session) > MAX_NAME:
+            client.end(f"expected a name of at most {MAX_NAME} characters as 'session'")
+            return
         if not client.greeted and sum(each.greeted for each in self.clients) >= MAX_CLIENTS:
             client.end(f"{MAX_CLIENTS} clients are already connected")
             return
         client.welcome()
         client.name, client.control, client.compensate = name, False, False
+        client.secret, client.session = secret.encode("utf-8", "surrogatepass"), session
+        for lost in [each for each in self.clients if each is not client and each.session == session != ""]:
+            if client.is_of(lost):
+                lost.end("its client has connected again")
         holder = next((each for each in self.clients if each.control), None)
-        client.control = arguments["control"] and (holder is None or holder.name == name != "")
+        client.control = arguments["control"] and (holder is None or client.is_of(holder))
         other = next((each for each in self.clients if each.compensate), None)
         asked = arguments.get("compensate", False) and self.compensates
-        client.compensate = asked and (other is None or other.name == name != "")
+        client.compensate = asked and (other is None or client.is_of(other))
         result = {
             "protocol": PROTOCOL,
             "control": client.control,

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,8 +26,8 @@ from errormotion.plugins import Identity, InstrumentInfo, MachineLimits, lazy
 
 ESTOP_TIMEOUT = 2.0  # s
 ESTOP_INTERVAL = 0.01  # s between two queries of the state
-NAME = f"errormotion {os.getpid()} {secrets.token_hex(8)}"
-"""Name of this process for a bridge; all its connections share the control of a machine."""
+SECRET_BYTES = 32
+"""Length of a secret, by which a bridge knows the connections of one client."""
 
 
 class LinuxCNC(Driver):
@@ -346,8 +347,8 @@ class LinuxCNC(Driver):
 
     def _greet(self, line: Transport) -> None:
         token = "" if line.simulated else read_token(self.settings.token_file, self.address)
-        hello = {"token": token, "control": self.settings.arm, "client": NAME}
-        line.write(codec.encode_request(0, "hello", hello))
+        own = {"secret": own_secret(os.getpid()), "session": f"{id(self):x}", "client": client_name()}
+        line.write(codec.encode_request(0, "hello", {"token": token, "control": self.settings.arm, **own}))
         answer = self._await(line, 0)
         if not answer.ok and "unknown operation" in answer.error:
             raise InstrumentError(
@@ -366,6 +367,17 @@ class LinuxCNC(Driver):
         self._number, self._lost = 0, False
         self._unawaited.clear()
         self.identify()
+
+
+def client_name() -> str:
+    """Return the name of this process in messages of a bridge."""
+    return f"errormotion {os.getpid()}"
+
+
+@cache
+def own_secret(pid: int) -> str:  # noqa: ARG001 - a forked process has another secret
+    """Return the secret of this process, whose drivers share the control of a machine."""
+    return secrets.token_hex(SECRET_BYTES)
 
 
 _WHERE = (

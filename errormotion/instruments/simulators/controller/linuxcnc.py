@@ -213,10 +213,10 @@ class SimulatedLinuxCNC(SimulatedDevice):
             self._bridge: Transport = open_transport(f"unix://{self._control.process.socket}", timeout=ANSWER_TIMEOUT)
             try:
                 ready = self._control.users == 1 and self._control.ready
-                self._wait_for("hello", **self._greeting(ready, OWN))
+                self._wait_for("hello", token=self._control.process.token, control=ready, client=OWN)
                 if ready:
                     self._make_ready()
-                    self._wait_for("hello", **self._greeting(False, OWN))
+                    self._wait_for("hello", token=self._control.process.token, control=False, client=OWN)
             except BaseException:
                 self._bridge.close()
                 raise
@@ -260,7 +260,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
                 self._forward_line(line + b"\n")  # the bridge answers with the error
                 continue
             if op == "hello":  # a simulated machine needs no token
-                request |= self._greeting(request.get("control"), request.get("client"))
+                request["token"] = self._control.process.token
             self._requests[number] = op
             if op in ("elapse", "move_to", "probe", "run_program"):
                 self._request_state(partial(self._prepared, request))
@@ -309,9 +309,6 @@ class SimulatedLinuxCNC(SimulatedDevice):
     def _forward_line(self, line: bytes) -> None:
         with suppress(InstrumentError):  # the other thread detects this and disconnects
             self._bridge.write(line)
-
-    def _greeting(self, control: Any, client: Any) -> Message:
-        return {"token": self._control.process.token, "control": control, "client": client}
 
     # ------------------------------------------------------------------ from the bridge
 

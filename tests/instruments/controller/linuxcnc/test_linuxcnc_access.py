@@ -15,8 +15,10 @@ from typing import Any
 import pytest
 
 from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.compensator.linuxcnc import LinuxCNCCompensatorSettings, LinuxCNCOffset
 from errormotion.instruments.controller.linuxcnc import BRIDGE, LinuxCNC, LinuxCNCSettings
 from errormotion.instruments.controller.linuxcnc.codec import decode_welcome, encode_request, parts_of
+from errormotion.instruments.controller.linuxcnc.driver import client_name
 
 LINUXCNC = """
 import os
@@ -178,6 +180,42 @@ def test_the_token_is_in_no_recording(start: Start, tmp_path: Path) -> None:
     assert token.read_text().strip().encode().hex() not in record.read_text()
     with LinuxCNC(f"replay://{record}") as machine:
         assert machine.state()["position"] == state["position"]
+
+
+def test_no_secret_is_in_the_recording_of_a_compensator(start: Start, tmp_path: Path) -> None:
+    path = start("--compensate")["socket"]
+    token = tmp_path / ".errormotion" / "linuxcnc.token"
+    record = tmp_path / "session.rec"
+    with LinuxCNCOffset(f"unix://{path}", LinuxCNCCompensatorSettings(token_file=token), record=record) as compensator:
+        identity = compensator.identify()
+    written = record.read_text()
+    assert token.read_text().strip().encode().hex() not in written
+    assert b"hello".hex() not in written
+    with LinuxCNCOffset(f"replay://{record}") as compensator:
+        assert compensator.identify().firmware == identity.firmware
+
+
+def test_a_driver_replaces_its_lost_connection_and_no_namesake_does(start: Start, tmp_path: Path) -> None:
+    port = start("--port", "0")["port"]
+    token = tmp_path / ".errormotion" / "linuxcnc.token"
+    armed = LinuxCNCSettings(token_file=token, arm=True, timeout=5.0)
+    with LinuxCNC(f"tcp://127.0.0.1:{port}", armed) as machine:
+        machine.enable()
+        reader = LinuxCNC(f"tcp://127.0.0.1:{port}", LinuxCNCSettings(token_file=token))
+        with reader, socket.create_connection(("127.0.0.1", port)) as line:
+            answers = line.makefile("rb")
+            for name in (client_name(), "", "another"):
+                hello = {"token": token.read_text().strip(), "control": True, "client": name, "secret": "0" * 64}
+                line.sendall(encode_request(0, "hello", hello))
+                assert json.loads(answers.readline())["result"]["control"] is False
+            kept = machine.transport  # open: the bridge does not notice the cut
+            machine._lost, machine._transport = True, None
+            machine._reconnect()
+            machine.enable()
+            line.sendall(encode_request(0, "hello", hello))
+            assert json.loads(answers.readline())["result"]["control"] is False
+            kept.close()
+    assert commands(tmp_path) == ["state 4"] * 2
 
 
 def test_an_earlier_bridge_is_named_as_such() -> None:

@@ -88,7 +88,7 @@ class Wire:
     abort = close
 
     def send(self, op: Any, **arguments: Any) -> None:
-        self.feed(json.dumps({"id": 7, "op": op, **arguments}).encode() + b"\n")
+        self.feed(json.dumps({**arguments, "id": 7, "op": op}).encode() + b"\n")
 
     async def ask(self, op: Any, **arguments: Any) -> Any:
         """Return the result, or the text of the refusal."""
@@ -316,12 +316,87 @@ def test_one_client_controls_and_the_others_read_and_stop(play: Callable[[Test],
     play(test)
 
 
-def test_a_program_has_several_connections_with_its_control(play: Callable[[Test], None]) -> None:
+SECRET = "f" * 64
+OTHER_SECRETS = [None, "", "e" + SECRET[1:], SECRET[:-1], SECRET + "f", SECRET.upper()]
+
+
+@pytest.mark.parametrize("secret", OTHER_SECRETS)
+@pytest.mark.parametrize("right", ["control", "compensate"])
+def test_the_name_of_the_holder_gives_no_right(play: Callable[[Test], None], secret: str | None, right: str) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
-        assert Wire(bridge).welcome["result"]["control"] is True
-        assert Wire(bridge, control=False).welcome["result"]["control"] is False
-        nameless = Wire(bridge, client="")
-        assert nameless.welcome["result"]["control"] is False
+        bridge.compensates = True
+        rights = {"control": False, "compensate": False, right: True}
+        await wire.disconnect()
+        holder = Wire(bridge, client="the holder", secret=SECRET, **rights)
+        assert holder.welcome["result"][right] is True
+        for _ in range(2):
+            reader = Wire(bridge, client="reader", control=False)
+            told = reader.welcome["result"][{"control": "controlled_by", "compensate": "compensated_by"}[right]]
+            assert told == "the holder"
+            assert SECRET not in json.dumps(reader.welcome)
+            copy = Wire(bridge, client=told, **rights, **({} if secret is None else {"secret": secret}))
+            assert copy.welcome["result"][right] is False
+            assert "does not compensate" in await copy.ask("set_offset", offset=[0, 0, 0])
+            assert "only reads" in await copy.ask("enable")
+            assert not holder.closed
+
+    play(test)
+
+
+def test_no_answer_contains_a_secret(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        holder = Wire(bridge, control=False, secret=SECRET)
+        answers = [holder.welcome]
+        answers += [await holder.ask(op) for op in ("identify", "state", "offset", "enable", SECRET[:8])]
+        assert SECRET not in json.dumps(answers)
+        assert TOKEN not in json.dumps(answers)
+
+    play(test)
+
+
+@pytest.mark.parametrize("right", ["control", "compensate"])
+def test_a_client_that_lost_its_connection_takes_its_right_back(play: Callable[[Test], None], right: str) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        bridge.compensates = True
+        await wire.disconnect()
+        rights = {"control": False, "compensate": False, right: True}
+        of_one = {**rights, "secret": SECRET}
+        cut = Wire(bridge, session="a", **of_one)  # the bridge has not noticed the cut
+        beside = Wire(bridge, session="b", **of_one)
+        again = Wire(bridge, client="another name", session="a", **of_one)
+        assert again.welcome["result"][right] is True
+        assert (cut.closed, beside.closed) == (True, False)
+        assert beside.welcome["result"][right] is True
+        foreign = Wire(bridge, client="third", session="b")
+        assert not beside.closed
+        assert foreign.welcome["result"][right] is False
+        third = Wire(bridge, client="third", secret="0" * 64, **rights)
+        assert third.welcome["result"][right] is False
+
+    play(test)
+
+
+def test_a_motion_of_the_lost_connection_ends_when_its_client_returns(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        await wire.disconnect()
+        fake.on_mdi = lambda *_: setattr(fake.values, "state", fake.RCS_EXEC)  # an endless motion
+        cut = Wire(bridge, secret=SECRET, session="a")
+        cut.send("move_to", position=[0.01, 0, 0])
+        while not bridge.job:
+            await asyncio.sleep(0.001)
+        again = Wire(bridge, secret=SECRET, session="a")
+        assert again.welcome["result"]["control"] is True
+        assert "abort" in fake.lines
+
+    play(test)
+
+
+@pytest.mark.parametrize("secret", [7, None, "f" * 31, "f" * 257, ["f" * 64]])
+def test_a_weak_secret_is_refused(play: Callable[[Test], None], secret: Any) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        other = Wire(bridge, client="two", secret=secret)
+        assert other.closed
+        assert "32 to 256 characters" in other.welcome["error"]
 
     play(test)
 
@@ -600,8 +675,9 @@ def test_a_failed_homing_has_a_reason(play: Callable[[Test], None]) -> None:
 def test_a_command_sends_heartbeats_until_it_ends_and_others_wait(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.on_mdi = lambda line: setattr(fake.values, "interp_state", fake.INTERP_READING)
+        await wire.ask("hello", token=TOKEN, control=True, client="one", secret=SECRET)
         wire.send("move_to", position=[0, 0, 0.1])
-        other = Wire(bridge)
+        other = Wire(bridge, secret=SECRET)
         while not (await other.ask("state"))["ordered"]:
             await asyncio.sleep(0.01)
         assert await other.ask("spindle", speed=1) == "the machine is busy: move to"
@@ -616,7 +692,8 @@ def test_a_command_sends_heartbeats_until_it_ends_and_others_wait(play: Callable
 
 def test_a_client_that_disconnects_ends_its_motion(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
-        other = Wire(bridge)
+        await wire.ask("hello", token=TOKEN, control=True, client="one", secret=SECRET)
+        other = Wire(bridge, secret=SECRET)
         fake.on_run = lambda: setattr(fake.values, "interp_state", fake.INTERP_READING)
         assert (await other.ask("run_program", text="G4 P9"))["program"] == "errormotion-1.ngc"
         assert (await wire.ask("state"))["running"] is True
