@@ -7,8 +7,13 @@ Both together form the tilt vector
 
     q = tan(alpha) (cos beta, sin beta) = (N.e1, N.e2) / (-N.u),    e1 = t x u / |t x u|,   e2 = u x e1,
 
-with t the normal of the plane of triangulation. q has no pole where the beam is perpendicular to the surface. The
-published deflection of a sensor is not a third freedom: u, t and N determine alpha and beta in any orientation.
+with t the normal of the plane of triangulation, on the side from which, looking along the beam with t upwards, the
+receiver is to the right of the laser: t = r x u, with r the direction from the laser to the receiver, and e1 = -r. At
+rotation 0 the normal of the surface leans away from the receiver, at 180 deg towards it, and at 90 deg along t. The
+opposite normal makes q its negative, and k another one.
+
+q has no pole where the beam is perpendicular to the surface. The published deflection of a sensor is not a third
+freedom: u, t and N determine alpha and beta in any orientation.
 """
 
 from __future__ import annotations
@@ -148,7 +153,8 @@ def tilt(beam: ArrayLike, triangulation_normal: ArrayLike, normal: ArrayLike) ->
     beam : array_like (3,)
         Unit vector from the sensor to the target.
     triangulation_normal : array_like (3,)
-        Unit normal of the plane of emitted and received beam; its component along the beam has no effect.
+        Unit normal of the plane of emitted and received beam, with the receiver to the right of the laser for an
+        observer who looks along the beam and has this normal upwards; its component along the beam has no effect.
     normal : array_like (..., 3)
         Unit normals of the surfaces, towards the sensor.
 

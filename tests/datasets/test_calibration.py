@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from errormotion import datasets
-from errormotion.datasets.calibrations.inclination import SCHEMA, InclinationCalibration, build, hole_texts, violations
+from errormotion.datasets.calibrations.inclination import (
+    AWAY,
+    ROTATION_ZERO,
+    SCHEMA,
+    InclinationCalibration,
+    build,
+    hole_texts,
+    violations,
+)
 from errormotion.datasets.calibrations.tilt_support import TiltSupport
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt_vector
@@ -51,7 +59,8 @@ def calibration(
         **{name: np.zeros(n) for name in ("group_depth", "group_residual", "offset", "slope", "slope_uncertainty")},
         **{name: np.zeros(n) for name in ("slope_predicted", "slope_predicted_uncertainty")},
     }
-    return InclinationCalibration(build({**variables, **changes}, {"order": 2, "mirror": 1, "provenance": "{}"}))
+    attributes = {"order": 2, "mirror": 1, ROTATION_ZERO: AWAY, "provenance": "{}"}
+    return InclinationCalibration(build({**variables, **changes}, attributes))
 
 
 @pytest.fixture(scope="module")

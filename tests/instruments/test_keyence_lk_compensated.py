@@ -7,7 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from errormotion.datasets.calibrations.inclination import InclinationCalibration, build, half_tilt, terms
+from errormotion.datasets.calibrations.inclination import (
+    AWAY,
+    ROTATION_ZERO,
+    InclinationCalibration,
+    build,
+    half_tilt,
+    terms,
+)
 from errormotion.errors import DatasetError, InstrumentError, MethodError
 from errormotion.instruments.point_lds.compensated import CompensatedSensor
 from errormotion.instruments.point_lds.keyence_lk import KeyenceLK, LKSettings
@@ -62,7 +69,8 @@ def calibration() -> InclinationCalibration:
         "remaining_error": K_UNCERTAINTY,
         "remaining_error_interval": [0.0, 2 * K_UNCERTAINTY],
     }
-    return InclinationCalibration(build(values, {"order": DEGREE, "mirror": 0, "provenance": "{}", "name": "twin"}))
+    attributes = {"order": DEGREE, "mirror": 0, ROTATION_ZERO: AWAY, "provenance": "{}", "name": "twin"}
+    return InclinationCalibration(build(values, attributes))
 
 
 @pytest.fixture(scope="module")

@@ -42,6 +42,8 @@ FOLDER = "calibrations"
 VARIABLE = "ERRORMOTION_CALIBRATIONS"
 """Environment variable with the path of a further such folder."""
 
+ROTATION_ZERO, AWAY = "rotation_zero", "away from the receiver"
+"""Attribute of a calibration with the direction in which a surface's normal leans at rotation 0, and its value."""
 EXTRAPOLATION = 0.05
 """Largest extrapolation beyond the calibrated range of readings, as a fraction of it."""
 
@@ -97,6 +99,8 @@ ATTRIBUTES = {
     "schema": f"`{SCHEMA}`",
     "order": "order of the polynomial that cross-validation chose",
     "mirror": "1: even in q2, the plane of triangulation is a plane of symmetry; 0: not",
+    ROTATION_ZERO: f"`{AWAY}`: the direction in which the normal of a surface leans at rotation 0. A file without it, "
+    "of an earlier version, is made anew: `errormotion calibrate`, with `receiver_rotation`",
     "provenance": "JSON text: settings with defaults, hash of the raw dataset, instruments, software",
 }
 _ALL_AROUND = 359.0
@@ -369,6 +373,8 @@ def hole_texts(holes: Sequence[Hole]) -> list[str]:
 def violations(ds: xr.Dataset) -> list[str]:
     """Return every violation of the schema of a calibration, one sentence each."""
     found = table_violations(ds, SCHEMA, ROWS, ATTRIBUTES, _SIZES, _MAY_BE_UNKNOWN)
+    if not found and ds.attrs[ROTATION_ZERO] != AWAY:
+        found = [f"attribute '{ROTATION_ZERO}': expected '{AWAY}'; found {ds.attrs[ROTATION_ZERO]!r}"]
     return found or _covariance_violations(ds["coefficient_covariance"].transpose("term", "term_").values)
 
 

@@ -101,7 +101,8 @@ class CompensatedSensor:
         inclination : float
             Angle between the beam and the normal of the surface, rad.
         rotation : float
-            Azimuth of that tilt about the beam from the plane of triangulation, rad.
+            Azimuth of the surface's normal about the beam, rad: 0 where it leans away from the receiver, clockwise for
+            an observer who looks along the beam.
 
         Raises
         ------

@@ -237,6 +237,7 @@ class Setup:
                 "machine": self.bench.machine,
                 "frame": "machine",
                 "moves": self.settings.moves,
+                **({} if self.settings.receiver is None else {"receiver": self.settings.receiver}),
                 "sensor": type(self.sensor).info.id,
                 "average": p.average,
                 "start": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -38,7 +38,9 @@ class Layout(PluginSettings):
         default=8.7e-3, gt=0, description="standard uncertainty of the nominal direction"
     )
     triangulation_normal: Vector | None = Field(
-        default=None, description="normal of the plane of emitted and received beam, for the inclination compensation"
+        default=None,
+        description="normal of the plane of emitted and received beam, for the inclination compensation; the setting "
+        "receiver states on which side of the laser the receiver is",
     )
     reading_range: tuple[Length, Length] = Field(
         default=(-10e-3, 10e-3),

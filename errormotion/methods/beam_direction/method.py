@@ -22,7 +22,7 @@ class BeamDirection:
         id="beam_direction",
         summary="Origin and direction of a point sensor's beam from planes of a sine gauge, inclination compensated",
         status="simulated_only",
-        version="1",
+        version="2",
         cannot_see=(
             "the rotation of the beam about its axis",
             "the zero point, if fewer than three planes have a known point",
@@ -55,16 +55,22 @@ class BeamDirection:
         return acquisition.measure_planes(bench, settings, inputs, done)
 
     def check(self, settings: BeamSettings) -> dict[str, str]:
-        """Return by setting why the calibration of the settings cannot be used; empty if it can."""
+        """Return by setting why the compensation of the settings is not possible; empty if it is."""
         if settings.compensation is None:
             return {}
         from errormotion.datasets.calibrations.inclination import InclinationCalibration
+        from errormotion.methods.beam_direction.identification.reading import NORMAL_NEEDED, RECEIVER_NEEDED
 
+        found = {}
         try:
             InclinationCalibration.find(settings.compensation)
         except DatasetError as error:
-            return {"compensation": str(error)}
-        return {}
+            found["compensation"] = str(error)
+        if settings.layout.triangulation_normal is None:
+            found["layout.triangulation_normal"] = NORMAL_NEEDED
+        if settings.receiver is None:
+            found["receiver"] = RECEIVER_NEEDED
+        return found
 
     def append_dim(self, settings: BeamSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``plane``."""

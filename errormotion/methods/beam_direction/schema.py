@@ -11,7 +11,7 @@ _POINT_SENSOR = (
         ("direction",),
         "1",
         *UNIT_VECTOR,
-        "normal of the sensor's triangulation plane, for the inclination compensation",
+        "normal of the sensor's triangulation plane, for the inclination compensation, with the attribute `receiver`",
         required=False,
     ),
     Row(
@@ -120,7 +120,23 @@ RAW_SCHEMAS = (
                 1.5,
                 "of the surface; negative: tilted in the opposite direction",
             ),
-            Row("rotation", ("group",), "rad", -6.3, 6.3, "azimuth of the tilt from the triangulation plane"),
+            Row(
+                "rotation",
+                ("group",),
+                "rad",
+                -6.3,
+                6.3,
+                "azimuth of the surface's normal, clockwise about the beam for an observer who looks along it",
+            ),
+            Row(
+                "receiver_rotation",
+                (),
+                "rad",
+                -6.3,
+                6.3,
+                "rotation at which the normal leans towards the receiver: 0 or 180 deg; needed, here or as a setting",
+                required=False,
+            ),
             Row("reading_noise", (), "m", *NOISE, "standard deviation of one reading", required=False),
             Row(
                 "mid_range",

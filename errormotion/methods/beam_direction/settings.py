@@ -41,6 +41,12 @@ class Settings(PluginSettings):
     allow_other_sensor: bool = Field(
         default=False, description="use a calibration of a sensor with another serial number or mid-range"
     )
+    receiver: Literal["left", "right"] | None = Field(
+        default=None,
+        description="side of the receiver, seen from the laser, when one looks along the beam with "
+        "triangulation_normal upwards; needed for the compensation; the attribute receiver of a raw dataset takes "
+        "precedence",
+    )
     triangulation_normal_uncertainty: Angle = Field(
         default=float(np.radians(0.5)),
         ge=0,

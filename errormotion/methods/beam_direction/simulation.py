@@ -21,7 +21,7 @@ from errormotion.methods.beam_direction.schema import INCLINATION_SCHEMA, SCHEMA
 from errormotion.methods.beam_direction.settings import Settings
 from errormotion.twin import VirtualMachine, kernels, truth
 from errormotion.twin.artefacts.planes import CheckBar, Target
-from errormotion.twin.sensors.point_sensor import PointSensor
+from errormotion.twin.sensors.point_sensor import RECEIVER, PointSensor
 from errormotion.twin.sensors.stage_sensor import NOISE, TEXTURE
 
 PLANES = tuple((np.radians(20.0), np.radians(rotation)) for rotation in (0.0, 90.0, 180.0))
@@ -281,6 +281,7 @@ def raw_inclination(
         "reference": ("group", reference, _M),
         "inclination": ("group", alpha, _RAD),
         "rotation": ("group", beta, _RAD),
+        "receiver_rotation": ((), np.pi, _RAD),
         "reading_noise": ((), float(np.hypot(noise, REFERENCE_NOISE)), _M),
         "mid_range": ((), sensor.mid_range, _M),
     }
@@ -300,7 +301,8 @@ def _stated(machine: VirtualMachine, sensor: PointSensor, speckle: bool) -> xr.D
     if speckle:
         variables["speckle"] = ((), sensor.speckle, _M)
         variables["speckle_length"] = ((), sensor.speckle_length, _M)
-    return xr.Dataset(variables, {"direction": list("xyz")}, {"schema": SCHEMA, **_labels(machine)})
+    attrs = {"schema": SCHEMA, "receiver": RECEIVER, **_labels(machine)}
+    return xr.Dataset(variables, {"direction": list("xyz")}, attrs)
 
 
 def _labels(machine: VirtualMachine) -> dict[str, str]:

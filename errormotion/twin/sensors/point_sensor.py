@@ -16,6 +16,8 @@ from errormotion.twin.sensors.triangulation import Optics, key_of, speckle
 NOMINAL_ORIGIN = (0.05, 0.0, -0.08)
 #: Nominal angle of the beam to -Z, rad.
 NOMINAL_TILT = np.radians(20.0)
+#: Side of the receiver for an observer who looks along the beam and has the triangulation normal upwards.
+RECEIVER = "right"
 #: Deviation of the beam: zero point in each direction, m; direction, rad; rotation about itself, rad (one sigma).
 ORIGIN_DEVIATION, DIRECTION_DEVIATION, ROLL_DEVIATION = 0.1e-3, np.radians(0.3), np.radians(0.5)
 
@@ -30,7 +32,7 @@ class PointSensor:
     ----------
     nominal_origin, nominal_direction, nominal_triangulation_normal : ndarray, (3,)
         Nominal: point where the reading is 0 with the stage at 0, m; unit vector from the sensor to the target;
-        unit normal of the plane of emitted and received beam.
+        unit normal of the plane of emitted and received beam, with the receiver to the `RECEIVER` of the laser.
     true_origin, true_direction, triangulation_normal : ndarray, (3,)
         The true ones.
     range : (low, high)

@@ -31,7 +31,8 @@ class Optics:
     Attributes
     ----------
     triangulation_angle : float
-        Between emitted and received beam, rad; a surface at a rotation of 180 deg is inclined towards the receiver.
+        Between emitted and received beam, rad. The receiver is in the direction -e1 from the emitted beam (see
+        `errormotion.kinematics.beams`): a surface at a rotation of 180 deg is inclined towards it.
     aperture : float
         Half angle of the receiving lens seen from the spot, rad.
     roughness : float

@@ -44,7 +44,8 @@ def readings(
     spread = {"inclination": a[..., None] + 0 * true, "rotation": b[..., None] + 0 * true}
     columns = {"reading": reading, "reference": reference, **spread}
     return xr.Dataset(
-        {name: ("group", values.ravel()) for name, values in columns.items()} | {"mid_range": mid},
+        {name: ("group", values.ravel()) for name, values in columns.items()}
+        | {"mid_range": mid, "receiver_rotation": np.pi},
         attrs={"schema": "errormotion.raw.inclination/1"},
     )
 
@@ -161,6 +162,7 @@ def test_every_reading_may_be_a_separate_setting() -> None:
             "reference": ("group", depth),
             "inclination": ("group", alpha),
             "rotation": ("group", beta),
+            "receiver_rotation": np.pi,
             "reading_noise": NOISE,
         },
         attrs={"schema": "errormotion.raw.inclination/1"},
@@ -250,6 +252,7 @@ def test_a_calibration_is_reproducible_and_states_its_source() -> None:
         "order": None,
         "mirror": None,
         "offsets": "auto",
+        "receiver_rotation": None,
         "serial_number": "",
     }
 

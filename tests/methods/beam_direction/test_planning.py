@@ -153,7 +153,7 @@ def test_impossible_plans_are_refused():
 
 def settings(**changes):
     layout = {"nominal_direction": tuple(BEAM), "triangulation_normal": (0.0, 1.0, 0.0)}
-    return Settings(layout=layout | changes.pop("layout", {}), **changes)
+    return Settings(layout=layout | changes.pop("layout", {}), **{"receiver": "right", **changes})
 
 
 @pytest.mark.usefixtures("short_search")

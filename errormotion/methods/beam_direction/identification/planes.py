@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from scipy.special import gammaincinv, ndtri
+from scipy.special import ndtri
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
@@ -29,8 +29,15 @@ from errormotion.methods.beam_direction.identification.compensation import (
     uncompensated,
 )
 from errormotion.methods.beam_direction.identification.origin import Origin, locate
-from errormotion.methods.beam_direction.identification.propagation import Propagated, closure_chi2, propagate
-from errormotion.methods.beam_direction.identification.reading import Readings, read
+from errormotion.methods.beam_direction.identification.propagation import (
+    FALSE_ALARM,
+    Propagated,
+    chi2_quantile,
+    closure_chi2,
+    propagate,
+)
+from errormotion.methods.beam_direction.identification.reading import Readings, read, triangulation_normal
+from errormotion.methods.beam_direction.identification.receiver import check_receiver
 from errormotion.methods.beam_direction.identification.slopes import UNKNOWNS, PlaneFit, fit_plane_readings
 
 if TYPE_CHECKING:
@@ -39,8 +46,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FALSE_ALARM = 1e-3
-"""Probability that correct data are reported as noisier than stated, correlated, or not closing."""
 _NOTED_CURVATURE = 0.05
 _PARAMETERS = ["px", "py", "pz", "ux", "uy", "uz"]
 _LABELS = {"direction": list("xyz"), "direction_": list("xyz"), "p": _PARAMETERS, "p_": _PARAMETERS}
@@ -165,6 +170,8 @@ def determine(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Determin
         converged.direction, compensated.offsets, compensated.covariances, data.points, data.point_uncertainty
     )
     propagated = propagate(converged, origin, data.point_uncertainty)
+    if sensor is not None:
+        check_receiver(planes, sensor, converged, propagated, settings, notes)
     closure_factor = _closure_factor(data, converged, propagated, notes)
     _note_roots(converged, data, notes)
     _note_origin(data, origin, notes)
@@ -177,7 +184,7 @@ def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
     Raises
     ------
     MethodError
-        The data do not state the orientation of the sensor.
+        The data do not state the orientation of the sensor, or the side of its receiver.
     DatasetError
         The calibration is not found, or belongs to another sensor.
     """
@@ -185,27 +192,18 @@ def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
         return None
     drawn = getattr(settings, "calibration", None)  # of a Monte Carlo trial
     calibration = InclinationCalibration.find(settings.compensation) if drawn is None else drawn
-    if "triangulation_normal" not in raw:
-        raise MethodError(
-            "Expected triangulation_normal(direction) in the raw dataset, for the inclination compensation: the normal "
-            "of the plane of the emitted and the received beam. Add it, or identify without compensation."
-        )
-    t = np.asarray(raw["triangulation_normal"].values, np.float64)
+    normal = triangulation_normal(raw, settings.receiver)
     name = "triangulation_normal_uncertainty"
     mid_range = float(raw["mid_range"]) if "mid_range" in raw else calibration.mid_range
     serial, allowed = owner.serial_number(raw.attrs, "point_lds"), settings.allow_other_sensor
     notes = calibration.require_sensor(serial, mid_range, allow_other_sensor=allowed)
     return Sensor(
         calibration,
-        t / np.linalg.norm(t),
+        normal,
         float(raw[name]) if name in raw else settings.triangulation_normal_uncertainty,
         mid_range,
         tuple(notes),
     )
-
-
-def _chi2_quantile(p: float, degrees: int) -> float:
-    return 2.0 * float(gammaincinv(degrees / 2, p))
 
 
 def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, notes: list[str]) -> float:
@@ -222,7 +220,7 @@ def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, note
         return 1.0
     chi2 = float(sum(w @ w for w in used))
     factor = 1.0
-    low, high = (_chi2_quantile(p, freedom) for p in (FALSE_ALARM, 1 - FALSE_ALARM))
+    low, high = (chi2_quantile(p, freedom) for p in (FALSE_ALARM, 1 - FALSE_ALARM))
     ratio = float(np.sqrt(chi2 / freedom))
     if chi2 > high:
         increased = settings.noise == "auto"
@@ -252,10 +250,14 @@ def _closure_factor(data: Readings, converged: Converged, propagated: Propagated
     if freedom < 1:
         return 1.0
     chi2 = closure_chi2(propagated)
-    if chi2 <= _chi2_quantile(1 - FALSE_ALARM, freedom):
+    if chi2 <= chi2_quantile(1 - FALSE_ALARM, freedom):
         return 1.0
     factor = float(np.sqrt(chi2 / freedom))
-    cause = "an invalid calibration" if converged.iterations else "the uncompensated inclination error of the sensor"
+    cause = (
+        "an invalid calibration, triangulation_normal or receiver"
+        if converged.iterations
+        else "the uncompensated inclination error of the sensor"
+    )
     notes.append(
         f"The planes contradict one another: chi-square {chi2:.4g} with {freedom} degrees of freedom; "
         f"{_largest_closure(data, propagated)}. Possible causes: {cause}, or a plane that moved. "
@@ -303,7 +305,7 @@ def _note_origin(data: Readings, origin: Origin | None, notes: list[str]) -> Non
         notes.append("No plane_point_uncertainty in the data: the known points of the planes are assumed to be exact.")
     if not np.isfinite(data.nominal_origin).all():
         notes.append("No nominal_origin in the data: the zero point is stated as beam_origin, its error is unknown.")
-    if known > 3 and origin.chi2 > _chi2_quantile(1 - FALSE_ALARM, known - 3):
+    if known > 3 and origin.chi2 > chi2_quantile(1 - FALSE_ALARM, known - 3):
         worst = int(np.nanargmax(np.abs(origin.misfit)))
         notes.append(
             f"The known points of the planes contradict one another: chi-square {origin.chi2:.4g} with {known - 3} "

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from errormotion.arrays import Array
 from errormotion.methods.beam_direction.identification.compensation import Planes, uncompensated
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
 
     from errormotion.methods.beam_direction.identification.compensation import Converged
     from errormotion.methods.beam_direction.identification.origin import Origin
+
+
+FALSE_ALARM = 1e-3
+"""Probability that correct data are reported as noisier than stated, correlated, or not closing."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,11 @@ def closure_chi2(propagated: Propagated) -> float:
     values, vectors = np.linalg.eigh(C)
     z = vectors[:, 2:].T @ (propagated.closure / size)
     return float(np.sum(z**2 / values[2:]))
+
+
+def chi2_quantile(p: float, degrees: int) -> float:
+    """Return the quantile of a chi-square distribution."""
+    return 2.0 * float(gammaincinv(degrees / 2, p))
 
 
 def expected_beam(

@@ -12,13 +12,22 @@ from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from errormotion.methods.beam_direction.settings import Settings
 
 
 MAX_MISSING = 0.3
 """Largest share of missing readings of a plane."""
+NORMAL_NEEDED = (
+    "expected the normal of the plane of emitted and received beam, for the compensation of the inclination error."
+)
+RECEIVER_NEEDED = (
+    "expected 'right' or 'left', for the compensation of the inclination error: the side of the receiving lens, seen "
+    "from the laser's exit, when one looks along the beam with triangulation_normal upwards. Find both openings on the "
+    "sensor's drawing, or cover one: the laser's light comes from the other. The wrong side reverses the correction."
+)
+"""What a statement on the sensor must contain, for messages."""
 _REVERSAL_COSINE = 0.999
 _MIN_STEP = 1e-3
 """Share of the longest step below which the stage is at rest."""
@@ -106,6 +115,45 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
         speckle_length=length,
         point_uncertainty=_scalar(raw, "plane_point_uncertainty"),
     )
+
+
+def with_receiver_right(normal: ArrayLike, receiver: str | None) -> Array:
+    """Return the unit normal (3,) of a triangulation plane on the side from which the receiver is on the right.
+
+    Parameters
+    ----------
+    normal : array_like (3,)
+        Normal of the plane of emitted and received beam, on either side.
+    receiver : {"left", "right"}
+        Side of the receiver, seen from the laser, for an observer who looks along the beam with the normal upwards.
+
+    Raises
+    ------
+    MethodError
+        The side is not stated.
+    """
+    if receiver not in ("left", "right"):
+        raise MethodError(f"receiver: {RECEIVER_NEEDED} Found {receiver!r}.")
+    t = np.asarray(normal, np.float64)
+    return np.asarray((t if receiver == "right" else -t) / np.linalg.norm(t))
+
+
+def triangulation_normal(raw: xr.Dataset, receiver: str | None = None) -> Array:
+    """Return the normal of the sensor's triangulation plane with the receiver on the right, see `with_receiver_right`.
+
+    ``receiver`` is used for a dataset without the attribute of this name.
+
+    Raises
+    ------
+    MethodError
+        The data do not state the plane, or neither they nor ``receiver`` the side of the receiver.
+    """
+    if "triangulation_normal" not in raw:
+        raise MethodError(
+            "Expected triangulation_normal(direction) in the raw dataset, for the inclination compensation: "
+            f"{NORMAL_NEEDED} Add it, or identify without compensation."
+        )
+    return with_receiver_right(raw["triangulation_normal"].values, raw.attrs.get("receiver", receiver))
 
 
 def _scalar(raw: xr.Dataset, name: str) -> float:

@@ -17,6 +17,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across, beam_errors, error_jacobian, tilt
 from errormotion.methods.beam_direction.identification.direction import bound
 from errormotion.methods.beam_direction.identification.propagation import Propagated, expected_beam
+from errormotion.methods.beam_direction.identification.reading import NORMAL_NEEDED, with_receiver_right
 from errormotion.methods.beam_direction.identification.slopes import gradient_covariance
 from errormotion.methods.beam_direction.planning import design
 
@@ -238,11 +239,8 @@ def _remaining(settings: Settings) -> RemainingError | None:
         return None
     p = settings.layout
     if p.triangulation_normal is None:
-        raise MethodError(
-            "layout.triangulation_normal: expected the normal of the plane of emitted and received beam, for a plan "
-            "with a calibration of the inclination error; found none."
-        )
-    u, t = np.array(p.nominal_direction, np.float64), np.array(p.triangulation_normal, np.float64)
+        raise MethodError(f"layout.triangulation_normal: {NORMAL_NEEDED}")
+    u, t = np.array(p.nominal_direction, np.float64), with_receiver_right(p.triangulation_normal, settings.receiver)
     calibration = InclinationCalibration.find(settings.compensation)
     return RemainingError(
         calibration,

@@ -29,6 +29,7 @@ from errormotion.methods.beam_direction.identification.check_bar.estimate import
 )
 from errormotion.methods.beam_direction.identification.check_bar.scanning import Points, points
 from errormotion.methods.beam_direction.identification.check_bar.surfaces import round_bar
+from errormotion.methods.beam_direction.identification.reading import triangulation_normal
 
 __all__ = ["BarFit", "fit_bar", "measure_bar"]
 
@@ -210,6 +211,7 @@ def measure_bar(
     hold_radius: bool = False,
     robust: bool = True,
     extrapolate: bool = False,
+    receiver: Literal["left", "right"] | None = None,
 ) -> tuple[Points, BarFit]:
     """Return points and bar of the rows ``bar_...`` of a raw dataset, for a known beam.
 
@@ -224,10 +226,13 @@ def measure_bar(
     shape, radius_uncertainty, hold_radius, robust
         See `fit_bar`.
 
+    receiver : {"left", "right"}, optional
+        Side of the receiver, for a dataset without the attribute.
+
     Raises
     ------
     MethodError
-        No check bar in the dataset, and as of `points` and `fit_bar`.
+        No check bar in the dataset, a calibration and no side of the receiver, and as of `points` and `fit_bar`.
     FitError
         See `fit_bar`.
     """
@@ -245,7 +250,7 @@ def measure_bar(
         noise=float(np.hypot(float(raw["distance_noise"]), speckle)),
         stage_noise=stage_noise,
         calibration=calibration,
-        triangulation_normal=raw["triangulation_normal"].values if "triangulation_normal" in raw else None,
+        triangulation_normal=triangulation_normal(raw, receiver) if calibration is not None else None,
         mid_range=float(raw["mid_range"]) if "mid_range" in raw else None,
         normals=round_bar(axis) if calibration is not None else None,
         moves=moves,

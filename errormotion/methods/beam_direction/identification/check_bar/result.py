@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -11,7 +12,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.timing import start_of
-from errormotion.errors import MethodError
+from errormotion.errors import FitError, MethodError
 from errormotion.methods.beam_direction.identification.check_bar.measure import measure_bar
 
 if TYPE_CHECKING:
@@ -21,6 +22,12 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger(__name__)
+
+_CONTRADICTION = (
+    "The check bar contradicts the stated side of the receiver: its residuals are systematic with it and random with "
+    "the opposite one. Check triangulation_normal and receiver on the sensor, and receiver_rotation of the readings "
+    "from which the calibration was made."
+)
 
 
 def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, method: str, version: str) -> xr.Dataset:
@@ -96,16 +103,25 @@ def bar_extras(
     notes: list[str],
 ) -> dict[str, xr.DataArray]:
     """Return the check bar of a raw dataset, measured with a beam; remarks are appended to ``notes``."""
-    points, bar = measure_bar(
-        raw,
-        origin,
-        direction,
-        covariance,
+    measure = partial(
+        measure_bar,
+        origin=origin,
+        direction=direction,
+        covariance=covariance,
         calibration=calibration,
         moves=moves,
         robust=settings.robust,
         extrapolate=settings.extrapolate,
+        receiver=settings.receiver,
     )
+    points, bar = measure(raw)
+    if calibration is not None and bar.systematic:
+        try:
+            confirmed = measure(raw.assign(triangulation_normal=-raw["triangulation_normal"]))[1].systematic
+        except (MethodError, FitError):  # no bar with the opposite side
+            confirmed = True
+        if not confirmed:
+            raise MethodError(_CONTRADICTION)
     notes.extend(f"Check bar: {note}" for note in (*points.notes, *bar.notes))
     left_out = np.zeros(len(bar.residuals), np.int8)
     left_out[list(bar.left_out)] = 1

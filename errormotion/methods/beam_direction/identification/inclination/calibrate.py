@@ -18,7 +18,16 @@ from pydantic import BaseModel, ConfigDict, Field
 from errormotion.arrays import NORMAL_MAD, Array
 from errormotion.datasets import provenance, validate
 from errormotion.datasets.calibrations import owner
-from errormotion.datasets.calibrations.inclination import InclinationCalibration, build, half_tilt, hole_texts, terms
+from errormotion.datasets.calibrations.inclination import (
+    AWAY,
+    ROTATION_ZERO,
+    InclinationCalibration,
+    build,
+    half_tilt,
+    hole_texts,
+    terms,
+)
+from errormotion.datasets.units import Angle
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt_vector
 from errormotion.methods.beam_direction.identification.inclination import lines as inclination_lines
@@ -68,6 +77,11 @@ class Settings(BaseModel):
     offsets: Literal["auto", "each", "none"] = Field(
         default="auto", description="whether each setting has its own zero of the interferometer"
     )
+    receiver_rotation: Angle | None = Field(
+        default=None,
+        description="rotation at which the normal of the surface leans towards the receiver, 0 or 180 deg; default: "
+        "that of the readings",
+    )
     serial_number: str = Field(default="", description="serial number of the sensor; default: that of the readings")
 
 
@@ -90,7 +104,7 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
     DatasetError
         The raw dataset violates its schema.
     MethodError
-        Implausible readings, or too few settings.
+        Implausible readings, no direction of rotation 0, or too few settings.
     """
     settings = settings or Settings()
     if raw.attrs.get("schema") != INCLINATION_SCHEMA:
@@ -99,7 +113,7 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
         )
     validate(raw)
     raw = raw.load()
-    readings = inclination_lines.read(raw)
+    readings = inclination_lines.read(raw, settings.receiver_rotation)
     lines = inclination_lines.fit(readings, settings.offsets)
     q = tilt_vector(readings.inclination, readings.rotation)
     kept, surface = _surface(q, lines, settings)
@@ -109,6 +123,7 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
         "order": surface.order,
         "mirror": int(surface.mirror),
         "free_offsets": int(lines.free_offsets),
+        ROTATION_ZERO: AWAY,
         "provenance": json.dumps(provenance.make(settings, raw, None)),
         **_serial_number(raw, settings),
         **{name: str(raw.attrs[name]) for name in ("machine", "sensor", "source", "title") if name in raw.attrs},
@@ -229,6 +244,11 @@ def _notes(
         f"inclination {a:g} deg at rotation {b:g} deg"
         for a, b in zip(np.degrees(readings.inclination), np.degrees(readings.rotation), strict=True)
     ]
+    if readings.turned:
+        yield (
+            "Rotations are counted from the direction away from the receiver: those of the readings "
+            f"{np.degrees(readings.turned):+.4g} deg."
+        )
     if readings.missing:
         yield f"{counted(readings.missing, 'group')} without a reading {_were(readings.missing)} ignored."
     outliers = np.flatnonzero(lines.left_out)

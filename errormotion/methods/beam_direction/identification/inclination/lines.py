@@ -21,6 +21,8 @@ SAME = 1e-5
 """Angle within which groups belong to one setting, rad."""
 MIN_FREEDOM = 30
 """Degrees of freedom from which on the noise is estimated from the scatter about the lines."""
+RECEIVER_TOLERANCE = 1e-3
+"""Largest deviation of the receiver's rotation from 0 or 180 deg, rad."""
 _ENOUGH = 4
 """Median number of readings per setting from which on each setting has its own zero."""
 _OUTLIER = 5.0
@@ -52,6 +54,8 @@ class Readings:
         m.
     missing : int
         Groups without a reading.
+    turned : float
+        Angle that was added to the stated rotations, so that the receiver is at 180 deg, rad.
     """
 
     error: Array
@@ -63,6 +67,7 @@ class Readings:
     noise: float
     mid_range: float
     missing: int
+    turned: float
 
 
 @dataclass(frozen=True)
@@ -92,14 +97,20 @@ class Lines:
     free_offsets: bool
 
 
-def read(raw: xr.Dataset) -> Readings:
+def read(raw: xr.Dataset, receiver_rotation: float | None = None) -> Readings:
     """Return the readings of a raw dataset; implausible readings are refused.
+
+    Parameters
+    ----------
+    raw : Dataset
+    receiver_rotation : float, optional
+        Rotation at which a surface's normal leans towards the receiver, rad; default: that of the dataset.
 
     Raises
     ------
     MethodError
-        Readings or references that do not change, have opposite signs or different units, depths on one side of
-        mid-range only, or no inclination.
+        No rotation of the receiver, readings or references that do not change, have opposite signs or different
+        units, depths on one side of mid-range only, or no inclination.
     """
     r, d, alpha, beta = (
         np.asarray(raw[name].values, dtype=float) for name in ("reading", "reference", "inclination", "rotation")
@@ -112,6 +123,9 @@ def read(raw: xr.Dataset) -> Readings:
     _check(r, d, m)
     if np.abs(alpha).max() < SAME:
         raise MethodError("Every inclination is 0; expected several inclinations.")
+    turn = _turn(raw, receiver_rotation)
+    if turn:
+        beta = np.mod(beta + turn + np.pi, 2 * np.pi) - np.pi
     written = np.round(np.stack([alpha, beta]) / SAME)
     _, first, setting = np.unique(written, axis=1, return_index=True, return_inverse=True)
     return Readings(
@@ -124,7 +138,28 @@ def read(raw: xr.Dataset) -> Readings:
         noise=float(raw["reading_noise"]) if "reading_noise" in raw.variables else float("nan"),
         mid_range=m,
         missing=int((~known).sum()),
+        turned=turn,
     )
+
+
+def _turn(raw: xr.Dataset, receiver_rotation: float | None) -> float:
+    """Return the angle to be added to the rotations, so that the receiver is at 180 deg, rad; 0 if it is there."""
+    if receiver_rotation is None and "receiver_rotation" in raw.variables:
+        receiver_rotation = float(raw["receiver_rotation"])
+    if receiver_rotation is None or not np.isfinite(receiver_rotation):
+        raise MethodError(
+            "receiver_rotation: expected the rotation at which the normal of the surface leans towards the receiver of "
+            "the sensor, 0 or 180 deg; found none. Add it to the readings ('# receiver_rotation = 180 deg' in a text "
+            "file), or state it: --set receiver_rotation=180deg. To find out, tilt the surface by 65 deg or more in "
+            "the plane of laser and receiver: turned away from the receiver, it is dark for the sensor first."
+        )
+    turn = float(np.mod(np.pi - receiver_rotation + np.pi, 2 * np.pi) - np.pi)
+    if min(abs(turn), np.pi - abs(turn)) > RECEIVER_TOLERANCE:
+        raise MethodError(
+            f"receiver_rotation: expected 0 or 180 deg, because rotations are measured from the plane of laser and "
+            f"receiver; found {np.degrees(receiver_rotation):.4g} deg. Measure the rotations from that plane."
+        )
+    return 0.0 if abs(turn) <= RECEIVER_TOLERANCE else np.pi
 
 
 def _check(r: Array, d: Array, m: float) -> None:
