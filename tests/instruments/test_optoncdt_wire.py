@@ -108,6 +108,43 @@ def test_outputs_of_an_earlier_user_are_cleared_and_restored(model: str, left_on
         assert sensor.settings == before
 
 
+OPTIONAL = [
+    ("ILD1420", "AVERAGE", "MOVING 16"),
+    ("ILD1420", "AVERAGE", "MEDIAN 5"),
+    ("ILD1420", "TRIGGER", "EDGE"),
+    ("ILD1420", "LASERPOW", "REDUCED"),
+    ("ILD2300", "OUTREDUCE", "10"),
+    ("ILD2300", "OUTHOLD", "INFINITE"),
+]
+
+
+@pytest.mark.parametrize(("model", "name", "value"), OPTIONAL)
+def test_a_setting_that_changes_the_values_and_cannot_be_cleared_is_an_error(model: str, name: str, value: str) -> None:
+    sensor = Sensor(model, millimetres=10.0, **{name: value})
+    sensor.grammar = sensor.grammar | {name: value.replace(".", r"\.")}  # it refuses every other value
+    settings = OPTO_2300 if model == "ILD2300" else OPTO_1420
+    with Bench(sensor), pytest.raises(InstrumentError, match=rf"refuses '{name} \w+': E.*its setting is '{name} {value}'"):
+        OptoNCDT(sensor.url, settings).open()
+    assert sensor.settings[name] == value
+
+
+@pytest.mark.parametrize(("model", "name", "value"), OPTIONAL)
+def test_a_setting_that_is_neutral_is_not_sent(model: str, name: str, value: str) -> None:
+    sensor = Sensor(model, millimetres=10.0)
+    sensor.grammar = sensor.grammar | {name: value}  # it would refuse the neutral value that it has
+    with Bench(sensor), OptoNCDT(sensor.url, OPTO_2300 if model == "ILD2300" else OPTO_1420) as driver:
+        assert np.isfinite(readings(driver, 100)).all()
+        assert "refused commands" not in driver.identify().details
+
+
+def test_a_setting_that_the_sensor_does_not_have_is_a_remark() -> None:
+    sensor = Sensor("ILD1420", millimetres=10.0)
+    sensor.grammar = {name: words for name, words in sensor.grammar.items() if name != "TRIGGER"}
+    del sensor.settings["TRIGGER"]
+    with Bench(sensor), OptoNCDT(sensor.url, OPTO_1420) as driver:
+        assert driver.identify().details["refused commands"] == "TRIGGER NONE"
+
+
 def test_values_that_cannot_be_cleared_are_refused_with_their_names() -> None:
     sensor = Sensor("ILD2300")
     sensor.layout = lambda: ["DIST1", "THICK12", "COUNTER"]  # type: ignore[method-assign]

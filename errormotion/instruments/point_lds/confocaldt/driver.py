@@ -89,10 +89,10 @@ class ConfocalDT(CountingDriver):
         self._sensor = codec.facts_of(dialogue.command(codec.SENSOR))
         found = codec.range_of(self._sensor)
         check_range(settings.measuring_range, found, "", "select the sensor in the controller (SENSORHEAD)")
-        master = setting(codec.MASTER, dialogue.command(codec.MASTER))
-        if master not in ("", f"{codec.MASTER} NONE"):
+        answer = dialogue.command(codec.MASTER)
+        if setting(codec.MASTER, answer) != f"{codec.MASTER} NONE":
             raise InstrumentError(
-                f"{self.address}: a master value is set ('{master}'), so that values are not relative to the start of "
+                f"{self.address}: a master value may be set (the answer is '{' '.join(answer)[:60]}'), so that values are not relative to the start of "
                 f"the range. Reset it: {codec.MASTER} NONE, or on the web page"
             )
         if settings.rate is not None:

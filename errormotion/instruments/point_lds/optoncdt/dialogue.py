@@ -140,6 +140,34 @@ class Dialogue:
         self.remember(command.split(" ", 1)[0])
         self.command(command)
 
+    def neutralise(self, command: str) -> bool:
+        """Give a setting its neutral value, unless it has it; return False if the sensor does not know the setting.
+
+        Raises
+        ------
+        RefusedCommandError
+            The setting has another value, or an unknown one, and the sensor refuses to change it.
+        """
+        name = command.split(" ", 1)[0]
+        try:
+            present = setting(name, self.command(name))
+        except RefusedCommandError:
+            present = None
+        words = command.split()
+        if present and present.split()[: len(words)] == words:
+            return True
+        try:
+            self.set(command)
+        except RefusedCommandError as error:
+            if present is None:  # neither read nor set
+                return False
+            stated = f"'{present}'" if present else "unknown"
+            raise RefusedCommandError(
+                f"{error}; its setting is {stated}, which may change the values. "
+                f"Set '{command}' on its web page, or restore its presets"
+            ) from None
+        return True
+
     def restore(self) -> None:
         """Restore the changed settings, except the output of values, which the closed line could not receive."""
         before, self._before = self._before, {}

@@ -15,7 +15,6 @@ from errormotion.instruments.point_lds.optoncdt.commands import (
     LINE_END,
     PROMPT,
     Layout,
-    RefusedCommandError,
     parse_info,
     parse_layout,
     reported_range,
@@ -137,8 +136,8 @@ class OptoNCDT(Driver):
         Raises
         ------
         InstrumentError
-            The rate exceeds the baud rate; model or range differ; the sensor refuses, or sends other values than the
-            distance and the counter.
+            The rate exceeds the baud rate; model or range differ; the sensor refuses, keeps a setting that changes
+            the values, or sends other values than the distance and the counter.
         """
         settings.line_speed(self.address)
         self._refuse_while_streaming()
@@ -147,12 +146,7 @@ class OptoNCDT(Driver):
         dialogue.set(f"MEASRATE {model.rate_word(settings.rate)}")
         for command in model.cleared:
             dialogue.set(command.format(termination=self._termination_of(command.split(" ", 1)[0])))
-        self._refused = []
-        for command in model.optional:
-            try:
-                dialogue.set(command)
-            except RefusedCommandError:
-                self._refused.append(command)
+        self._refused = [command for command in model.optional if not dialogue.neutralise(command)]
         dialogue.set(f"OUTADD_RS422 {'COUNTER' if settings.counter else 'NONE'}")
         self._layout = parse_layout(self.command("GETOUTINFO_RS422"), counter=settings.counter)
         if model.synchronises:

@@ -33,8 +33,8 @@ class Model:
         Commands that reset settings of an earlier user which would change the values or their sequence;
         ``{termination}`` stands for the line termination that the sensor reports for this command.
     optional : tuple of str
-        Commands for the same purpose whose grammar is not documented for this family: a refusal is noted and does not
-        end the session.
+        Commands for the same purpose whose grammar is not documented for this family. They are sent where the sensor
+        states another value, or none; a refusal is noted only if the sensor refuses to state the setting, too.
     """
 
     name: str
