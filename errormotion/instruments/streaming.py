@@ -183,7 +183,8 @@ class Reader:
                 return self._reply
             if self._error is not None:
                 raise self._error
-            raise InstrumentTimeoutError(f"{self._name}: no answer to {request!r} within {timeout:g} s")
+            partial = f"; received {self._text[:64]!r}, which is not complete" if self._text.strip() else ""
+            raise InstrumentTimeoutError(f"{self._name}: no answer to {request!r} within {timeout:g} s{partial}")
 
     def stop(self, request: bytes, timeout: float) -> bytes:
         """Write the request that ends the stream, wait for its answer, end the thread; return the answer."""

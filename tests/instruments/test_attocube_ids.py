@@ -8,6 +8,8 @@ import pytest
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments import simulators
 from errormotion.instruments.interferometer.attocube_ids import AttocubeIds, IdsSettings
+from errormotion.instruments.simulators.interferometer.attocube_ids import SimulatedIds
+from errormotion.instruments.transports import parse_address
 from errormotion.testing import InstrumentConformance, InstrumentSubject
 
 QUIET = "sim://cframe/ids?seed=3&noise=0&running=1"
@@ -67,6 +69,49 @@ def test_an_idle_device_is_started_and_an_aligned_one_is_unchanged() -> None:
         AttocubeIds("sim://cframe/ids?seed=3&contrast=50", ONE).open()
     with pytest.raises(InstrumentTimeoutError, match="measurement starting"):
         AttocubeIds("sim://cframe/ids?seed=3&init=9", ONE.model_copy(update={"start_timeout": 0.2})).open()
+
+
+@pytest.mark.parametrize("functions", ["ids", "sen", "ids,sen"])
+def test_either_family_of_functions_is_used(functions: str) -> None:
+    settings = IdsSettings(axes=(1, 2), averaging=1e-6, timeout=0.7, after_break="clear")
+    with AttocubeIds(f"sim://cframe/ids?seed=3&noise=0&functions={functions}", settings) as ids:
+        assert ids.identify().model == "IDS3010"
+        assert ids.identify().details["average_parameter"] == 4.0
+        ids.zero()
+        assert ids.read() == pytest.approx({"axis1": 0.0, "axis2": 0.0}, abs=1e-12)
+        assert ids.refraction() > 1.0
+    with AttocubeIds(f"{QUIET}&functions={functions}&fault=beam_broken&broken=2&fault_at=1", settings) as ids:
+        ids.read()
+        found = ids.read()
+        assert math.isfinite(found["axis1"])
+        assert math.isnan(found["axis2"])
+        assert "interrupted" in ids.flags["axis2"]
+
+
+def test_a_device_that_knows_neither_family_is_named_with_both() -> None:
+    class Other(SimulatedIds):
+        def _function(self, method: str) -> None:
+            return None
+
+    device = Other(parse_address("sim://cframe/ids?seed=3"))
+    try:
+        with pytest.raises(InstrumentError, match=r"'com.attocube.ids.system.getDeviceType': .*'com.attocube.sen.sy"):
+            AttocubeIds(device.url, ONE).open()
+    finally:
+        device.close()
+
+
+def test_replies_to_other_requests_are_named_where_none_came_to_this_one() -> None:
+    class Stray(SimulatedIds):
+        def answer(self, request: bytes) -> bytes:
+            return super().answer(request).replace(b'"id":', b'"id":9')
+
+    device = Stray(parse_address("sim://cframe/ids?seed=3"))
+    try:
+        with pytest.raises(InstrumentTimeoutError, match=r"1 answer to other requests was discarded"):
+            AttocubeIds(device.url, ONE).open()
+    finally:
+        device.close()
 
 
 def test_another_pass_mode_is_refused() -> None:

@@ -226,6 +226,43 @@ def test_endless_answers_with_other_numbers_end_with_the_time_limit() -> None:
         LeicaGeoCom(address, GeoComSettings(timeout=0.3)).open()
 
 
+RECORDED = [
+    b"110001+00000001 21.102+17920860 22.102+07567500 31..00+00003387 \r\n",
+    b"*110002+0000000000000PT2 21.302+0000000017920860 81..00+0000000000012345 \r\n",
+    b"*41....+000000000000CODE \r\n",
+]
+
+
+@pytest.mark.parametrize("recorded", RECORDED)
+def test_a_point_that_the_operator_records_does_not_end_the_session(recorded: bytes) -> None:
+    def answer(call: int, transaction: int, values: list[str]) -> bytes:
+        found = {5004: '0,"TS30"', 5003: "0,123"}.get(call, "0,1,2,3")
+        return recorded + f"%R1P,0,{transaction}:{found}\r\n".encode() + recorded
+
+    with scripted(answer) as address, LeicaGeoCom(address) as station:
+        assert station.identify().serial_number == "123"
+        assert station.identify().model == "TS30"
+
+
+def test_a_station_that_only_sends_gsi_is_named() -> None:
+    with (
+        scripted(lambda call, transaction, values: RECORDED[0]) as address,
+        pytest.raises(ProtocolError, match="lines of GSI and none of GeoCOM.*set to GeoCOM"),
+    ):
+        LeicaGeoCom(address, GeoComSettings(timeout=0.3)).open()
+
+
+def test_replies_to_other_calls_are_named_where_none_came_to_this_one() -> None:
+    def answer(call: int, transaction: int, values: list[str]) -> bytes:
+        return f"%R1P,0,{transaction % 7 + 1}:0\r\n".encode()
+
+    with (
+        scripted(answer) as address,
+        pytest.raises(InstrumentTimeoutError, match=r"No answer to .*, but 1 answer to other requests was discarded"),
+    ):
+        LeicaGeoCom(address, GeoComSettings(timeout=0.3)).open()
+
+
 def test_another_protocol_is_an_error_that_names_the_interface() -> None:
     with (
         scripted(lambda call, transaction, values: b"@W127\r\n") as address,

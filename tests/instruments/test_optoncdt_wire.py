@@ -123,7 +123,10 @@ def test_a_setting_that_changes_the_values_and_cannot_be_cleared_is_an_error(mod
     sensor = Sensor(model, millimetres=10.0, **{name: value})
     sensor.grammar = sensor.grammar | {name: value.replace(".", r"\.")}  # it refuses every other value
     settings = OPTO_2300 if model == "ILD2300" else OPTO_1420
-    with Bench(sensor), pytest.raises(InstrumentError, match=rf"refuses '{name} \w+': E.*its setting is '{name} {value}'"):
+    with (
+        Bench(sensor),
+        pytest.raises(InstrumentError, match=rf"refuses '{name} \w+': E.*its setting is '{name} {value}'"),
+    ):
         OptoNCDT(sensor.url, settings).open()
     assert sensor.settings[name] == value
 

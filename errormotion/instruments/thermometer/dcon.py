@@ -11,8 +11,9 @@ from typing import ClassVar
 from pydantic import Field
 
 from errormotion.datasets.units import Time
-from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, LineThermometer, ThermometerSettings
+from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo
 
 LINE_END = b"\r"
@@ -204,9 +205,12 @@ class DconTemperature(LineThermometer):
         super().resynchronise()
         line, start = self.transport, f"!{self._unit}".encode("ascii")
         line.write(encode(f"${self._unit}M", with_checksum=self.settings.checksum))
-        for _ in range(MAX_LATE_LINES):
-            if line.read_until(LINE_END, limit=MAX_LINE_BYTES).startswith(start):
-                return
+        for others in range(MAX_LATE_LINES):
+            try:
+                if line.read_until(LINE_END, limit=MAX_LINE_BYTES).startswith(start):
+                    return
+            except InstrumentTimeoutError as error:
+                raise after_others(error, others, f"'${self._unit}M'") from None
         raise ProtocolError(f"{self.address}: expected an answer that starts with {start!r}; found other lines")
 
     def _start_session(self) -> None:

@@ -55,3 +55,22 @@ def await_quiet(line: Transport, interval: float, since: float | None = None) ->
                 f"{line.url}: {count} bytes arrived in {now - start:.1f} s without a request; expected a line without "
                 f"data for {interval:g} s. Stop the output of the device, and open it again"
             )
+
+
+def after_others(error: InstrumentTimeoutError, count: int, what: str) -> InstrumentTimeoutError:
+    """Return the error of a missing answer, with the number of answers to other requests that came instead.
+
+    Parameters
+    ----------
+    error : InstrumentTimeoutError
+    count : int
+        Number of answers that were read and discarded while this one was awaited; 0: the error is returned unchanged.
+    what : str
+        The request.
+    """
+    if not count:
+        return error
+    discarded = "1 answer to other requests was" if count == 1 else f"{count} answers to other requests were"
+    return InstrumentTimeoutError(
+        f"{error}. No answer to {what} came, but {discarded} discarded: the device answers late, or other requests"
+    )

@@ -21,6 +21,7 @@ from errormotion.instruments.door import Door
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.nc_limits import check_program
 from errormotion.instruments.transports import Transport, open_transport
+from errormotion.instruments.transports.quiet import after_others
 from errormotion.instruments.transports.recording import Recorder, RecordingTransport
 from errormotion.plugins import Identity, InstrumentInfo, MachineLimits, lazy
 
@@ -293,21 +294,25 @@ class LinuxCNC(Driver):
         return answer.result
 
     def _await(self, line: Transport, number: int) -> codec.Answer:
+        others = 0
         while True:
             try:
                 message = codec.decode(
                     line.read_until(codec.LINE_END, limit=codec.MAX_LINE, timeout=self.settings.timeout)
                 )
             except InstrumentTimeoutError:
-                raise InstrumentTimeoutError(
+                error = InstrumentTimeoutError(
                     f"{self.address}: the bridge of LinuxCNC did not answer within {self.settings.timeout:g} s"
-                ) from None
+                )
+                raise after_others(error, others, f"request {number}") from None
             if message.number is None and not getattr(message, "ok", True):
                 raise InstrumentError(f"{self.address}: the bridge ends the connection: {message.error}; {_WHERE}")
             if message.number in self._unawaited:
                 self._unawaited.discard(message.number)
+                others += 1
                 continue
             if isinstance(message.number, int) and message.number < number:  # late: of a command that has failed
+                others += 1
                 continue
             if message.number != number:
                 raise ProtocolError(f"{self.address}: expected the answer to request {number}; found {message}")

@@ -286,7 +286,7 @@ class Shdr(Driver):
     def _ping(self) -> None:
         self.transport.write(PING)
         self._last_ping = time.monotonic()
-        end = self._last_ping + self.settings.timeout
+        end, received = self._last_ping + self.settings.timeout, 0
         while True:
             left = end - time.monotonic()
             if left <= 0:
@@ -296,11 +296,13 @@ class Shdr(Driver):
             except InstrumentTimeoutError:
                 break
             self._last_data = time.monotonic()
+            received += len(data)
             if self._process(data):
                 return
         if not (self._fresh and self._memory.values):
+            others = f", but {received} bytes of other lines" if received else "; is it an SHDR adapter?"
             raise InstrumentTimeoutError(
-                f"{self.address}: no answer to '* PING' within {self.settings.timeout:g} s; is it an SHDR adapter?"
+                f"{self.address}: no answer to '* PING' within {self.settings.timeout:g} s{others}"
             )
         self.heartbeat = math.inf
         log.warning("%s: the adapter has no heartbeat; values expire after %g s", self.address, self.settings.silence)

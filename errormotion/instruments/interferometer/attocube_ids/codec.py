@@ -16,9 +16,10 @@ PICOMETRE = 1e-12  # m
 API = 2
 """Version of the interface: every result starts with the number of an error or a warning."""
 
-DISPLACEMENT = "com.attocube.ids.displacement."
-SYSTEM = "com.attocube.ids.system."
-AXIS = "com.attocube.ids.axis."
+FAMILIES = ("ids", "sen")
+"""Names of the family of sensor functions, older first: firmware 1.9 has ``com.attocube.sen``, before ``ids``."""
+_SENSOR = "com.attocube.ids."
+DISPLACEMENT, SYSTEM, AXIS = f"{_SENSOR}displacement.", f"{_SENSOR}system.", f"{_SENSOR}axis."
 UNIT = "com.attocube.ecu."
 SERVICE = "com.attocube.system."
 
@@ -78,6 +79,11 @@ class Reply:
         if index >= len(self.values):
             raise ProtocolError(f"A reply has {len(self.values)} values; expected at least {index + 1}")
         return self.values[index]
+
+
+def in_family(method: str, family: str) -> str:
+    """Return the name of a function in a family; functions of the environmental unit and the device have one name."""
+    return f"com.attocube.{family}.{method.removeprefix(_SENSOR)}" if method.startswith(_SENSOR) else method
 
 
 def request(method: str, number: int, *parameters: bool | int | str) -> bytes:

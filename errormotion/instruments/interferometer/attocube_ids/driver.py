@@ -12,10 +12,12 @@ from errormotion.instruments import simulators
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.interferometer.attocube_ids import codec
 from errormotion.instruments.interferometer.attocube_ids.settings import IdsSettings, axis_name
+from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 from errormotion.plugins.readings import Environment
 
-IDLE, STARTING, RUNNING = "system idle", "measurement starting", "measurement running"
+IDLE, RUNNING = "system idle", "measurement running"
+STARTING = ("measurement starting", "measurement restarting")
 ALL_AXES = -1
 """Axis of the requests for the refraction index: the device accepts no other."""
 POLL_INTERVAL = 0.2
@@ -63,6 +65,7 @@ class AttocubeIds(Driver):
         return InstrumentSubject(cls, "sim://cframe/ids?seed=3", vary=simulators.in_steps(seed=3))
 
     _number = 0
+    _family = codec.FAMILIES[0]
 
     @property
     def channels(self) -> dict[str, str]:
@@ -73,21 +76,29 @@ class AttocubeIds(Driver):
 
     def _call(self, method: str, *parameters: bool | int | str) -> codec.Reply:
         """Return the reply to one request, whatever its code; late replies to earlier requests are discarded."""
+        found = self._reply(method, *parameters)
+        if found.refusal:
+            method = codec.in_family(method, self._family)
+            raise InstrumentError(f"{self.address} refuses '{method}': {found.refusal}")
+        return found
+
+    def _reply(self, method: str, *parameters: bool | int | str) -> codec.Reply:
+        """Return the reply to one request, also one that states that it was not executed."""
         self._number += 1
+        method, stray = codec.in_family(method, self._family), 0
         limit = self.settings.timeout
         with self.exchange() as line:
             line.write(codec.request(method, self._number, *parameters))
             deadline = time.monotonic() + limit
             while True:
                 left = deadline - time.monotonic()
-                if left <= 0.0:
-                    raise InstrumentTimeoutError(f"{self.address}: no answer to '{method}' within {limit:g} s")
-                found = codec.reply(line.read_until(codec.LINE_END, limit=codec.MAX_REPLY, timeout=left))
+                try:
+                    found = codec.reply(line.read_until(codec.LINE_END, limit=codec.MAX_REPLY, timeout=max(left, 0.0)))
+                except InstrumentTimeoutError as error:
+                    raise after_others(error, stray, f"'{method}'") from None
                 if found.number == self._number or (found.number is None and found.refusal):
-                    break
-        if found.refusal:
-            raise InstrumentError(f"{self.address} refuses '{method}': {found.refusal}")
-        return found
+                    return found
+                stray += 1
 
     def _request(self, method: str, *parameters: bool | int | str) -> codec.Reply:
         """Return the reply to a request that must succeed."""
@@ -108,7 +119,7 @@ class AttocubeIds(Driver):
         self.flags: dict[str, str] = dict.fromkeys(self.channels, GOOD)
         self._zero = dict.fromkeys(self.settings.axes, 0.0)
         self._lost: dict[int, str] = {}  # reasons by axis, until the next zero
-        model = self._request(codec.SYSTEM + "getDeviceType").text(0)
+        model = self._device_type()
         if not model.startswith("IDS"):
             raise InstrumentError(f"{self.address}: expected an IDS3010; found '{model}'")
         passes = self._passes()
@@ -119,6 +130,18 @@ class AttocubeIds(Driver):
             )
         self._prepare()
 
+    def _device_type(self) -> str:
+        """Return the type of the device, in the first family of functions that it knows; use this one from now on."""
+        refusals = []
+        for self._family in codec.FAMILIES:
+            found = self._reply(codec.SYSTEM + "getDeviceType")
+            if not found.refusal:
+                if found.code:
+                    raise InstrumentError(f"{self.address} refuses its type: {self._meaning(found.code)}")
+                return found.text(0)
+            refusals.append(f"'{codec.in_family(codec.SYSTEM, self._family)}getDeviceType': {found.refusal}")
+        raise InstrumentError(f"{self.address} refuses {'; '.join(refusals)}")
+
     def _passes(self) -> str:
         mode = self._request(codec.AXIS + "getPassMode").quantity(0)
         return PASSES[int(mode)] if mode in (0.0, 1.0) else f"mode {mode:g}"
@@ -126,7 +149,7 @@ class AttocubeIds(Driver):
     def _prepare(self) -> None:
         """Set the averaging, and start the measurement if it is not running."""
         mode = self._mode()
-        if mode not in (IDLE, STARTING, RUNNING):
+        if mode not in (IDLE, *STARTING, RUNNING):
             raise InstrumentError(
                 f"{self.address}: expected a device that measures or is idle; its mode is '{mode}'. End the alignment "
                 "of the optics first"
@@ -137,7 +160,7 @@ class AttocubeIds(Driver):
                     f"{self.address} does not measure. Start the measurement at the device, or set 'start = true'"
                 )
             self._start()
-        elif mode == STARTING:
+        elif mode in STARTING:
             self._await(RUNNING)
         if (parameter := self.settings.average_parameter) is not None:
             self._request(codec.DISPLACEMENT + "setAverageN", parameter)

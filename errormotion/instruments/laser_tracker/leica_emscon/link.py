@@ -28,6 +28,7 @@ from errormotion.instruments.laser_tracker.leica_emscon.codec import (
     encode_command,
 )
 from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.quiet import after_others
 
 BUSY_INTERVAL = 0.1  # s between two requests to a busy server
 MAX_EVENTS = 1000  # largest number of stored events
@@ -208,14 +209,16 @@ class Link:
         InstrumentTimeoutError
             No such packet within ``limit`` s. It may arrive later, and is then ignored.
         """
-        end = time.monotonic() + limit
+        end, others = time.monotonic() + limit, 0
         while True:
             packet = self.next_packet(max(end - time.monotonic(), 0.0))
             if packet is None:
                 self._unanswered.add(number)
-                raise InstrumentTimeoutError(f"{self._transport.url}: no answer to {what} within {limit:g} s")
+                error = InstrumentTimeoutError(f"{self._transport.url}: no answer to {what} within {limit:g} s")
+                raise after_others(error, others, what)
             if wanted(packet):
                 return packet
+            others += packet.kind in (COMMAND, ERROR)
             if packet.kind in POINTS:
                 self.early.append(packet)
 

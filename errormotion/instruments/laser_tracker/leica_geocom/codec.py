@@ -20,6 +20,8 @@ _NUMBER = re.compile(r"[+-]?\d{1,40}(?:\.\d{0,40})?(?:[eE][+-]?\d{1,3})?", re.AS
 _WHOLE = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 _HEX = re.compile(r"0[xX][0-9a-fA-F]{1,16}", re.ASCII)
 _BYTE = re.compile(r"'([0-9a-fA-F]{2})'", re.ASCII)
+_GSI_WORD = r"\d\d[\d.]{4}[+-](?:[0-9A-Za-z.\-+]{16}|[0-9A-Za-z.\-+]{8})"
+_GSI = re.compile(rf"\*?{_GSI_WORD}(?: +{_GSI_WORD})*", re.ASCII)
 _FIELD = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"|[^,"]*', re.DOTALL)  # possessive: no backtracking
 _ESCAPE = re.compile(r"\\(?:[xX]([0-9a-fA-F]{2})|(.))", re.DOTALL)
 
@@ -96,6 +98,15 @@ def request(call: int, transaction: int, *parameters: int | float) -> bytes:
 def _decimal(value: float) -> str:
     text = f"{value:.15f}".rstrip("0")
     return text + "0" if text.endswith(".") else text
+
+
+def is_gsi(line: bytes) -> bool:
+    """Whether a line has data words of the GSI interface, which the station sends when its operator records a point.
+
+    A word has an index of two digits, four characters of information, a sign, and 8 or 16 characters of data; the
+    first word of a line with 16 follows an asterisk.
+    """
+    return _GSI.fullmatch(line.decode("latin-1").strip()) is not None
 
 
 def reply(line: bytes) -> Reply:

@@ -8,11 +8,13 @@ import time
 from collections import Counter
 from typing import ClassVar
 
-from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments import simulators
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.laser_tracker.leica_geocom import air, codec, codes
 from errormotion.instruments.laser_tracker.leica_geocom.settings import GeoComSettings
+from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 from errormotion.plugins.readings import Environment, Measurement
 
@@ -80,23 +82,34 @@ class LeicaGeoCom(Driver):
         try:
             with self.exchange() as line:
                 line.write((b"\n" if self._clear else b"") + codec.request(call, number, *parameters))
-                deadline = time.monotonic() + limit
-                while True:
-                    left = deadline - time.monotonic()
-                    if left <= 0.0:
-                        raise InstrumentTimeoutError(
-                            f"{self.address}: no answer to GeoCOM call {codes.name(call)} within {limit:g} s"
-                        )
-                    found = codec.reply(
-                        line.read_until(codec.LINE_END, limit=codec.MAX_REPLY, timeout=min(left, limit))
-                    )
-                    if found.transaction == number:
-                        break
+                found = self._reply(line, number, codes.name(call), limit)
         except InstrumentError:
             self._clear = True
             raise
         self._clear = False
         return found
+
+    def _reply(self, line: Transport, number: int, call: str, limit: float) -> codec.Reply:
+        """Return the reply with a number; late replies, and data that the station records in between, are discarded."""
+        deadline, others, recorded = time.monotonic() + limit, 0, 0
+        while True:
+            try:
+                left = max(deadline - time.monotonic(), 0.0)
+                text = line.read_until(codec.LINE_END, limit=codec.MAX_REPLY, timeout=left)
+            except InstrumentTimeoutError as error:
+                if recorded and not others:
+                    raise ProtocolError(
+                        f"{self.address}: expected a GeoCOM reply to {call}; found {recorded} lines of GSI and none of "
+                        "GeoCOM. Check that the interface of the station is set to GeoCOM"
+                    ) from None
+                raise after_others(error, others, f"GeoCOM call {call}") from None
+            if codec.is_gsi(text):
+                recorded += 1
+                continue
+            found = codec.reply(text)
+            if found.transaction == number:
+                return found
+            others += 1
 
     def _request(self, call: int, *parameters: int | float, limit: float | None = None) -> codec.Reply:
         """Return the reply to a call that must succeed."""

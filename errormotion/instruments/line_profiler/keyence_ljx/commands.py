@@ -8,7 +8,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.line_profiler.keyence_ljx import codec
 from errormotion.instruments.line_profiler.keyence_ljx.codec import Reply
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.quiet import discard_input
+from errormotion.instruments.transports.quiet import after_others, discard_input
 
 SYNCHRONISING: tuple[int, ...] = (codec.GET_STATUS, codec.GET_TEMPERATURE, codec.GET_COUNTS)
 """Opcodes that only read: after a timeout, the reply to one of them shows that all earlier replies have arrived."""
@@ -101,8 +101,11 @@ class CommandLine:
         return reply
 
     def _reply(self, opcode: int) -> Reply:
-        for _ in range(MAX_STALE_REPLIES + 1):
-            reply = codec.parse_reply(self._frame())
+        for others in range(MAX_STALE_REPLIES + 1):
+            try:
+                reply = codec.parse_reply(self._frame())
+            except InstrumentTimeoutError as error:
+                raise after_others(error, others, f"command {opcode:02X}") from None
             if reply.command == opcode or (not reply.command and self._unanswered == [opcode]):
                 return reply
             if not reply.command:

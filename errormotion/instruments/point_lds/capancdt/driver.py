@@ -12,6 +12,7 @@ from errormotion.instruments.point_lds.capancdt.blocks import REASONS, block_dec
 from errormotion.instruments.point_lds.capancdt.settings import CapaSettings
 from errormotion.instruments.point_lds.counted import CountedReadings
 from errormotion.instruments.point_lds.counting import CountingDriver, check_range
+from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo
 
 MAX_OTHER_LINES = 16
@@ -186,8 +187,11 @@ class CapaNCDT(CountingDriver):
         """Send a command and return its answer; lines that answer other commands are skipped."""
         with self.exchange() as line:
             line.write(codec.encode(command))
-            for _ in range(MAX_OTHER_LINES):
-                answer = line.read_until(codec.LINE_END, limit=codec.MAX_LINE_BYTES)
+            for others in range(MAX_OTHER_LINES):
+                try:
+                    answer = line.read_until(codec.LINE_END, limit=codec.MAX_LINE_BYTES)
+                except InstrumentTimeoutError as error:
+                    raise after_others(error, others, f"'${command}'") from None
                 if codec.echoes(command, answer):
                     break
             else:

@@ -90,10 +90,11 @@ class ConfocalDT(CountingDriver):
         found = codec.range_of(self._sensor)
         check_range(settings.measuring_range, found, "", "select the sensor in the controller (SENSORHEAD)")
         answer = dialogue.command(codec.MASTER)
+        stated = " ".join(answer)[:60]
         if setting(codec.MASTER, answer) != f"{codec.MASTER} NONE":
             raise InstrumentError(
-                f"{self.address}: a master value may be set (the answer is '{' '.join(answer)[:60]}'), so that values are not relative to the start of "
-                f"the range. Reset it: {codec.MASTER} NONE, or on the web page"
+                f"{self.address}: a master value may be set (the answer is '{stated}'), so that values are not "
+                f"relative to the start of the range. Reset it: {codec.MASTER} NONE, or on the web page"
             )
         if settings.rate is not None:
             dialogue.command(codec.rate_request(settings.rate))

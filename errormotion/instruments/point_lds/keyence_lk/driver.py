@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.point_lds.keyence_lk.codec import (
     CONTROLLERS,
@@ -36,7 +36,7 @@ from errormotion.instruments.point_lds.keyence_lk.codec import (
 )
 from errormotion.instruments.point_lds.keyence_lk.settings import LKSettings
 from errormotion.instruments.transports import Transport, open_transport, parse_address
-from errormotion.instruments.transports.quiet import discard_input
+from errormotion.instruments.transports.quiet import after_others, discard_input
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, Samples
 
 BLOCK_SECONDS = 0.5
@@ -224,8 +224,11 @@ class KeyenceLK(Driver):
         """
         self._synchronised = False
         self.transport.write(encode(mode))
-        for _ in range(MAX_LATE_LINES):
-            line = self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES)
+        for others in range(MAX_LATE_LINES):
+            try:
+                line = self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES)
+            except InstrumentTimeoutError as error:
+                raise after_others(error, others, f"'{mode}'") from None
             text = line.removesuffix(LINE_END).decode("ascii", errors="replace")
             # The error means that the controller was already in this mode.
             if text.endswith((mode, *(f"{ERROR},{mode},{code}" for code in STATE_ERRORS))):

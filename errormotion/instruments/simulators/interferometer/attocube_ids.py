@@ -24,6 +24,8 @@ LONGEST = 4096
 """Largest request, bytes; a longer one without an end is a parse error."""
 PICOMETRES = 1e12  # per m
 AXES = 3
+FAMILIES = ("ids", "sen")
+"""Names of the functions of the sensor: com.attocube.ids until firmware 1.8, com.attocube.sen from 1.9 on."""
 SINGLE_MODE = -1
 """The axis that the environmental unit expects: all axes."""
 
@@ -112,6 +114,9 @@ class SimulatedIds(SimulatedDevice):
         self._contrast, self._passes = int(address.number("contrast", 840)), int(address.number("passes", 1)) - 1
         self._unit, self._unit_on = bool(address.number("ecu", 1)), True
         self._old, self._code = address.number("api", 2) < 2, int(address.number("code", BAD_VALUE))
+        self._families = tuple(address.params.get("functions", ",".join(FAMILIES)).split(","))
+        if not set(self._families) <= set(FAMILIES):
+            raise InstrumentError(f"'functions': expected some of {', '.join(FAMILIES)}")
         self._breaks = {int(each) - 1 for each in numbers(address, "broken", "1,2,3")}
         self._beams = [self._beam(address, axis) for axis in range(AXES)]
         self._distances = [address.number(f"distance{axis + 1}", 0.5) for axis in range(AXES)]
@@ -183,14 +188,11 @@ class SimulatedIds(SimulatedDevice):
 
     def _function(self, method: str) -> Callable[..., Sequence[Any]] | None:
         """Return the function for a method, such as ``_system_resetAxes`` for com.attocube.ids.system.resetAxes."""
-        for prefix, group in (
-            ("com.attocube.ids.displacement.", "_displacement_"),
-            ("com.attocube.ids.system.", "_system_"),
-            ("com.attocube.ids.axis.", "_axis_"),
-            ("com.attocube.ids.adjustment.", "_adjustment_"),
-            ("com.attocube.ecu.", "_ecu_"),
-            ("com.attocube.system.", "_service_"),
-        ):
+        groups = {"com.attocube.ecu.": "_ecu_", "com.attocube.system.": "_service_"}
+        for family in self._families:
+            for group in ("displacement", "system", "axis", "adjustment"):
+                groups[f"com.attocube.{family}.{group}."] = f"_{group}_"
+        for prefix, group in groups.items():
             if method.startswith(prefix) and method.removeprefix(prefix).isidentifier():
                 return getattr(self, group + method.removeprefix(prefix), None)
         return None
@@ -417,7 +419,7 @@ class SimulatedIds(SimulatedDevice):
         return ("L000S0042",)
 
     def _service_getFirmwareVersion(self) -> Sequence[Any]:
-        return ("1.7.0",)
+        return ("1.9.1" if "sen" in self._families else "1.7.0",)
 
     def _service_getDeviceName(self) -> Sequence[Any]:
         return ("virtual IDS",)

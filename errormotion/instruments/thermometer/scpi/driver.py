@@ -11,6 +11,7 @@ from errormotion.instruments.thermometer.scpi import codec
 from errormotion.instruments.thermometer.scpi.settings import ScpiSettings
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, OUT_OF_RANGE, LineThermometer
 from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo
 
 T = TypeVar("T")
@@ -163,9 +164,11 @@ class ScpiTemperature(LineThermometer):
         super().resynchronise()
         line = self.transport
         line.write(codec.encode("*IDN?"))
-        for _ in range(MAX_LATE):
+        for others in range(MAX_LATE):
             try:
                 self._answer(line, "*IDN?", codec.parse_identity)
+            except InstrumentTimeoutError as error:
+                raise after_others(error, others, "'*IDN?'") from None
             except ProtocolError:
                 continue
             return

@@ -30,6 +30,7 @@ from errormotion.instruments.transports.can.pdo import (
 )
 from errormotion.instruments.transports.can.sdo import SdoClient, SdoRefusal
 from errormotion.instruments.transports.lost import Reopened
+from errormotion.instruments.transports.quiet import after_others
 
 MAX_PDOS = 8
 """Number of transmit PDOs that are examined: the four standard ones and further ones."""
@@ -128,7 +129,7 @@ class CanNode(Transport):
         except SdoRefusal as refusal:
             raise SdoRefusal(refusal.code, f"{self._where}, {what}") from None
         except InstrumentTimeoutError:
-            raise self._silence("did not answer") from None
+            raise after_others(self._silence("did not answer"), self._sdo.others, what) from None
         except ProtocolError as error:
             raise ProtocolError(f"{self._where}, {what}: {error}") from None
 

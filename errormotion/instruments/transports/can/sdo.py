@@ -165,13 +165,15 @@ class SdoClient:
         Frames from the node, added by the receiving thread.
     late : int
         Number of answers that were ignored because they were late or belonged to another request.
+    others : int
+        Number of those since the last request.
     """
 
     def __init__(self, send: Callable[[bytes, Callable[[], None] | None], None], timeout: float) -> None:
         self._send = send
         self.timeout = timeout
         self.answers: queue.Queue[bytes] = queue.Queue()
-        self.late = 0
+        self.late = self.others = 0
         self._settled = True
         self._barriers = cycle(BARRIERS)
 
@@ -203,7 +205,7 @@ class SdoClient:
         was_settled, self._settled = self._settled, False
         self._send(upload_request(index, subindex), self._forget)
         end = time.monotonic() + self.timeout
-        for _ in range(MAX_STRAY):
+        for self.others in range(MAX_STRAY):
             try:
                 reply = upload_reply(self._next(end), index, subindex)
             except SdoRefusal:
