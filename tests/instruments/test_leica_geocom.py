@@ -247,7 +247,7 @@ def test_a_point_that_the_operator_records_does_not_end_the_session(recorded: by
 def test_a_station_that_only_sends_gsi_is_named() -> None:
     with (
         scripted(lambda call, transaction, values: RECORDED[0]) as address,
-        pytest.raises(ProtocolError, match="lines of GSI and none of GeoCOM.*set to GeoCOM"),
+        pytest.raises(ProtocolError, match=r"lines of GSI and none of GeoCOM.*set to GeoCOM"),
     ):
         LeicaGeoCom(address, GeoComSettings(timeout=0.3)).open()
 
