@@ -26,8 +26,9 @@ from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.claims import claimed
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
 from errormotion.campaign.folder import FolderGoneError, RunFolder, Status, list_runs, new_entries, now
+from errormotion.campaign.planning.release import Release, announced, refuse, to_release
 from errormotion.campaign.sections import head
-from errormotion.campaign.sections.limits import NO_MOTIONS, announcement, steps_of
+from errormotion.campaign.sections.limits import NO_MOTIONS
 from errormotion.campaign.sections.timeline import follower
 from errormotion.campaign.storage.journal import cause_of, journal
 from errormotion.campaign.storage.recorder import DiskFullError, Recorder
@@ -107,6 +108,7 @@ def run(
     progress: Progress | None = None,
     ask: Callable[[str], None] | None = None,
     report: Callable[[Path], Path] | None = None,
+    release: Release = refuse,
 ) -> list[RunFolder]:
     """Execute every test of a campaign.
 
@@ -122,6 +124,9 @@ def run(
         Sends a request to the operator; see :class:`~errormotion.campaign.bench.OpenBench`.
     report : callable, optional
         Writes the report of a run folder, and returns its path.
+    release : callable, optional
+        Called with the motions of the tests before anything is opened or created, if they move a machine and not all
+        devices are simulated; returns when a person has released them. Default: they are refused.
 
     Returns
     -------
@@ -133,11 +138,12 @@ def run(
     BenchError
         An instrument could not be opened. Nothing was measured.
     RunError
-        A test failed. The message states the test, the cause, the location of the data, and how to continue.
+        The motions were not released, or another program uses the instruments: nothing was created. Or a test failed:
+        the message states the test, the cause, the location of the data, and how to continue.
     KeyboardInterrupt
         The operator stopped the run; the folder is complete and can be resumed.
     """
-    session = _Session(campaign, runs or campaign.runs, uuid4().hex[:8], progress, ask, report)
+    session = _Session(campaign, runs or campaign.runs, uuid4().hex[:8], progress, ask, report, release)
     return session.work({})
 
 
@@ -149,6 +155,7 @@ def resume(
     progress: Progress | None = None,
     ask: Callable[[str], None] | None = None,
     report: Callable[[Path], Path] | None = None,
+    release: Release = refuse,
 ) -> list[RunFolder]:
     """Continue the newest unfinished campaign of a runs folder; finished tests are skipped.
 
@@ -158,7 +165,7 @@ def resume(
         Continue only this one. Its files must not have changed since it was started.
     run_id : str, optional
         Continue only the campaign with this ``id`` in its ``run.json``.
-    runs, progress, ask, report
+    runs, progress, ask, report, release
         As for :func:`run`.
 
     Raises
@@ -190,7 +197,7 @@ def resume(
             skipped.append(f"{folders[0].path / 'run.json'}: is not a complete record of a run ({cause_of(error)})")
             log.warning("skipped: %s", skipped[-1])
             continue
-        session = _Session(plan, runs, run_id, progress, ask, report)
+        session = _Session(plan, runs, run_id, progress, ask, report, release)
         with folders[0].locked():  # one process at a time continues a campaign
             for reason in skipped:
                 session.progress.announce(f"skipped: {reason}")
@@ -202,6 +209,17 @@ def resume(
         )
     message = f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished."
     raise RunError("\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]))
+
+
+def folders_of(folder: RunFolder, tests: Sequence[str]) -> dict[str, RunFolder]:
+    """Return the run folders of the campaign of a run folder by test.
+
+    Raises
+    ------
+    RunError
+        The test of a run folder is unclear.
+    """
+    return _folders_by_test(folder.path.parent, str(folder.data["id"]), [folder], tests)
 
 
 def _folders_by_test(runs: Path, run_id: str, known: Sequence[RunFolder], tests: Sequence[str]) -> dict[str, RunFolder]:
@@ -237,6 +255,12 @@ def _folders_by_test(runs: Path, run_id: str, known: Sequence[RunFolder], tests:
     return found
 
 
+def to_measure(campaign: CampaignPlan, folders: Mapping[str, RunFolder]) -> list[TestPlan]:
+    """Return the tests whose raw data are not complete; ``folders`` are the run folders by test."""
+    found = [(test, folders.get(test.name)) for test in campaign.tests]
+    return [test for test, folder in found if folder is None or not (folder.finished or folder.data["acquired"])]
+
+
 def _belongs(path: Path, run_id: str) -> bool:
     """Return whether a path has the name of a run folder of this campaign."""
     return bool(run_id) and path.name.endswith(f"-{run_id}") and not path.name.startswith(".") and path.is_dir()
@@ -253,19 +277,21 @@ class _Session:
         progress: Progress | None,
         ask: Callable[[str], None] | None,
         report: Callable[[Path], Path] | None,
+        release: Release,
     ) -> None:
         self.campaign, self.runs, self.run_id = campaign, runs, run_id
         self.progress = progress or Quiet()
         self.bench = OpenBench(campaign.bench, ask)
-        self.report = report
+        self.report, self.release = report, release
         self.records: Callable[[Path], None] = lambda run: None  # noqa: ARG005 - until the bench is opened
 
     def work(self, folders: dict[str, RunFolder]) -> list[RunFolder]:
         """Execute the unfinished tests."""
-        for test in self.campaign.tests:
-            folder = folders.get(test.name)
-            if folder is None or not (folder.finished or folder.data["acquired"]):
-                self.progress.announce(self._announcement(test))
+        unmeasured = to_measure(self.campaign, folders)
+        for test in unmeasured:
+            self.progress.announce(announced(self.campaign, test))
+        if motions := to_release(self.campaign, unmeasured):
+            self.release(motions)
         with ExitStack() as opened:
             for number, test in enumerate(self.campaign.tests):
                 folder = folders.get(test.name)
@@ -285,11 +311,6 @@ class _Session:
                 with journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
                     self._test(folder, test, folders)
         return [folders[test.name] for test in self.campaign.tests]
-
-    def _announcement(self, test: TestPlan) -> str:
-        bench = self.campaign.bench
-        steps = steps_of(test.method, test.settings, bench.chosen(test.instruments).settings_by_kind)
-        return announcement(test.name, steps, bench.limits)
 
     def _new_folder(self, test: TestPlan) -> RunFolder:
         plan = self.campaign

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -19,7 +19,13 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from errormotion.campaign.planning.release import WORD, require_word
 from errormotion.cli.curves import Curves
+
+
+def on_terminal() -> bool:
+    """Return whether a person can be asked: input and messages are on a terminal."""
+    return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 class _Display(Progress):
@@ -112,6 +118,30 @@ class Bars:
         self._progress.stop()
         try:
             self._console.input(f"\n{message}\nPress Enter when it is done, Ctrl-C to stop: ", markup=False)
+        finally:
+            self._progress.start()
+
+    def release(self, motions: Sequence[str]) -> None:
+        """Show the motions of the tests, and wait for the word that releases them.
+
+        Raises
+        ------
+        RunError
+            Another text was typed. Nothing has moved.
+        """
+        self._progress.stop()
+        try:
+            if not self._announcing:
+                for line in motions:
+                    self._console.print(line, markup=False, soft_wrap=True)
+            try:
+                typed = self._console.input(
+                    f"\nThe machine is not simulated. Type '{WORD}' to release these motions, anything else to end: ",
+                    markup=False,
+                )
+            except EOFError:
+                typed = ""
+            require_word(typed)
         finally:
             self._progress.start()
 

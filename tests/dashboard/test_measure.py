@@ -190,3 +190,46 @@ def test_many_clients_do_not_increase_the_load_of_the_server() -> None:
     assert [lately.get("a", make) for _ in range(20)] == [0] * 20
     assert [lately.get(key, make) for key in "bca"] == [1, 2, 3]
     assert TimedCache(0.0).get("a", make) == 4
+
+
+def _real(folder: Path, name: str) -> str:
+    """Write a bench at real addresses that nothing answers, and return a campaign for it."""
+    (folder / f"{name}-bench.toml").write_text(BENCH.replace("sim://cframe/controller?seed=3", "tcp://127.0.0.1:9"))
+    return CAMPAIGN.replace("{name}", name).replace("bench.toml", f"{name}-bench.toml")
+
+
+def test_a_real_machine_is_started_only_with_the_word_that_releases_its_motions(
+    controlling: Any, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[list[str]] = []
+
+    def spawn(where: Path, runs: Path, state: dict[str, Any], arguments: list[str]) -> None:
+        started.append(list(arguments))
+
+    monkeypatch.setattr(processes, "_spawn", spawn)
+    order = {"file": "real.toml", "text": _real(folder, "real"), "before": hash_of("")}
+    status, found = _post(controlling, "/measure/start", **order)
+    assert (status, found["process"], found["word"], started) == (200, "", "move", [])
+    (line,) = found["motions"]
+    assert line.startswith("drift: the machine will move: spindle up to 15000 /min")
+    for wrong in ("yes", "MOVE", "true"):
+        status, found = _post(controlling, "/measure/start", **order, release=wrong)
+        assert (status, started) == (400, [])
+        assert "expected the word 'move'" in found["error"]
+    for odd in (True, 1, ["move"]):
+        assert _post(controlling, "/measure/start", **order, release=odd)[0] == 400
+    assert started == []
+    status, found = _post(controlling, "/measure/start", **order, release="move")
+    assert (status, bool(found["process"])) == (200, True)
+    assert [each[-1] for each in started] == ["--move"]
+
+
+def test_a_simulated_machine_is_started_at_once(
+    controlling: Any, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[list[str]] = []
+    monkeypatch.setattr(processes, "_spawn", lambda *values: started.append(list(values[-1])))
+    text = (folder / "drift.toml").read_text()
+    status, found = _post(controlling, "/measure/start", file="drift.toml", text=text, before=hash_of(text))
+    assert (status, bool(found["process"])) == (200, True)
+    assert ["--move" in each for each in started] == [False]

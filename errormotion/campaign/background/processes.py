@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -25,8 +25,10 @@ from uuid import uuid4
 from errormotion.campaign.background import signals
 from errormotion.campaign.background.detached import printed, spawn
 from errormotion.campaign.background.publishing import ANSWER, STATUS
-from errormotion.campaign.files import load_campaign
+from errormotion.campaign.files import CampaignPlan, TestPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, is_locked, now, replace_text
+from errormotion.campaign.planning.release import OPTION, Release, refuse, to_release
+from errormotion.campaign.runner import folders_of, stored_plan, to_measure
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.errors import RunError
 
@@ -110,21 +112,28 @@ class Background:
     stopping: bool = False
 
 
-def start(campaign: Path, runs: Path) -> str:
+def start(campaign: Path, runs: Path, release: Release = refuse) -> str:
     """Start a campaign in a separate process, and return the name of the process.
+
+    Parameters
+    ----------
+    campaign, runs : Path
+        The campaign file, and the folder of runs.
+    release : callable, optional
+        As for `errormotion.campaign.runner.run`; called in this process, since the other one has no terminal.
 
     Raises
     ------
     BenchError
         The campaign or its bench file is invalid.
     RunError
-        Another process measures on the same machine, or the process cannot be started.
+        The motions were not released, another process measures on the same machine, or the process cannot be started.
     """
     plan = load_campaign(campaign)
-    return _start(runs, plan.name, plan.bench.machine, [str(campaign.resolve())])
+    return _start(runs, plan, plan.tests, [str(campaign.resolve())], release)
 
 
-def resume(folder: Path) -> str:
+def resume(folder: Path, release: Release = refuse) -> str:
     """Continue the campaign of a run folder in a separate process, and return the name of the process.
 
     Raises
@@ -132,12 +141,13 @@ def resume(folder: Path) -> str:
     RunError
         The folder is not the run folder of a campaign; or as for `start`.
     """
-    data = RunFolder.open(folder).data
+    first = RunFolder.open(folder)
     try:
-        campaign, machine = str(data["campaign"]["name"]), str(data["bench"]["machine"])
-    except (KeyError, TypeError):
+        plan = stored_plan(first)
+    except (KeyError, TypeError, AttributeError):
         raise RunError(f"{folder}: expected the run folder of a campaign; found another folder") from None
-    return _start(folder.parent, campaign, machine, ["--resume", str(folder.resolve())])
+    tests = to_measure(plan, folders_of(first, [test.name for test in plan.tests]))
+    return _start(folder.parent, plan, tests, ["--resume", str(folder.resolve())], release)
 
 
 def found(runs: Path) -> list[Background]:
@@ -192,9 +202,15 @@ def stop(runs: Path, name: str) -> None:
     requested.touch()
 
 
-def _start(runs: Path, campaign: str, machine: str, arguments: list[str]) -> str:
+def _start(
+    runs: Path, plan: CampaignPlan, tests: Sequence[TestPlan], arguments: Sequence[str], release: Release
+) -> str:
     if fcntl is None:
         raise RunError("A background process needs a system with file locks (Linux, macOS). Use 'errormotion run'.")
+    machine = plan.bench.machine
+    if motions := to_release(plan, tests):
+        release(motions)
+        arguments = [*arguments, OPTION]
     try:
         runs.mkdir(parents=True, exist_ok=True)
         root = runs / FOLDER
@@ -205,13 +221,13 @@ def _start(runs: Path, campaign: str, machine: str, arguments: list[str]) -> str
                     raise RunError(f"'{each.campaign}' has used {machine} since {each.started}; stop it first")
             _tidy(root)
             name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{uuid4().hex[:8]}"
-            _spawn(root / name, runs, {"campaign": campaign, "machine": machine, "started": now()}, arguments)
+            _spawn(root / name, runs, {"campaign": plan.name, "machine": machine, "started": now()}, arguments)
     except OSError as error:
         raise RunError(f"{runs}: the process cannot be started: {error.strerror}") from error
     return name
 
 
-def _spawn(folder: Path, runs: Path, state: dict[str, Any], arguments: list[str]) -> None:
+def _spawn(folder: Path, runs: Path, state: dict[str, Any], arguments: Sequence[str]) -> None:
     folder.mkdir(mode=0o700)
     command = [*COMMAND[2:], *_publishing(folder), *arguments, "--runs", str(runs.resolve())]
     lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)

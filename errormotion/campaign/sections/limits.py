@@ -183,6 +183,11 @@ def announcement(test: str, steps: Sequence[Step] | None, limits: Limits) -> str
     return f"{test}: the machine will move: {', '.join(parts)}." if parts else f"{test}: nothing will move."
 
 
+def moves(steps: Sequence[Step] | None) -> bool:
+    """Return whether an axis or the spindle moves; ``steps`` as from `steps_of`."""
+    return any(step.place is not None or step.spindle_speed != 0 for step in steps or ())
+
+
 NO_MOTIONS = "the method '{}' does not state its motions ('motions'); whether they stay within the limits is unknown"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from errormotion.campaign.background.preliminary import preliminary, samples
 from errormotion.campaign.background.processes import Background
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.form.fields import Form
+from errormotion.campaign.planning.release import WORD, require_word
 from errormotion.campaign.runner import MEASURING
 from errormotion.dashboard.cache import TimedCache
 from errormotion.dashboard.campaigns import Campaigns, hash_of
@@ -51,6 +53,34 @@ class _OfCampaigns(Guarded):
             raise HTTPError(400, reason=f"Expected a JSON object with the texts {', '.join(names)}")
         self.found = found
         return [found[name] for name in names]
+
+    async def released(self, start: Callable[..., str], *values: Any) -> dict[str, Any]:
+        """Start a process, and return its name as ``process``; empty until the person has released its motions.
+
+        The text ``release`` of the request is what the person typed. Without it, nothing is started; the answer has the
+        ``motions`` and the ``word`` that releases them.
+        """
+        typed = self.found.get("release", "")
+        if not isinstance(typed, str):
+            raise HTTPError(400, reason="release: expected a text")
+
+        def release(motions: Sequence[str]) -> None:
+            if not typed:
+                raise _UnreleasedError(tuple(motions))
+            require_word(typed)
+
+        try:
+            return {"process": await self.in_thread(start, *values, release)}
+        except _UnreleasedError as found:
+            return {"process": "", "motions": found.motions, "word": WORD}
+
+
+class _UnreleasedError(Exception):
+    """The motions of a process have not been released."""
+
+    def __init__(self, motions: tuple[str, ...]) -> None:
+        super().__init__(*motions)
+        self.motions = motions
 
 
 class Measure(_OfCampaigns):
@@ -125,11 +155,11 @@ class Start(_OfCampaigns):
     controls = True
 
     async def post(self) -> None:
-        """Start the campaign."""
+        """Start the campaign, or send the motions that the person must release first."""
         name, text, before = self.body("file", "text", "before")
         path = await self.in_thread(self.campaigns().save, name, text, before)
-        process = await self.in_thread(processes.start, path, self.context.lab.runs)
-        self.finish({"process": process, "before": hash_of(text)})
+        started = await self.released(processes.start, path, self.context.lab.runs)
+        self.finish(started | {"before": hash_of(text)})
 
 
 class Resume(_OfCampaigns):
@@ -138,9 +168,9 @@ class Resume(_OfCampaigns):
     controls = True
 
     async def post(self) -> None:
-        """Continue the campaign."""
+        """Continue the campaign, or send the motions that the person must release first."""
         (key,) = self.body("run")
-        self.finish({"process": await self.in_thread(processes.resume, self.context.lab.folder(key))})
+        self.finish(await self.released(processes.resume, self.context.lab.folder(key)))
 
 
 class Stop(_OfCampaigns):

@@ -187,6 +187,58 @@ async function order(path, body) {
   }
 }
 
+// Motions of a real machine: nothing starts before the word that releases them was typed
+
+let release = null; // repeats the order with the typed word
+
+function askRelease(found, again) {
+  release = again;
+  byId("motions").replaceChildren(...found.motions.map((each) => element("li", each)));
+  byId("word").textContent = found.word;
+  byId("typed").value = "";
+  byId("release-card").hidden = false;
+  byId("release-card").scrollIntoView();
+  byId("typed").focus();
+}
+
+function endRelease() {
+  release = null;
+  byId("release-card").hidden = true;
+}
+
+async function started(path, body, typed = "") { // start or resume; returns the answer once a process was started
+  const found = await ask(path, { ...body, release: typed });
+  if (found.process) {
+    endRelease();
+    return found;
+  }
+  askRelease(found, (word) => started(path, body, word));
+  return null;
+}
+
+if (control) {
+  byId("release-form").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const again = release, typed = byId("typed").value;
+    if (!again || !typed) return;
+    endRelease();
+    try {
+      const found = await again(typed);
+      if (found) taken(found);
+      complain();
+    } catch (error) {
+      complain(error);
+    }
+    ready();
+  });
+  byId("unreleased").addEventListener("click", endRelease);
+}
+
+function taken(found) {
+  before = found.before ?? before;
+  reveal = found.process;
+}
+
 if (control) {
   byId("save").addEventListener("click", async () => {
     const found = await order("/measure/save", { file: byId("name").value, text: text.value, before });
@@ -194,10 +246,12 @@ if (control) {
   });
   byId("start").addEventListener("click", async () => {
     byId("start").disabled = true;
-    const found = await order("/measure/start", { file: byId("name").value, text: text.value, before });
-    if (found) {
-      before = found.before;
-      reveal = found.process;
+    try {
+      const found = await started("/measure/start", { file: byId("name").value, text: text.value, before });
+      complain();
+      if (found) taken(found);
+    } catch (error) {
+      complain(error);
     }
     ready();
   });
@@ -208,10 +262,10 @@ if (control) {
 const WORDS = { finished: "✓ finished", interrupted: "■ stopped", failed: "✕ failed", killed: "✕ ended without a report" };
 const cards = new Map();
 
-async function command(path, body, pressed) {
+async function command(path, body, pressed, send = ask) {
   pressed.disabled = true;
   try {
-    await ask(path, body);
+    await send(path, body);
     byId("refused").hidden = true;
   } catch (error) {
     byId("refused").textContent = error.message;
@@ -254,7 +308,7 @@ function process(each) { // replaced only if more than the progress has changed,
     }
     if (each.elsewhere) links.append(element("span", "It was started in a terminal or by another program; stop it there with Ctrl-C.", "note"));
     else if (control && each.alive) links.append(button("Stop", (event) => command("/measure/stop", { process: each.name }, event.target), "stop"));
-    if (control && each.resume) links.append(button("Resume", (event) => command("/measure/resume", { run: each.resume }, event.target)));
+    if (control && each.resume) links.append(button("Resume", (event) => command("/measure/resume", { run: each.resume }, event.target, started)));
     if (links.childNodes.length) made.append(links);
     if (card) card.replaceWith(made);
     cards.set(each.name, (card = made));

@@ -11,6 +11,7 @@ from errormotion.cli import options
 from errormotion.cli.guard import USAGE
 from errormotion.cli.root import app, background_app
 
+Move = Annotated[bool, typer.Option("--move", help="Release the motions of the machine without a question.")]
 Process = Annotated[str | None, typer.Option(help="Name of the process; needed if there are several.")]
 OfRuns = Annotated[Path, typer.Argument(help="The folder of runs.")]
 
@@ -53,7 +54,10 @@ def run(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the newest unfinished campaign.")] = False,
     runs: options.Runs = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Treat every request to the operator as done.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Treat every request to the operator as done; releases no motion.")
+    ] = False,
+    move: Move = False,
     report: Annotated[bool, typer.Option(help="Write a report for each test.")] = True,
     tolerances: options.Tolerances = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report path and duration, without motion.")] = False,
@@ -81,11 +85,11 @@ def run(
     from errormotion.cli.commands.campaigns import run as command
 
     if detach:
-        command.detach(campaign, resume=resume, runs=runs, as_json=json_)
+        command.detach(campaign, resume=resume, runs=runs, move=move, as_json=json_)
         return
     command.run(
-        campaign, resume=resume, runs=runs, yes=yes, with_report=report, tolerances=tolerances, as_json=json_,
-        publish=publish,
+        campaign, resume=resume, runs=runs, yes=yes, move=move, with_report=report, tolerances=tolerances,
+        as_json=json_, publish=publish,
     )  # fmt: skip
 
 
@@ -131,9 +135,10 @@ def program(
     campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
     out: Annotated[Path, typer.Option(help="The folder for the programs; existing files are not replaced.")],
     test: Annotated[str | None, typer.Option(help="One test; default: every test that has programs.")] = None,
+    move: Move = False,
     json_: options.Json = False,
 ) -> None:
     """Write the NC programs of the tests of a campaign."""
     from errormotion.cli.commands.campaigns import program as command
 
-    command.write(campaign, test, out, json_)
+    command.write(campaign, test, out, move=move, as_json=json_)

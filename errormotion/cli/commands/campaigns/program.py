@@ -8,23 +8,25 @@ from typing import Any
 import typer
 
 from errormotion.campaign.files import load_campaign
-from errormotion.campaign.sections.limits import announcement, steps_of
+from errormotion.campaign.planning.release import announced, refuse, released, to_release
 from errormotion.cli.output import show, show_json, table
+from errormotion.cli.progress import Bars, on_terminal
 from errormotion.errors import BenchError
 
 
-def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
+def write(campaign: Path, test: str | None, out: Path, *, move: bool, as_json: bool) -> None:
     """Write the NC programs of one test, or of every test whose method has programs; files are never replaced.
 
-    The motions of the programs are printed on stderr, one line for each test. With several such tests, each has a
-    folder in ``out``.
-
-        With several such tests, each has its own folder in ``out``.
+    The motions of the programs are printed on stderr, one line for each test. Unless all devices of the bench are
+    simulated, a person releases them as for a run: a control moves as soon as it executes a program. With several such
+    tests, each has its own folder in ``out``.
 
     Raises
     ------
-        BenchError
-            The test does not exist, its method has no programs, or a file already exists. Nothing is written.
+    BenchError
+        The test does not exist, its method has no programs, or a file already exists. Nothing is written.
+    RunError
+        The motions were not released. Nothing is written.
     """
     plan = load_campaign(campaign)
     chosen = [entry for entry in plan.tests if test is None or entry.name == test]
@@ -37,21 +39,19 @@ def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
         names = ", ".join(sorted({entry.method.info.id for entry in chosen}))
         raise BenchError(f"{campaign}: the method {names} has no NC programs; nothing was written")
     files: list[tuple[str, Path, str]] = []
-    announced: list[str] = []
     for entry in with_programs:
         folder = out / entry.name if len(with_programs) > 1 else out
         instruments = plan.bench.chosen(entry.instruments).settings_by_kind
-        announced.append(
-            announcement(entry.name, steps_of(entry.method, entry.settings, instruments), plan.bench.limits)
-        )
         texts = entry.method().programs(entry.settings, instruments)
         files += [(entry.name, folder / name, text) for name, text in texts.items()]
     if existing := [str(path) for _, path, _ in files if path.exists()]:
         raise BenchError(
             f"{existing[0]} already exists; choose another folder, or remove the file. Nothing was written."
         )
-    for line in announced:
-        typer.echo(line, err=True)
+    for entry in with_programs:
+        typer.echo(announced(plan, entry), err=True)
+    if motions := to_release(plan, with_programs):
+        (released if move else Bars(quiet=True, announcing=True).release if on_terminal() else refuse)(motions)
     for _, path, text in files:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="ascii", newline="\r\n") as file:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,11 @@ from errormotion.campaign.background import processes
 from errormotion.campaign.background.publishing import Published
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
+from errormotion.campaign.planning.release import refuse, released
 from errormotion.cli.commands.campaigns import background as command
 from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json
-from errormotion.cli.progress import Bars
+from errormotion.cli.progress import Bars, on_terminal
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.cli.tolerances import end_with, remarks
 from errormotion.datasets.results.merit import figures_of
@@ -32,6 +32,7 @@ def run(
     resume: bool,
     runs: Path | None,
     yes: bool,
+    move: bool,
     with_report: bool,
     tolerances: Path | None,
     as_json: bool,
@@ -55,7 +56,7 @@ def run(
     if plan is not None and limits is not None:
         plan = replace(plan, tolerances=limits)
     folders = work(
-        plan, resume=resume, runs=runs, yes=yes, with_report=with_report, quiet=as_json, announcing=True,
+        plan, resume=resume, runs=runs, yes=yes, move=move, with_report=with_report, quiet=as_json, announcing=True,
         run_id=run_id, publish=publish,
     )  # fmt: skip
     decisions = [folder.data["conformity"] for folder in folders if folder.data.get("conformity")]
@@ -78,32 +79,38 @@ def work(
     resume: bool = False,
     runs: Path | None = None,
     yes: bool = False,
+    move: bool = False,
     with_report: bool = True,
     quiet: bool = False,
     announcing: bool = False,
     run_id: str = "",
     publish: Path | None = None,
 ) -> list[RunFolder]:
-    """Run or resume a campaign with progress bars on a terminal; without a plan, the newest unfinished one."""
+    """Run or resume a campaign with progress bars on a terminal; without a plan, the newest unfinished one.
+
+    ``yes`` treats every request to the operator as done, and ``move`` releases the motions of the machine; neither
+    includes the other.
+    """
     with Bars(quiet, announcing=announcing) if publish is None else Published(publish) as bars:
-        answered = publish is not None or (sys.stdin.isatty() and sys.stderr.isatty())
-        ask = _assume_done if yes else bars.ask if answered else None
+        ask = _assume_done if yes else bars.ask if publish is not None or on_terminal() else None
+        release = released if move else bars.release if isinstance(bars, Bars) and on_terminal() else refuse
         report = report_of_run if with_report else None
         if resume or plan is None:
-            return runner.resume(plan, run_id=run_id, runs=runs, progress=bars, ask=ask, report=report)
-        return runner.run(plan, runs=runs, progress=bars, ask=ask, report=report)
+            return runner.resume(plan, run_id=run_id, runs=runs, progress=bars, ask=ask, report=report, release=release)
+        return runner.run(plan, runs=runs, progress=bars, ask=ask, report=report, release=release)
 
 
-def detach(campaign: Path | None, *, resume: bool, runs: Path | None, as_json: bool) -> None:
+def detach(campaign: Path | None, *, resume: bool, runs: Path | None, move: bool, as_json: bool) -> None:
     """Start or resume a campaign in a separate process, and print the name of the process."""
     if campaign is None:
         typer.echo("--detach: expected a campaign file, or a run folder with --resume.", err=True)
         raise typer.Exit(USAGE)
+    release = released if move else Bars(quiet=True).release if on_terminal() else refuse
     if resume:
-        command.started(processes.resume(campaign), campaign.parent, as_json)
+        command.started(processes.resume(campaign, release), campaign.parent, as_json)
         return
     runs = runs or load_campaign(campaign).runs
-    command.started(processes.start(campaign, runs), runs, as_json)
+    command.started(processes.start(campaign, runs, release), runs, as_json)
 
 
 def report_of_run(folder: Path) -> Path:
