@@ -2,19 +2,25 @@
 
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import minimalmodbus
 import pytest
 import serial
 from libmodbus import Client, installed, served
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+from pymodbus.exceptions import ModbusIOException
+from pymodbus.framer import FramerRTU, FramerType
+from pymodbus.pdu import DecodePDU
 from wire_vectors import Vector, vectors
 
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.thermometer.modbus import SimulatedModbus
 from errormotion.instruments.thermometer.modbus_temperature import ModbusTemperature
 from errormotion.instruments.thermometer.registers import ModbusSettings
 from errormotion.instruments.transports import parse_address
+from errormotion.instruments.transports.loopback.serving import TcpServer
 from errormotion.instruments.transports.modbus import codec
 
 UNIT, FIRST = 5, 32
@@ -108,6 +114,69 @@ def test_the_driver_reads_a_server_of_libmodbus(function: int) -> None:
         thermometer.configure(ModbusSettings(channels=("air", "bed"), function=function, first=200, unit=7))
         with pytest.raises(codec.ModbusRefusal, match="illegal data address"):
             thermometer.read()
+
+
+# ------------------------------------------------------------------ why pymodbus is not the client: decision 7
+
+FRAME = codec.encode_answer("rtu", 0x50, 3, [1, 2])
+DAMAGED = FRAME[:-1] + bytes((FRAME[-1] ^ 1,))
+
+
+@contextmanager
+def answering(answer: bytes) -> Iterator[int]:
+    """Answer everything with the same bytes; yield the port."""
+    server = TcpServer("modbus", lambda data: server.send(answer) if answer else None)
+    server.start()
+    try:
+        yield parse_address(server.url).port
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (b"", "unit 80 did not answer"),
+        (DAMAGED, "has the checksum"),
+        (codec.encode_answer("rtu", 0x51, 3, [1, 2]), "answer of unit 80; found that of unit 81"),
+        (b"\0" + FRAME, "expected"),
+    ],
+    ids=["silence", "checksum", "another unit", "a stray byte"],
+)
+def test_the_client_of_pymodbus_reports_faults_as_silence_or_passes_over_them(answer: bytes, message: str) -> None:
+    with answering(answer) as port:
+        theirs = ""
+        with ModbusTcpClient("127.0.0.1", port=port, framer=FramerType.RTU, timeout=0.3, retries=0) as client:
+            try:
+                client.read_holding_registers(0, count=2, device_id=0x50)
+            except ModbusIOException as error:
+                theirs = str(error)
+        assert not theirs if answer[:1] == b"\0" else "No response received" in theirs
+        ours = ModbusTemperature(
+            f"modbus+rtu-tcp://127.0.0.1:{port}?unit=80", ModbusSettings(channels=("a", "b"), timeout=0.3)
+        )
+        with pytest.raises(InstrumentError, match=f"(?i){message}"):
+            ours.open()
+
+
+def test_the_framers_of_pymodbus_pass_over_stray_bytes_and_other_units() -> None:
+    framer = FramerRTU(DecodePDU(is_server=False))
+    assert framer.decode(b"\0" + FRAME)[3] == FRAME[1:-2]
+    assert framer.handleFrame(FRAME, 0x51, 0) == (len(FRAME), None)
+    with pytest.raises(ProtocolError, match="checksum"):
+        codec.decode_answer("rtu", b"\0" + FRAME, 0x50, 3, 2)
+    with pytest.raises(ProtocolError, match="unit 81; found that of unit 80"):
+        codec.decode_answer("rtu", FRAME, 0x51, 3, 2)
+
+
+def test_answers_to_other_requests_are_named_where_none_came_to_this_one() -> None:
+    old = codec.encode_answer("tcp", 1, 3, [1, 2], 65535)
+    with answering(old) as port:
+        thermometer = ModbusTemperature(
+            f"modbus+tcp://127.0.0.1:{port}?unit=1", ModbusSettings(channels=("a", "b"), timeout=0.3)
+        )
+        with pytest.raises(InstrumentTimeoutError, match="but 1 answer to other requests was discarded"):
+            thermometer.open()
 
 
 # ------------------------------------------------------------------ the client's frames against the specification

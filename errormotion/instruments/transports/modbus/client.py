@@ -5,9 +5,9 @@
 * ``modbus+rtu-tcp://192.168.0.9:4001?unit=1`` RTU frames through a serial server
 * ``sim://cframe/logger?framing=rtu`` a simulated device; ``replay://session.rec`` a recorded session
 
-The frames are implemented here (`modbus.codec`) over the byte transports, so that sessions can be recorded and
-replayed, and faults can be distinguished. `pymodbus`, whose client owns its socket and waits without a time limit after
-a wrong checksum, is only used in tests.
+Frames are built and read by PDUs and framers of pymodbus (`modbus.codec`) over the byte transports, so that sessions
+can be recorded and replayed, and faults can be distinguished: the client of pymodbus owns its socket, and waits in
+vain after a wrong checksum as after silence.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from errormotion.instruments.transports.modbus.codec import (
     encode_write,
     missing,
 )
-from errormotion.instruments.transports.quiet import await_quiet, discard_input
+from errormotion.instruments.transports.quiet import after_others, await_quiet, discard_input
 from errormotion.instruments.transports.reconnecting import disconnect_after_timeout, open_reconnecting
 from errormotion.instruments.transports.recording import read_recording
 
@@ -128,21 +128,22 @@ class ModbusLine(Transport):
         prepare()
         self._number = (self._number + 1) % (1 << 16)
         self._line.write(encode(self._number))
-        end = time.monotonic() + self.timeout
+        end, others = time.monotonic() + self.timeout, 0
         try:
             while True:
                 found = decode(self._frame(end), self._number)
                 if found is not None:
                     return found
+                others += 1
         except ModbusRefusal as error:
             raise ModbusRefusal(error.code, f"{self.url}: {what}") from None
         except ProtocolError as error:
             self._settle()
             raise ProtocolError(f"{self.url}: {error}") from None
-        except InstrumentTimeoutError:
+        except InstrumentTimeoutError as error:
             self._unanswered_at, self._passed_over = time.monotonic(), False
             disconnect_after_timeout(self._line)
-            raise
+            raise after_others(error, others, what) from None
 
     def _await_late_answer(self, function: int, register: int, count: int) -> None:
         """Discard unread bytes; after a timeout, ensure that no late answer is mistaken for the next one.
@@ -174,9 +175,11 @@ class ModbusLine(Transport):
         """Request a number of registers and skip answers until the answer to this request, or its refusal."""
         self._line.write(encode_request(self.framing, self.unit, function, register, count))
         end = time.monotonic() + self.timeout
-        for _ in range(MAX_LATE_ANSWERS):
+        for others in range(MAX_LATE_ANSWERS):
             try:
                 decode_answer(self.framing, self._frame(end), self.unit, function, count)
+            except InstrumentTimeoutError as error:
+                raise after_others(error, others, f"function {function} for {count} registers") from None
             except ModbusRefusal:
                 return
             except ProtocolError:

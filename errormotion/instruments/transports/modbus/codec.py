@@ -1,13 +1,27 @@
 """Modbus frames for reading (functions 3 and 4) and writing (6 and 16) registers, in the framings RTU and TCP (MBAP).
 
-After the Modbus application protocol 1.1b3 and the serial line guide 1.02. Pure functions from bytes to numbers.
+Requests, answers, framing and checksum are those of pymodbus, whose PDUs and framers do no input and output. What they
+pass over is an error here: another unit, stray bytes, a wrong checksum, a length that does not fit. Pure functions
+from bytes to numbers.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping, Sequence
 from typing import Literal
+
+from pymodbus.framer import FramerRTU, FramerSocket
+from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
+from pymodbus.pdu.register_message import (
+    ReadHoldingRegistersRequest,
+    ReadHoldingRegistersResponse,
+    ReadInputRegistersRequest,
+    ReadInputRegistersResponse,
+    WriteMultipleRegistersRequest,
+    WriteMultipleRegistersResponse,
+    WriteSingleRegisterRequest,
+    WriteSingleRegisterResponse,
+)
 
 from errormotion.errors import InstrumentError, ProtocolError
 
@@ -29,22 +43,35 @@ WRITE_ONE, WRITE_SEVERAL = 6, 16
 MAX_WRITTEN = 123
 """Largest number of registers in one request of function 16."""
 _HEAD = 7  # bytes of an MBAP header
+_SHORTEST = 5  # bytes of the shortest RTU answer, a refusal
 _MAX_MBAP_LENGTH = 254  # bytes after its length field
+_DECODER = DecodePDU(is_server=False)
+_FRAMERS = {"tcp": FramerSocket(_DECODER), "rtu": FramerRTU(_DECODER)}
+_READS: Mapping[int, tuple[type[ModbusPDU], type[ModbusPDU]]] = {
+    3: (ReadHoldingRegistersRequest, ReadHoldingRegistersResponse),
+    4: (ReadInputRegistersRequest, ReadInputRegistersResponse),
+}
+_KNOWN = (*_READS, WRITE_ONE, WRITE_SEVERAL)
 
 
 def crc16(data: bytes) -> bytes:
-    """Return the checksum of an RTU frame, as it follows the frame: low byte first (polynomial A001, start FFFF)."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
-    return crc.to_bytes(2, "little")
+    """Return the checksum of an RTU frame, as it follows the frame: low byte first."""
+    return FramerRTU.compute_CRC(data).to_bytes(2, "big")  # pymodbus swaps the bytes
 
 
 def encode_request(framing: Framing, unit: int, function: int, register: int, count: int, number: int = 0) -> bytes:
-    """Return the request for ``count`` registers from ``register`` on; ``number`` identifies a TCP transaction."""
-    return _frame(framing, unit, struct.pack(">BHH", function, register, count), number)
+    """Return the request for ``count`` registers from ``register`` on; ``number`` identifies a TCP transaction.
+
+    Raises
+    ------
+    ValueError
+        The function does not read registers, or not this number of them.
+    """
+    if function not in _READS:
+        raise ValueError(f"function {function} does not read registers")
+    return _FRAMERS[framing].buildFrame(
+        _READS[function][0](address=register, count=count, dev_id=unit, transaction_id=number)
+    )
 
 
 def encode_write(
@@ -59,35 +86,33 @@ def encode_write(
     """
     count = len(values)
     if function == WRITE_ONE and count == 1:
-        pdu = struct.pack(">BHH", function, register, values[0])
+        kind: type[ModbusPDU] = WriteSingleRegisterRequest
     elif function == WRITE_SEVERAL and 1 <= count <= MAX_WRITTEN:
-        pdu = struct.pack(f">BHHB{count}H", function, register, count, 2 * count, *values)
+        kind = WriteMultipleRegistersRequest
     else:
         raise ValueError(f"function {function} does not write {count} registers")
-    return _frame(framing, unit, pdu, number)
+    return _FRAMERS[framing].buildFrame(
+        kind(address=register, registers=list(values), dev_id=unit, transaction_id=number)
+    )
 
 
 def encode_answer(framing: Framing, unit: int, function: int, registers: Sequence[int], number: int = 0) -> bytes:
     """Return the answer with these registers."""
-    pdu = struct.pack(f">BB{len(registers)}H", function, 2 * len(registers), *registers)
-    return _frame(framing, unit, pdu, number)
-
-
-def _frame(framing: Framing, unit: int, pdu: bytes, number: int) -> bytes:
-    if framing == "rtu":
-        body = bytes((unit,)) + pdu
-        return body + crc16(body)
-    return struct.pack(">HHHB", number, 0, len(pdu) + 1, unit) + pdu
+    return _FRAMERS[framing].buildFrame(
+        _READS[function][1](registers=list(registers), dev_id=unit, transaction_id=number)
+    )
 
 
 def missing(framing: Framing, data: bytes) -> int:
     """Return the number of bytes that an incomplete answer still needs, as far as known from its start."""
     if framing == "rtu":
-        size = 5 if len(data) < 3 or data[1] & 0x80 else 8 if data[1] in (WRITE_ONE, WRITE_SEVERAL) else 5 + data[2]
+        size = _SHORTEST
+        if len(data) >= 2 and data[1] & 0x7F in _KNOWN and (kind := _DECODER.lookupPduClass(data)) is not None:
+            size = kind.calculateRtuFrameSize(data) or _SHORTEST
     elif len(data) < _HEAD - 1:
         size = _HEAD + 2
     else:
-        protocol, length = struct.unpack(">HH", data[2:6])
+        protocol, length = _head(data)[1:3]
         valid = not protocol and length <= _MAX_MBAP_LENGTH
         size = 6 + length if valid else 0  # no further bytes are expected without a header
     return max(size - len(data), 0)
@@ -110,7 +135,7 @@ def decode_answer(
         return None
     if pdu[1] != 2 * count or len(pdu) != 2 + 2 * count:
         raise ProtocolError(f"Expected {count} registers; found {len(pdu) - 2} bytes: {_hex(data)}")
-    return list(struct.unpack(f">{count}H", pdu[2:]))
+    return list(_decoded(pdu, data).registers)
 
 
 def decode_written(
@@ -128,9 +153,12 @@ def decode_written(
     pdu = _pdu(framing, data, unit, function, number)
     if pdu is None:
         return None
-    expected = struct.pack(">BHH", function, register, values[0] if function == WRITE_ONE else len(values))
-    if pdu != expected:
-        raise ProtocolError(f"Expected the confirmation {expected.hex(' ')}; found {_hex(data)}")
+    expected: ModbusPDU = WriteMultipleRegistersResponse(address=register, count=len(values))
+    if function == WRITE_ONE:
+        expected = WriteSingleRegisterResponse(address=register, registers=list(values))
+    confirmation = bytes((function,)) + expected.encode()
+    if pdu != confirmation:
+        raise ProtocolError(f"Expected the confirmation {confirmation.hex(' ')}; found {_hex(data)}")
     return list(values)
 
 
@@ -157,26 +185,37 @@ def _pdu(framing: Framing, data: bytes, unit: int, function: int, number: int) -
     if answered != unit:
         raise ProtocolError(f"Expected an answer of unit {unit}; found that of unit {answered}: {_hex(data)}")
     if pdu[0] == function | 0x80 and len(pdu) == 2:
-        raise ModbusRefusal(pdu[1], f"Function {function} of unit {unit}")
+        refusal = _decoded(pdu, data)
+        assert isinstance(refusal, ExceptionResponse)
+        raise ModbusRefusal(refusal.exception_code, f"Function {function} of unit {unit}")
     if pdu[0] != function:
         raise ProtocolError(f"Expected an answer to function {function}; found {_hex(data)}")
     return pdu
 
 
+def _decoded(pdu: bytes, data: bytes) -> ModbusPDU:
+    """Return the content of an answer whose length has been checked."""
+    found = _DECODER.decode(pdu)
+    if found is None:
+        raise ProtocolError(f"Expected an answer of Modbus; found {_hex(data)}")
+    return found
+
+
 def _unframed_rtu(data: bytes) -> tuple[int, bytes]:
-    if len(data) < 5:
-        raise ProtocolError(f"Expected a Modbus answer of at least 5 bytes; found {data.hex(' ') or 'nothing'}")
-    if data[-2:] != (expected := crc16(data[:-2])):
+    if len(data) < _SHORTEST:
         raise ProtocolError(
-            f"The answer {_hex(data)} has the checksum {data[-2:].hex(' ')}; expected {expected.hex(' ')}"
+            f"Expected a Modbus answer of at least {_SHORTEST} bytes; found {data.hex(' ') or 'nothing'}"
         )
+    if not FramerRTU.check_CRC(data[:-2], int.from_bytes(data[-2:], "big")):
+        expected = crc16(data[:-2]).hex(" ")
+        raise ProtocolError(f"The answer {_hex(data)} has the checksum {data[-2:].hex(' ')}; expected {expected}")
     return data[0], data[1:-2]
 
 
 def _unframed_tcp(data: bytes, number: int) -> tuple[int, bytes] | None:
     if len(data) < _HEAD + 2:
         raise ProtocolError(f"Expected a Modbus answer of at least {_HEAD + 2} bytes; found {data.hex(' ')}")
-    answered, protocol, length, unit = struct.unpack(">HHHB", data[:_HEAD])
+    (answered, protocol, length), unit = _head(data), data[_HEAD - 1]
     if protocol or length != len(data) - 6:
         raise ProtocolError(f"Expected the header of a Modbus answer; found {_hex(data)}")
     if answered != number:
@@ -184,6 +223,12 @@ def _unframed_tcp(data: bytes, number: int) -> tuple[int, bytes] | None:
             return None
         raise ProtocolError(f"Expected the answer to transaction {number}; found that to {answered}")
     return unit, data[_HEAD:]
+
+
+def _head(data: bytes) -> tuple[int, int, int]:
+    """Return transaction, protocol and length of an MBAP header."""
+    first, second, third = (int.from_bytes(data[i : i + 2], "big") for i in (0, 2, 4))
+    return first, second, third
 
 
 def _hex(data: bytes) -> str:
