@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
+import itertools
 import os
+import re
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -15,7 +18,7 @@ from errormotion.compensation.program.interpreter.screening import screen
 from errormotion.compensation.program.reading.frames import Triple
 from errormotion.compensation.program.reading.offsets import Offsets
 from errormotion.compensation.program.reading.reader import Reader
-from errormotion.compensation.program.reading.words import MAX_LINE, lines_of
+from errormotion.compensation.program.reading.words import MAX_LINE, BlockError, is_title, lines_of, refusal
 from errormotion.compensation.program.writing.dividing import Correcting
 from errormotion.compensation.program.writing.rewriting import Rewriting, Summary
 from errormotion.datasets.files.reading import require_regular
@@ -28,6 +31,8 @@ ROUTES = ("auto", "plain", "interpreter")
 """Reader of the program: the plain reader and, for unsupported programs, LinuxCNC's interpreter, or only one."""
 
 _COMMENT = 70  # characters
+_UTF8 = codecs.BOM_UTF8.decode("latin-1")
+_SUBROUTINE = re.compile(r"\s*/?\s*(?:[nN]\s*\d+\s*)?[oO]")
 
 
 @dataclass(frozen=True)
@@ -126,26 +131,25 @@ def compensate(
                     raise
                 why = str(error)
         try:
-            expanded = _expanded(program, offsets, chosen)
-            return _written(program, expanded, beside, out, correcting, offsets, chosen, head, why)
+            if chosen.unit != "mm":
+                raise ProgramError("LinuxCNC's interpreter starts in mm: state the unit in the program (G20)")
+            source = [text for _, text in lines_of(_lines(program))]
+            screen(source)
+            return _written(program, source, beside, out, correcting, offsets, chosen, head, why)
         except ProgramError as error:
             raise ProgramError(f"{error}" + (f"\nThe plain reader: {why}" if why else "")) from error
     finally:
         beside.unlink(missing_ok=True)
 
 
-def _expanded(program: Path, offsets: Offsets, settings: Settings) -> Generator[str]:
-    if settings.unit != "mm":
-        raise ProgramError("LinuxCNC's interpreter starts in mm: state the unit in the program (G20)")
-    source = [text for _, text in lines_of(_lines(program))]
-    screen(source)
+def _expanded(source: list[str], expansion: Expansion, offsets: Offsets, settings: Settings) -> Generator[str]:
     with closing(canonical.commands(source, offsets, deleted=settings.deleted)) as commands:
-        yield from Expansion(source, offsets, settings.tolerance).lines(commands)
+        yield from expansion.lines(commands)
 
 
 def _written(
     program: Path,
-    expanded: Generator[str] | None,
+    source: list[str] | None,
     beside: Path,
     out: Path,
     correcting: Correcting,
@@ -154,34 +158,59 @@ def _written(
     head: Sequence[str],
     why: str,
 ) -> Outcome:
-    unit = settings.unit if expanded is None else "mm"
+    """Write the corrected program of a file, or of lines that the interpreter expands."""
+    unit = settings.unit if source is None else "mm"
     reader = Reader(offsets, unit=unit, start=settings.start, deleted=settings.deleted)
     rewriting = Rewriting(reader, correcting, tolerance=settings.tolerance, step=settings.step)
-    source = _lines(program) if expanded is None else expanded
+    expansion = None if source is None else Expansion(source, offsets, settings.tolerance)
+    lines = _lines(program) if expansion is None else _expanded(source or [], expansion, offsets, settings)
     end = _line_end(program)
-    with closing(source), beside.open("w", encoding="latin-1", newline="") as file:
-        for text in _with_head(rewriting.lines(source), head):
-            file.write(text + end)
+    try:
+        with closing(lines), beside.open("w", encoding=_written_as(program), newline="") as file:
+            for text in _with_head(rewriting.lines(lines), head):
+                file.write(text + end)
+    except BlockError as error:
+        if source is None or not error.line:
+            raise
+        raise refusal(error.line, source[error.line - 1], error.why) from error
+    if expansion is not None and source is not None:
+        rewriting.summary.after_end = _after_end(source, expansion.end)
     checked = 0
     if settings.check:
         with beside.open(encoding="latin-1", newline="") as file:
             new = [text for _, text in lines_of(file)]
-        checked = agreement.check(
-            new, offsets, Reader(offsets, unit=unit, start=settings.start, deleted=settings.deleted)
-        )
+        try:
+            checked = agreement.check(
+                new, offsets, Reader(offsets, unit=unit, start=settings.start, deleted=settings.deleted)
+            )
+        except ProgramError as error:
+            raise ProgramError(f"the check of the new program: {error}") from error
     os.replace(beside, out)
-    return Outcome(rewriting.summary, "plain" if expanded is None else "interpreter", why, checked, _digest(program))
+    return Outcome(rewriting.summary, "plain" if source is None else "interpreter", why, checked, _digest(program))
+
+
+def _after_end(source: list[str], end: int) -> tuple[int, int]:
+    """Return number and first of the lines that follow the end of an expanded program, except subroutines."""
+    first = next((number for number, text in enumerate(source, 1) if text.strip()), 0)
+    marks = [number for number, text in enumerate(source, 1) if text.strip() == "%" and number > first]
+    ends = ([end] if end else []) + marks[:1]
+    if not ends:
+        return 0, 0
+    after = enumerate(source[min(ends) :], min(ends) + 1)
+    main = itertools.takewhile(lambda each: not _SUBROUTINE.match(each[1]), after)
+    left = [number for number, text in main if text.strip() not in ("", "%")]
+    return len(left), left[0] if left else 0
 
 
 def _with_head(lines: Iterable[str], head: Sequence[str]) -> Iterator[str]:
-    """Yield lines with comments before the first, or after it if it is ``%``."""
-    comments = [f"({_plain(sentence)})" for sentence in head]
-    for number, text in enumerate(lines):
-        if number == 0 and text.strip() != "%":
+    """Yield lines with comments before the first block, after ``%`` and the number of the program."""
+    comments: list[str] = [f"({_plain(sentence)})" for sentence in head]
+    for text in lines:
+        if comments and text.strip() not in ("", "%") and not is_title(text):
             yield from comments
+            comments = []
         yield text
-        if number == 0 and text.strip() == "%":
-            yield from comments
+    yield from comments
 
 
 def _plain(sentence: str) -> str:
@@ -191,15 +220,31 @@ def _plain(sentence: str) -> str:
 
 
 def _lines(path: Path) -> Generator[str]:
-    """Yield the lines of a file, read up to a length that `lines_of` rejects."""
-    with path.open(encoding="latin-1", newline="") as file:
-        while line := file.readline(MAX_LINE + 3):
-            yield line
+    """Yield the lines of a file without a byte order mark, read up to a length that `lines_of` rejects."""
+    try:
+        with path.open(encoding=_encoding(path), newline="") as file:
+            if _encoding(path) == "latin-1" and file.read(len(_UTF8)) != _UTF8:
+                file.seek(0)
+            while line := file.readline(MAX_LINE + 3):
+                yield line
+    except UnicodeDecodeError as error:
+        raise ProgramError(f"{path}: expected text in UTF-16, as its byte order mark states: {error.reason}") from None
+
+
+def _encoding(path: Path) -> str:
+    """Return the encoding of a program: latin-1, whose characters are bytes, or UTF-16 with its mark."""
+    with path.open("rb") as file:
+        return "utf-16" if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "latin-1"
+
+
+def _written_as(path: Path) -> str:
+    """Return the encoding of the new program, which LinuxCNC reads."""
+    return "utf-8" if _encoding(path) == "utf-16" else "latin-1"
 
 
 def _line_end(path: Path) -> str:
-    with path.open("rb") as file:
-        return "\r\n" if b"\r\n" in file.read(4096) else "\n"
+    with path.open(encoding=_encoding(path), errors="replace", newline="") as file:
+        return "\r\n" if "\r\n" in file.read(4096) else "\n"
 
 
 def _digest(path: Path) -> str:

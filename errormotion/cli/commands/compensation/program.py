@@ -18,7 +18,8 @@ from errormotion.cli.output import show, show_json
 from errormotion.cli.page import Page
 from errormotion.compensation.correction import Correction, correction
 from errormotion.compensation.program import UNCHANGED, ByTool, Offsets, Outcome, Settings, compensate
-from errormotion.compensation.program.reading.offsets import read_parameters, read_tools
+from errormotion.compensation.program.reading.offsets import read_parameters
+from errormotion.compensation.program.reading.tools import read_table
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import DatasetError, ProgramError
@@ -104,10 +105,10 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
                 settings,
                 program=part.name,
                 uncertainty=uncertainty,
-                notes=found.notes,
+                notes=(*offsets.notes, *found.notes),
                 form=choice.page.form,
             )
-    _show(target, outcome, found, expanded, time, choice, as_json)
+    _show(target, outcome, (*offsets.notes, *found.notes), expanded, time, choice, as_json)
 
 
 def _correction(sources: list[Any], choice: Choice) -> Correction:
@@ -124,11 +125,11 @@ def _last(found: Correction) -> float:
 
 def _offsets(choice: Choice) -> Offsets:
     unit = _one_of("--machine-unit", choice.machine_unit, ("mm", "inch"))
-    offsets = Offsets() if choice.parameters is None else read_parameters(choice.parameters, unit)
+    offsets = Offsets(unit=unit) if choice.parameters is None else read_parameters(choice.parameters, unit)
     for name, origin in choice.origins:
         offsets = offsets.with_system(name, origin)
     if choice.tools is not None:
-        offsets.tools.update(read_tools(choice.tools, unit))
+        offsets = offsets.with_tools(read_table(choice.tools, unit))
     return offsets
 
 
@@ -150,7 +151,7 @@ def _head(
 def _show(
     target: Path,
     outcome: Outcome,
-    found: Correction,
+    notes: tuple[str, ...],
     expanded: np.ndarray,
     time: float | None,
     choice: Choice,
@@ -178,7 +179,11 @@ def _show(
         counted = {name: {"number": count, "first_line": line} for name, (count, line) in summary.unchanged.items()}
         more = {
             name: {"number": value[0], "first_line": value[1]}
-            for name, value in (("outside", summary.outside), ("uncorrected", summary.uncorrected))
+            for name, value in (
+                ("outside", summary.outside),
+                ("uncorrected", summary.uncorrected),
+                ("after_end", summary.after_end),
+            )
         }
         page = {}
         if choice.page is not None:
@@ -192,7 +197,7 @@ def _show(
                 "checked": outcome.checked,
             }
             | figures
-            | {"left": counted, **more, "uncertainty": uncertainty, "time": time, "notes": list(found.notes)}
+            | {"left": counted, **more, "uncertainty": uncertainty, "time": time, "notes": list(notes)}
             | page
         )
         return
@@ -213,7 +218,10 @@ def _show(
     if summary.outside[0]:
         count, line = summary.outside
         show(f"  WARNING: {count} moves outside the measured range, the first in line {line}: corrected as at its edge")
-    for note in found.notes:
+    if summary.after_end[0]:
+        count, line = summary.after_end
+        show(f"  not corrected: {count} lines after the end of the program, the first is line {line}")
+    for note in notes:
         show(f"  note: {note}")
     for path in choice.page.files if choice.page is not None else ():
         show(str(path))

@@ -8,7 +8,7 @@ from contextlib import closing
 
 from errormotion.compensation.program.interpreter.canonical import Command, commands
 from errormotion.compensation.program.reading.arcs import SMALL
-from errormotion.compensation.program.reading.items import COUNTERCLOCKWISE, LINE, PLANES, RAPID, Move, Unchanged
+from errormotion.compensation.program.reading.items import COUNTERCLOCKWISE, LINE, PLANES, RAPID, Move, Text, Unchanged
 from errormotion.compensation.program.reading.offsets import Offsets
 from errormotion.compensation.program.reading.reader import Reader
 from errormotion.errors import ProgramError
@@ -35,6 +35,7 @@ def check(source: Sequence[str], offsets: Offsets, reader: Reader) -> int:
     ProgramError
         The interpreter reports an error in a line, or its move differs.
     """
+    source = [str(text) for text in source]  # lines are counted here, not where they come from
     left: set[int] = set()
     moves = _moves(reader, source, left)
     count = 0
@@ -65,8 +66,8 @@ def check(source: Sequence[str], offsets: Offsets, reader: Reader) -> int:
 
 def _moves(reader: Reader, source: Iterable[str], left: set[int]) -> Iterator[Move]:
     for number, item in enumerate(reader.items(source), 1):
-        if isinstance(item, Unchanged):
-            left.add(number)
+        if isinstance(item, Unchanged) or (isinstance(item, Text) and item.motion is not None):
+            left.add(number)  # a motion without a position is a move of no length for the interpreter
         elif isinstance(item, Move):
             yield item
 

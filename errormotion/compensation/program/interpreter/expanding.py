@@ -15,6 +15,7 @@ from errormotion.compensation.program.interpreter.canonical import Command, own_
 from errormotion.compensation.program.reading.frames import Frame, Triple
 from errormotion.compensation.program.reading.items import PLANES
 from errormotion.compensation.program.reading.offsets import SYSTEMS, UNITS, Offsets
+from errormotion.compensation.program.reading.words import SourceLine, refusal
 from errormotion.errors import ProgramError
 
 _DIGIT = 5e-5  # half of the last digit that the interpreter prints
@@ -24,8 +25,11 @@ _HEIGHT = re.compile(r"H\s*(\d+)(?![.\d\[#])")
 _IN_MACHINE = re.compile(r"G\s*(53|28|30)(?![.\d])")
 _END = re.compile(r"M\s*0*(2|30)(?![.\d])")
 _STATED = re.compile(r"G\s*10(?![.\d])")
-_IN_ORDER = re.compile(r"\[[^\]]*\]|#<[^>]*>")  # expressions and names, which may contain the letters of axes
+_IN_ORDER = re.compile(r"\[[^\]]*\]|#\s*<[^>]*>")  # expressions and names, which may contain the letters of axes
+_NAMES = re.compile(r"#\s*<[^>]*>")
 _COMMENT = re.compile(r"\([^()]*\)|;.*")
+_FAR = 1e5
+"""Largest coordinate, m; larger ones follow from a value that is unknown."""
 _WORDS = {
     "MIST_ON": "M7",
     "FLOOD_ON": "M8",
@@ -77,6 +81,11 @@ class Expansion:
         Offsets of the interpreter.
     tolerance : float
         m; checked for inches, whose last digit printed by the interpreter is larger than most tolerances.
+
+    Attributes
+    ----------
+    end : int
+        Line of the end of the program (M2, M30) once it was expanded; 0: none.
     """
 
     def __init__(self, source: Sequence[str], offsets: Offsets, tolerance: float) -> None:
@@ -94,11 +103,13 @@ class Expansion:
         self._at = self._frame.program((0.0, 0.0, 0.0))  # where the interpreter starts
         self._plane = 0
         self._numbered = 0
+        self._line = 0
+        self.end = 0
         self._begun = False
         self._changing = False
         self._blend = ""
         self._known = [False] * 3
-        self._incremental = False
+        self._incremental = self._homing = False
         self._handlers: dict[str, Callable[[Command], list[str]]] = {
             "USE_LENGTH_UNITS": self._units,
             "SELECT_PLANE": self._select,
@@ -133,8 +144,8 @@ class Expansion:
         ProgramError
             A command without a block.
         """
-        yield "%"
-        yield "G21 G90 G17 G94 G40 G49 G91.1"
+        yield SourceLine("%", 0)
+        yield SourceLine("G21 G90 G17 G94 G40 G49 G91.1", 0)
         ended = False
         for command in commands:
             if ended:
@@ -144,6 +155,7 @@ class Expansion:
                 continue
             if command.name == "PROGRAM_END":
                 ended = True
+                self.end = command.line
                 yield self._with_number(command, "M30" if "30" in self._text(command) else "M2")
                 continue
             if command.name in _RESET and _END.search(self._text(command)):
@@ -151,8 +163,8 @@ class Expansion:
             for text in self._blocks(command):
                 yield self._with_number(command, text)
         if not ended:
-            yield "M2"
-        yield "%"
+            yield SourceLine("M2", self._line)
+        yield SourceLine("%", self._line)
 
     def _blocks(self, command: Command) -> list[str]:
         name = command.name
@@ -174,17 +186,19 @@ class Expansion:
             return ""
         return _COMMENT.sub(" ", self._source[command.line - 1]).upper()
 
-    def _with_number(self, command: Command, text: str) -> str:
+    def _with_number(self, command: Command, text: str) -> SourceLine:
+        self._line = command.line or self._line
         if command.line and command.line != self._numbered:
             self._numbered = command.line
             number, _ = own_number(self._source[command.line - 1])
             if number:
-                return f"N{number} {text}"
-        return text
+                text = f"N{number} {text}"
+        return SourceLine(text, self._line)
 
     def _refusal(self, command: Command, why: str) -> ProgramError:
-        where = f"line {command.line} '{self._text(command).strip()[:60]}'" if command.line else "a subroutine"
-        return ProgramError(f"{where}: {why}")
+        if command.line:
+            return refusal(command.line, self._source[command.line - 1], why)
+        return ProgramError(f"a control word (O) after line {self._line}: {why}")
 
     def _units(self, command: Command) -> list[str]:
         unit = "inch" if "INCH" in command.text else "mm"
@@ -254,7 +268,7 @@ class Expansion:
         x, y, z = self._three(command, command.numbers())
         scale = self._frame.scale
         new = (x * scale, y * scale, z * scale)
-        text = self._text(command)
+        text = _NAMES.sub(" ", self._text(command))
         number = _HEIGHT.search(text)
         if _TOOL.search(text) and number is not None:
             if int(number[1]) in self._offsets.tools:
@@ -320,6 +334,8 @@ class Expansion:
         The interpreter starts at zero, and assumes that a probing move reaches its end: the position of an axis is
         unknown until it is moved to a stated position.
         """
+        if any(not abs(value) * self._frame.scale <= _FAR for value in new):
+            raise self._refusal(command, "moves too far: the size of the tool or another value is unknown")
         text = "" if all(self._known) else _IN_ORDER.sub(" ", self._text(command))
         words = []
         for k, axis in enumerate("XYZ"):
@@ -346,17 +362,36 @@ class Expansion:
 
     def _in_machine(self, command: Command, new: Triple, code: str) -> list[str]:
         """Return the block of G53, G28 or G30, a move to a position in machine coordinates."""
-        if code != "53" and any(v != v for v in self._offsets.homes[0 if code == "28" else 1]):
-            raise self._refusal(command, f"the position of G{code} is unknown: state --parameters")
-        if any(v != v for v in self._systems[self._system]) or self._frame.rotation:
-            raise self._refusal(command, "a position in machine coordinates with an unknown or rotated work offset")
+        if self._frame.rotation:
+            raise self._refusal(command, "a position in machine coordinates with a rotated work offset")
         text = _IN_ORDER.sub(" ", self._text(command))
-        axes = [k for k in range(3) if "XYZ"[k] in text] or [0, 1, 2]
+        axes = [k for k in range(3) if "XYZ"[k] in text]
+        if code != "53":
+            return self._home(new, code, axes)
+        if any(v != v for v in self._systems[self._system]):
+            raise self._refusal(command, "a position in machine coordinates with an unknown work offset")
         place = self._frame.machine(new)
         for k in axes:
             self._known[k] = True
         self._at = new
         return ["G53 G0 " + " ".join(f"{'XYZ'[k]}{place[k] / self._frame.scale:.4f}" for k in axes)]
+
+    def _home(self, new: Triple, code: str, axes: list[int]) -> list[str]:
+        """Return the blocks of G28 or G30, which the interpreter prints as two moves: to a position, and from there.
+
+        The position may be an increment from one that is unknown.
+        """
+        old, self._at = self._at, new
+        self._homing = not self._homing
+        if not self._homing:
+            home = self._offsets.homes[0 if code == "28" else 1]
+            origin = self._systems[self._system]
+            for k in axes or range(3):
+                self._known[k] = home[k] == home[k] and origin[k] == origin[k]
+            return []
+        base = old if self._incremental else (0.0, 0.0, 0.0)
+        block = " ".join([f"G{code}", *(f"{'XYZ'[k]}{new[k] - base[k]:.4f}" for k in axes)])
+        return ["G91", block, "G90"] if self._incremental and axes else [block]
 
     def _probe(self, command: Command) -> list[str]:
         found = _PROBE.search(self._text(command))

@@ -1,4 +1,4 @@
-"""Detection of codes whose effect the interpreter does not print, and of values of the running machine.
+"""Detection of codes whose effect the interpreter does not print.
 
 Every other code than those with plain code raises an error with its line, whether it is executed or not.
 """
@@ -15,17 +15,13 @@ _G = {
     *(81, 82, 83, 84, 85, 86, 87, 88, 89, 90, 91, 92, 93, 94, 95, 97, 98, 99, 38.2, 38.3, 38.4, 38.5, 41.1, 42.1),
     *(43.1, 59.1, 59.2, 59.3, 61.1, 90.1, 91.1, 92.1, 92.2, 92.3),
 }
-_M = {*range(10), 19, 30, *range(48, 54), *range(60, 66), 67, 68}
+_M = {*range(10), 19, 30, *range(48, 54), *range(60, 66), 67, 68, 98, 99}
 _COMMENT = re.compile(r"\(([^()]*)\)|;.*")
 _LOST = re.compile(r"\s*(PRINT|LOG\w*)\s*,?", re.IGNORECASE)
 _INSIDE = re.compile(r"\[[^\[\]]*\]")
 _NAME = re.compile(r"#\s*<[^<>]*>")
 _CODE = re.compile(r"([GM])\s*(\d*\.?\d*)")
 _CONTROL = re.compile(r"^\s*/?\s*(N\s*\d+)?\s*O", re.IGNORECASE)
-_OF_MACHINE = re.compile(r"#\s*(50[6]\d|5070|5399|54[23]\d)(?!\d)|#\s*<\s*_(hal|[xyzabcuvw]|abs_\w+)\b", re.IGNORECASE)
-_STORED = re.compile(r"#\s*5[0-4]\d\d\s*=")
-_INDIRECT = re.compile(r"#\s*[#\[]")
-_PROBE = re.compile(r"G\s*38", re.IGNORECASE)
 
 
 def screen(source: Iterable[str]) -> None:
@@ -36,24 +32,13 @@ def screen(source: Iterable[str]) -> None:
     ProgramError
         The message contains the number of the line.
     """
-    probing = False
-    indirect: tuple[int, str] | None = None
     for line, text in enumerate(source, 1):
         for comment in _COMMENT.finditer(text):
             if comment[1] and _LOST.match(comment[1]):
                 raise refusal(line, text, "prints or logs values, which are unknown before the program runs")
         plain = _COMMENT.sub(" ", text)
-        if _OF_MACHINE.search(plain):
-            raise refusal(line, text, "a parameter that the running machine sets (position, probe, input)")
-        if _STORED.search(plain):
-            raise refusal(line, text, "sets a parameter of the control")
-        if _INDIRECT.search(plain):
-            indirect = indirect or (line, text)
-        probing = probing or bool(_PROBE.search(plain))
         if not _CONTROL.match(plain):
             _codes(line, text, plain)
-        if probing and indirect is not None:
-            raise refusal(*indirect, "a parameter with a computed number, in a program that probes")
 
 
 def _codes(line: int, text: str, plain: str) -> None:

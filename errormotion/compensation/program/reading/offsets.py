@@ -1,4 +1,4 @@
-"""Work offsets, tools and reference positions of a control: LinuxCNC parameter files (.var) and tool tables (.tbl).
+"""State of a control before a program starts: work offsets, parameters, tools; LinuxCNC parameter files (.var).
 
 Unknown values are NaN; a cut that depends on them raises an error.
 """
@@ -13,18 +13,18 @@ from pathlib import Path
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.datasets.files.reading import require_regular
+from errormotion.compensation.program.reading.files import UNITS as UNITS
+from errormotion.compensation.program.reading.files import text_of
+from errormotion.compensation.program.reading.tools import Cutter, Table
+from errormotion.compensation.program.reading.tools import read_tools as read_tools
 from errormotion.errors import ProgramError
 
 SYSTEMS = ("G54", "G55", "G56", "G57", "G58", "G59", "G59.1", "G59.2", "G59.3")
-UNITS = {"mm": 1e-3, "inch": 25.4e-3}
-"""Lengths of the units of programs, m."""
-
-MAX_FILE = 1 << 20
-"""Maximum size of a parameter file or tool table, bytes."""
+LAST_PARAMETER = 5602
+"""Largest number of a parameter of LinuxCNC."""
 
 _FIRST = 5221  # X of G54; the other systems follow at intervals of 20, the rotation follows 9 after
-_TOOL = re.compile(r"([TPXYZABCUVWDIJQ])\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)", re.IGNORECASE)
+_LINE = re.compile(r"\s*(\d{1,5})\s+([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?!\S)")
 
 
 @dataclass(frozen=True)
@@ -38,21 +38,43 @@ class Offsets:
     rotations : array (9,)
         About Z, degrees.
     g92 : array (3,)
-        Offset of G92, m.
+        Offset of G92 that is active, m.
+    stored : array (3,)
+        Offset that G92.3 makes active, m.
     homes : array (2, 3)
         Positions of G28 and G30 in machine coordinates, m.
     tools : mapping of int to array (3,)
         Offset of each tool, m; X, Y, Z.
+    cutters : mapping of int to Cutter
+        The other columns of the tool table.
     system : int
         Index of the active system, 0 for G54.
+    unit : str
+        ``mm`` or ``inch``: the unit of the machine and of its parameters.
+    parameters : mapping of int to float
+        Parameters that are stated, in units of the machine.
+    table : str
+        The tool table as it is in its file; empty: `tools` and `cutters` do not come from a file.
+    notes : tuple of str
+        What differs from the look of the files.
     """
 
     systems: Array = field(default_factory=lambda: np.full((9, 3), math.nan))
     rotations: Array = field(default_factory=lambda: np.zeros(9))
     g92: Array = field(default_factory=lambda: np.zeros(3))
+    stored: Array = field(default_factory=lambda: np.full(3, math.nan))
     homes: Array = field(default_factory=lambda: np.full((2, 3), math.nan))
     tools: dict[int, Array] = field(default_factory=dict)
+    cutters: dict[int, Cutter] = field(default_factory=dict)
     system: int = 0
+    unit: str = "mm"
+    parameters: dict[int, float] = field(default_factory=dict)
+    table: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if np.any(self.g92) and np.isnan(self.stored).all():
+            object.__setattr__(self, "stored", self.g92)
 
     def with_system(self, name: str, origin: tuple[float, float, float]) -> Offsets:
         """Return the offsets with another origin of one system, m."""
@@ -61,6 +83,16 @@ class Offsets:
         systems = self.systems.copy()
         systems[SYSTEMS.index(name.upper())] = origin
         return replace(self, systems=systems)
+
+    def with_tools(self, table: Table) -> Offsets:
+        """Return the offsets with the tools of a table."""
+        return replace(
+            self,
+            tools=table.offsets,
+            cutters=table.cutters,
+            table=table.text,
+            notes=(*self.notes, *table.notes),
+        )
 
 
 def read_parameters(path: Path, unit: str = "mm") -> Offsets:
@@ -80,16 +112,20 @@ def read_parameters(path: Path, unit: str = "mm") -> Offsets:
     """
     scale = UNITS[unit]
     values: dict[int, float] = {}
-    for number, line in enumerate(_lines(path), 1):
-        words = line.split()
-        if not words:
+    for number, line in enumerate(text_of(path).splitlines(), 1):
+        if not line.strip():
             continue
-        try:
-            key, value = int(words[0]), float(words[1])
-        except (ValueError, IndexError):
-            raise ProgramError(f"{path}, line {number}: expected a number and a value; found '{line[:40]}'") from None
+        found = _LINE.match(line)
+        if found is None:
+            raise ProgramError(f"{path}, line {number}: expected a number and a value; found '{line[:40]}'")
+        key, value = int(found[1]), float(found[2])
+        if not 0 < key <= LAST_PARAMETER or key in values:
+            raise ProgramError(
+                f"{path}, line {number}: expected a parameter from 1 to {LAST_PARAMETER} that no other line states; "
+                f"found {key}"
+            )
         if not math.isfinite(value):
-            raise ProgramError(f"{path}, line {number}: expected a finite value; found '{words[1][:40]}'")
+            raise ProgramError(f"{path}, line {number}: expected a finite value; found '{found[2][:40]}'")
         values[key] = value
 
     def three(first: int) -> list[float]:
@@ -102,41 +138,10 @@ def read_parameters(path: Path, unit: str = "mm") -> Offsets:
     return Offsets(
         systems=np.array([three(start) for start in starts]),
         rotations=np.array([values.get(start + 9, 0.0) for start in starts]),
-        g92=np.nan_to_num(three(5211)) if values.get(5210) else np.zeros(3),
+        g92=np.array(three(5211)) if values.get(5210) else np.zeros(3),
+        stored=np.array(three(5211)),
         homes=np.array([three(5161), three(5181)]),
         system=int(active) - 1,
+        unit=unit,
+        parameters=values,
     )
-
-
-def read_tools(path: Path, unit: str = "mm") -> dict[int, Array]:
-    """Return the offsets of the tools of a LinuxCNC tool table, m.
-
-    Raises
-    ------
-    ProgramError
-        Not such a file.
-    """
-    tools: dict[int, Array] = {}
-    for number, line in enumerate(_lines(path), 1):
-        plain = line.partition(";")[0].strip()
-        if not plain:
-            continue
-        words = {letter.upper(): float(value) for letter, value in _TOOL.findall(plain)}
-        if _TOOL.sub("", plain).strip() or "T" not in words:
-            raise ProgramError(f"{path}, line {number}: expected a tool, such as 'T1 P1 Z80.25'; found '{line[:40]}'")
-        offset = UNITS[unit] * np.array([words.get(axis, 0.0) for axis in "XYZ"])
-        if not np.isfinite(offset).all():
-            raise ProgramError(f"{path}, line {number}: expected finite offsets; found '{line[:40]}'")
-        tools[int(words["T"])] = offset
-    return tools
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        if require_regular(path).st_size > MAX_FILE:
-            raise ProgramError(f"{path}: expected a file of at most {MAX_FILE} bytes")
-        return path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise ProgramError(f"{path} cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise ProgramError(f"{path}: expected text; found other bytes at {error.start}") from None

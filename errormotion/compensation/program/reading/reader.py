@@ -14,7 +14,7 @@ from errormotion.compensation.program.reading import arcs
 from errormotion.compensation.program.reading.frames import Frame, Triple
 from errormotion.compensation.program.reading.items import LINE, PLANES, RAPID, Item, Move, Setting, Text, Unchanged
 from errormotion.compensation.program.reading.offsets import SYSTEMS, UNITS, Offsets
-from errormotion.compensation.program.reading.words import Block, lines_of, refusal, split
+from errormotion.compensation.program.reading.words import Block, is_title, lines_of, refusal, split
 
 UNKNOWN: Triple = (math.nan, math.nan, math.nan)
 
@@ -47,6 +47,13 @@ class Reader:
         Position of the machine axes before the program starts, m.
     deleted : bool, optional
         Whether blocks that start with ``/`` are skipped; None: they raise an error.
+
+    Attributes
+    ----------
+    ended : bool
+        Whether the end of the program was read (M2, M30, or the second ``%``).
+    after_end : (int, int)
+        Lines with code or comments after it: number, and line of the first.
     """
 
     def __init__(
@@ -57,19 +64,20 @@ class Reader:
         self._systems = offsets.systems.copy()
         self._rotations = offsets.rotations.copy()
         self._system = offsets.system
-        self._stored: Triple = _triple(offsets.g92)
+        self._stored: Triple = _triple(offsets.stored)
         self._motion: int | None = None
         self._plane = 0
         self._absolute, self._centre_absolute = True, False
         self._feed_mode, self._feed, self._speed = 94, math.nan, math.nan
         self._tool, self._waiting = None, None  # type: tuple[int | None, int | None]
         self._frame = Frame(
-            UNITS[unit], float(self._rotations[self._system]), self._stored, self._origin(), (0.0, 0.0, 0.0)
+            UNITS[unit], float(self._rotations[self._system]), _triple(offsets.g92), self._origin(), (0.0, 0.0, 0.0)
         )
         self._at: Triple = self._frame.program(start) if start is not None else UNKNOWN
         self._why = "no position was commanded yet, and none is stated by --start"
         self._measured: set[int] = set()
         self.ended = False
+        self.after_end = (0, 0)
 
     def items(self, source: Iterable[str]) -> Iterator[Item]:
         """Yield the item of each line of a program.
@@ -79,19 +87,26 @@ class Reader:
         ProgramError
             A line is not supported, or its effect is not determined.
         """
-        begun = False
+        begun = titled = False
         for number, text in lines_of(source):
             plain = text.strip()
-            if self.ended or not plain:
+            if self.ended:
+                if plain not in ("", "%"):
+                    self.after_end = self.after_end[0] + 1, self.after_end[1] or number
+                yield Text(text)
+            elif not plain:
                 yield Text(text)
             elif plain == "%":
                 self.ended = begun
+                begun = True
+                yield Text(text)
+            elif not titled and is_title(text):
+                begun = titled = True
                 yield Text(text)
             else:
                 begun = True
+                titled = titled or plain[0] not in "(;"
                 yield self._item(split(number, text))
-                continue
-            begun = begun or plain == "%"
 
     def _item(self, block: Block) -> Item:
         if block.skippable:
@@ -267,6 +282,10 @@ class Reader:
         else:
             if code == 921:
                 self._stored = (0.0, 0.0, 0.0)
+            if code == 923 and any(map(math.isnan, self._stored)):
+                self._why = (
+                    f"line {block.line} restores an offset of G92 that is not stated: state --parameters FILE.var"
+                )
             self._change(replace(self._frame, g92=self._stored if code == 923 else (0.0, 0.0, 0.0)))
             item = Text(block.text)
         if more := values.keys() - allowed:

@@ -28,6 +28,41 @@ STRIDE = 4
 """Number of parts that repeat along a line: text between, letter, number, comment."""
 
 
+_TITLE = re.compile(r"\s*(?:[nN]\s*\d+\s*)?[oO]\s*\d+\s*(?:\([^()]*\)\s*|;.*)*")
+
+
+class BlockError(ProgramError):
+    """Error of one line of a program.
+
+    Attributes
+    ----------
+    line : int
+    why : str
+    """
+
+    def __init__(self, line: int, text: str, why: str) -> None:
+        super().__init__(f"line {line} '{text.strip()[:60]}': {why}")
+        self.line, self.why = line, why
+
+
+class SourceLine(str):
+    """A line that an expansion makes of a line of a program.
+
+    Attributes
+    ----------
+    number : int
+        Of the line of the program.
+    """
+
+    number: int
+
+    def __new__(cls, text: str, number: int) -> SourceLine:
+        """Return a text with the number of its line."""
+        made = super().__new__(cls, text)
+        made.number = number
+        return made
+
+
 @dataclass(slots=True)
 class Block:
     """One line of a program.
@@ -67,7 +102,7 @@ def split(line: int, text: str) -> Block:
     if between:
         skippable = between == "/" and (parts[0] or "").strip() == "/"
         if not skippable:
-            raise unknown(line, text, between)
+            raise _unknown(line, text, [part.strip() for part in parts[::STRIDE] if part and part.strip()])
     words: list[tuple[str, str, int]] = []
     for k in range(1, len(parts), STRIDE):
         letter = parts[k]
@@ -76,29 +111,35 @@ def split(line: int, text: str) -> Block:
     return Block(line, text, parts, words, skippable)
 
 
-def unknown(line: int, text: str, what: str) -> ProgramError:
-    """Return the error of a line that is not supported."""
-    if _OTHER.search(what) or text.lstrip().lower().startswith("o"):
+def _unknown(line: int, text: str, pieces: list[str]) -> BlockError:
+    """Return the error of a line with other pieces of text than words and comments."""
+    if any(_OTHER.search(piece) for piece in pieces) or text.lstrip().lower().startswith("o"):
         return refusal(line, text, "an expression, a variable or a control word (O), not supported by the plain reader")
-    return refusal(line, text, f"expected words (letter and number) and comments; found '{what[:20]}'")
+    return refusal(line, text, f"expected words (letter and number) and comments; found '{pieces[0][:20]}'")
 
 
-def refusal(line: int, text: str, why: str) -> ProgramError:
+def is_title(text: str) -> bool:
+    """Return whether a line is a program number, such as ``O0001``."""
+    return _TITLE.fullmatch(text) is not None
+
+
+def refusal(line: int, text: str, why: str) -> BlockError:
     """Return the error of a line."""
-    return ProgramError(f"line {line} '{text.strip()[:60]}': {why}")
+    return BlockError(line, text, why)
 
 
 def lines_of(source: Iterable[str]) -> Iterator[tuple[int, str]]:
-    """Yield number and text of each line of a program.
+    """Yield number and text of each line of a program; a `SourceLine` has the number of its source.
 
     Raises
     ------
     ProgramError
         Too many lines, a line that is too long, or control characters in a line.
     """
-    for number, line in enumerate(source, 1):
-        if number > MAX_LINES:
+    for count, line in enumerate(source, 1):
+        if count > MAX_LINES:
             raise ProgramError(f"expected a program of at most {MAX_LINES} lines")
+        number = line.number if isinstance(line, SourceLine) else count
         text = line.rstrip("\r\n")
         if len(text) > MAX_LINE:
             raise ProgramError(f"line {number}: expected at most {MAX_LINE} characters; found {len(text)}")

@@ -46,6 +46,8 @@ class Summary:
         Cuts that start at a position without correction: number, and line of the first.
     outside : (int, int)
         Moves outside the measured range, with the correction at its limit: number, and line of the first.
+    after_end : (int, int)
+        Lines after the end of the program (M2, M30, ``%``), which are not corrected: number, and line of the first.
     largest : float
         Largest correction, m.
     largest_line : int
@@ -71,6 +73,7 @@ class Summary:
     unchanged: dict[str, tuple[int, int]] = field(default_factory=dict)
     uncorrected: tuple[int, int] = (0, 0)
     outside: tuple[int, int] = (0, 0)
+    after_end: tuple[int, int] = (0, 0)
     largest: float = 0.0
     largest_line: int = 0
     length: float = 0.0
@@ -216,6 +219,7 @@ class Rewriting:
     def _finish(self) -> None:
         summary, writer = self.summary, self._writer
         summary.divided = writer.divided
+        summary.after_end = self._reader.after_end
         summary.uncorrected = writer.uncorrected, writer.first_uncorrected
         if self._shown:
             rows = np.concatenate(self._shown)
