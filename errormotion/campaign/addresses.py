@@ -45,6 +45,11 @@ def scheme_of(url: str) -> str:
     return scheme if mark else ""
 
 
+def is_line(url: str) -> bool:
+    """Return whether an address is that of a serial line, which serves one program at a time."""
+    return scheme_of(url) in _SERIAL
+
+
 def same_device(url: str) -> str:
     """Return a text that is equal for all addresses of one device; empty without an address.
 

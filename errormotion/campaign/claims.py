@@ -1,8 +1,12 @@
-"""Exclusive use of the instruments of a machine: many instruments accept one connection only.
+"""Exclusive use of devices: many accept one connection only, and offsets of a machine have one writer.
 
-A program that measures or compensates claims the instruments before it opens them, and states its run folder. A
-program that only displays readings then closes the instruments, and reads the run folder instead. A claim is a locked
-file in the user's state folder, named after the machine; the operating system releases it when its process ends.
+A program that measures or compensates claims the addresses of its devices before it opens them; a second one is
+refused, and told who uses them. A program that only displays readings then closes the instruments, and reads the run
+folder of the claim instead.
+
+A claim is a locked file in a folder of the computer in which every user may lock; the operating system releases it when
+its process ends for any reason. It has the hashes of the addresses, and states user, process, start, purpose and run
+folder. Claims prevent mistakes; they do not protect against a user of the computer who wants to disturb.
 """
 
 from __future__ import annotations
@@ -11,152 +15,376 @@ import hashlib
 import json
 import logging
 import os
+import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from uuid import uuid4
 
-from errormotion.campaign.folder import is_locked
-from errormotion.datasets.files.reading import read_bytes
+from errormotion.campaign.addresses import EXEMPT, is_line, same_device, scheme_of, urls
+from errormotion.campaign.files import BenchCompensator, BenchInstrument, BenchPlan
+from errormotion.errors import RunError
 
 try:
     import fcntl
 except ImportError:  # Windows: no locks, and no claims
     fcntl = None  # type: ignore[assignment]
 
+Role = Literal["measure", "follow", "offset", "show"]
+"""Why an address is claimed. ``measure`` and ``offset`` exclude their like; ``follow``, the readings of a compensation,
+goes beside a measurement, which shows its effect; ``show``, a simulated device, excludes nothing."""
+
+FOLDERS = ("/run/lock/errormotion", "/tmp/errormotion-lock")
+"""Folders of the computer; the first that every user may use is used."""
+SHARED = 0o1777
+"""Mode of such a folder: everybody writes, and removes only what is his own."""
 RELEASE_TIMEOUT = 15.0
 """Longest time for which a claim waits until programs that display readings have closed the instruments, s."""
+LOCK_TIMEOUT = 10.0
+"""Longest time for which a claim waits for another that is just being made, s."""
 POLL_INTERVAL = 0.05
-MAX_CLAIM = 1 << 14
+MAX_CLAIM = 1 << 16
 """Largest size of a claim, bytes."""
+MAX_CLAIMS = 5000
+"""Number of files of the folder that are examined."""
+MAX_TEXT = 300
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Claim:
-    """The program that uses the instruments: ``what`` it does, and its run folder as soon as it has one."""
+    """The program that uses devices: ``what`` it does, and its run folder as soon as it has one.
+
+    ``user``, ``process`` and ``since`` state who, by name, process id, and local time.
+    """
 
     what: str
     run: Path | None = None
+    user: str = field(default="", compare=False)
+    process: int = field(default=0, compare=False)
+    since: str = field(default="", compare=False)
+
+    def __str__(self) -> str:
+        """Return user, process, start, purpose and run folder as text."""
+        where = f", run folder {self.run}" if self.run is not None else ""
+        return f"{self.what} of user {self.user}, process {self.process}, since {self.since}{where}"
 
 
-@contextmanager
-def claimed(machine: str, what: str) -> Iterator[Callable[[Path], None]]:
-    """Claim the instruments of a machine, and wait until programs that display readings have closed them.
+@dataclass(frozen=True)
+class Use:
+    """One address that a program needs: its hash, why it is claimed, and what it is for messages."""
+
+    key: str
+    role: Role
+    label: str
+
+
+class Held:
+    """A claim in effect. ``note`` states why other users' programs may not see it; empty if they do."""
+
+    def __init__(self, descriptor: int, content: dict[str, Any], note: str) -> None:
+        self._descriptor, self._content, self.note = descriptor, content, note
+        self._write()
+
+    def records(self, run: Path) -> None:
+        """State the run folder of the program."""
+        self._content["run"] = str(run.resolve())
+        self._write()
+
+    def _write(self) -> None:
+        if self._descriptor >= 0:
+            text = json.dumps(self._content).encode() + b"\n"
+            with suppress(OSError):
+                os.pwrite(self._descriptor, text, 0)
+                os.ftruncate(self._descriptor, len(text))
+
+
+def uses(plan: BenchPlan, role: Role = "measure", *, only: str = "", offsets: bool = False) -> tuple[Use, ...]:
+    """Return the addresses of the instruments of a bench.
 
     Parameters
     ----------
-    machine : str
-        Name of the machine of the bench.
+    plan : BenchPlan
+    role : str
+        Why they are claimed.
+    only : str, optional
+        Name of one instrument; default: all.
+    offsets : bool
+        Whether offsets are written to the compensator of the bench.
+    """
+    found = [_use(plan.machine, each, role) for each in plan.instruments if only in ("", each.name)]
+    if offsets and plan.compensator is not None:
+        found.append(_use(plan.machine, plan.compensator, "offset"))
+    return tuple(each for part in found for each in part)
+
+
+def use_of(url: str) -> Use:
+    """Return the use of one address by a measurement."""
+    return Use(_hash(same_device(url)), "show" if scheme_of(url) in EXEMPT else "measure", url)
+
+
+@contextmanager
+def claimed(wanted: Iterable[Use], what: str) -> Iterator[Held]:
+    """Claim addresses, and wait until programs that display readings have closed the instruments.
+
+    Parameters
+    ----------
+    wanted : iterable of Use
     what : str
         Activity of the program, such as ``a run``.
 
-    Yields
+    Raises
     ------
-    callable
-        States the run folder of the program.
+    RunError
+        Another program has claimed one of them. Nothing was claimed.
     """
-    descriptor, path = -1, _folder() / f"{_key(machine)}-{uuid4().hex}.claim"
-    if fcntl is not None:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        except OSError as error:  # a measurement does not depend on a claim
-            log.warning("%s: the instruments are not claimed: %s", path, error)
+    wanted = tuple(wanted)
+    folder, note = _folder()
+    if note:
+        log.warning("%s", note)
+    if folder is None:  # a measurement does not depend on a claim
+        yield Held(-1, {}, note)
+        return
+    with _new_file(folder, "claim", wanted, what, note) as held:
+        _wait(folder, wanted)
+        yield held
 
-    def state(run: Path | None) -> None:
-        if descriptor >= 0:
-            text = json.dumps({"what": what, "run": str(run.resolve()) if run is not None else ""}).encode()
-            with suppress(OSError):
-                os.pwrite(descriptor, text.ljust(len(text) + 1, b"\n"), 0)
-                os.ftruncate(descriptor, len(text) + 1)
 
+def require_free(wanted: Iterable[Use]) -> None:
+    """Raise RunError if another program has claimed one of the addresses."""
+    if (folder := _folder()[0]) is not None:
+        _refuse_conflict(folder, tuple(wanted))
+
+
+def holder(wanted: Iterable[Use]) -> Claim | None:
+    """Return the newest claim of one of the addresses, or None."""
+    keys, folder = {each.key for each in wanted}, _folder()[0]
+    if folder is None:
+        return None
+    found = [(time_ns, claim) for time_ns, claim, theirs in _locked(folder, "claim") if keys & theirs.keys()]
+    return max(found, key=lambda each: each[0])[1] if found else None
+
+
+@contextmanager
+def watching(wanted: Iterable[Use]) -> Iterator[bool]:
+    """Register a program that displays readings; the context returns whether the instruments are free of claims."""
+    wanted, folder = tuple(wanted), _folder()[0]
+    if folder is None:
+        yield True
+        return
+    watched = tuple(Use(each.key, "show", each.label) for each in wanted)
+    with _new_file(folder, "watch", watched, "", ""):
+        yield holder(wanted) is None  # tested after the registration: a later claim waits for its end
+
+
+@contextmanager
+def _new_file(folder: Path, ending: str, wanted: tuple[Use, ...], what: str, note: str) -> Iterator[Held]:
+    """Make and lock the file of a program, unless its uses are in conflict with a claim."""
+    path = folder / f"{uuid4().hex}.{ending}"
+    descriptor = -1
     try:
-        state(None)
-        if descriptor >= 0:
-            _wait(machine)
-        yield state
+        with _one_at_a_time(folder):
+            _remove_ended(folder)
+            _refuse_conflict(folder, wanted)
+            try:
+                descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+                os.fchmod(descriptor, 0o644)  # every user reads it, whatever the mask
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+            except OSError as error:
+                raise RunError(f"{path}: the instruments cannot be claimed: {error.strerror}") from error
+            content = {"what": what, "run": "", "process": os.getpid(), "keys": {e.key: e.role for e in wanted}}
+            content["since"] = f"{datetime.now(UTC).astimezone():%Y-%m-%d %H:%M:%S}"
+            held = Held(descriptor, content, note)
+        yield held
     finally:
         if descriptor >= 0:
             path.unlink(missing_ok=True)
             os.close(descriptor)
 
 
-def holder(machine: str) -> Claim | None:
-    """Return the newest claim of the instruments of a machine, or None."""
-    if fcntl is None:
-        return None
-    found = []
-    for path in _folder().glob(f"{_key(machine)}-*.claim"):
-        with suppress(OSError):
-            if is_locked(path):
-                found.append((path.stat().st_mtime_ns, _read(path)))
-            elif time.time() - path.stat().st_mtime > 1.0:  # of a killed process, not one that is being created
-                path.unlink(missing_ok=True)
-    return max(found, key=lambda each: each[0])[1] if found else None
-
-
 @contextmanager
-def watching(machine: str) -> Iterator[bool]:
-    """Register a program that displays readings; the context returns whether the instruments are free of claims."""
-    if fcntl is None:
-        yield True
-        return
-    path = _folder() / f"{_key(machine)}.watched"
+def _one_at_a_time(folder: Path) -> Iterator[None]:
+    """Serialize claims, so that of two programs that start at the same time one is refused."""
+    path = folder / "lock"
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            descriptor = os.open(path, flags)
+        except FileNotFoundError:
+            descriptor = os.open(path, flags | os.O_CREAT, 0o644)
+            with suppress(OSError):
+                os.fchmod(descriptor, 0o644)
     except OSError as error:
-        log.warning("%s: cannot be locked: %s", path, error)
-        yield True
-        return
+        raise RunError(f"{path}: the instruments cannot be claimed: {error.strerror}") from error
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH)
-        yield holder(machine) is None  # tested under the lock: a later claim waits until the lock is released
+        end = time.monotonic() + LOCK_TIMEOUT
+        while not _try_lock(descriptor):
+            if time.monotonic() > end:
+                raise RunError(f"{path}: another program has held this lock for {LOCK_TIMEOUT:g} s; find and end it")
+            time.sleep(POLL_INTERVAL)
+        yield
     finally:
         os.close(descriptor)
 
 
-def _wait(machine: str) -> None:
-    end = time.monotonic() + RELEASE_TIMEOUT
-    while _watched(machine):
+def _try_lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _refuse_conflict(folder: Path, wanted: tuple[Use, ...]) -> None:
+    exclusive = {(each.key, each.role): each for each in wanted if each.role in ("measure", "offset")}
+    if not exclusive:
+        return
+    for _, claim, theirs in _locked(folder, "claim"):
+        for each in theirs.items():
+            if each in exclusive:
+                raise RunError(
+                    f"{exclusive[each].label} is in use by another program: {claim}. Wait for its end, or stop it "
+                    "there. Nothing was opened, and nothing was created."
+                )
+
+
+def _wait(folder: Path, wanted: tuple[Use, ...]) -> None:
+    keys, end = {each.key for each in wanted}, time.monotonic() + RELEASE_TIMEOUT
+    while any(keys & theirs.keys() for _, _, theirs in _locked(folder, "watch")):
         if time.monotonic() > end:
-            log.warning("another program still reads the instruments of %s", machine)
+            log.warning("another program still reads the instruments")
             return
         time.sleep(POLL_INTERVAL)
 
 
-def _watched(machine: str) -> bool:
+def _locked(folder: Path, ending: str) -> list[tuple[int, Claim, Mapping[str, str]]]:
+    """Return time (ns), claim, and hashes with their roles, of each program that is alive."""
+    found = []
+    for _, descriptor in _files(folder, f".{ending}"):
+        state = os.fstat(descriptor)
+        if stat.S_ISREG(state.st_mode) and not _free(descriptor):
+            found.append((state.st_mtime_ns, *_read(descriptor, state.st_uid)))
+    return found
+
+
+def _remove_ended(folder: Path) -> None:
+    """Remove the files of killed programs; call it while no file is being made."""
+    for path, descriptor in _files(folder, (".claim", ".watch")):
+        if _free(descriptor):
+            with suppress(OSError):  # of another user
+                path.unlink()
+
+
+def _files(folder: Path, endings: str | tuple[str, ...]) -> Iterator[tuple[Path, int]]:
+    """Yield the files of programs, each opened until the next one."""
     try:
-        descriptor = os.open(_folder() / f"{_key(machine)}.watched", os.O_RDWR)
+        names = sorted(name for name in os.listdir(folder) if name.endswith(endings))
+    except OSError:
+        return
+    for name in names[:MAX_CLAIMS]:
+        try:
+            descriptor = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        except OSError:  # ended, or not a file of this program
+            continue
+        try:
+            yield folder / name, descriptor
+        finally:
+            os.close(descriptor)
+
+
+def _free(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _read(descriptor: int, owner: int) -> tuple[Claim, Mapping[str, str]]:
+    try:
+        content: Any = json.loads(os.pread(descriptor, MAX_CLAIM, 0))
+        keys = {str(key): str(role) for key, role in content["keys"].items()}
+        run = Path(content["run"]) if content["run"] else None
+        what, since = _text(content["what"]), _text(content["since"])
+        return Claim(what, run, _user(owner), int(content["process"]), since), keys
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):  # it is being written
+        return Claim("another program", user=_user(owner)), {}
+
+
+def _text(value: Any) -> str:
+    return "".join(each if each.isprintable() else "?" for each in str(value)[:MAX_TEXT])
+
+
+def _user(number: int) -> str:
+    import pwd
+
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return str(number)
+
+
+def _folder() -> tuple[Path | None, str]:
+    """Return the folder of claims, None if there is none, and a note if it is not the first choice."""
+    if fcntl is None:
+        return None, "This system has no file locks: whether another program uses the instruments is not known."
+    for place in FOLDERS:
+        if _is_shared(place):
+            other = f"{FOLDERS[0]} cannot be used; the claims of the instruments are in {place}."
+            return Path(place), "" if place == FOLDERS[0] else other
+    own = _state_folder() / "claims"
+    try:
+        own.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        none = f"No folder for claims of the instruments can be used ({', '.join(FOLDERS)}, {own}: {error.strerror})."
+        return None, f"{none} Whether another program uses the instruments is not known."
+    return own, (
+        f"None of {', '.join(FOLDERS)} can be used by every user of this computer; the claims of the instruments are "
+        f"in {own}. Programs of other users do not see them."
+    )
+
+
+def _is_shared(place: str) -> bool:
+    """Return whether every user may lock in a folder, which is created if necessary; a link is not followed."""
+    if not os.path.lexists(place):
+        mask = os.umask(0)  # the folder has its mode from the first instant on
+        try:
+            os.mkdir(place, SHARED)
+        except OSError:
+            pass  # another program has just created it, or it cannot be created
+        finally:
+            os.umask(mask)
+    try:
+        found = os.lstat(place)
     except OSError:
         return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
+    right = stat.S_ISDIR(found.st_mode) and stat.S_IMODE(found.st_mode) & SHARED == SHARED
+    return right and os.access(place, os.W_OK | os.X_OK)
 
 
-def _read(path: Path) -> Claim:
-    try:
-        content: Any = json.loads(read_bytes(path, MAX_CLAIM))
-        return Claim(str(content["what"]), Path(content["run"]) if content["run"] else None)
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):  # it is being written
-        return Claim("another program")
-
-
-def _folder() -> Path:
+def _state_folder() -> Path:
     base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(base) / "errormotion" / "turns"
+    return Path(base) / "errormotion"
 
 
-def _key(machine: str) -> str:
-    return hashlib.sha256(machine.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+def _use(machine: str, device: BenchInstrument | BenchCompensator, role: Role) -> list[Use]:
+    name = device.name if isinstance(device, BenchInstrument) else "the offset output"
+    found = []
+    for url in urls(device):
+        same, own = same_device(url), role
+        if scheme_of(url) in EXEMPT or not same:  # of this process, or of this user
+            same = f"{_state_folder()}|{machine}|{device.driver.info.id}|{url}"
+            own = "show" if url else role
+        elif is_line(url):
+            own = "measure"
+        found.append(Use(_hash(same), own, f"{name} ({url})" if url else name))
+    return found
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:32]

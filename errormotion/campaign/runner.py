@@ -23,7 +23,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.campaign.bench import OpenBench
-from errormotion.campaign.claims import claimed
+from errormotion.campaign.claims import claimed, uses
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
 from errormotion.campaign.folder import FolderGoneError, RunFolder, Status, list_runs, new_entries, now
 from errormotion.campaign.planning.release import Release, announced, refuse, to_release
@@ -300,7 +300,10 @@ class _Session:
                     continue
                 if (folder is None or not folder.data["acquired"]) and not self.bench.answers:
                     self.progress.stage("opening the bench")
-                    self.records = opened.enter_context(claimed(self.campaign.bench.machine, "a run"))
+                    held = opened.enter_context(claimed(uses(self.campaign.bench), "a run"))
+                    self.records = held.records
+                    if held.note:
+                        self.progress.announce(held.note)
                     opened.enter_context(self.bench)
                 if folder is None:
                     folder = folders[test.name] = self._new_folder(test)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.campaign.background.recorded import Recorded, Value, recorded
-from errormotion.campaign.claims import Claim, holder, watching
+from errormotion.campaign.claims import Claim, holder, uses, watching
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.monitor.clock import Clock
 from errormotion.campaign.monitor.sources import Source
@@ -171,6 +171,7 @@ class Watch:
 
     def __init__(self, plan: BenchPlan, runs: Path, interval: float = 1.0) -> None:
         self.plan, self.runs, self.interval = plan, runs, interval
+        self._uses = uses(plan)
         self._lock, self._end = threading.Lock(), threading.Event()
         self._clock = _InterruptibleClock(self._must_release)
         self._monitor = Monitor(plan, runs, interval, self._clock)
@@ -317,10 +318,10 @@ class Watch:
     def _work(self) -> None:
         try:
             while not self._end.is_set():
-                with watching(self.plan.machine) as free:
+                with watching(self._uses) as free:
                     if free:
                         self._read()
-                while not self._end.is_set() and (claim := holder(self.plan.machine)) is not None:
+                while not self._end.is_set() and (claim := holder(self._uses)) is not None:
                     self._look(claim)
                     self._end.wait(CLAIM_INTERVAL)
                 with self._lock:
@@ -348,7 +349,7 @@ class Watch:
                     break
 
     def _must_release(self) -> bool:
-        return self._end.is_set() or holder(self.plan.machine) is not None
+        return self._end.is_set() or holder(self._uses) is not None
 
     def _start_time(self) -> datetime:
         """Return time 0 of the history."""

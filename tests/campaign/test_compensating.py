@@ -27,7 +27,7 @@ from errormotion.compensation.thermal_model import ThermalModel
 from errormotion.compensation.thermal_model.features import Feature
 from errormotion.compensation.thermal_model.model import Parts
 from errormotion.datasets import provenance
-from errormotion.errors import BenchError, CompensationError, InstrumentError
+from errormotion.errors import BenchError, CompensationError, InstrumentError, RunError
 from errormotion.instruments.compensator.modbus_registers import ModbusRegisters
 from errormotion.instruments.simulators.compensator.plc import SimulatedPlc
 from errormotion.instruments.transports import parse_address
@@ -375,12 +375,32 @@ def test_earlier_readings_at_an_unknown_time_are_refused(plan: BenchPlan, model:
 def test_one_machine_has_one_compensation(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     with Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()):
         with (
-            pytest.raises(CompensationError, match=r"already compensated by process \d+"),
+            pytest.raises(RunError, match=r"the offset output is in use .* an armed compensation of .* process \d+"),
             Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()),
         ):
             pass
         with Compensation(plan, model, tmp_path, clock=SimulatedClock()):  # a second one may compute
             pass
+
+
+def test_two_state_folders_do_not_arm_one_output(
+    plan: BenchPlan, model: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = f"watchdog=1&slew={2 * LIMITS.slew}&limit={LIMITS.limit}"
+    with closing(SimulatedPlc(parse_address(f"sim://cframe/plc?{limits}"))) as plc:
+        port, settings = parse_address(plc.driver_url).port, ModbusRegisters.Settings(**plc.driver_settings)
+        first, second = (
+            replace(plan, compensator=BenchCompensator(ModbusRegisters, url, settings, LIMITS))
+            for url in (f"modbus+tcp://127.0.0.1:{port}", f"modbus+tcp://LOCALHOST:{port}?unit=1")
+        )
+        with Compensation(first, model, tmp_path / "one", arm=MACHINE, clock=SimulatedClock()):
+            monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+            with (
+                pytest.raises(RunError, match=r"is in use by another program: an armed compensation of user"),
+                Compensation(second, model, tmp_path / "two", arm=MACHINE, clock=SimulatedClock()),
+            ):
+                pass
+            assert not (tmp_path / "two").exists()
 
 
 def test_contradictions_are_reported_before_any_connection(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from errormotion.campaign.background.recorded import Value
-from errormotion.campaign.claims import claimed
+from errormotion.campaign.claims import claimed, uses
 from errormotion.campaign.files import load_bench
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.dashboard.watch import Present, Watch
@@ -127,14 +127,14 @@ def test_instruments_are_released_for_a_measurement_and_opened_again(
     watch = make()
     wait(watch, lambda now: now.rows >= 2)
     other = Monitor(watch.plan, tmp_path / "others", 0.1)
-    with claimed(watch.plan.machine, "a run <i>") as records:
+    with claimed(uses(watch.plan), "a run <i>") as held:
         # The claim is given once the instruments are closed here: nobody else has them now.
         assert [source._driver for source in watch._monitor.sources] == [None]
         present = wait(watch, lambda now: now.lent.startswith("A run <i>"))
         assert "recorded no samples yet" in present.lent
         assert [each.state for each in present.instruments] == ["lent"]
         with other:
-            records(other.folder.path)
+            held.records(other.folder.path)
             for snapshot in other.watch():
                 present = watch.present()
                 value = present.temperatures[0].value

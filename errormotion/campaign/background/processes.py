@@ -25,6 +25,7 @@ from uuid import uuid4
 from errormotion.campaign.background import signals
 from errormotion.campaign.background.detached import printed, spawn
 from errormotion.campaign.background.publishing import ANSWER, STATUS
+from errormotion.campaign.claims import require_free, uses
 from errormotion.campaign.files import CampaignPlan, TestPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, is_locked, now, replace_text
 from errormotion.campaign.planning.release import OPTION, Release, refuse, to_release
@@ -208,6 +209,8 @@ def _start(
     if fcntl is None:
         raise RunError("A background process needs a system with file locks (Linux, macOS). Use 'errormotion run'.")
     machine = plan.bench.machine
+    if tests:
+        require_free(uses(plan.bench))
     if motions := to_release(plan, tests):
         release(motions)
         arguments = [*arguments, OPTION]

@@ -7,12 +7,10 @@ is armed (``arm``), the offsets are only computed and logged, and nothing is wri
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import math
-import os
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,7 +21,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
-from errormotion.campaign.claims import claimed
+from errormotion.campaign.claims import claimed, uses
 from errormotion.campaign.compensation.following import AUDIT, STOP, Status, is_zero, numbers, write_status
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.monitor.clock import Clock
@@ -104,6 +102,8 @@ class Compensation:
         The run folder, once entered.
     armed : bool
         Whether offsets are written.
+    note : str
+        Why other users' programs may not see that this one uses the instruments; empty if they do.
 
     Raises
     ------
@@ -138,6 +138,7 @@ class Compensation:
         self._last: tuple[State, str, tuple[float, ...]] | None = None
         self._status: Status | None = None
         self._stack = ExitStack()
+        self.note = ""
 
     def _check(self, model: xr.Dataset, arm: str | None) -> None:
         machine, frame = str(model.attrs.get("machine", "unknown")), str(model.attrs.get("frame", "unknown"))
@@ -197,16 +198,16 @@ class Compensation:
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            if self.armed:
-                stack.enter_context(_only_one(self.plan.machine))
-            records = stack.enter_context(claimed(self.plan.machine, "a compensation"))
+            what = "an armed compensation" if self.armed else "a compensation in shadow mode"
+            held = stack.enter_context(claimed(uses(self.plan, "follow", offsets=self.armed), what))
+            self.note = held.note
             if self.plan.compensator is not None:
                 each = self.plan.compensator
                 self._output = each.driver(each.address, each.settings)
                 self._output.open()
                 stack.callback(self._close)
             stack.enter_context(self._monitor)
-            records(self.folder.path)
+            held.records(self.folder.path)
             self._audit = stack.enter_context(AuditLog(self.folder.path / AUDIT))
             self._begin()
             self._stack = stack.pop_all()
@@ -416,31 +417,3 @@ class Compensation:
 def _parameters(state: Mapping[str, Any]) -> dict[str, float]:
     values = {name: state.get(name) for name in PARAMETERS}
     return {name: math.nan if value is None else float(value) for name, value in values.items()}
-
-
-@contextmanager
-def _only_one(machine: str) -> Iterator[None]:
-    """Prevent a second compensation of a machine on this computer; the lock ends with the process."""
-    try:
-        import fcntl
-    except ImportError:  # Windows: no lock
-        yield
-        return
-    folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "errormotion"
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"compensation-{hashlib.sha256(machine.encode()).hexdigest()[:16]}.lock"
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.read(descriptor, 100).decode("utf-8", "replace").strip()
-            raise CompensationError(
-                f"The machine '{machine}' is already compensated{f' by process {holder}' if holder else ''}; stop that "
-                "compensation first."
-            ) from None
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, json.dumps(os.getpid()).encode())
-        yield
-    finally:
-        os.close(descriptor)

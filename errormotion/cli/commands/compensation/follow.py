@@ -61,6 +61,8 @@ def run(
         Live(console=console, auto_refresh=False, transient=True) as live,
         _ramping_when_stopped(compensation, console),
     ):
+        if compensation.note and not as_json:
+            console.print(compensation.note, markup=False)
         for last in compensation.follow(length):
             states[str(last.step.state)] += 1
             if as_json:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from errormotion.campaign.bench import OpenBench
-from errormotion.campaign.claims import claimed
+from errormotion.campaign.claims import claimed, uses
 from errormotion.campaign.files import BenchPlan, load_bench
 from errormotion.cli.output import show, show_json, table
 
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 def probe(file: Path, as_json: bool) -> bool:
     """Open, identify and read every instrument of a bench; return whether all of them answered."""
     plan = load_bench(file)
-    with claimed(plan.machine, "a probe of the bench"):
+    with claimed(uses(plan), "a probe of the bench"):
         return _probe(plan, as_json)
 
 

@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from errormotion.campaign.claims import claimed
+from errormotion.campaign.claims import claimed, uses
 from errormotion.campaign.files import load_bench
 from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.cli import options
@@ -43,12 +43,14 @@ def run(file: Path, runs: Path, interval: str, duration: str | None, as_json: bo
     folder: Path | None = None
     try:
         with (
-            claimed(monitor.plan.machine, "a monitor") as records,
+            claimed(uses(monitor.plan), "a monitor") as held,
             monitor,
             Live(console=console, auto_refresh=False, transient=True, screen=False) as live,
         ):
             folder = monitor.folder.path
-            records(folder)
+            held.records(folder)
+            if held.note:
+                console.print(held.note, markup=False)
             for last in monitor.watch(length):
                 screen.take(last)
                 if as_json:

@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from errormotion import __version__, plugins
+from errormotion.campaign.claims import claimed, uses
 from errormotion.campaign.files import BenchInstrument, load_bench
 from errormotion.cli import options
 from errormotion.cli.output import show, show_json
@@ -36,12 +37,13 @@ def record(bench: Path, name: str, duration: str, out: Path | None, mask_serial:
     if path.exists():
         raise InstrumentError(f"The recording {path} already exists; choose another file or remove it")
     early: dict[Path, int] = {}  # number of frames before the identity was known
-    session = run_live(
-        instrument.driver(instrument.address, instrument.settings, record=path),
-        seconds,
-        lambda: sum(each.stat().st_size for each in _files(path)) > MAX_RECORDING,
-        lambda: early.update({each: len(each.read_bytes().splitlines()) - 1 for each in _files(path)}),
-    )
+    with claimed(uses(load_bench(bench), only=name), "a recording"):
+        session = run_live(
+            instrument.driver(instrument.address, instrument.settings, record=path),
+            seconds,
+            lambda: sum(each.stat().st_size for each in _files(path)) > MAX_RECORDING,
+            lambda: early.update({each: len(each.read_bytes().splitlines()) - 1 for each in _files(path)}),
+        )
     if not path.is_file():
         raise InstrumentError(session.message or f"Nothing was recorded from the instrument '{name}'")
     note = _note(instrument, session)

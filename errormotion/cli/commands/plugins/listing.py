@@ -68,8 +68,10 @@ def show_plugin(plugin_id: str, as_json: bool) -> None:
 def check_plugin(plugin_id: str, address: str | None, mutants: int | None, as_json: bool) -> bool:
     """Run the conformance kit on a plugin, print each check, and return whether all passed."""
     from errormotion import testing
+    from errormotion.campaign.claims import claimed, use_of
 
-    results = testing.check_plugin(group_of(plugin_id), plugin_id, address=address, mutants=mutants)
+    with claimed([] if address is None else [use_of(address)], "a check of a plugin"):
+        results = testing.check_plugin(group_of(plugin_id), plugin_id, address=address, mutants=mutants)
     good = all(result.ok for result in results)
     if as_json:
         show_json({"ok": good, "plugin": plugin_id, "checks": [asdict(result) for result in results]})
