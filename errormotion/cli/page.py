@@ -38,11 +38,9 @@ def page_of(file: Path | None, pdf: bool, paper: str | None, language: str | Non
         if given:
             raise DatasetError(f"{', '.join(given)}: allowed with a page only; add --report PAGE.html")
         return None
-    if file.suffix != ".html":
-        raise DatasetError(f"{file}: expected a name that ends in .html")
-    from errormotion.report import Form
+    from errormotion.report.write import Form, page_file
 
-    return Page(file, Form(language or "", paper or "", ("pdf",) if pdf else ()))
+    return Page(page_file(file), Form(language or "", paper or "", ("pdf",) if pdf else ()))
 
 
 def new_files(page: Page | None, *others: Path | None) -> list[Path]:

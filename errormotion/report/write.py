@@ -81,7 +81,7 @@ def write_report(
     errors : Dataset or sequence of Dataset
         Error datasets, one chapter each, or logs of a monitor.
     out : Path
-        The file; an older one is replaced in one step.
+        The file, ``*.html``; an older one is replaced in one step.
     raw : Dataset, optional
         The raw dataset that they come from, for the counts of lost samples; its samples are not read.
     title : str, optional
@@ -99,10 +99,11 @@ def write_report(
     Raises
     ------
     DatasetError
-        There is no dataset, or one is not an error dataset.
+        There is no dataset, one is not an error dataset, or the name of the file is not that of a page.
     RunError
         The page was written, but its PDF could not be.
     """
+    target = page_file(Path(out))
     datasets = [errors] if isinstance(errors, xr.Dataset) else list(errors)
     if not datasets:
         raise DatasetError("Expected at least one error dataset for a report; found none.")
@@ -120,7 +121,23 @@ def write_report(
         parts[:1] = [_noted(part, run or {}) for part in parts[:1]]
         decision = verdict(_judged(sources, tolerances)) if tolerances is not None else None
         found = page(sources, parts, title, head=head, decision=decision, texts=texts)
-    return _finished(found, Path(out), form, head)
+    return _finished(found, target, form, head)
+
+
+def page_file(path: Path) -> Path:
+    """Return the file of a page, whose further forms stand beside it under the same name.
+
+    Raises
+    ------
+    DatasetError
+        The name does not end in .html: the PDF or the workbook of a page would replace the page.
+    """
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise DatasetError(
+            f"{path}: expected a name that ends in .html, that of the page; its PDF (--pdf), workbook and tables are "
+            "written beside it under the same name"
+        )
+    return path
 
 
 def _finished(found: Page, out: Path, form: Form, head: Head) -> Path:
@@ -202,7 +219,7 @@ def write_page(
     make : callable
         Returns the chapters; called once, while numbers are written in the language of the page.
     out : Path
-        The file; an older one is replaced in one step.
+        The file, ``*.html``; an older one is replaced in one step.
     title : str, optional
         By default made from the machine and the title of the first chapter.
     form : Form, optional
@@ -217,15 +234,18 @@ def write_page(
 
     Raises
     ------
+    DatasetError
+        The name of the file is not that of a page.
     RunError
         The page was written, but its PDF could not be.
     """
+    target = page_file(Path(out))
     head = form.of(Head())
     catalogues = [catalogue_of(source, head.language) for source in sources]
     catalogues += [texts(head.language)] if texts is not None else []
     with written_in(head.language, Catalogue(head.language, catalogues).word):
         found = page(sources, make(), title, head=head, texts=catalogues)
-    return _finished(found, Path(out), form, head)
+    return _finished(found, target, form, head)
 
 
 def _owner(dataset: xr.Dataset) -> Any:

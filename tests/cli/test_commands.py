@@ -230,6 +230,12 @@ def test_report_of_a_file_of_errors(run: Run, answer: Answer, raw: Path, tmp_pat
     assert answer("report", "errors.nc")["report"] == "errors.html"
     assert "<html" in (tmp_path / "errors.html").read_text()
     assert "run folder" in run("report", tmp_path, code=1).stderr
+    before = (tmp_path / "errors.nc").read_bytes()
+    for name in ("page.pdf", "errors.nc", "page"):  # the PDF would replace the page, the page the result
+        refused = run("report", "errors.nc", "--pdf", "--out", name, code=1).stderr
+        assert f"{name}: expected a name that ends in .html" in refused
+    assert (tmp_path / "errors.nc").read_bytes() == before
+    assert not (tmp_path / "page.pdf").exists()
 
 
 def test_import_reports_its_result(run: Run, answer: Answer, tmp_path: Path) -> None:
