@@ -53,7 +53,7 @@ def demo(
     """Measure a virtual machine and compare the result with the truth."""
     shown = COMPENSATED if compensate else CONTROLLERS
     if controller not in shown:
-        typer.echo(f"--controller {controller}: expected one of {', '.join(shown)}.", err=True)
+        show(f"--controller {controller}: expected one of {', '.join(shown)}.", err=True)
         raise typer.Exit(USAGE)
     import_module(shown[controller]).run(runs, json_)
 

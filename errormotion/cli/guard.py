@@ -7,11 +7,11 @@ import logging
 import os
 import signal
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
+from traceback import format_exc
 from typing import Any, ParamSpec
 
 import typer
@@ -56,7 +56,7 @@ def _run(function: Callable[..., None], args: Any, kwargs: Any) -> None:
         fail(f"{name}{error.strerror or error}", error, ERROR, as_json)
     except Exception as error:  # noqa: BLE001 - the last handler
         text = f"Internal error: {type(error).__name__}: {error}\n"
-        text += f"The traceback is in {log_file()}."
+        text += f"The traceback is in {log_file()}." if os.access(log_file().parent, os.W_OK) else format_exc()
         fail(text, error, INTERNAL, as_json)
 
 
@@ -65,7 +65,7 @@ def fail(message: str, error: BaseException, code: int, as_json: bool) -> None:
     logging.getLogger("errormotion.cli").error("%s", message, exc_info=error)
     if as_json:
         output.show_json({"ok": False, "error": {"type": type(error).__name__, "message": message, "exit_code": code}})
-    typer.echo(message, err=True)
+    output.show(message, err=True)
     raise typer.Exit(code)
 
 
@@ -83,16 +83,25 @@ class _LogHandler(RotatingFileHandler):
         pass
 
 
+class _Formatter(logging.Formatter):
+    """Writes control characters as escapes: a log is read on a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return output.printable(super().format(record))
+
+
 @contextmanager
 def _log() -> Iterator[None]:
     """Write warnings and errors to the log file, not to the terminal; 1 MB at most, and one older file."""
     path = log_file()
+    handler: logging.Handler
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         handler = _LogHandler(path, maxBytes=2**20, backupCount=1, encoding="utf-8", delay=True)
     except OSError:
-        handler = _LogHandler(Path(tempfile.gettempdir()) / "errormotion.log", encoding="utf-8", delay=True)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        # Not in the folder for temporary files: anyone could have placed a link under the name there.
+        handler = logging.NullHandler()
+    handler.setFormatter(_Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     handler.setLevel(logging.WARNING)
     logger = logging.getLogger("errormotion")
     before = logger.propagate

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from errormotion.cli.guard import USAGE
+from errormotion.cli.output import show
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
 Runs = Annotated[Path | None, typer.Option("--runs", help="Folder for run folders; default: that of the campaign.")]
@@ -36,7 +37,7 @@ def point(option: str, text: str) -> Point:
     try:
         x, y, z = (float(part) / 1e3 for part in text.split(","))
     except ValueError:
-        typer.echo(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", err=True)
+        show(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", err=True)
         raise typer.Exit(USAGE) from None
     return x, y, z
 
@@ -53,7 +54,7 @@ def date(option: str, text: str | None) -> datetime | None:
     try:
         return datetime.fromisoformat(text)
     except ValueError:
-        typer.echo(f"{option} {text}: expected a date, as in 2026-03-31 or 2026-03-31T08:00+01:00", err=True)
+        show(f"{option} {text}: expected a date, as in 2026-03-31 or 2026-03-31T08:00+01:00", err=True)
         raise typer.Exit(USAGE) from None
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import sys
 import textwrap
@@ -23,20 +24,39 @@ NOTICE_DELAY = 1.0
 """Duration after which a line states what the command is doing, s."""
 
 
-def show(text: str = "") -> None:
-    """Print a text."""
-    typer.echo(text)
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+"""Characters that a terminal executes: controls other than tab and line feed, and changes of direction."""
+
+
+def printable(text: str) -> str:
+    r"""Return a text with its control characters as escapes, such as \x1b.
+
+    Names, messages and notes come from files and devices; as they are, they could retitle the window of the terminal,
+    write to its clipboard or hide what was printed.
+    """
+    return _CONTROL.sub(_escape, text)
+
+
+def _escape(found: re.Match[str]) -> str:
+    code = ord(found[0])
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
+
+
+def show(text: str = "", *, err: bool = False) -> None:
+    """Print a text; on stderr with ``err``."""
+    typer.echo(printable(text), err=err)  # noqa: TID251 - the one place
 
 
 def show_json(value: Any) -> None:
     """Print one JSON document; NaN and infinite numbers become null."""
-    sys.stdout.write(json.dumps(_strict(value), indent=2, ensure_ascii=False, default=str) + "\n")
+    text = json.dumps(_strict(value), indent=2, ensure_ascii=False, default=str)
+    sys.stdout.write(_CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text) + "\n")
 
 
 @contextmanager
 def working(what: str) -> Iterator[None]:
     """Print on a terminal what the command is doing, if the block takes longer than `NOTICE_DELAY`."""
-    timer = threading.Timer(NOTICE_DELAY, lambda: typer.echo(f"{what} ...", err=True))
+    timer = threading.Timer(NOTICE_DELAY, lambda: show(f"{what} ...", err=True))
     timer.daemon = True
     if sys.stderr.isatty():
         timer.start()

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Self
 
-from rich.console import Console, RenderableType
+from rich.console import RenderableType
 from rich.progress import (
     BarColumn,
     Progress,
@@ -21,6 +21,7 @@ from rich.progress import (
 
 from errormotion.campaign.planning.release import WORD, require_word
 from errormotion.cli.curves import Curves
+from errormotion.cli.terminal import Terminal
 
 
 def on_terminal() -> bool:
@@ -31,7 +32,9 @@ def on_terminal() -> bool:
 class _Display(Progress):
     """Bars, and curves below them."""
 
-    def __init__(self, curves: Callable[[], Curves], *columns: ProgressColumn, console: Console, disable: bool) -> None:
+    def __init__(
+        self, curves: Callable[[], Curves], *columns: ProgressColumn, console: Terminal, disable: bool
+    ) -> None:
         self._curves, self._own = curves, console
         super().__init__(*columns, console=console, disable=disable)
 
@@ -53,7 +56,7 @@ class Bars:
 
     def __init__(self, quiet: bool = False, *, announcing: bool = False) -> None:
         self._announcing = announcing
-        self._console = Console(stderr=True, highlight=False)
+        self._console = Terminal()
         self._shown = not quiet and sys.stderr.isatty()
         self._curves = Curves()
         self._progress = _Display(

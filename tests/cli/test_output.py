@@ -1,14 +1,21 @@
 """Tables that fit the width of a terminal."""
 
+import io
+import json
 import os
 import shutil
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import pytest
+from rich.table import Table
+from rich.text import Text
 
-from errormotion.cli import output
+from errormotion.cli import main, output
 from errormotion.cli.output import table
+from errormotion.cli.terminal import Terminal
 
 HEAD = ("name", "value", "what it is")
 ROWS = [("first", "12.5", "a sentence of many words that goes on"), ("second", "3", "short")]
@@ -56,3 +63,56 @@ def test_long_operations_are_announced_on_a_terminal_only(monkeypatch: pytest.Mo
     assert work(0.2) == "Writing the report ...\n"
     monkeypatch.setattr(output, "NOTICE_DELAY", 60.0)
     assert work(0.0) == ""
+
+
+CONTROLS = "\x1b]0;title\x07 \x9b31m \x7f \u202e \r"
+ESCAPES = r"\x1b]0;title\x07 \x9b31m \x7f \u202e \x0d"
+
+
+def test_control_characters_are_printed_as_escapes(capsys) -> None:
+    output.show(f"a\tb\n{CONTROLS}")
+    output.show(CONTROLS, err=True)
+    shown = capsys.readouterr()
+    assert shown.out == f"a\tb\n{ESCAPES}\n"
+    assert shown.err == f"{ESCAPES}\n"
+
+
+def test_json_contains_no_control_characters_and_the_same_values(capsys) -> None:
+    output.show_json({CONTROLS: CONTROLS})
+    text = capsys.readouterr().out
+    assert json.loads(text) == {CONTROLS: CONTROLS}
+    assert not any(code in text for code in CONTROLS if code not in " ]0;title31m")
+
+
+def test_what_rich_draws_contains_no_control_characters_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    terminal = Terminal()
+    grid = Table(title=CONTROLS)
+    grid.add_row(Text(CONTROLS))
+    terminal.print(grid, f"loud {CONTROLS}", markup=False)
+    assert stream.getvalue().count(r"\x1b]0;title") == 3  # rich itself omits the bell
+    assert not any(code in stream.getvalue() for code in "\x1b\x07\x9b\x7f\u202e\r")
+
+
+def test_a_name_in_a_file_cannot_control_the_terminal(tmp_path: Path, capfd) -> None:
+    (tmp_path / "bench.toml").write_text('schema = "errormotion.bench/1"\n"\\u001b]0;x\\u0007" = 1\n')
+    with pytest.raises(SystemExit):
+        main(["bench", "validate", str(tmp_path / "bench.toml")])
+    shown = capfd.readouterr()
+    assert r"\x1b]0;x\x07" in shown.err
+    assert "\x1b" not in shown.out + shown.err
+
+
+def test_without_a_state_folder_no_log_is_written_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd
+) -> None:
+    victim, state = tmp_path / "victim", tmp_path / "state"
+    state.write_text("a file where the folder should be")
+    victim.write_text("mine")
+    (tmp_path / "errormotion.log").symlink_to(victim)
+    monkeypatch.setenv("XDG_STATE_HOME", str(state))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(SystemExit):
+        main(["bench", "validate", str(tmp_path / "none.toml")])
+    assert victim.read_text() == "mine"

@@ -1,9 +1,12 @@
 """Rules for the files of the repository."""
 
+import json
 import re
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,6 +14,7 @@ import errormotion
 
 ROOT = Path(__file__).parents[2]
 MAX_MODULES = 12
+TEXT: dict[str, Any] = {"capture_output": True, "text": True}
 TARGETS = {"setup", "demo", "test", "lint", "docs", "bench", "validate"}
 
 
@@ -46,6 +50,30 @@ def test_no_tracked_file_contains(what: str, pattern: str) -> None:
     found = [f"{where}: {line.strip()[:100]}" for where, line in _lines(_tracked(), pattern)]
     found = [line for line in found if not line.startswith("tests/repository/test_tree.py:")]
     assert not found, f"{what} stands in\n" + "\n".join(found)
+
+
+CONNECTIONS = """
+import socket, asyncio, can, serial.tools
+import tornado.web
+import urllib.parse, urllib.request
+from http import client
+from urllib import request
+def later():
+    from asyncua import ua
+    from pymodbus.client import ModbusTcpClient
+"""
+
+
+def _banned(file: str) -> int:
+    """Return the number of imports that ruff forbids a module of the package."""
+    command = [sys.executable, "-m", "ruff", "check", "--select", "TID251", "--output-format", "json"]
+    done = subprocess.run([*command, "--stdin-filename", file, "-"], cwd=ROOT, input=CONNECTIONS, **TEXT)
+    return len(json.loads(done.stdout))
+
+
+def test_a_new_package_may_not_open_connections() -> None:
+    assert _banned("errormotion/new/module.py") == _banned("errormotion/record/module.py") == 10
+    assert _banned("errormotion/instruments/transports/module.py") == 0
 
 
 def test_version_is_one() -> None:

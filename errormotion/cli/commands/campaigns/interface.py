@@ -9,6 +9,7 @@ import typer
 
 from errormotion.cli import options
 from errormotion.cli.guard import USAGE
+from errormotion.cli.output import show
 from errormotion.cli.root import app, background_app
 
 Move = Annotated[bool, typer.Option("--move", help="Release the motions of the machine without a question.")]
@@ -75,12 +76,12 @@ def run(
         from errormotion.cli.commands.campaigns import dry_run as dry
 
         if campaign is None or resume or campaign.is_dir():
-            typer.echo("--dry-run: expected a campaign file and no --resume.", err=True)
+            show("--dry-run: expected a campaign file and no --resume.", err=True)
             raise typer.Exit(USAGE)
         dry.run(campaign, out, json_)
         return
     if out is not None:
-        typer.echo("--out is allowed with --dry-run only.", err=True)
+        show("--out is allowed with --dry-run only.", err=True)
         raise typer.Exit(USAGE)
     from errormotion.cli.commands.campaigns import run as command
 

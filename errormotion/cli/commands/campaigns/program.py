@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import typer
-
 from errormotion.campaign.files import load_campaign
 from errormotion.campaign.planning.release import announced, refuse, released, to_release
 from errormotion.cli.output import show, show_json, table
@@ -49,7 +47,7 @@ def write(campaign: Path, test: str | None, out: Path, *, move: bool, as_json: b
             f"{existing[0]} already exists; choose another folder, or remove the file. Nothing was written."
         )
     for entry in with_programs:
-        typer.echo(announced(plan, entry), err=True)
+        show(announced(plan, entry), err=True)
     if motions := to_release(plan, with_programs):
         (released if move else Bars(quiet=True, announcing=True).release if on_terminal() else refuse)(motions)
     for _, path, text in files:

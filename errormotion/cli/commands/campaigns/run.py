@@ -40,10 +40,10 @@ def run(
 ) -> None:
     """Run or resume a campaign and print its results."""
     if campaign is None and not resume:
-        typer.echo("Expected a campaign file, or --resume to continue the newest unfinished campaign.", err=True)
+        show("Expected a campaign file, or --resume to continue the newest unfinished campaign.", err=True)
         raise typer.Exit(USAGE)
     if tolerances is not None and (resume or campaign is None):
-        typer.echo(
+        show(
             "--tolerances is not allowed with --resume. Resume first, then: errormotion report RUN --tolerances FILE",
             err=True,
         )
@@ -103,7 +103,7 @@ def work(
 def detach(campaign: Path | None, *, resume: bool, runs: Path | None, move: bool, as_json: bool) -> None:
     """Start or resume a campaign in a separate process, and print the name of the process."""
     if campaign is None:
-        typer.echo("--detach: expected a campaign file, or a run folder with --resume.", err=True)
+        show("--detach: expected a campaign file, or a run folder with --resume.", err=True)
         raise typer.Exit(USAGE)
     release = released if move else Bars(quiet=True).release if on_terminal() else refuse
     if resume:
@@ -166,4 +166,4 @@ def _lines(folder: RunFolder) -> list[str]:
 
 def _assume_done(message: str) -> None:
     """Print a request to the operator, and continue as if it were done."""
-    typer.echo(f"assumed done (--yes): {message}", err=True)
+    show(f"assumed done (--yes): {message}", err=True)

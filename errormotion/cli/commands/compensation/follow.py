@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 
 import numpy as np
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -23,6 +23,7 @@ from errormotion.campaign.files import load_bench
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli import options
 from errormotion.cli.output import show
+from errormotion.cli.terminal import Terminal
 from errormotion.compensation.online.follower import State
 from errormotion.datasets import load
 
@@ -50,7 +51,7 @@ def run(
         functional_point=None if functional_point is None else np.array(functional_point),
         since=None if since is None else load(RunFolder.open(since).raw if since.is_dir() else since),
     )
-    console = Console(stderr=True, highlight=False)
+    console = Terminal()
     shown = sys.stderr.isatty() and not as_json
     states: Counter[str] = Counter()
     last: Moment | None = None
@@ -76,7 +77,7 @@ def run(
 
 
 @contextmanager
-def _ramping_when_stopped(compensation: Compensation, console: Console) -> Iterator[None]:
+def _ramping_when_stopped(compensation: Compensation, console: Terminal) -> Iterator[None]:
     """Handle Ctrl-C and SIGTERM: the first one ramps to zero, the second one ends the command at once."""
     stopping = False
 

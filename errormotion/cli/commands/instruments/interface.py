@@ -24,7 +24,7 @@ def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], 
     except BenchError as error:
         if json_:
             show_json({"ok": False, "file": str(file), "message": str(error)})
-        typer.echo(str(error), err=True)
+        show(str(error), err=True)
         raise typer.Exit(INVALID) from error
     rows = [[i.name, i.driver.info.id, i.driver.info.kind, i.address] for i in plan.instruments]
     if json_:

@@ -9,7 +9,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -20,6 +20,7 @@ from errormotion.campaign.monitor.watch import Monitor, Snapshot
 from errormotion.cli import options
 from errormotion.cli.curves import bars
 from errormotion.cli.output import show
+from errormotion.cli.terminal import Terminal
 
 TREND = 30
 """Points of the curve of a temperature."""
@@ -37,7 +38,7 @@ def run(file: Path, runs: Path, interval: str, duration: str | None, as_json: bo
     length = math.inf if duration is None else options.duration("--duration", duration)
     monitor = Monitor(load_bench(file), runs, step)
     screen = Screen(monitor.sensors)
-    console = Console(stderr=True, highlight=False)
+    console = Terminal()
     shown = sys.stderr.isatty() and not as_json
     last: Snapshot | None = None
     folder: Path | None = None

@@ -67,7 +67,7 @@ def identify(
 
     scheduler, note = batch.choose_scheduler(scheduler)
     if note:
-        typer.echo(note, err=True)
+        show(note, err=True)
     with Bars(as_json) as bars:
         outcomes = batch.identify_runs(
             raws, method_id, settings, out, scheduler=scheduler, workers=workers, progress=bars
@@ -170,7 +170,7 @@ def _show_outcomes(
                 monte_carlo.show_evaluation(evaluated, raw)
     broken = any(outcome.traceback for outcome in failed)
     if broken:
-        typer.echo(f"The tracebacks are in {log_file()}.", err=True)
+        show(f"The tracebacks are in {log_file()}.", err=True)
     if failed or refused:
         raise typer.Exit(INTERNAL if broken else ERROR)
     end_with(decisions)

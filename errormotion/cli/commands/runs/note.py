@@ -28,11 +28,11 @@ def note(folder: Path, text: str, machine: str | None, at: str | None, by: str, 
     time = date("--at", at)
     if (folder / "run.json").exists():
         if machine is not None:
-            typer.echo(f"--machine is not allowed for a run; {folder} states its machine", err=True)
+            show(f"--machine is not allowed for a run; {folder} states its machine", err=True)
             raise typer.Exit(USAGE)
         read_entry(folder)
     elif machine is None or time is None:
-        typer.echo(f"{folder} is not a run folder; a note on a machine needs --machine NAME and --at DATE", err=True)
+        show(f"{folder} is not a run folder; a note on a machine needs --machine NAME and --at DATE", err=True)
         raise typer.Exit(USAGE)
     entry = event(text, by=by, at=time, machine=machine or "")
     file = append(folder, entry)

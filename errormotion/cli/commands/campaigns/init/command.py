@@ -64,7 +64,7 @@ def init(
     if ask is not None:
         asking.complete(answers, ask)
     elif not answers.machine or not answers.instruments:
-        typer.echo("Expected --machine and at least one --instrument, as there is no terminal for questions.", err=True)
+        show("Expected --machine and at least one --instrument, as there is no terminal for questions.", err=True)
         raise typer.Exit(USAGE)
     try:
         texts = _checked(answers, folder)
