@@ -14,6 +14,7 @@ from errormotion.twin import VirtualMachine
 HEAD = """# schema = errormotion.raw.inclination/1
 # sensor = LK-H050
 # mid_range = 0 mm
+# receiver_rotation = 180 deg
 inclination [deg],rotation [deg],reading [mm],reference [mm]
 """
 
