@@ -1,7 +1,11 @@
 """What holds for every test: in CI (environment variable CI set) a skipped test is a failed test.
 
-Property tests have no time limit an example, since machines differ. In CI their examples are the same each time;
-elsewhere they are drawn anew, and so find more.
+`skipped.toml` lists the tests that are skipped where only git, make and Python are installed, with the reasons. With
+`--skips FILE`, any other skip, and a listed one that does not occur, is a failure (`tools/bare`). With `--beyond FILE`,
+only those tests and the slow ones run, which is what such a computer leaves to be tested (`.ci/run`).
+
+Property tests have no time limit an example, since machines differ. Where a change is judged (CI, `--skips`) their
+examples are the same each time; elsewhere they are drawn anew, and so find more.
 
 Every worker keeps its linear algebra to one thread: there are more workers than processors.
 """
@@ -24,15 +28,77 @@ for _library in ("OPENBLAS", "OMP", "MKL"):  # before anything imports numpy
 PACKAGE = Path(__file__).parents[1] / "errormotion"
 IN_CI = os.environ.get("CI", "").lower() not in ("", "0", "false")
 
-hypothesis.settings.register_profile(
-    "errormotion", deadline=None, derandomize=IN_CI, suppress_health_check=[hypothesis.HealthCheck.too_slow]
-)
-hypothesis.settings.load_profile("errormotion")
-
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the folder of pictures."""
+    """Add the folder of pictures, and the uses of the list of skipped tests."""
     parser.addoption("--pictures", metavar="FOLDER", help="write the pictures of the documentation that tests make")
+    parser.addoption(
+        "--skips", metavar="FILE", help="fail unless exactly the tests in FILE are skipped, each with its reason"
+    )
+    parser.addoption("--beyond", metavar="FILE", help="run only slow tests and the tests in FILE")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Set the examples of property tests; compare the skips with the list, in the process that receives all reports."""
+    hypothesis.settings.register_profile(
+        "errormotion",
+        deadline=None,
+        derandomize=IN_CI or bool(config.getoption("--skips")),
+        suppress_health_check=[hypothesis.HealthCheck.too_slow],
+    )
+    hypothesis.settings.load_profile("errormotion")
+    if (file := config.getoption("--skips")) and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(_Skips(_listed(file)))
+
+
+def _listed(file: str) -> dict[str, str]:
+    """Return the beginning of the reason for every listed file or test."""
+    groups = tomllib.loads(Path(file).read_text(encoding="utf-8"))["skipped"]
+    return {test: group["reason"] for group in groups for test in group["tests"]}
+
+
+def _entry(nodeid: str, listed: dict[str, str]) -> str | None:
+    """Return the entry of a test: itself, itself without parameters, or its file."""
+    names = nodeid, nodeid.partition("[")[0], nodeid.partition("::")[0]
+    return next((name for name in names if name in listed), None)
+
+
+class _Skips:
+    """The skips of a run, against those that are listed."""
+
+    def __init__(self, listed: dict[str, str]) -> None:
+        self.listed, self.found = listed, dict[str, str]()
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self._add(report)
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        self._add(report)
+
+    def _add(self, report: pytest.TestReport | pytest.CollectReport) -> None:
+        if report.skipped and not hasattr(report, "wasxfail"):
+            reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+            self.found[report.nodeid] = reason.removeprefix("Skipped: ")
+
+    def _differences(self) -> list[str]:
+        entries = {test: _entry(test, self.listed) for test in self.found}
+        missing = [f"not skipped, but listed: {entry}" for entry in self.listed.keys() - set(entries.values())]
+        return sorted(missing) + [
+            f"skipped, but not listed with this reason: {test}: {self.found[test]}"
+            for test, entry in sorted(entries.items())
+            if entry is None or not self.found[test].startswith(self.listed[entry])
+        ]
+
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        differences = self._differences()
+        if session.config.cache is not None:
+            session.config.cache.set("errormotion/skips", differences)  # read by tools/repeat_failed
+        if differences and session.exitstatus == pytest.ExitCode.OK:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        for line in self._differences():
+            terminalreporter.write_line(line, red=True)
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
@@ -75,8 +141,13 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
     return _ByFile(config, log)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Begin with the longest of the files that wait, and with slow tests: no worker has a long file at the end."""
+    if file := config.getoption("--beyond"):
+        listed = _listed(file)
+        beyond = [bool(item.get_closest_marker("slow") or _entry(item.nodeid, listed)) for item in items]
+        config.hook.pytest_deselected(items=[item for item, runs in zip(items, beyond, strict=True) if not runs])
+        items[:] = [item for item, runs in zip(items, beyond, strict=True) if runs]
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: (_waiting(item.nodeid.partition("::")[0]), item.path not in slow))
 

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import needed_open3d
 import numpy as np
 import pytest
 import xarray as xr
@@ -36,7 +37,7 @@ def write_cloud(path: Path, positions: np.ndarray, ascii: bool = False) -> Path:
     if path.suffix == ".xyz":
         np.savetxt(path, positions, fmt="%.10g")
         return path
-    open3d = pytest.importorskip("open3d")
+    open3d = needed_open3d.open3d()
     cloud = open3d.t.geometry.PointCloud(open3d.core.Tensor(positions))
     assert open3d.t.io.write_point_cloud(str(path), cloud, write_ascii=ascii)
     return path
@@ -67,7 +68,7 @@ def scan(path: Path, chosen: ProfileFileSettings | None = None) -> Scan:
 def test_a_point_cloud_becomes_a_height_map_to_the_rounding_of_its_file(
     tmp_path: Path, suffix: str, dtype: str
 ) -> None:
-    pytest.importorskip("open3d")
+    needed_open3d.open3d()
     found = scan(write_cloud(tmp_path / f"scan{suffix}", (1e3 * points()).astype(dtype)), MM)
     rounding = 1e-9 if suffix == ".xyz" or dtype == "f4" else 1e-12  # 2 mm in 24 bits: 0.1 nm; xyz: ten digits
     assert found.heights == pytest.approx(HEIGHTS, abs=rounding, nan_ok=True)

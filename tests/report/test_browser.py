@@ -15,7 +15,7 @@ from errormotion.report.drawings.turntable import Dots, Scene, draw
 BROWSER = shutil.which("chromium")
 NAME = "<script>alert(1)</script>"
 
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="chromium is not installed")
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser is installed")
 
 ACTIONS = """addEventListener("load", () => {
   const found = [], tip = document.querySelector(".tip"), svg = document.querySelector("figure > svg");

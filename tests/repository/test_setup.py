@@ -168,5 +168,5 @@ def test_the_output_of_the_installer_is_shown_only_if_it_fails(tmp_path: Path, f
 def test_open3d_loads_with_the_system_libraries_that_ci_installs() -> None:
     done = subprocess.run([sys.executable, "-c", "import open3d"], capture_output=True, text=True)
     if "cannot open shared object file" in done.stderr or "No module named" in done.stderr:
-        pytest.skip(f"open3d or a library beneath it is missing: {done.stderr.strip().splitlines()[-1]}")
+        pytest.skip(f"Open3D cannot be loaded: {done.stderr.strip().splitlines()[-1].partition(': ')[2]}")
     assert done.returncode == 0, done.stderr

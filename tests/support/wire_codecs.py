@@ -205,18 +205,19 @@ def http_answers() -> list[bytes]:
 
 
 def linuxcnc_lines() -> list[bytes]:
+    """Return what a bridge sends: the golden vectors, and lines as recorded; none needs an installed LinuxCNC."""
     flags = '"running": false, "homed": true, "enabled": true, "estop": false, "alarms": ["a", "b"]'
     state = (
         '{"time": 1.5, "position": [0.1, 0.2, null], "commanded_position": [0.1, 0.2, 0.3], "spindle_speed": 1200, '
         f'"spindle_load": null, "feed": 0.01, "mode": "mdi", "program": "a.ngc", {flags}}}'
     )
-    touch = '{"tripped": true, "position": [0.1, 0.2, 0.3], "time": 2.25}'
-    texts = (
-        *(f'{{"id": 1, "ok": true, "result": {result}, "time": 1.5}}' for result in (state, touch)),
-        '{"id": 1, "ok": false, "error": "the machine is busy", "time": 1.5}',
-        '{"id": 1, "beat": 7, "time": 3.2, "running": true}',
+    identity = (
+        '{"manufacturer": "LinuxCNC", "model": "cframe", "serial_number": "seed 3", "firmware": "2.9.0~pre1", '
+        '"travel": {"X": [-0.305001, 0.305001], "Y": [-0.255001, 0.255001], "Z": [-1e-06, 0.460001]}}'
     )
-    return [*split(joined("linuxcnc"), linuxcnc.LINE_END), *(text.encode() + linuxcnc.LINE_END for text in texts)]
+    texts = [f'{{"id": 1, "ok": true, "result": {result}, "time": 1.5}}' for result in (identity, state)]
+    golden = rows("linuxcnc", "welcome", "answer", "beat", "touch")
+    return [data.rstrip(linuxcnc.LINE_END) + linuxcnc.LINE_END for data in (*golden, *(t.encode() for t in texts))]
 
 
 def virtual_lines() -> list[bytes]:

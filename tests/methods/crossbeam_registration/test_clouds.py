@@ -2,6 +2,7 @@
 
 import sys
 
+import needed_open3d
 import numpy as np
 import pytest
 
@@ -25,10 +26,7 @@ def small_pair(make_scanner):
 @pytest.fixture(scope="module")
 def _open3d(small_pair):
     # The pair first: numba warns where it starts its threads after Open3D has loaded a TBB of its own.
-    try:
-        import open3d  # noqa: F401
-    except (ImportError, OSError) as error:
-        pytest.skip(f"open3d cannot be loaded: {error}")
+    needed_open3d.open3d()
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import dataclasses
 import logging
 
+import needed_open3d
 import numpy as np
 import pytest
 import xarray as xr
@@ -364,10 +365,7 @@ def thin_by_maps(thin):
 @pytest.fixture
 def _open3d(thin_by_maps):
     # Maps first: numba warns where it starts its threads after Open3D has loaded a TBB of its own.
-    try:
-        import open3d  # noqa: F401
-    except (ImportError, OSError) as error:
-        pytest.skip(f"open3d cannot be loaded: {error}")
+    needed_open3d.open3d()
 
 
 @pytest.mark.usefixtures("_open3d")
