@@ -109,6 +109,71 @@ def test_published_devices_open_and_are_read_with_default_settings(vector: Vecto
         assert "spindle_speed" in state["unavailable"]
 
 
+# ---------------------------------------------------------------------- values that are no numbers, restarts
+
+
+def machine_of(x: str) -> bytes:
+    """Return the description of a machine whose X has the data item ``x``."""
+    linear = "".join(
+        f'<Linear id="a{axis}" name="{axis}"><DataItems><DataItem id="{key}" category="SAMPLE" type="POSITION" '
+        'subType="ACTUAL" units="MILLIMETER"/></DataItems></Linear>'
+        for axis, key in (("X", x), ("Y", "y"), ("Z", "z"))
+    )
+    rotary = (
+        '<Rotary id="c" name="C"><DataItems><DataItem id="speed" category="SAMPLE" type="ROTARY_VELOCITY" '
+        'subType="ACTUAL" units="REVOLUTION/MINUTE"/></DataItems></Rotary>'
+    )
+    return (
+        f'<MTConnectDevices>{HEADER}/><Devices><Device id="d" name="M"><Components><Axes id="ax"><Components>{linear}'
+        f"{rotary}</Components></Axes></Components></Device></Devices></MTConnectDevices>"
+    ).encode()
+
+
+def observed(*values: tuple[str, str], first: int = 1) -> list[tuple[int, str]]:
+    return [
+        (number, f'<Position dataItemId="{item}" {TIME} sequence="{number}">{value}</Position>')
+        for number, (item, value) in enumerate(values, start=first)
+    ]
+
+
+@pytest.mark.parametrize("word", ["NaN", "1,5", "inf", "near", "1.234,5", "1 2"])
+def test_a_value_that_is_no_number_is_unknown_and_the_others_are_known(word: str) -> None:
+    with agent(machine_of("x")) as there:
+        there.observations = observed(("x", word), ("y", "2"), ("z", "-3.5"), ("speed", "6000"))
+        with MTConnect(there.url) as driver:
+            state = driver.state()
+    assert math.isnan(state["position"][0])
+    assert state["position"][1:] == pytest.approx([0.002, -0.0035])
+    assert state["spindle_speed"] == 6000.0
+    assert "position" in state["unavailable"]
+    assert list(state["reasons"]) == ["position.X"]
+    assert word.split()[0] in state["reasons"]["position.X"]
+
+
+def test_an_agent_that_begins_anew_with_the_same_instance_is_described_again() -> None:
+    with agent(machine_of("x")) as there:
+        there.observations = observed(("x", "1"), ("y", "2"), ("z", "3"), first=100)
+        with MTConnect(there.url) as driver:
+            assert driver.state()["position"][0] == pytest.approx(0.001)
+            there.probe = machine_of("another")
+            there.observations = observed(("another", "9"), ("y", "2"), ("z", "3"), first=1)
+            assert driver.state()["position"][0] == pytest.approx(0.009)
+            assert driver.restarts == 1
+            assert driver.state()["position"][0] == pytest.approx(0.009)
+            assert driver.restarts == 1
+
+
+def test_an_agent_that_begins_anew_with_the_same_instance_does_not_stop_the_samples() -> None:
+    with agent(machine_of("x")) as there:
+        there.observations = observed(("x", "1"), ("y", "2"), ("z", "3"), first=100)
+        with MTConnect(there.url) as driver:
+            driver.sample()
+            there.observations = observed(("x", "9"), ("y", "2"), first=1)
+            found = driver.sample()
+            assert found.restarted
+            assert [each.value for each in found.observations] == ["9", "2"]
+
+
 # ---------------------------------------------------------------------- the package mtconnect, version 0.3
 
 PEER_ITEMS = {

@@ -275,13 +275,51 @@ def test_invalid_lines_are_counted_if_so_set() -> None:
             assert driver.malformed == 1
 
 
-def test_a_value_that_is_no_number_names_its_key() -> None:
-    with (
-        adapter(b"|Xact|near\n") as there,
-        Shdr(there.url) as driver,
-        pytest.raises(ProtocolError, match="key 'Xact': Expected a number; found 'near'"),
-    ):
-        driver.state()
+@pytest.mark.parametrize("word", ["near", "1,5", "NaN", "nan", "inf", "1.234,5", "1 2"])
+def test_a_value_that_is_no_number_is_unknown_with_a_reason_and_the_others_are_known(word: str) -> None:
+    lines = f"2026-03-01T12:00:00Z|Xact|{word}|Yact|2|Zact|3|spindle_speed|6000|estop|ARMED\n".encode()
+    with adapter(lines) as there, Shdr(there.url) as driver:
+        state = driver.state()
+    assert math.isnan(state["position"][0])
+    assert state["position"][1:] == pytest.approx([0.002, 0.003])
+    assert state["spindle_speed"] == 6000.0
+    assert state["estop"] is False
+    assert "position" in state["unavailable"]
+    assert list(state["reasons"]) == ["Xact"]
+    assert word in state["reasons"]["Xact"]
+
+
+@pytest.mark.parametrize("words", ["1 NaN 3", "1 2,5 3"])
+def test_one_unknown_coordinate_of_three_is_unknown_alone(words: str) -> None:
+    settings = ShdrSettings(items={"position": "Ppos"})
+    with adapter(f"|Ppos|{words}\n".encode()) as there, Shdr(there.url, settings) as driver:
+        state = driver.state()
+    assert state["position"] == pytest.approx([0.001, math.nan, 0.003], nan_ok=True)
+    assert list(state["reasons"]) == ["Ppos"]
+
+
+@pytest.mark.parametrize(
+    ("line", "program", "others"),
+    [
+        ("avail|AVAILABLE|estop|ARMED|program|O1|23", "", {"availability": True, "estop": False}),
+        ("program|A|B|avail|AVAILABLE|estop|TRIGGERED", "", {"estop": True}),
+        ("avail|AVAILABLE|program|a|b|c|d|estop|ARMED", "", {"estop": False}),
+        ("avail|AVAILABLE|program|a|b|estop|TRIGGERED|Xact", "", {"estop": True}),
+        ("avail|AVAILABLE|program|O1|other|5|estop|ARMED|x", "O1", {}),
+    ],
+)
+def test_a_separator_in_a_value_makes_this_value_unknown(line: str, program: str, others: dict[str, bool]) -> None:
+    with adapter(f"2026-11-27T11:33:50.303089Z|{line}\n".encode()) as there, Shdr(there.url) as driver:
+        state = driver.state()
+        assert driver.malformed >= 1
+    assert state["program"] == program
+    assert ("program" in state["unavailable"]) == (not program)
+    assert ("program" in state["reasons"]) == (not program)
+    if "estop" in others:
+        assert state["estop"] is others["estop"]
+    if others.get("availability"):
+        assert state["enabled"] is True
+        assert "availability" not in state["unavailable"]
 
 
 def test_commands_identify_the_device() -> None:

@@ -149,6 +149,27 @@ def test_the_document_follows_the_schema_version() -> None:
         assert "deviceModelChangeTime" not in header(client.read("/probe"))
 
 
+@pytest.mark.parametrize("version", ["1.4", "1.7", "2.0", "2.7"])
+def test_the_header_of_assets_states_no_buffer_of_observations(version: str) -> None:
+    with agent(f"version={version}") as client:
+        assets, probe = (set(header(client.read(path))) for path in ("/assets", "/probe"))
+    assert {"assetBufferSize", "assetCount"} <= assets
+    assert "bufferSize" not in assets
+    assert {"assetBufferSize", "assetCount", "bufferSize"} <= probe
+
+
+@pytest.mark.parametrize("style", sorted(STYLES))
+def test_the_parts_of_a_component_have_the_order_of_the_schema(style: str) -> None:
+    order = ["Description", "Configuration", "DataItems", "Components", "Compositions", "References"]
+    with agent(f"style={style}&series=1") as client:
+        probe = client.read("/probe")
+    devices = next(each for each in probe if each.tag == "Devices")
+    assert [each.tag for each in devices] in (["Device"], ["Agent", "Device"])
+    for each in devices.iter():
+        parts = [part.tag for part in each if part.tag in order]
+        assert parts == sorted(set(parts), key=order.index)
+
+
 @pytest.mark.parametrize("query", ["style=haas", "version=1.2", "version=9", "multipart=x", "offset=1,2", "fault=sulk"])
 def test_unknown_parameters_of_the_address_are_refused(query: str) -> None:
     with pytest.raises(InstrumentError), agent(query):

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from errormotion.errors import InstrumentError
+from errormotion.instruments.simulators.controller import shdr
 from errormotion.instruments.simulators.controller.mtconnect.devices import Devices
 from errormotion.instruments.simulators.controller.mtconnect.machine import Condition, Series
 from errormotion.instruments.simulators.controller.mtconnect.styles import STYLES
@@ -171,6 +172,25 @@ def test_a_client_that_stops_its_pings_is_disconnected() -> None:
         line.until("* PONG")
         while line.next():
             pass
+
+
+def test_the_device_has_the_name_in_the_address() -> None:
+    for query, name in (("name=OKUMA", "OKUMA"), ("device=VMC", "VMC"), ("name=OKUMA&device=VMC", "OKUMA")):
+        with connected(query) as line:
+            assert "* device: " + name in [line.next() for _ in range(4)]
+
+
+@pytest.mark.parametrize(("query", "expected"), [("", r'"O1\|23"'), ("pipes=raw", "O1|23")], ids=["escaped", "raw"])
+def test_separators_in_values_are_escaped_or_not(query: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = shdr.reading
+    monkeypatch.setattr(
+        shdr, "reading", lambda values, source: "O1|23" if source == "program" else real(values, source)
+    )
+    with connected(query) as line:
+        for _ in range(20):
+            if "pprogram|" in (text := line.next()):
+                break
+    assert f"pprogram|{expected}" in text
 
 
 def test_keys_can_have_the_name_of_the_device() -> None:

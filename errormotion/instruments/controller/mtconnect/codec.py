@@ -75,6 +75,7 @@ class Header:
     buffer: int = 0
     version: str = ""
     sender: str = ""
+    model_changed: str = ""  # deviceModelChangeTime, as stated
 
 
 @dataclass(frozen=True)
@@ -248,6 +249,7 @@ def _header(root: Element) -> Header:
         buffer=_whole(header, "bufferSize", 0),
         version=header.get("version"),
         sender=header.get("sender"),
+        model_changed=header.get("deviceModelChangeTime"),
     )
 
 

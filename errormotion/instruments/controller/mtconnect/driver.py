@@ -96,6 +96,8 @@ class MTConnect(Driver):
         self.lost = 0
         self.restarts = 0
         self._instance: int | None = None
+        self._model_changed = ""
+        self._newest = 0  # sequence number after the newest observation of the agent, as last stated
         self._next: int | None = None
         self._buffer_size = 0  # number of observations in the buffer of the agent
         self._started_at: float | None = None
@@ -141,13 +143,13 @@ class MTConnect(Driver):
             (X, Y, Z, m), ``position_time`` (when the position last changed, s on the same clock), ``spindle_speed``
             (1/min), ``spindle_load`` (fraction), ``feed`` (m/s), ``mode`` (``manual``, ``mdi``, ``automatic`` or
             empty), ``program``, ``running``, ``homed`` (None: agents do not report it), ``enabled``, ``estop``,
-            ``alarms`` and ``warnings`` (lists of str), and ``unavailable``: names of unknown values. Unknown numbers
-            are NaN.
+            ``alarms`` and ``warnings`` (lists of str), ``unavailable``: names of unknown values, and ``reasons``: why a
+            value that the agent states is unknown (``1,5`` is not a number), by its name. Unknown numbers are NaN.
 
         Raises
         ------
         ProtocolError
-            The answer is not that of an agent, or a value is invalid.
+            The answer is not that of an agent.
         InstrumentTimeoutError
             No answer within the time limit.
         """
@@ -224,7 +226,8 @@ class MTConnect(Driver):
     def _next_observed(self, document: Document) -> Observed | None:
         """Return the observations of an answer; None if the sequence numbers must be determined again."""
         assert self._next is not None
-        if document.header.instance != self._instance or OUT_OF_RANGE in document.errors:
+        header = document.header
+        if header.instance != self._instance or OUT_OF_RANGE in document.errors or 0 < header.next < self._next:
             return None
         self._refuse(document, "sample")
         return self._take(document, max(0, document.header.first - self._next), restarted=False)
@@ -234,6 +237,7 @@ class MTConnect(Driver):
         fresh = tuple(each for each in document.observations if each.sequence >= first)
         after = fresh[-1].sequence + 1 if fresh else first  # for an agent that does not state the next number
         self._next = max(document.header.next or after, first)
+        self._newest = max(self._newest, self._next)
         self._count(lost)
         return Observed(fresh, self._next, lost, restarted)
 
@@ -268,8 +272,18 @@ class MTConnect(Driver):
             log.warning("%s: %d observations were overwritten before they were requested", self.address, lost)
 
     def _detect_restart(self, document: Document) -> bool:
-        """Read the description of the device again if the agent was restarted; return whether it was."""
-        if document.header.instance == self._instance:
+        """Read the description of the device again if the agent was restarted; return whether it was.
+
+        An agent without a clock may have the same instance again: then its sequence numbers begin anew. A description
+        that has changed without a restart is read again, too.
+        """
+        header = document.header
+        again = header.instance != self._instance or _end(document) < self._newest
+        self._newest = _end(document)
+        if not again:
+            if header.model_changed != self._model_changed:
+                log.warning("%s: the description of the device has changed", self.address)
+                self._examine()
             return False
         self.restarts += 1
         log.warning("%s: the agent was restarted", self.address)
@@ -326,7 +340,7 @@ class MTConnect(Driver):
 
     def _examine(self) -> None:
         document = self._query("probe")
-        self._instance = document.header.instance
+        self._instance, self._model_changed = document.header.instance, document.header.model_changed
         self._device = self._one(document)
         self._choose(self.settings)
         self._start(document)

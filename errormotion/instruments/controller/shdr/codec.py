@@ -45,6 +45,8 @@ class Observed:
         For a condition one of `LEVELS`; else empty.
     code : str
         For a condition or message the code of the machine.
+    doubt : str
+        Why the value, which is ``UNAVAILABLE``, cannot be told from the line; empty if it can.
     """
 
     key: str
@@ -52,6 +54,7 @@ class Observed:
     time: float
     level: str = ""
     code: str = ""
+    doubt: str = ""
 
 
 @dataclass(frozen=True)
@@ -64,11 +67,12 @@ class Command:
 
 @dataclass(frozen=True)
 class Keys:
-    """Keys whose values have several fields, as stated in the settings."""
+    """Keys whose values have several fields, as stated in the settings, and all keys that are known."""
 
     conditions: Set[str] = frozenset()
     messages: Set[str] = frozenset()
     series: Set[str] = frozenset()
+    known: Set[str] = frozenset()
 
 
 class Lines:
@@ -129,6 +133,9 @@ class Lines:
 def parse_line(line: bytes, keys: Keys = Keys()) -> Command | list[Observed]:
     """Return the content of a line: a command of the adapter, or values in their order; no values for an asset.
 
+    A separator within a value, which the adapter has not escaped, makes the value doubtful: it is that between two
+    known keys.
+
     Raises
     ------
     ProtocolError
@@ -146,7 +153,17 @@ def parse_line(line: bytes, keys: Keys = Keys()) -> Command | list[Observed]:
     time = parse_time(fields[0])
     if fields[1].startswith("@"):
         return []
-    return list(_observed(fields[1:], time, keys, text))
+    several = keys.conditions | keys.messages | keys.series
+    simple = fields[1] in keys.known and not several & set(fields)
+    try:
+        found = list(_observed(fields[1:], time, keys, text))
+    except ProtocolError:
+        if not simple or len(fields) % 2:
+            raise
+        return list(_between_known(fields[1:], time, keys.known))
+    if simple and any(each.key not in keys.known and each.value in keys.known for each in found):  # shifted by one
+        return list(_between_known(fields[1:], time, keys.known))
+    return found
 
 
 def split_fields(text: str) -> list[str]:
@@ -237,6 +254,29 @@ def _observed(fields: list[str], time: float, keys: Keys, text: str) -> Iterator
         else:
             yield Observed(key, rest[0], time)
         index += 1 + size
+
+
+def _between_known(fields: list[str], time: float, known: Set[str]) -> Iterator[Observed]:
+    """Yield the values of a line in which a separator is not escaped.
+
+    An odd number of fields from one known key to the next are its value and further pairs; with an even number, or
+    none, it cannot be told which of them are its value.
+    """
+    index = 0
+    while index < len(fields):
+        end = next((i for i in range(index + 2, len(fields)) if fields[i] in known), len(fields))
+        span = fields[index + 1 : end]
+        if len(span) % 2:
+            yield from (
+                Observed(*pair, time) for pair in zip(fields[index:end:2], fields[index + 1 : end : 2], strict=True)
+            )
+        else:
+            found = "|".join(span)[:60]
+            doubt = (
+                f"the value has a separator that is not escaped: '{found}'" if span else "the line ends behind the key"
+            )
+            yield Observed(fields[index], UNAVAILABLE, time, doubt=doubt)
+        index = end
 
 
 def _size(key: str, rest: list[str], keys: Keys, *, alone: bool) -> int:

@@ -63,7 +63,8 @@ class Shdr(Driver):
     heartbeat : float
         Heartbeat that the adapter requires, s; infinite if it does not answer ``* PING``.
     malformed : int
-        Number of lines that were ignored because they do not follow the protocol (``lenient``).
+        Number of lines that were ignored because they do not follow the protocol (``lenient``), and of values that
+        could not be told from their line.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -131,25 +132,21 @@ class Shdr(Driver):
             position last changed, s on the same clock), ``spindle_speed`` (1/min), ``spindle_load`` (fraction),
             ``feed`` (m/s), ``mode`` (``manual``, ``mdi``, ``automatic`` or empty), ``program``, ``running``, ``homed``
             (None: adapters do not report it), ``enabled``, ``estop``, ``alarms`` and ``warnings`` (lists of str),
-            ``temperatures`` (degC) and ``angles`` (rad) by the names in the settings, and ``unavailable``: names of
-            what is unknown. Unknown numbers are NaN.
+            ``temperatures`` (degC) and ``angles`` (rad) by the names in the settings, ``unavailable``: names of what is
+            unknown, and ``reasons``: why a value that the adapter sends is unknown, by its key. Unknown numbers are
+            NaN.
 
         Raises
         ------
         InstrumentTimeoutError
             No answer to ``* PING`` within the time limit.
         ProtocolError
-            A line that is not of the protocol (unless ``lenient``), or a value that is not a number.
+            A line that is not of the protocol (unless ``lenient``).
         InstrumentError
             The connection is lost.
         """
         self._update()
-        try:
-            return self._state()
-        except ProtocolError as error:
-            raise ProtocolError(f"{self.address}, {error}") from None
-
-    def _state(self) -> dict[str, Any]:
+        self._reasons = dict(self._memory.doubtful)
         settings, memory = self.settings, self._memory
         position, moved = self._position("position")
         numbers = {
@@ -189,6 +186,7 @@ class Shdr(Driver):
             ),
             *(key for key, value in text.items() if not value),
         ]
+        state["reasons"] = self._reasons
         return state
 
     # ------------------------------------------------------------------ values
@@ -196,17 +194,24 @@ class Shdr(Driver):
     def _assign(self) -> None:
         settings = self.settings
         self._items = {**DEFAULT_ITEMS, **settings.items}
-        self._keys = Keys(*(frozenset(each) for each in (settings.conditions, settings.messages, settings.series)))
+        mark = f"{settings.device}:" if settings.device else ""
+        used = (*self._items.values(), *settings.temperatures.values(), *settings.angles.values())
+        stated = (settings.conditions, settings.messages, settings.series, [f"{mark}{key}" for key in used])
+        self._keys = Keys(*(frozenset(each) for each in stated))
 
     def _number(self, key: str, scale: float = 1.0) -> float:
-        return self._memory.numbers(key)[0] * scale
+        found = self._memory.numbers(key, self._reasons)
+        if len(found) > 1:
+            self._reasons[key] = f"expected one number; found '{self._memory.text(key)[:40]}'"
+            return math.nan
+        return found[0] * scale
 
     def _position(self, quantity: str) -> tuple[list[float], float]:
         """Return X, Y, Z in m, and the time of their last change, s since 1970."""
         scale, memory = LENGTHS[self.settings.length_unit], self._memory
         whole = self._items.get(quantity, "")
         if whole in memory.values:
-            found = [scale * x for x in memory.numbers(whole)]
+            found = [scale * x for x in memory.numbers(whole, self._reasons)]
             return (found[:3] if len(found) >= 3 else [math.nan] * 3), memory.values[whole].time
         keys = [self._items[f"{quantity}.{axis}"] for axis in "XYZ"]
         return [self._number(key, scale) for key in keys], memory.changed(keys)
@@ -228,6 +233,9 @@ class Shdr(Driver):
             else:
                 for observed in filter(None, map(self._of_device, found)):
                     self._memory.store(observed)
+                    if observed.doubt:
+                        self.malformed += 1
+                        log.warning("%s: key '%s' is unknown: %s", self.address, observed.key, observed.doubt)
         if wrong and not self.settings.lenient:
             raise ProtocolError(f"{self.address}: {wrong}; set 'lenient' to ignore and count such lines")
         if wrong:

@@ -21,6 +21,8 @@ class Memory:
         Last values by key.
     conditions : dict of (str, str) to Observed
         Active warnings and faults, by key and code.
+    doubtful : dict of str to str
+        Why the last value of a key could not be told from its line.
     started, newest : float
         Times of the first and of the newest line, s since 1970; NaN if no line had a time.
     """
@@ -28,12 +30,14 @@ class Memory:
     def __init__(self) -> None:
         self.values: dict[str, Observed] = {}
         self.conditions: dict[tuple[str, str], Observed] = {}
+        self.doubtful: dict[str, str] = {}
         self.started = self.newest = math.nan
 
     def clear(self) -> None:
         """Discard values and conditions; the clock continues."""
         self.values.clear()
         self.conditions.clear()
+        self.doubtful.clear()
 
     def store(self, observed: Observed) -> None:
         """Store a value or condition.
@@ -50,6 +54,9 @@ class Memory:
             self._condition(observed)
         elif observed.key in self.values or len(self.values) < MAX_KEYS:
             self.values[observed.key] = observed
+            self.doubtful.pop(observed.key, None)
+            if observed.doubt:
+                self.doubtful[observed.key] = observed.doubt
         else:
             raise ProtocolError(f"Expected at most {MAX_KEYS} keys; found '{observed.key[:40]}' in addition")
 
@@ -58,15 +65,19 @@ class Memory:
         observed = self.values.get(key)
         return "" if observed is None or observed.value.upper() == UNAVAILABLE else observed.value
 
-    def numbers(self, key: str) -> list[float]:
-        """Return the numbers of a value; one NaN if it is unknown. ProtocolError if it is not numeric."""
+    def numbers(self, key: str, reasons: dict[str, str]) -> list[float]:
+        """Return the numbers of a value, each NaN where it is unknown, at least one; why is added to ``reasons``."""
         observed = self.values.get(key)
         if observed is None:
             return [math.nan]
-        try:
-            return parse_numbers(observed.value)
-        except ProtocolError as error:
-            raise ProtocolError(f"key '{key}': {error}") from None
+        found = []
+        for word in observed.value.partition(":")[0].split() or [UNAVAILABLE]:
+            try:
+                found += parse_numbers(word)
+            except ProtocolError as error:
+                reasons[key] = str(error)
+                found.append(math.nan)
+        return found
 
     def reported(self, level: str) -> list[str]:
         """Return the texts of the conditions of a level, such as ``system 1104: overtravel``."""

@@ -14,6 +14,8 @@ Parameters of the address in addition to those of every simulated device:
 identifiers of its data items. Values have their native units: feeds of ``okuma`` are in mm/min
 * ``heartbeat``: in ms, 10000; 0: ``* PING`` is ignored, as by adapters without heartbeat
 * ``device``: name before every key, ``device:key``
+* ``name``: name of the device in ``* device: name``; default: that of ``device``, else that of the machine
+* ``pipes=raw``: separators within values are not escaped, as by adapters that do not know of them
 * ``times``: ``absolute``, or ``none`` (lines start with the separator)
 * ``assets=1``: a cutting tool in several lines
 
@@ -92,6 +94,8 @@ class SimulatedAdapter:
         self._timed = times == "absolute"
         self._heartbeat = int(address.number("heartbeat", HEARTBEAT))
         self._prefix = f"{address.params['device']}:" if "device" in address.params else ""
+        self._name = address.params.get("name", address.params.get("device", ""))
+        self._raw = _choice(address, "pipes", ("escaped", "raw")) == "raw"
         self._assets = bool(address.number("assets", 0))
         self._lines = 0
         self._pinged: tuple[object, float] = (None, 0.0)  # connection and time of the last ``* PING``
@@ -105,7 +109,7 @@ class SimulatedAdapter:
                 self.world.tick(clock)
             text = style.document(self.world.name, f"errormotion-{seed}", f"seed {seed}")
             devices = Devices(text, series() if address.number("series", 0) else "")
-            self._device = devices.root[0][-1].get("name", "")
+            self._device = self._name or devices.root[0][-1].get("name", "")
             machine = [item for item in devices.items.values() if item.device is devices.root[0][-1]]
             self._items = {self._prefix + item.key: item for item in machine}
             self._server = TcpServer(address.path or "shdr", self._on_data, self._on_connection)
@@ -162,7 +166,8 @@ class SimulatedAdapter:
             if sent.get(key) == value:
                 continue
             sent[key] = value
-            fields = f"{key}|{field_text(value, item)}"
+            field = field_text(value, item)
+            fields = f"{key}|{value if self._raw and isinstance(value, str) and field == escaped(value) else field}"
             alone = item.category == "CONDITION" or "representation" in item.attributes or _kind(item) == "MESSAGE"
             (separate if alone else simple).append(fields)
         if simple:
@@ -204,6 +209,13 @@ class SimulatedAdapter:
             if line.strip() == b"* PING" and self._heartbeat:
                 self._pinged = (self._server.connection, time.monotonic())
                 self._send(f"* PONG {self._heartbeat}")
+
+
+def _choice(address: Address, name: str, known: tuple[str, ...]) -> str:
+    value = address.params.get(name, known[0])
+    if value not in known:
+        raise InstrumentError(f"'{name}={value}' in '{address.url}': expected one of {', '.join(known)}")
+    return value
 
 
 def field_text(value: Value, item: DataItem) -> str:

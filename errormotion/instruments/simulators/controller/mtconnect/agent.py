@@ -12,6 +12,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -132,7 +133,7 @@ class SimulatedAgent:
             return
         self._fault_applied = True
         if self.fault.kind == "restart":
-            self._frame = Frame(self._frame.version, self._frame.buffer_size, self._frame.instance + 1)
+            self._frame = replace(self._frame, instance=self._frame.instance + 1)
             self._start()
             return
         key = next(key for key, item in self._devices.items.items() if item.source == "spindle.load")
@@ -190,7 +191,7 @@ class SimulatedAgent:
             f"Content-Type: multipart/{self._multipart};boundary={BOUNDARY}\r\n"
             "Expires: -1\r\nCache-Control: no-cache, no-store, max-age=0\r\nTransfer-Encoding: chunked\r\n\r\n"
         ).encode()
-        begin, sent, instance = request.begin, float("-inf"), self._frame.instance
+        begin, sent, frame = request.begin, float("-inf"), self._frame
         while True:
             with self._lock:
                 number, fault = self._requests, self.fault
@@ -201,7 +202,7 @@ class SimulatedAgent:
                 silent = fault.kind == "silence" and number >= fault.at
                 self._apply_fault(request.kind, number)
                 self._observe()
-                if self._frame.instance != instance:
+                if self._frame is not frame:
                     yield b""  # a new instance has no connections of the previous one
                     return
                 refused = False

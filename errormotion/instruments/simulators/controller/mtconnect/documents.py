@@ -64,8 +64,9 @@ class Frame:
             "sender": SENDER,
             "instanceId": self.instance,
             "version": f"{self.version}.0.0",
-            "bufferSize": self.buffer_size,
         }
+        if kind != "Assets":  # its header states the number of assets only
+            attributes["bufferSize"] = self.buffer_size
         if self.schema >= (1, 7):
             attributes["deviceModelChangeTime"] = "2025-01-01T00:00:00.000000Z"
         return (

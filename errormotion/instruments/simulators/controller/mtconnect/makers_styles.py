@@ -241,11 +241,11 @@ def mazak(name: str, uuid: str, serial: str) -> str:
     systems = (("base", "BASE", ""), ("machcoord", "MACHINE", "base"), ("workcoord", "OBJECT", "machcoord"))
     return (
         f'<Device id="d1" name="{name}" uuid="{uuid}"><Description>errormotion {name} {serial}</Description>'
+        + coordinate_systems(*systems)
         + data_items(
             data_item("EVENT", "AVAILABILITY", "avail", "avail"),
             data_item("EVENT", "EQUIPMENT_MODE", "empowered", "=ON", subType="POWERED"),
         )
-        + coordinate_systems(*systems)
         + inside(
             f'<Axes id="a" name="base">{data_items(data_item("CONDITION", "ACTUATOR", "servo_cond", "normal"))}'
             + inside(
