@@ -8,6 +8,9 @@ import xarray as xr
 
 from errormotion.errors import DatasetError
 
+SWITCHING = 1.0
+"""Time that a control needs to switch a compensation, s."""
+
 
 def later(start: str, seconds: float) -> str:
     """Return the instant some seconds after another one, in UTC to the microsecond; empty if ``start`` is empty.

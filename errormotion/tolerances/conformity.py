@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from errormotion.datasets.results.merit import figures_of, is_planned
+from errormotion.datasets.results.merit import figures_of, is_planned, of_reference
 from errormotion.plugins import FigureOfMerit
 from errormotion.tolerances.decision import INSIDE, OPEN, OUTSIDE, WORDS, decide, overall
 from errormotion.tolerances.table import Limit, Tolerances
@@ -114,8 +114,9 @@ class Conformity:
 def judge(errors: xr.Dataset, tolerances: Tolerances) -> Conformity:
     """Decide on every limit that applies to an error dataset.
 
-    A name in ``figures`` may contain ``*`` for any characters. A freedom is within its limits if all of its
-    known points are; the row states the worst point.
+    A name in ``figures`` may contain ``*`` for any characters. A freedom is within its limits if all of its known
+    points are, and if these are at least the share ``least_known`` of its points; the row states the worst point.
+    Points of the reference state, and all that are 0 ± 0, are so by definition and are not counted.
     """
     failure, figures = "", list[FigureOfMerit]()
     if is_planned(errors):
@@ -173,11 +174,19 @@ def _of_freedom(errors: xr.Dataset, name: str, limit: Limit, tolerances: Toleran
     k = errors.em.names.index(name)
     values = errors.em.estimates().values[..., k]
     U = errors.em.expanded(2.0).values[..., k]
-    row = _row(name, values.ravel(), U.ravel(), str(errors[name].attrs.get("units", "")), limit, tolerances)
+    measured = ~(of_reference(errors) | ((values == 0) & (U == 0)))
+    unit = str(errors[name].attrs.get("units", ""))
+    row = _row(name, values[measured], U[measured], unit, limit, tolerances)
     known = np.isfinite(values)
-    if known.all() or row.remark:
+    if not known[measured].any() and known.any() and unit == limit.unit:
+        return replace(row, remark="only the reference state is known, which is 0 by definition")
+    if row.remark or known[measured].all():
         return row
-    return replace(row, remark=f"{int(known.sum())} of {known.size} points known")
+    count, total = int(known[measured].sum()), int(measured.sum())
+    remark = f"{count} of {total} points known"
+    if row.decision == INSIDE and count < tolerances.least_known * total:
+        return replace(row, decision=OPEN, remark=f"{remark}, fewer than {100 * tolerances.least_known:g} %")
+    return replace(row, remark=remark)
 
 
 def _row(name: str, value: Any, U: Any, unit: str, limit: Limit, tolerances: Tolerances) -> Row:
@@ -190,6 +199,8 @@ def _row(name: str, value: Any, U: Any, unit: str, limit: Limit, tolerances: Tol
     if known.size == 0:
         return Row(name, math.nan, math.nan, unit, lower, upper, math.nan, OPEN, "the value is unknown")
     value, U = value[known], U[known]
+    if tolerances.rule != "simple":
+        U = np.where(U == 0, np.nan, U)  # no measured value is exact: its uncertainty is not stated
     guard = tolerances.guard_factor * U if tolerances.rule == "iso 14253-1" else np.zeros_like(U)
     decisions = decide(value, U, lower, upper, tolerances.rule, tolerances.guard_factor, tolerances.largest_ratio)
     decision = overall([int(each) for each in np.unique(decisions)])

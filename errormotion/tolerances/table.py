@@ -100,6 +100,9 @@ class Tolerances(BaseModel):
     largest_ratio: float = Field(
         default=1.0 / 3.0, gt=0, le=1, description="largest U (k = 2) divided by half the tolerance"
     )
+    least_known: float = Field(
+        default=0.5, gt=0, le=1, description="share of known points of a freedom below which conformity is not proved"
+    )
     figures: dict[str, Limit] = {}
     freedoms: dict[str, Limit] = {}
 

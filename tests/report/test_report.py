@@ -151,6 +151,15 @@ def test_a_switched_compensation_is_reported_with_its_change(page):
     assert float(found[1]) == pytest.approx(29.3, abs=0.1)
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_mean_across_a_switched_compensation_does_not_change_its_step(read, make_drift):
+    errors = make_drift(1561)  # every 4 s, one instant 4 s after the switch
+    across = int(np.flatnonzero(errors["time"].values > 6060.0)[0])
+    errors["EZ"][across] -= 15e-6
+    found = re.search(r"Z compensation off at 101.0 min: .*? stepped by \+(\d+\.\d+) ±", read(errors).text)
+    assert float(found[1]) == pytest.approx(29.3, abs=0.1)
+
+
 def test_an_undetermined_freedom_is_a_dash_with_its_reason(page):
     row = re.search(r"EC ECC arcsec (.*?) a not determined by this method", page.text)
     assert row[1].replace("a", "").split() == ["—"] * 3

@@ -132,6 +132,59 @@ def test_unknown_points_are_counted_and_an_unknown_freedom_is_not_decided(tmp_pa
     assert (unknown.decision, unknown.remark) == (OPEN, "the value is unknown")
 
 
+def test_the_reference_state_proves_nothing(tmp_path: Path, errors: xr.Dataset) -> None:
+    table = limits(tmp_path, 'freedoms = { EX = "9 um" }\nfigures = { "EX*" = "9 um" }')
+    assert judge(errors, table).decision == INSIDE
+    only = errors.assign_attrs(reference_interval=np.array([0.0, 60.0]))
+    only["EX"][2] = np.nan
+    found = judge(only, table)
+    assert [row.decision for row in found.rows] == [OPEN, OPEN]
+    assert found.rows[1].remark == "only the reference state is known, which is 0 by definition"
+    exact = errors.copy(deep=True)  # without the interval: 0 ± 0 is a definition, too
+    exact["EX"][1:], exact["covariance"][0] = np.nan, 0.0
+    assert [row.decision for row in judge(exact, table).rows] == [OPEN, OPEN]
+
+
+@pytest.mark.parametrize("rule", ["iso 14253-1", "simple", "shared risk"])
+@pytest.mark.parametrize(("known", "expected"), [(0, OPEN), (1, OPEN), (4, OPEN), (5, INSIDE), (10, INSIDE)])
+def test_too_few_known_points_prove_no_conformity(
+    tmp_path: Path, errors: xr.Dataset, rule: str, known: int, expected: int
+) -> None:
+    table = limits(tmp_path, f'rule = "{rule}"\nfreedoms = {{ EX = "30 um" }}')
+    many = errors.isel(time=[0] + [1] * 10).assign_coords(time=np.arange(11.0))
+    many.attrs["reference_interval"] = np.zeros(2)
+    many["EX"][known + 1 :] = np.nan
+    (row,) = judge(many, table).rows
+    assert row.decision == expected
+    if 0 < known < 10:
+        assert row.remark.startswith(f"{known} of 10 points known")
+    # One point outside of the limits is enough.
+    (row,) = judge(many, limits(tmp_path, f'rule = "{rule}"\nfreedoms = {{ EX = "1.4 um" }}')).rows
+    assert row.decision == (OUTSIDE if known and rule != "shared risk" else OPEN)
+
+
+def test_the_least_share_of_known_points_is_a_setting(tmp_path: Path, errors: xr.Dataset) -> None:
+    text = 'least_known = {}\nfreedoms = {{ EA = "20 urad" }}'
+    assert judge(errors, limits(tmp_path, text.format(0.7))).decision == OPEN
+    assert judge(errors, limits(tmp_path, text.format(0.6))).decision == INSIDE
+
+
+@pytest.mark.parametrize(("rule", "expected"), [("iso 14253-1", OPEN), ("shared risk", OPEN), ("simple", INSIDE)])
+def test_a_value_without_uncertainty_is_decided_by_no_rule_that_needs_it(
+    tmp_path: Path, errors: xr.Dataset, monkeypatch: pytest.MonkeyPatch, rule: str, expected: int
+) -> None:
+    monkeypatch.setattr(Foreign, "figures", lambda _: [FigureOfMerit("G", 5e-6, 0.0, "m")])
+    monkeypatch.setattr(plugins, "owner_of_method", {"foreign": Foreign}.get)
+    errors["covariance"][:] = 0.0
+    table = limits(tmp_path, f'rule = "{rule}"\nfigures = {{ G = "7 um" }}\nfreedoms = {{ EX = "7 um" }}')
+    assert [row.decision for row in judge(errors, table).rows] == [expected] * 2
+
+
+def test_an_empty_dataset_proves_nothing(tmp_path: Path, errors: xr.Dataset) -> None:
+    (row,) = judge(errors.isel(time=slice(0)), limits(tmp_path, 'freedoms = { EX = "7 um" }')).rows
+    assert (row.decision, row.remark) == (OPEN, "the value is unknown")
+
+
 def test_a_limit_in_another_unit_has_no_decision(tmp_path: Path, errors: xr.Dataset) -> None:
     found = judge(errors, limits(tmp_path, 'freedoms = { EX = "20 arcsec" }'))
     assert found.decision == OPEN

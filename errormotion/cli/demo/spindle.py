@@ -21,15 +21,12 @@ from errormotion.cli.output import show, show_json, table
 from errormotion.compare import compare as compared
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.twists import move
+from errormotion.report.drawings.series import step_weights
 from errormotion.twin import VirtualMachine
 
 CAMPAIGN = Path(__file__).parent / "campaign.toml"
 
 UM, ARCSEC = (1e6, "um"), (648000 / np.pi, "arcsec")
-AROUND_A_STEP = 10.0
-"""Interval of the mean before and after a compensation is switched off, s."""
-SWITCHED = 0.9
-"""Time after which a compensation is off, s."""
 
 
 @dataclass(frozen=True)
@@ -108,11 +105,10 @@ def _drift_numbers(machine: VirtualMachine, errors: xr.Dataset, clock: float, se
         numbers.append(_number(what, errors, truth, weights, k, scale))
     for event in off:
         axis = next(iter(event.compensation))
-        before = (t >= event.at - AROUND_A_STEP) & (t <= event.at - half)
-        after = (t >= event.at + SWITCHED + half) & (t < event.at + AROUND_A_STEP)
-        weights = after / after.sum() - before / before.sum()
-        what = f"E{axis} step, compensation of {axis} switched off"
-        numbers.append(_number(what, errors, truth, weights, "XYZ".index(axis), UM))
+        found = step_weights(errors, f"E{axis}", event.at - float(errors.attrs["reference_time"]))
+        if found is not None:
+            what = f"E{axis} step, compensation of {axis} switched off"
+            numbers.append(_number(what, errors, truth, found.step, "XYZ".index(axis), UM))
     return numbers
 
 

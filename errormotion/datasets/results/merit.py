@@ -11,6 +11,7 @@ from errormotion.plugins import FigureOfMerit
 
 if TYPE_CHECKING:
     import xarray as xr
+    from numpy.typing import NDArray
 
 
 def is_planned(errors: xr.Dataset) -> bool:
@@ -38,10 +39,26 @@ def stored(figure: FigureOfMerit) -> dict[str, Any]:
     return {"name": figure.name, **known, "unit": figure.unit}
 
 
+def of_reference(errors: xr.Dataset) -> NDArray[np.bool_]:
+    """Return which points belong to the reference state, whose errors are 0 by definition, over `em.dims`."""
+    found = np.zeros(tuple(errors.sizes[dim] for dim in errors.em.dims), bool)
+    if "time" in errors.em.dims and "time" in errors.coords and "reference_interval" in errors.attrs:
+        first, last = np.asarray(errors.attrs["reference_interval"], dtype=float)
+        time = np.asarray(errors["time"].values, dtype=float)
+        inside = (time >= first - 1e-6) & (time <= last + 1e-6)
+        shape = [-1 if dim == "time" else 1 for dim in errors.em.dims]
+        found |= inside.reshape(shape)
+    return found
+
+
 def last_values(errors: xr.Dataset) -> list[FigureOfMerit]:
-    """Return every estimate at its last known time, with U (k = 2); empty for a dataset over other dimensions."""
+    """Return every estimate at its last known time, with U (k = 2); empty for a dataset over other dimensions.
+
+    An estimate of which only the reference state is known is unknown (NaN).
+    """
     found = []
     covariance = errors.em.covariance().values
+    reference = of_reference(errors)
     for k, name in enumerate(errors.em.names):
         error = errors[name]
         known = np.flatnonzero(np.isfinite(np.asarray(error.values, dtype=float)))
@@ -49,10 +66,10 @@ def last_values(errors: xr.Dataset) -> list[FigureOfMerit]:
             continue
         last = int(known[-1])
         minutes = float(errors["time"].values[last]) / 60.0
-        U = 2.0 * float(np.sqrt(covariance[last, k, k]))
-        found.append(
-            FigureOfMerit(f"{name} after {minutes:.1f} min", float(error.values[last]), U, error.attrs["units"])
-        )
+        value, U = float(error.values[last]), 2.0 * float(np.sqrt(covariance[last, k, k]))
+        if reference[known].all():
+            value = U = np.nan
+        found.append(FigureOfMerit(f"{name} after {minutes:.1f} min", value, U, error.attrs["units"]))
     return found
 
 

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from errormotion.datasets.results.extremes import expanded
 from errormotion.datasets.results.merit import is_planned
 from errormotion.methods.linear_positioning.identification.standard import FIGURES
 from errormotion.methods.linear_positioning.settings import LIMITS
@@ -46,7 +47,7 @@ def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
 def _merit(errors: xr.Dataset, figure: str, title: str, unit: str, limit: float | None = None) -> list[FigureOfMerit]:
     """Return a figure of one freedom or diagonal; nothing if it is unknown."""
     value, bias, u = (float(errors[name].sel(figure=figure)) for name in ("figure_value", "figure_bias", "figure_u"))
-    return [FigureOfMerit(title, value, 2.0 * u + abs(bias), unit, limit)] if math.isfinite(value) else []
+    return [FigureOfMerit(title, value, float(expanded(bias, u)), unit, limit)] if math.isfinite(value) else []
 
 
 def _diagonals(errors: xr.Dataset) -> list[FigureOfMerit]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from errormotion.datasets.timing import SWITCHING
 from errormotion.report.canvas import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from errormotion.report.document import Source
 from errormotion.report.provenance import read
@@ -25,6 +26,9 @@ WHAT = {
     "A": "tilt about X",
     "B": "tilt about Y",
 }
+
+AROUND_A_STEP = 10.0
+"""Interval before and after a step over which means are taken, s."""
 
 LOOK: dict[str, tuple[str, tuple[float, ...] | None]] = {
     "X1": (BLUE, None),
@@ -96,12 +100,95 @@ def end_of_running(errors: xr.Dataset) -> int | None:
     """
     stated = read(errors).get("settings", {}).get("running_end")
     if isinstance(stated, (int, float)):
-        # Relative to the start of the record; the time of the dataset is relative to the reference state.
+        # Relative to the start of the record; the time of the dataset is relative to the reference state. A mean that
+        # ends later contains readings after the end of running.
         end = stated - float(errors.attrs.get("reference_time", 0.0))
-        before = np.flatnonzero(errors["time"].values <= end + 1e-6)
+        length, mean = length_of_means(errors)
+        before = np.flatnonzero(errors["time"].values + (length / 2 if mean else 0.0) <= end + 1e-6)
         return int(before[-1]) if before.size else None
     turning = running(errors)
     return int(np.flatnonzero(turning)[-1]) if turning is not None and turning.any() else None
+
+
+def length_of_means(errors: xr.Dataset) -> tuple[float, bool]:
+    """Return the interval of the instants, s, and whether each is the middle of a mean of this length.
+
+    A record whose readings are less frequent than the means is not averaged: its instants are time stamps.
+    """
+    time = np.asarray(errors["time"].values, float)
+    interval = float(np.median(np.diff(time))) if time.size > 1 else 0.0
+    average = read(errors).get("settings", {}).get("average")
+    return interval, isinstance(average, (int, float)) and abs(interval - average) < 0.01 * average
+
+
+@dataclass(frozen=True)
+class StepWeights:
+    """Weights over time, (time,), whose sums with the values of a freedom are parts of a step.
+
+    Attributes
+    ----------
+    before, step : ndarray
+        Mean before the step, and mean after it minus mean before it.
+    drift : ndarray
+        Part of the difference of the means that is the drift between them, by lines on both sides.
+    """
+
+    before: np.ndarray
+    step: np.ndarray
+    drift: np.ndarray
+
+
+def step_weights(errors: xr.Dataset, freedom: str, at: float, others: Sequence[float] = ()) -> StepWeights | None:
+    """Return the weights of a step of a freedom over ``time``, by means over `AROUND_A_STEP` before and after it.
+
+    Values whose mean contains a time from ``at`` until `SWITCHING` later are on neither side. Where no value is within
+    `AROUND_A_STEP`, the nearest one is used. None where one side has no value, or where the drift is unknown.
+
+    Parameters
+    ----------
+    errors : Dataset
+        Over ``time``.
+    freedom : str
+    at : float
+        Time of the step, s.
+    others : sequence of float
+        Times of other changes, s, beyond which no value is used.
+    """
+    time = np.asarray(errors["time"].values, float)
+    known = np.isfinite(errors[freedom].values)
+    length, mean = length_of_means(errors)
+    reach = length / 2 if mean else length  # a time stamp may be that of the start or of the end of a reading
+    means, slopes, distances = [], [], []
+    for later in (False, True):
+        usable = known & ((time - reach >= at + SWITCHING - 1e-6) if later else (time + reach <= at + 1e-6))
+        for other in others:
+            if other > at:
+                usable &= time + reach <= other + 1e-6
+            elif other < at:
+                usable &= time - reach >= other + SWITCHING - 1e-6
+        nearest = np.flatnonzero(usable)
+        nearest = nearest[np.argsort(np.abs(time[nearest] - at), kind="stable")]
+        if not nearest.size:
+            return None
+        near = nearest[: max(1, int((np.abs(time[nearest] - at) <= AROUND_A_STEP).sum()))]
+        means.append(_spread(time.size, near, np.full(near.size, 1.0 / near.size)))
+        distances.append(float(time[near].mean()) - at)
+        if nearest.size > 1:
+            line = nearest[: max(2, near.size)]
+            centred = time[line] - time[line].mean()
+            slopes.append(_spread(time.size, line, centred / (centred @ centred)))
+        else:
+            slopes.append(None)
+    first, second = (each if each is not None else other for each, other in (slopes, slopes[::-1]))
+    if first is None or second is None:
+        return None
+    return StepWeights(means[0], means[1] - means[0], distances[1] * second - distances[0] * first)
+
+
+def _spread(size: int, places: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    found = np.zeros(size)
+    found[places] = weights
+    return found
 
 
 def last_known(values: np.ndarray, index: int | None = None) -> int | None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification.iso230_3 import MEASURES, QUANTITIES, evaluate, quantities
@@ -20,11 +21,11 @@ def drift(t, tau=1500.0):
     return errors
 
 
-def results(t, errors=None, **options):
+def results(t, errors=None, reference_u=3 * U, **options):
     errors = drift(t) if errors is None else errors
     independent = np.tile(np.diag([U**2] * 6), (t.size, 1, 1))
     influence = np.zeros((1, t.size, 6))
-    influence[0, 1:] = 3 * U  # the reference: one draw in all values but the first
+    influence[0, 1:] = reference_u  # the reference: one draw in all values but the first
     series = quantities(errors, independent, influence, np.array([0.01, 0.05]), np.zeros(3))
     settings = {
         "temperature": None,
@@ -69,13 +70,82 @@ def test_levels_follow_from_displacement_and_tilt():
 def test_only_a_difference_from_the_start_contains_the_uncertainty_of_the_reference():
     t = np.arange(0, 4000.0, 10.0)
     found = results(t)
-    # Three instants of 10 s in half a minute, and the reference that they share.
+    # The end of a line through three instants of 10 s in half a minute, and the reference that they share.
+    of_end = np.linalg.pinv(np.column_stack([np.ones(3), [-2.0, -1.0, 0.0]]))[0]
     u = value(found, "Z", "difference_60min", "uncertainty")
-    assert u == pytest.approx(U * np.sqrt(1 / 3 + 9), rel=1e-9)
-    assert found.series.difference(4, np.array([100]), np.array([50]))[1] == pytest.approx(U * np.sqrt(2), rel=1e-9)
+    assert u == pytest.approx(U * np.sqrt(of_end @ of_end + 9), rel=1e-9)
+    change = found.series.weighted(4, np.array([100, 50]), np.array([1.0, -1.0]))
+    assert change[1] == pytest.approx(U * np.sqrt(2), rel=1e-9)
 
 
-def test_noise_does_not_widen_a_range():
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [0.0, 0.02, 1.0], ids=["at rest", "nearly at rest", "moving"])
+def test_ranges_lie_within_their_uncertainty_at_rest_and_moving(size):
+    t = np.arange(0, 4000.0, 10.0)
+    fine = np.arange(0, t[-1] + 0.5, 1.0)
+    seeds = 200
+    truth = {}
+    for name, (height, freedom) in {"X1": (0.01, 0), "Z": (0.0, 2), "A": (0.0, 3)}.items():
+        values = size * drift(fine)[:, freedom] + height * size * drift(fine)[:, 4] * (freedom == 0)
+        truth[name] = np.ptp(values[fine <= 3600.0])
+    held = dict.fromkeys(truth, 0)
+    for seed in range(seeds):
+        draw = np.random.default_rng(seed).standard_normal
+        errors = size * drift(t) + U * draw((t.size, 6))
+        errors[1:] -= 3 * U * draw()  # the reference
+        errors[0] = 0.0
+        found = results(t, errors)
+        for name, range_ in truth.items():
+            held[name] += abs(value(found, name, "range_60min") - range_) <= 2 * value(
+                found, name, "range_60min", "uncertainty"
+            )
+    assert min(held.values()) >= stats.binom.ppf(1e-3, seeds, 0.95), held
+
+
+def test_the_bias_of_a_range_at_rest_is_its_value():
+    t = np.arange(0, 4000.0, 0.5)
+    errors = np.zeros((t.size, 6))
+    ratio = []
+    for seed in range(20):
+        errors[1:, 2] = np.random.default_rng(seed).normal(0, U, t.size - 1)
+        found = results(t, errors, reference_u=0.0)
+        ratio.append(value(found, "Z", "range_60min", "bias") / value(found, "Z", "range_60min"))
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.25)
+
+
+def test_the_value_at_the_end_does_not_lag_behind_the_drift():
+    t = np.arange(0.25, 4000.0, 0.5)
+    errors = np.zeros((t.size, 6))
+    errors[:, 2] = 10e-6 * t / 3600.0
+    found = results(t, errors, mean=0.5)
+    for measure in ("range_60min", "difference_60min"):
+        assert value(found, "Z", measure) == pytest.approx(10e-6, abs=1e-12)
+
+
+def test_a_mean_across_the_end_of_running_is_left_out():
+    t = np.arange(2.0, 4400.0, 4.0)
+    errors = drift(t)
+    end = 3661.0  # within a mean of 4 s
+    errors[t + 2.0 > end, 2] += 27e-6 * np.clip((t[t + 2.0 > end] + 2.0 - end) / 4.0, 0.0, 1.0)
+    found = results(t, errors, running_end=end, mean=4.0)
+    smooth = 20e-6 * -np.expm1(-end / 1500)
+    for measure in ("range_running", "difference_running"):
+        assert value(found, "Z", measure) == pytest.approx(smooth, abs=0.03e-6)
+
+
+def test_no_mean_of_a_range_contains_a_switched_compensation():
+    t = np.arange(0, 4400.0, 1.0)
+    errors = np.zeros((t.size, 6))
+    errors[:, 2] = 10e-6 * t / 4000.0
+    at = 4011.0
+    errors[t > at, 2] -= 30e-6
+    found = results(t, errors, changes=[at])
+    peak, low = 10e-6 * at / 4000.0, 10e-6 * (at + 1) / 4000.0 - 30e-6
+    # Half a minute of the drift, 2.5 nm/s, at the peak and after it.
+    assert value(found, "Z", "range_total") == pytest.approx(peak - low, abs=2 * 15 * 2.5e-9)
+
+
+def test_noise_widens_a_range_less_than_its_uncertainty():
     t = np.arange(0, 7200.0, 0.5)
     errors = drift(t)
     errors[:, 2] += np.random.default_rng(0).normal(0, 0.1e-6, t.size)

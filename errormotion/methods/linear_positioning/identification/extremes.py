@@ -20,40 +20,17 @@ uncertainty (root sum of squares). The mean reversal error is not an extreme val
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy import special
 
 from errormotion.arrays import Array
+from errormotion.datasets.results.extremes import BIAS_UNCERTAINTY, SEED, Extremes
 from errormotion.methods.linear_positioning.identification import standard
 from errormotion.methods.linear_positioning.identification.scatter import Scatter
 from errormotion.methods.linear_positioning.identification.standard import Statistics
 
-SEED = 230
 SIGNIFICANT = 0.01
 """Probability below which a variance of the drift is significantly different from 0."""
-BIAS_UNCERTAINTY = 0.5
-"""Standard uncertainty of a bias, relative to it."""
-
-
-@dataclass(frozen=True)
-class Figures:
-    """Figures of one freedom in the order of ``standard.FIGURES``; m or rad, NaN = unknown.
-
-    Attributes
-    ----------
-    value : ndarray, (figure,)
-        As the standard defines them.
-    bias : ndarray, (figure,)
-        Typical excess over the true figure.
-    u : ndarray, (figure,)
-        Standard uncertainty of ``value - bias``.
-    """
-
-    value: Array
-    bias: Array
-    u: Array
 
 
 def straightened(statistics: Statistics, z: Array) -> Statistics:
@@ -70,8 +47,8 @@ def _measured_approach(mean: Array) -> Array:
     return np.asarray(np.where(np.isfinite(mean[..., 0, :]), mean[..., 0, :], mean[..., 1, :]))
 
 
-def figures(x: Array, spread: Scatter, shared: Array, target_u: float, *, straight: bool, trials: int) -> Figures:
-    """Return the figures of readings with their bias and uncertainty.
+def figures(x: Array, spread: Scatter, shared: Array, target_u: float, *, straight: bool, trials: int) -> Extremes:
+    """Return the figures of readings in the order of ``standard.FIGURES`` with their bias and uncertainty; m or rad.
 
     Parameters
     ----------
@@ -90,14 +67,14 @@ def figures(x: Array, spread: Scatter, shared: Array, target_u: float, *, straig
     observed = standard.statistics(x)
     value = _evaluate(observed, spread.z, straight)
     if not trials:
-        return Figures(value, *np.full((2, value.size), np.nan))
+        return Extremes(value, *np.full((2, value.size), np.nan))
     true = _evaluate(_trials(x, observed, spread, shared, target_u, trials), spread.z, straight)
     bias = value - np.median(true, axis=0)
     u = np.hypot(true.std(axis=0, ddof=1), BIAS_UNCERTAINTY * bias)
     mean = standard.FIGURES.index("B_mean")  # not an extreme value: unbiased
     if np.isfinite(value[mean]):
         bias[mean], u[mean] = 0.0, _mean_reversal_u(x, spread)
-    return Figures(value, bias, u)
+    return Extremes(value, bias, u)
 
 
 def _mean_reversal_u(x: Array, spread: Scatter) -> float:

@@ -11,6 +11,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.certificates import certified
+from errormotion.datasets.results.extremes import Extremes
 from errormotion.datasets.timing import start_of
 from errormotion.kinematics.iso import direction_of, iso_names
 from errormotion.methods.linear_positioning.identification import budget, extremes, standard
@@ -64,7 +65,7 @@ class Evaluated:
         name = self.readings.freedoms[k]
         return name in LENGTHS and name != self.readings.along
 
-    def figures(self, k: int, trials: int) -> extremes.Figures:
+    def figures(self, k: int, trials: int) -> Extremes:
         """Return the figures of freedom ``k`` with bias and uncertainty."""
         effects = np.array([source.effect[k] for source in self.systematic])
         return extremes.figures(

@@ -1,9 +1,10 @@
 """Thermal distortion by a moving axis (ISO 230-3): errors at both ends of the stroke over time, and their ranges.
 
 The errors are the deviations minus their mean in the cold state. The noise of a reading follows from second differences
-over time, ``var(x_1 - 2 x_2 + x_3) = 6 s^2``, in which a smooth drift of the machine vanishes. A range of noisy values
-is too large; ranges are therefore those of means of three successive cycles, and the uncertainty of a range is that of
-the difference of its two extremes.
+over time, ``var(x_1 - 2 x_2 + x_3) = 6 s^2``, in which a smooth drift of the machine vanishes. Ranges are those of
+single readings, and of the value after exactly 60 min, between two readings: a mean over cycles lags behind the drift.
+A range of noisy readings is too large; its mean excess is stated as bias, and is contained in its uncertainty
+(`errormotion.datasets.results.extremes`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.certificates import certified
+from errormotion.datasets.results.extremes import expanded, range_from_reference
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
@@ -36,8 +38,10 @@ QUANTITIES = ("P1", "P2", "P2 - P1")
 """The two ends, in the order of their positions, and the change of the length between them."""
 MEASURES = ("range_60min", "range_moving", "range_total", "end_of_moving")
 HOUR = 3600.0
-CYCLES_PER_MEAN = 3
-"""Successive cycles in a mean."""
+MIN_DIFFERENCES = 3
+"""Smallest number of second differences for the noise."""
+MIN_CYCLES = 6
+"""Smallest number of cycles after the cold state."""
 COLD, LENGTH = "cold reference", "scale of the lengths"
 
 
@@ -130,10 +134,8 @@ def _check(time: Array, moving: Array, P: Array) -> None:
         raise MethodError("moving: expected 0 or 1 for each cycle; found NaN")
     if not (time <= 0).any():
         raise MethodError("reading_time: expected a cold state at times of 0 or less; found none")
-    if (time > 0).sum() < 2 * CYCLES_PER_MEAN:
-        raise MethodError(
-            f"cycle: expected {2 * CYCLES_PER_MEAN} cycles or more after the cold state; found {(time > 0).sum()}"
-        )
+    if (time > 0).sum() < MIN_CYCLES:
+        raise MethodError(f"cycle: expected {MIN_CYCLES} cycles or more after the cold state; found {(time > 0).sum()}")
     if not (np.isfinite(P).all() and np.ptp(P) > 0):
         raise MethodError("end_position: expected two different positions; found NaN, or one position twice")
 
@@ -142,63 +144,64 @@ def _noise(values: Array) -> float:
     """Return the standard deviation of one reading, from readings (cycle, end) under a smooth drift."""
     second = values[2:] - 2.0 * values[1:-1] + values[:-2]
     second = second[np.isfinite(second)]
-    if second.size < CYCLES_PER_MEAN:
+    if second.size < MIN_DIFFERENCES:
         raise MethodError("end_deviation: expected more readings in successive cycles; found too few for their noise")
     return float(np.sqrt(np.mean(second**2) / 6.0))
 
 
 def _figures(
     value: Array, t: Array, moving: NDArray[np.bool_], noise: float, u_cold: Array, lever: Array
-) -> tuple[Array, Array]:
-    """Return figures and standard uncertainties of one freedom, both (quantity, measure); ``value`` is (time, end)."""
+) -> tuple[Array, Array, Array]:
+    """Return figures, biases and standard uncertainties of one freedom, (quantity, measure); ``value`` is (time, end).
+
+    Half of the bias of a range is contained in its uncertainty, so that the expanded uncertainty contains all of it.
+    """
     both = np.concatenate([value, value[:, 1:] - value[:, :1]], axis=1)
     noises = noise * np.array([1.0, 1.0, np.sqrt(2.0)])
-    shared = np.sqrt(np.array([*(u_cold**2 + lever**2), (u_cold**2).sum() + np.ptp(lever) ** 2]))
+    effects = [(u_cold[0], 0.0, lever[0]), (0.0, u_cold[1], lever[1]), (-u_cold[0], u_cold[1], lever[1] - lever[0])]
     last = float(t[moving].max()) if moving.any() else float(t[-1])
-    figures, u = np.full((3, len(MEASURES)), np.nan), np.full((3, len(MEASURES)), np.nan)
+    figures, bias, u = np.full((3, 3, len(MEASURES)), np.nan)
     for q in range(3):
-        means, times, counts = _means(both[:, q], t)
+        warm = np.flatnonzero(np.isfinite(both[:, q]))[1:]  # the first instant is the cold state, 0 by definition
+        x, times = both[warm, q], t[warm]
+        shared = np.array(effects[q])
         for k, end in enumerate((HOUR, last, float(t[-1]))):
-            here = times <= end + 1e-9
-            if k == 0 and t[-1] < HOUR - 1e-9:
+            if t[-1] < end - 1e-9 or not (times <= end + 1e-9).any():
                 continue
-            figures[q, k], u[q, k] = _range(means[here], counts[here], noises[q], shared[q])
-        final = np.flatnonzero(times <= last + 1e-9)[-1]
-        figures[q, 3] = means[final]
-        u[q, 3] = np.hypot(noises[q] / np.sqrt(counts[final]), shared[q]) if final else np.nan
-    return figures, u
+            inside, variance = _until(x, times, end, noises[q] ** 2)
+            found = range_from_reference(inside, variance, np.tile(shared[:, None], inside.size))
+            figures[q, k], bias[q, k] = float(found.value), float(found.bias)
+            u[q, k] = float(expanded(found.bias, found.u)) / 2.0
+        moved = np.flatnonzero(times <= last + 1e-9)
+        if moved.size:
+            figures[q, 3], bias[q, 3] = x[moved[-1]], 0.0
+            u[q, 3] = np.hypot(noises[q], np.linalg.norm(shared))
+    return figures, bias, u
 
 
-def _means(values: Array, t: Array) -> tuple[Array, Array, Array]:
-    """Return means of successive cycles, their times and counts; the first is the cold state, 0 by definition."""
-    means, times, counts = [0.0], [0.0], [0]
-    for part in (np.arange(i, min(i + CYCLES_PER_MEAN, t.size)) for i in range(1, t.size, CYCLES_PER_MEAN)):
-        known = part[np.isfinite(values[part])]
-        if known.size:
-            means.append(float(values[known].mean()))
-            times.append(float(t[known].mean()))
-            counts.append(int(known.size))
-    return np.array(means), np.array(times), np.array(counts)
-
-
-def _range(means: Array, counts: Array, noise: float, shared: float) -> tuple[float, float]:
-    low, high = int(means.argmin()), int(means.argmax())
-    if low == high:
-        return 0.0, float("nan")
-    own = sum(noise**2 / counts[i] for i in (low, high) if counts[i])
-    cold = shared**2 if 0 in (low, high) else 0.0  # the reference cancels between two warm states
-    return float(means[high] - means[low]), float(np.sqrt(own + cold))
+def _until(x: Array, t: Array, end: float, variance: float) -> tuple[Array, Array]:
+    """Return readings until ``end`` and their variances; the last one is the value at ``end``, between two readings."""
+    before = int((t <= end + 1e-9).sum())
+    inside, variances = x[:before], np.full(before, variance)
+    if before == t.size or t[before - 1] > end - 1e-9:
+        return inside, variances
+    share = (end - t[before - 1]) / (t[before] - t[before - 1])
+    value = (1.0 - share) * x[before - 1] + share * x[before]
+    return np.append(inside, value), np.append(variances, variance * ((1.0 - share) ** 2 + share**2))
 
 
 def _extras(
-    figures: list[tuple[Array, Array]], freedoms: list[str], moving: NDArray[np.bool_], noise: Array
+    figures: list[tuple[Array, Array, Array]], freedoms: list[str], moving: NDArray[np.bool_], noise: Array
 ) -> dict[str, xr.DataArray]:
     coords: dict[str, Any] = {"freedom": freedoms, "quantity": list(QUANTITIES), "measure": list(MEASURES)}
     dims = tuple(coords)
     attrs = {"long_name": "ISO 230-3, thermal distortion by the moving axis; m, rad"}
     return {
-        "distortion": xr.DataArray(np.array([value for value, _ in figures]), coords, dims, attrs=attrs),
-        "distortion_u": xr.DataArray(np.array([u for _, u in figures]), coords, dims, attrs=attrs),
+        name: xr.DataArray(np.array(values), coords, dims, attrs=attrs)
+        for name, values in zip(
+            ("distortion", "distortion_bias", "distortion_u"), zip(*figures, strict=True), strict=True
+        )
+    } | {
         "moving": xr.DataArray(moving.astype(float), dims="time", attrs={"long_name": "1 while the axis moved"}),
         "reading_noise": xr.DataArray(noise, {"freedom": freedoms}, "freedom", attrs={"long_name": "m, rad"}),
     }

@@ -26,6 +26,7 @@ from errormotion.methods.spindle_drift.identification.frame_expansion import (
 from errormotion.methods.spindle_drift.identification.record import (
     average_record,
     count_unknown,
+    length_of_means,
     noise,
     reference_windows,
     run_out_at_rest,
@@ -128,6 +129,8 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
             sensor=settings.iso_temperature,
             average=settings.iso_average,
             reference=reference,
+            mean=length_of_means(averages, settings),
+            changes=[event.at - zero for event in settings.schedule if event.compensation],
         )
     names = [(s.name, s.group) for s in sources] + [(name, group) for name, group, _ in effects]
     unseen = np.cross(then.a[0], point - then.E[0]) * settings.unseen_rotation

@@ -2,8 +2,10 @@
 
 Seven quantities: the axis displacement at the two levels (X1, Y1 at L1, X2, Y2 at L2), Z, and the tilts A and B. For
 each, the range over an interval and the difference between its end and its start; the name states which, because the
-two differ for a curve that is not monotonic. The range of thousands of noisy values is biased. Ranges are therefore
-taken over means of half a minute, and the uncertainty of a range is that of the difference of the two extreme means.
+two differ for a curve that is not monotonic. Ranges are taken over means of half a minute and the value at the end of
+the interval, that of a line through the last half minute. A range of noisy values is too large; its mean excess is
+stated as bias, and is contained in its uncertainty (`errormotion.datasets.results.extremes`). No mean reaches beyond
+the end of an interval.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets.results.extremes import expanded, range_from_reference
+from errormotion.datasets.timing import SWITCHING
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification.record import turns
 
@@ -53,12 +57,6 @@ class Series:
     influence: Array
     variance: Array
 
-    def difference(self, k: int, later: Index, earlier: Index) -> tuple[float, float, Array]:
-        """Return what `weighted` does of quantity k's mean over some instants minus that over others."""
-        index = np.concatenate([later, earlier])
-        weights = np.concatenate([np.full(later.size, 1.0 / later.size), np.full(earlier.size, -1.0 / earlier.size)])
-        return self.weighted(k, index, weights)
-
     def weighted(self, k: int, index: Index, weights: Array) -> tuple[float, float, Array]:
         """Return value, standard uncertainty and influence (source,) of a weighted sum of quantity k over instants."""
         shared = self.influence[:, k, index] @ weights
@@ -90,11 +88,14 @@ def quantities(errors: Array, independent: Array, influence: Array, heights: Arr
 class Results:
     """ISO 230-3 values and their standard uncertainties, (quantity, measure), SI; NaN where not determined.
 
-    ``influence`` (source, quantity, measure) is the effect of one standard uncertainty of each source.
+    ``bias`` is the mean excess of a range by noise, for which its value is not corrected. Half of it is contained in
+    ``uncertainty``, so that the expanded uncertainty contains all of it. ``influence`` (source, quantity, measure) is
+    the effect of one standard uncertainty of each source.
     """
 
     test: str
     value: Array
+    bias: Array
     uncertainty: Array
     influence: Array
     sensor: str
@@ -118,6 +119,7 @@ class Results:
 
         return {
             "iso_value": xr.DataArray(self.value, dims=table, attrs=units),
+            "iso_bias": xr.DataArray(self.bias, dims=table, attrs=units),
             "iso_uncertainty": xr.DataArray(self.uncertainty, dims=table, attrs=units),
             "iso_influence": xr.DataArray(F, dims=("source", *table), attrs=units),
             "displacement": by_level(self.series.value[:4]),
@@ -136,43 +138,48 @@ def evaluate(
     sensor: str | None,
     average: float,
     reference: Index,
+    mean: float = 0.0,
+    changes: Sequence[float] = (),
 ) -> Results:
     """Return the ISO 230-3 values of a record; ``time`` (t,) in s since the reference state.
 
     ``average`` (s) is the averaging time for ranges and end values. The reference state (the instants ``reference``) is
-    one further mean, whose value is zero.
+    one further mean, whose value is zero. ``mean`` (s) is the time that the value of each instant covers, 0 for a
+    single reading. No mean of a range contains one of the times ``changes`` (s) at which the curve may have a step.
     """
     value = np.full((len(QUANTITIES), len(MEASURES)), np.nan)
-    uncertainty = np.full_like(value, np.nan)
+    bias, uncertainty = np.zeros_like(value), np.full_like(value, np.nan)
     influence = np.zeros((len(series.influence), *value.shape))
     step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
     turning = spindle_speed is not None and bool(turns(spindle_speed).any())
     still = spindle_speed is not None and not turning
-    end = running_end if running_end is not None else _end_of_running(time, spindle_speed, turning)
-    hottest, change = _thermometer(temperature, sensors, sensor, time <= end)
+    end = running_end if running_end is not None else _end_of_running(time, spindle_speed, turning) + mean / 2
+    until_then = time + mean / 2 <= end + 1e-6
+    hottest, change = _thermometer(temperature, sensors, sensor, until_then)
     known = np.isfinite(series.value) & (time >= -1e-9)
-    divided: dict[tuple[int, bytes], list[Index]] = {}  # most quantities are known at the same instants
+    whole = np.ones(time.size, bool)
+    for each in changes:
+        whole &= (time + mean / 2 <= each + 1e-6) | (time - mean / 2 >= each + SWITCHING - 1e-6)
+    divided: dict[tuple[int, bytes], list[Weighted]] = {}  # most quantities are known at the same instants
     for k in range(len(QUANTITIES)):
-        for column, until in ((0, HOUR), (2, end), (4, time[-1])):
+        for column, until in ((0, HOUR), (2, end), (4, time[-1] + mean / 2)):
             place = (column, known[k].tobytes())
             if place not in divided:
-                inside = np.flatnonzero(known[k] & (time <= until + 1e-6))
+                inside = np.flatnonzero(known[k] & whole & (time + mean / 2 <= until + 1e-6))
                 complete = inside.size >= 2 and time[-1] >= until - 1.5 * step
-                divided[place] = [reference, *_blocks(inside, time, average)] if complete else []
-            blocks = divided[place]
-            if not blocks:
+                later = np.flatnonzero(known[k] & (time > until)) if column == 0 else inside[:0]
+                divided[place] = _divided(inside, later, time, average, until, 1.5 * step, changes) if complete else []
+            parts = divided[place]
+            if not parts:
                 continue
-            means = np.array([series.value[k, block].mean() for block in blocks])
-            top, bottom = blocks[means.argmax()], blocks[means.argmin()]
-            value[k, column], uncertainty[k, column], influence[:, k, column] = (
-                series.difference(k, top, bottom) if top is not bottom else (0.0, 0.0, 0.0)
-            )
-            if time[blocks[-1][-1]] >= until - max(1.5 * step, average):
+            found, own_influence = _range(series, k, parts, reference)
+            value[k, column], bias[k, column], uncertainty[k, column] = found
+            influence[:, k, column] = own_influence
+            if time[parts[-1].index].max() >= until - max(1.5 * step, average):
                 # The errors are zero in the reference state: the value at the end is the difference.
-                weights = np.full(blocks[-1].size, 1.0 / blocks[-1].size)
-                found = series.weighted(k, blocks[-1], weights)
-                value[k, column + 1], uncertainty[k, column + 1], influence[:, k, column + 1] = found
-        running = np.flatnonzero(known[k] & (time <= end))
+                last = series.weighted(k, parts[-1].index, parts[-1].weights)
+                value[k, column + 1], uncertainty[k, column + 1], influence[:, k, column + 1] = last
+        running = np.flatnonzero(known[k] & until_then)
         value[k, 6] = _time_constant(time[running], series.value[k, running])
         tail = running[time[running] >= end - _SLOPE_SPAN]
         if tail.size > 10 and np.ptp(time[tail]) > 0.9 * _SLOPE_SPAN:
@@ -183,8 +190,59 @@ def evaluate(
             if warm.size > 10 and np.ptp(change[warm]) > _MIN_CHANGE:
                 found = series.weighted(k, warm, _slope_weights(change[warm]))
                 value[k, 8], uncertainty[k, 8], influence[:, k, 8] = found
+    bias[np.isnan(value)] = np.nan
     test = "ETVE (spindle still)" if still else "rotating spindle" if turning else "spindle speed not recorded"
-    return Results(test, value, uncertainty, influence, hottest, series)
+    return Results(test, value, bias, uncertainty, influence, hottest, series)
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """A weighted mean of instants, whose weights have the sum 1."""
+
+    index: Index
+    weights: Array
+
+
+def _divided(
+    inside: Index, later: Index, time: Array, average: float, until: float, gap: float, changes: Sequence[float]
+) -> list[Weighted]:
+    """Return means of ``average`` seconds over the instants of an interval, and as the last one its value at the end.
+
+    It is that of a line through the last mean, or between the last instant and the first of the ``later`` ones if the
+    mean has fewer than three instants, if both are within ``gap`` of the end.
+    """
+    between = np.split(inside, np.searchsorted(time[inside], np.sort(np.asarray(changes, float)), side="right"))
+    blocks = [block for part in between if part.size for block in _blocks(part, time, average)]
+    parts = [Weighted(block, np.full(block.size, 1.0 / block.size)) for block in blocks]
+    last = parts[-1].index
+    if last.size >= 3:
+        t = time[last] - time[last].mean()
+        ahead = min(until, time[last[-1]] + gap) - time[last].mean()
+        return [*parts[:-1], Weighted(last, 1.0 / last.size + t * ahead / (t @ t))]
+    if later.size and time[later[0]] - until <= gap and until - time[last[-1]] <= gap:
+        pair = np.array([last[-1], later[0]])
+        share = (until - time[pair[0]]) / (time[pair[1]] - time[pair[0]])
+        return [*parts, Weighted(pair, np.array([1.0 - share, share]))]
+    return parts
+
+
+def _range(series: Series, k: int, parts: list[Weighted], reference: Index) -> tuple[tuple[float, float, float], Array]:
+    """Return range, bias and standard uncertainty of quantity k over some means and the reference, and influence."""
+    value, variance = np.empty(len(parts)), np.empty(len(parts))
+    shared = np.empty((len(series.influence), len(parts)))
+    for i, part in enumerate(parts):
+        value[i] = series.value[k, part.index] @ part.weights
+        variance[i] = series.variance[k, part.index] @ part.weights**2
+        shared[:, i] = series.influence[:, k, part.index] @ part.weights
+    found = range_from_reference(value, variance, shared)
+    every = [Weighted(reference, np.full(reference.size, 1.0 / reference.size)), *parts]
+    levels = np.concatenate([[series.value[k, reference].mean()], value])
+    top, bottom = every[int(levels.argmax())], every[int(levels.argmin())]
+    _, u, effects = series.weighted(
+        k, np.concatenate([top.index, bottom.index]), np.concatenate([top.weights, -bottom.weights])
+    )
+    size, bias = float(found.value), float(found.bias)
+    return (size, bias, max(float(expanded(bias, found.u)) / 2.0, u)), effects
 
 
 def _blocks(index: Index, time: Array, length: float) -> list[Index]:

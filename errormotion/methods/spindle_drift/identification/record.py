@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 _CHANCE = 3.3
 """Standard deviations by which the observed noise must exceed the stated one (about one record in a thousand)."""
+_EDGE = 0.01
+"""Share of a mean by which its edges may be off, because the interval of the samples does not divide its length."""
 _ENOUGH = 30
 """Smallest number of values for a standard deviation."""
 _SAME_SPEED = 0.02
@@ -181,7 +183,8 @@ def reference_windows(
     if settings.reference_time is None and coming_up[0]:
         start = averages.time[int(np.argmin(coming_up))]
     length = settings.reference_average or 0.0
-    inside = (averages.time >= start - 1e-6) & (averages.time < start + max(length - 0.5 * settings.average, 1e-6))
+    last = start + max(length - length_of_means(averages, settings), 0.0) + _EDGE * settings.average
+    inside = (averages.time >= start - 1e-6) & (averages.time < last)
     if not inside.any():
         later = np.flatnonzero(averages.time >= start - 1e-6)
         if later.size == 0:
@@ -190,7 +193,12 @@ def reference_windows(
                 f"{start:g} s (reference_time)."
             )
         inside[later[0]] = True
-    if settings.reference_time is not None and coming_up[inside].any():
+    steady = np.flatnonzero(inside & ~coming_up)
+    if steady.size:  # means after the next change of speed belong to another state
+        changes = np.flatnonzero(coming_up[steady[0] :])
+        inside[:] = False
+        inside[steady if not changes.size else steady[steady < steady[0] + changes[0]]] = True
+    elif settings.reference_time is not None and coming_up[inside].any():
         notes.append("The reference state is within spin_up of a change of speed: its run-out is part of all errors.")
     known = inside & np.isfinite(mean).all(axis=0)
     if not known.any():
@@ -200,6 +208,11 @@ def reference_windows(
             ". Choose another reference state with reference_time and reference_average."
         )
     return np.flatnonzero(known)
+
+
+def length_of_means(averages: Averages, settings: Settings) -> float:
+    """Return the time that each mean covers, s; 0 where each is a single reading at its time."""
+    return settings.average if averages.expected.max() > 1 else 0.0
 
 
 def noise(raw: xr.Dataset, averages: Averages, settings: Settings, notes: list[str]) -> Array:

@@ -23,11 +23,10 @@ from errormotion.report.drawings.series import (
     events,
     last_known,
     minutes_of,
+    step_weights,
     unit_of,
 )
 from errormotion.report.text import UM, finite, fixed, integer, listed, minutes
-
-_OMITTED, _AVERAGED = 1 / 60, 10 / 60  # interval before and after a switched compensation, min
 
 
 def part(source: Source, key: str) -> Part:
@@ -138,36 +137,38 @@ def _largest(errors: xr.Dataset, line: Curve, name: str) -> list[str]:
 
 
 def _changes(errors: xr.Dataset, done: Sequence[Event]) -> list[str]:
-    """Return the effect of a switched compensation: mean of ten seconds after it minus mean of ten seconds before."""
-    time, words = minutes_of(errors), []
+    """Return the effect of each switched compensation: the step of the displacement at the functional point.
+
+    The warm-up goes on between the means before and after it. Half of this drift is a standard uncertainty of the step.
+    """
+    words = []
     for event in done:
         for axis in event.axes:
             freedom = f"E{axis}"
-            known = np.isfinite(errors[freedom].values)
-            before = np.flatnonzero(known & (time < event.minute - _OMITTED))
-            after = np.flatnonzero(known & (time > event.minute + _OMITTED))
-            if not (before.size and after.size):
+            others = [60 * other.minute for other in done if axis in other.axes or not other.axes]
+            head = f"{event.what[0].upper()}{event.what[1:]} at {fixed(event.minute, 1)} min"
+            weights = step_weights(errors, freedom, 60 * event.minute, others)
+            if weights is None:
+                words.append(f"{head}: the step of {axis} is unknown: too few means before or after it are complete.")
                 continue
-            before = before[(time[before] >= event.minute - _AVERAGED) | (before == before[-1])]
-            after = after[(time[after] <= event.minute + _AVERAGED) | (after == after[0])]
-            near = errors.isel(time=np.concatenate([before, after]))
-            weights = np.repeat([0.0, 1.0], [before.size, after.size]) / after.size
-            mean_before = np.repeat([1.0, 0.0], [before.size, after.size]) / before.size
-            start, change = (_combined(near, each, freedom) for each in (mean_before, weights - mean_before))
+            drift, _ = _combined(errors, weights.drift, freedom)
+            before, u_before = _combined(errors, weights.before, freedom)
+            step, u_step = _combined(errors, weights.step, freedom)
+            start = estimate(before / UM[1], 2 * u_before / UM[1])
+            change = estimate(step / UM[1], 2 * math.hypot(u_step, drift / 2) / UM[1])
             words.append(
-                f"{event.what[0].upper()}{event.what[1:]} at {fixed(event.minute, 1)} min: {axis} at the "
-                f"functional point stepped by {change} µm, from {start} µm."
+                f"{head}: {axis} at the functional point stepped by {_with_uncertainty(change)} µm, from "
+                f"{_with_uncertainty(start)} µm."
             )
     return words
 
 
-def _combined(errors: xr.Dataset, weights: np.ndarray, freedom: str) -> str:
-    """Return a linear combination of one displacement over time with its expanded uncertainty, in micrometres."""
-    combined = errors.em.combine(weights, "time")
+def _combined(errors: xr.Dataset, weights: np.ndarray, freedom: str) -> tuple[float, float]:
+    """Return a linear combination of one displacement over time with its standard uncertainty, m."""
+    used = np.flatnonzero(weights)
+    combined = errors.isel(time=used).em.combine(weights[used], "time")
     variance = float(combined.covariance.sel(dof=freedom, dof_=freedom))
-    return _with_uncertainty(
-        estimate(float(combined.value.sel(dof=freedom)) / UM[1], 2 * math.sqrt(max(variance, 0.0)) / UM[1])
-    )
+    return float(combined.value.sel(dof=freedom)), math.sqrt(max(variance, 0.0))
 
 
 def _first_hour(errors: xr.Dataset) -> list[str]:
