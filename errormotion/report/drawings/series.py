@@ -158,7 +158,8 @@ def step_weights(errors: xr.Dataset, freedom: str, at: float, others: Sequence[f
     known = np.isfinite(errors[freedom].values)
     length, mean = length_of_means(errors)
     reach = length / 2 if mean else length  # a time stamp may be that of the start or of the end of a reading
-    means, slopes, distances = [], [], []
+    means, distances = list[np.ndarray](), list[float]()
+    slopes = list[np.ndarray | None]()
     for later in (False, True):
         usable = known & ((time - reach >= at + SWITCHING - 1e-6) if later else (time + reach <= at + 1e-6))
         for other in others:

@@ -172,9 +172,8 @@ def evaluate(
             parts = divided[place]
             if not parts:
                 continue
-            found, own_influence = _range(series, k, parts, reference)
-            value[k, column], bias[k, column], uncertainty[k, column] = found
-            influence[:, k, column] = own_influence
+            of_range, influence[:, k, column] = _range(series, k, parts, reference)
+            value[k, column], bias[k, column], uncertainty[k, column] = of_range
             if time[parts[-1].index].max() >= until - max(1.5 * step, average):
                 # The errors are zero in the reference state: the value at the end is the difference.
                 last = series.weighted(k, parts[-1].index, parts[-1].weights)
