@@ -220,7 +220,7 @@ class Compensation:
         with suppress(CompensationError):
             applied = last.applied if last is not None else None
             ended = {"state": str(self.state), "offset": numbers(self._follower.offset), "applied": applied}
-            self._audit.write({"event": "ended", **ended})
+            self._audit.write({"event": "ended", **ended}, last=True)
         if last is not None:
             self._show(last.model_copy(update={"ended": True, "time": datetime.now(UTC), "state": str(self.state)}))
         self._stack.__exit__(kind, error, trace)

@@ -14,6 +14,7 @@ from tornado.web import HTTPError
 
 from errormotion.arrays import Array
 from errormotion.campaign.compensation.following import Status, is_working, read_status, request_stop
+from errormotion.compensation.online.audit import Verdict
 from errormotion.compensation.online.follower import State as States
 from errormotion.dashboard.cache import TimedCache
 from errormotion.dashboard.compensations import Compensations, Start, rows
@@ -214,6 +215,8 @@ def _chosen(known: Compensations, key: str) -> dict[str, Any]:
             "complete": following.complete,
             "broken": following.broken,
             "hash": following.reader.hash,
+            "keyed": following.reader.verdict is Verdict.UNBROKEN,
+            "ended": following.reader.ended,
             "model": str(first.get("model") or "")[:200],
             "started": str(first.get("time") or "")[:40],
         },

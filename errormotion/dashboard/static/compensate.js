@@ -120,9 +120,10 @@ function showChosen(found) {
   const { limit, slew, period, oldest, uncertainty, hold, settle } = status.limits;
   const limits = [["each axis", `${+(1e6 * limit).toFixed(3)} µm`], ["change", `${+(1e6 * slew).toFixed(4)} µm/s`], ["period", `${period} s`], ["age of a reading", `${oldest} s`], ["U (k = 2)", `${+(1e6 * uncertainty).toFixed(3)} µm`], ["hold", `${hold} s`], ["settle", `${settle} s`]];
   byId("limits").replaceChildren(...limits.flatMap(([name, value]) => [element("dt", name), element("dd", value)]));
-  byId("chain").className = audit.broken ? "bad" : "good";
+  const unproved = !audit.keyed ? " This user has no key of it: others can compute the hashes anew." : !found.working && !audit.ended ? " It has no mark of an orderly end." : "";
+  byId("chain").className = audit.broken ? "bad" : unproved ? "open" : "good";
   byId("chain").textContent = audit.broken ? "✕ The chain of hashes is broken."
-    : audit.complete ? `✓ ${audit.entries} entries, the chain of hashes is unbroken.` : `${audit.entries} entries checked so far.`;
+    : audit.complete ? `${unproved ? "?" : "✓"} ${audit.entries} entries, the chain of hashes is unbroken.${unproved}` : `${audit.entries} entries checked so far.`;
   byId("hash").textContent = `Last hash ${audit.hash.slice(0, 16)}…, model ${audit.model.split(":").at(-1).slice(0, 16)}…, started ${audit.started}`;
   byId("log").replaceChildren(...found.rows.map((each) => {
     return cells(element("tr"), [[each.time.replace("T", " ").slice(0, 19), "time"], [each.what], [each.offset, "number"], [each.cause]]);

@@ -7,14 +7,14 @@ from typing import Any
 
 from errormotion.campaign.compensation.following import AUDIT, compensations, is_working, read_status, request_stop
 from errormotion.cli.output import show, show_json, table
-from errormotion.compensation.online.audit import verify
+from errormotion.compensation.online.audit import Verdict, check
 from errormotion.errors import CompensationError
 
 
 def status(path: Path, as_json: bool) -> int:
     """Print the state of one compensation, or of those of a folder of runs, and check their audit logs.
 
-    Return the exit code: 1 if the hash chain of an audit log is broken, else 0.
+    Return the exit code: 1 if an audit log was altered, cut or emptied, else 0.
     """
     folders = [path] if (path / AUDIT).is_file() else list(compensations(path))
     if not folders:
@@ -46,25 +46,37 @@ def stop(folder: Path, as_json: bool) -> None:
 
 def _state_of(folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = {"folder": str(folder), "working": is_working(folder), "broken": "", "entries": None}
+    found |= {"verdict": None, "complete": None}
     try:
         found["status"] = read_status(folder).model_dump(mode="json")
     except CompensationError as error:
         found["status"], found["reason"] = None, str(error)
     try:
-        found["entries"] = verify(folder / AUDIT)[0]
+        audit = check(folder / AUDIT)
+        found |= {"broken": audit.message, "verdict": str(audit.verdict), "complete": audit.ended}
+        found["entries"] = None if audit.message else audit.entries
     except CompensationError as error:
         found["broken"] = str(error)
     return found
 
 
 def _row(each: dict[str, Any]) -> list[str]:
-    name, log = Path(each["folder"]).name, "broken" if each["broken"] else f"{each['entries']} entries, unbroken"
+    name, log = Path(each["folder"]).name, _log(each)
     last = each["status"]
     if last is None:
         return [name, "unknown", "", "running" if each["working"] else "unknown", "", "", log]
     state = last["state"] if each["working"] else f"ended: {last['state']}"
     mode = "armed" if last["armed"] else "shadow"
     return [name, last["machine"], mode, state, _um(last["offset"]), _um(last["applied"]), log]
+
+
+def _log(each: dict[str, Any]) -> str:
+    if each["broken"]:
+        return f"broken: {each['verdict'] or 'cannot be read'}"
+    text = f"{each['entries']} entries, unbroken"
+    if each["verdict"] == Verdict.WITHOUT_KEY:
+        text += ", without key"
+    return text if each["working"] or each["complete"] else f"{text}, without end"
 
 
 def _um(values: list[float | None] | None) -> str:
