@@ -229,6 +229,7 @@ class Watch:
         alarms = alarms if isinstance(alarms, list | tuple) else (alarms,)
         if last.state.get("estop") is True and EMERGENCY_STOP not in alarms:
             alarms = (EMERGENCY_STOP, *alarms)
+        alarms = (*alarms, *(f"{name} {why}" for name, why in last.doubtful.items()))
         return Present(
             self._start_time() + timedelta(seconds=self._shift + last.time),
             running,

@@ -435,3 +435,25 @@ def test_a_bench_states_its_compensator(tmp_path: Path) -> None:
     ):
         with pytest.raises(BenchError, match=message):
             parse_bench(head + wrong, Path("b.toml"))
+
+
+def test_a_frozen_thermometer_holds_then_ramps_and_a_measuring_one_continues(
+    plan: BenchPlan, model: xr.Dataset, tmp_path: Path
+) -> None:
+    noise = np.random.default_rng(5).normal(0.0, 5e-3, 700).round(3)
+    script: Script = {
+        k: set_to(Thermometer, "value", STEADY + 2 + float(noise[k])) for k in range(700) if not 300 <= k < 500
+    }  # for 200 readings the gateway answers with the value of its cache
+    compensation = Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock())
+    first = {0: set_to(Thermometer, "value", STEADY)}
+    moments = run(compensation, {**script, **first}, 700)
+    assert states(moments) == ["following", "holding", "ramping", "armed", "following"]
+    held = next(k for k, moment in enumerate(moments) if moment.step.state is State.HOLDING)
+    assert 300 + 60 <= held < 300 + 120
+    assert moments[held].step.cause == "spindle repeats one value, in spite of its noise"
+    assert not moments[499].step.offset.any()
+    assert moments[-1].step.offset[0] == pytest.approx(-10e-6, abs=0.2e-6)
+    steps = [each["sensor"] for each in compensation.folder.data["steps"] if each["outcome"] == "doubtful"]
+    assert steps == ["spindle"]
+    assert "measures again" in compensation.folder.log.read_text()
+    never_beyond()

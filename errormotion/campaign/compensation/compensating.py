@@ -306,9 +306,20 @@ class Compensation:
         for name, value in readings.items():
             if math.isfinite(value):
                 self._known[name] = snapshot.time, value
-        recent = {name: value for name, (at, value) in self._known.items() if snapshot.time - at <= self.limits.oldest}
+        recent = {
+            name: value
+            for name, (at, value) in self._known.items()
+            if snapshot.time - at <= self.limits.oldest and name not in snapshot.doubtful
+        }
         prediction = self._predictor.update(snapshot.time, recent, recent)
+        doubtful = self._doubtful(snapshot)
+        if doubtful:
+            return prediction, "; ".join(f"{name} {why}" for name, why in doubtful.items())
         return prediction, refusal(prediction, self.limits)
+
+    def _doubtful(self, snapshot: Snapshot) -> dict[str, str]:
+        """Return the inputs of the model whose sensors no longer measure, and why."""
+        return {name: why for name, why in snapshot.doubtful.items() if name in self._predictor.temperatures}
 
     def _read(self) -> tuple[tuple[float, float, float] | None, str, str]:
         """Return the offset in effect, why it must not change, and why the machine accepts none."""
@@ -397,7 +408,8 @@ class Compensation:
             predicted=numbers(prediction.errors),
             uncertainty=numbers(prediction.uncertainty),
             inputs={name: each for name in names for each in numbers([self._known.get(name, (0.0, math.nan))[1]])},
-            missing=tuple(prediction.missing),
+            missing=tuple(name for name in prediction.missing if name not in moment.snapshot.doubtful),
+            doubtful=tuple(self._doubtful(moment.snapshot)),
             outside=tuple(prediction.outside),
             limited=tuple("XYZ"[k] for k in step.limited),
             estop=estop if isinstance(estop, bool) else None,

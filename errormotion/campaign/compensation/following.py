@@ -61,8 +61,9 @@ class Status(BaseModel):
         Predicted errors, m and rad, and their standard uncertainty.
     inputs : mapping of str to float
         Inputs of the model as used: degC, 1/min, m/s.
-    missing, outside, limited : tuple of str
-        Unknown inputs, inputs outside the range of the training data, axes whose target exceeds the limit.
+    missing, doubtful, outside, limited : tuple of str
+        Unknown inputs, inputs whose sensors no longer measure, inputs outside the range of the training data, axes
+        whose target exceeds the limit.
     estop : bool, optional
         Emergency stop as the controller reports it; None if unknown.
     program : str
@@ -87,6 +88,7 @@ class Status(BaseModel):
     uncertainty: Twist
     inputs: dict[Text, Number] = Field(max_length=2000)
     missing: tuple[Text, ...]
+    doubtful: tuple[Text, ...] = ()
     outside: tuple[Text, ...]
     limited: tuple[Text, ...]
     estop: bool | None

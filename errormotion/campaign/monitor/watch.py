@@ -26,6 +26,7 @@ from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.folder import FolderGoneError, RunFolder, Status, new_entries, now
 from errormotion.campaign.monitor.clock import Clock
+from errormotion.campaign.monitor.liveness import Liveness
 from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.campaign.monitor.sources import Source
 from errormotion.campaign.storage.journal import cause_of, journal
@@ -74,6 +75,8 @@ class Snapshot:
         Rows in the log.
     gaps : mapping of str to int
         Rows without a reading, by instrument.
+    doubtful : mapping of str to str
+        Temperatures whose sensors no longer measure, and why; their values are those that the instruments state.
     """
 
     time: float
@@ -83,6 +86,7 @@ class Snapshot:
     silent: Mapping[str, str]
     logged: int
     gaps: Mapping[str, int] = field(default_factory=dict)
+    doubtful: Mapping[str, str] = field(default_factory=dict)
 
 
 class Monitor:
@@ -107,6 +111,8 @@ class Monitor:
         The run folder, once entered.
     sensors : tuple of str
         Names of the temperatures: those of the thermometers, preceded by the instrument where names are equal.
+    doubted : dict of str to str
+        Temperatures that were doubtful at any time, and why.
 
     Raises
     ------
@@ -131,6 +137,10 @@ class Monitor:
         self._columns = _columns([source for source in self.sources if source is not self.controller])
         self.sensors = tuple(self._columns.values())
         self._gaps: Counter[str] = Counter()
+        self._liveness = Liveness()
+        self._taken: dict[str, float] = {}  # time of the last reading of each thermometer
+        self._doubtful: dict[str, str] = {}
+        self.doubted: dict[str, str] = {}
         self._noted: tuple[Answer, ...] = ()
         self._stack = ExitStack()
 
@@ -240,6 +250,7 @@ class Monitor:
         flags = dict.fromkeys(self.sensors, "no answer")
         state: dict[str, Any] = {}
         silent = {}
+        new: dict[str, float] = {}
         for source in self.sources:
             reading = source.fresh(oldest)
             if reading is None:
@@ -251,7 +262,24 @@ class Monitor:
                 for channel, value in reading.values.items():
                     name = self._columns[source.name, channel]
                     temperatures[name], flags[name] = float(value), reading.flags.get(channel, "")
-        return Snapshot(at, temperatures, flags, state, silent, logged, dict(self._gaps))
+                    if self._taken.get(source.name) != reading.at:
+                        new[name] = float(value)
+                self._taken[source.name] = reading.at
+        return Snapshot(at, temperatures, flags, state, silent, logged, dict(self._gaps), self._doubt(new))
+
+    def _doubt(self, new: Mapping[str, float]) -> dict[str, str]:
+        """Return the temperatures whose sensors no longer measure; log each change."""
+        self._liveness.put(new)
+        found = self._liveness.found()
+        for name in found.keys() - self._doubtful.keys():
+            log.warning("%s %s", name, found[name])
+            if name not in self.doubted:
+                self.doubted[name] = found[name]
+                self.folder.step("readings", "doubtful", sensor=name, reason=found[name])
+        for name in self._doubtful.keys() - found.keys():
+            log.info("%s measures again", name)
+        self._doubtful = found
+        return dict(found)
 
     def _row(self, snapshot: Snapshot) -> xr.Dataset:
         gap = np.array([[source.name in snapshot.silent for source in self.sources]], dtype=np.int8)

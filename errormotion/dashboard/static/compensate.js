@@ -114,7 +114,7 @@ function showChosen(found) {
     const row = element("tr"), name = element("th", input);
     name.scope = "row";
     row.append(name);
-    const wrong = status.missing.includes(input) ? "no recent reading" : status.outside.some((each) => each.startsWith(input)) ? "outside the training range" : "";
+    const wrong = status.missing.includes(input) ? "no recent reading" : status.doubtful.includes(input) ? "does not measure" : status.outside.some((each) => each.startsWith(input)) ? "outside the training range" : "";
     return cells(row, [[number(value === null ? null : factor * value, unit === "°C" ? 2 : 0), "number"], [unit], [wrong || "used", wrong ? "flagged" : "good"]]);
   }));
   const { limit, slew, period, oldest, uncertainty, hold, settle } = status.limits;

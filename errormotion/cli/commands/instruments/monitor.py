@@ -6,6 +6,7 @@ import json
 import math
 import sys
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def run(file: Path, runs: Path, interval: str, duration: str | None, as_json: bo
         if folder is None:  # before the log was created
             raise
     if not as_json:
-        show(summary(last, monitor.folder.path))
+        show(summary(last, monitor.folder.path, monitor.doubted))
 
 
 class Screen:
@@ -109,6 +110,8 @@ class Screen:
             parts.append(_parameters(snapshot.state))
         for name, why in snapshot.silent.items():
             parts.append(Text(f"{name} is silent: {why}", style="red"))
+        for name, why in snapshot.doubtful.items():
+            parts.append(Text(f"{name} {why}", style="red"))
         lost = [f"{name} {count}" for name, count in snapshot.gaps.items()]
         if lost:
             parts.append(Text("rows without an answer: " + ", ".join(lost), style="yellow"))
@@ -163,13 +166,16 @@ def clock(seconds: float) -> str:
     return (f"{days} d " if days else "") + f"{hour:02d}:{minute:02d}:{second:02d}"
 
 
-def summary(last: Snapshot | None, folder: Path) -> str:
+def summary(last: Snapshot | None, folder: Path, doubted: Mapping[str, str] | None = None) -> str:
     """Return the summary that is printed at the end."""
     if last is None:
         return f"Nothing was logged in {folder}."
     lines = [f"{last.logged} rows over {clock(last.time)} in {folder}."]
     lines += [
         f"{name}: no answer in {count} of the rows; they are marked as gaps." for name, count in last.gaps.items()
+    ]
+    lines += [
+        f"{name} {why}: its values may be wrong. The time is in log.jsonl." for name, why in (doubted or {}).items()
     ]
     return "\n".join(lines)
 
@@ -192,4 +198,5 @@ def _plain(snapshot: Snapshot) -> dict[str, Any]:
         "flags": flags,
         "state": state,
         "silent": dict(snapshot.silent),
+        "doubtful": dict(snapshot.doubtful),
     }
