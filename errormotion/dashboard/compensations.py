@@ -22,8 +22,9 @@ from errormotion.campaign.background.detached import printed, spawn
 from errormotion.campaign.compensation.following import AUDIT, STATUS, Status, compensations, is_working, read_status
 from errormotion.campaign.files import BenchPlan, load_bench
 from errormotion.compensation.online.audit import AuditReader
-from errormotion.compensation.online.prediction import predictor
+from errormotion.compensation.online.prediction import predictor, predicts
 from errormotion.dashboard.cache import Cache, stamp
+from errormotion.datasets.files.containers import stated_schema
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import CompensationError, ErrormotionError
 
@@ -242,13 +243,13 @@ def _bench(name: str, path: Path) -> Bench:
 
 def _model(name: str, path: Path) -> Model | None:
     try:
-        if path.stat().st_size > MAX_MODEL:
-            return None
+        if path.stat().st_size > MAX_MODEL or not predicts(stated_schema(path)):
+            return None  # results, and whatever else lies there, are not read
         with reading(path), datasets.load(path) as found:
             inputs = predictor(found)
             machine = str(found.attrs.get("machine", "unknown"))
             return Model(name, path, machine, (*inputs.temperatures, *inputs.parameters))
-    except (ErrormotionError, OSError):
+    except (ErrormotionError, OSError, RuntimeError):
         return None
 
 

@@ -80,6 +80,11 @@ class Predictor(Protocol):
         """
 
 
+def predicts(schema: str) -> bool:
+    """Return whether datasets of a schema are models that predict errors from readings."""
+    return hasattr(plugins.owner_of_schema(schema), "predictor")
+
+
 def predictor(model: xr.Dataset, functional_point: Array | None = None) -> Predictor:
     """Return the predictor of a model by the plugin of its schema (``predictor`` of a kind of dataset).
 

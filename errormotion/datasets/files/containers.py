@@ -13,11 +13,12 @@ import stat
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py  # type: ignore[import-untyped]
 import numpy as np
 
+from errormotion.datasets.files.hdf5 import Stored, violations
 from errormotion.datasets.files.reading import parse_json, read_bytes
 from errormotion.errors import DatasetError
 
@@ -36,6 +37,9 @@ DEEPEST = 24
 """Largest number of levels of folders in a Zarr folder."""
 CODECS = ("bytes", "transpose", "blosc", "zstd", "crc32c", "vlen-utf8")
 """Accepted codecs of Zarr v3, which decode numbers and texts only."""
+_COMPRESSORS = ("blosc", "zstd")
+_CRC_BYTES = 4
+"""What the codec crc32c appends, bytes."""
 MAX_TEXT = 1 << 20
 """Largest size of a text of fixed length, bytes."""
 _TEXT, _WIDE = "string", "fixed_length_utf32"
@@ -58,7 +62,7 @@ def check_netcdf(path: Path) -> None:
         file.attrs.get("_nc3_strict")  # h5netcdf leaves an incomplete object if this fails
         if len(file) > MAX_VARIABLES:
             raise DatasetError(f"{path}: expected at most {MAX_VARIABLES} variables; found {len(file)}")
-        found, total = [], 0
+        found, total, variables = [], 0, {}
         for name in file:
             link = file.get(name, getlink=True)
             if not isinstance(link, h5py.HardLink):
@@ -69,12 +73,29 @@ def check_netcdf(path: Path) -> None:
                 continue  # groups are not read
             if variable.external or variable.is_virtual:
                 found.append(f"{name!r:.100}: expected values in this file; found a reference to another one")
-            filters = variable.id.get_create_plist()
-            if sum(filters.get_filter(k)[0] == h5py.h5z.FILTER_DEFLATE for k in range(filters.get_nfilters())) > 1:
-                found.append(f"{name!r:.100}: expected values that are compressed once")
             pieces = variable.chunks or ()
             total += max(math.prod(variable.shape or ()), math.prod(pieces)) * max(1, variable.dtype.itemsize)
+            variables[name] = variable
+        if not found and total <= _most(size):  # what follows reads as much as the file states
+            stored = Stored(path, size, file)
+            found += [f"{name!r:.100}: {text}" for name, each in variables.items() for text in violations(each)]
+            total += stored.texts(variables.values(), _most(size) - total)
     _raise(path, found, total, size)
+
+
+def stated_schema(path: Path) -> str:
+    """Return the schema that a NetCDF-4 file states, without reading anything else; empty if it states none.
+
+    Raises
+    ------
+    OSError, RuntimeError
+        The file cannot be read, or is not one.
+    """
+    with h5py.File(path) as file:
+        if "schema" not in file.attrs:
+            return ""
+        attribute = h5py.h5a.open(file.id, b"schema")
+        return str(file.attrs["schema"]) if math.prod(attribute.shape) == 1 else ""
 
 
 def check_zarr(path: Path) -> None:
@@ -179,8 +200,8 @@ def _wrong(metadata: Any) -> str:
     )
     if not found or not all(each in CODECS for each in found):
         return f"expected codecs of {', '.join(CODECS)}; found {found!r:.100}"
-    if len({*found}) < len(found):
-        return f"expected each codec once; found {found!r:.100}"
+    if len({*found}) < len(found) or {*_COMPRESSORS} <= {*found}:
+        return f"expected each codec once, and one of {' and '.join(_COMPRESSORS)} at most; found {found!r:.100}"
     return ""
 
 
@@ -213,18 +234,23 @@ def _stated(metadata: Mapping[str, Any]) -> int:
 def _wrong_chunks(folder: Path, metadata: Mapping[str, Any], size: int) -> Iterator[str]:
     """Yield violations in the decompressed sizes that the chunks of an array state."""
     names = [each["name"] for each in metadata["codecs"]]
-    packed = next((name for name in ("blosc", "zstd") if name in names), "")
+    packed = next((name for name in _COMPRESSORS if name in names), "")
     if not packed or not (folder / "c").exists():
         return
+    checked = _CRC_BYTES if "crc32c" in names[names.index(packed) :] else 0
     items = math.prod(_chunk_shape(metadata))
     largest = _most(size) if metadata["data_type"] == _TEXT else items * _item(metadata)
     for file in _below(folder / "c"):
         with open(file, "rb") as chunk:
             head = chunk.read(18)
-        stated = _blosc_size(head) if packed == "blosc" else _zstd_size(head)
+            stated = _blosc_size(head) if packed == "blosc" else _zstd_size(head)
+            longer = stated is not None and packed == "zstd" and _continues(chunk, head, checked)
         name = Path(file).relative_to(folder)
         if stated is None:
             yield f"{name}: expected a chunk that states its size; it is truncated or damaged: copy the folder again"
+            return
+        if longer:
+            yield f"{name}: expected a chunk of one Zstandard frame; found more behind it"
             return
         if stated > largest:
             yield f"{name}: expected a chunk of at most {largest} bytes; it states {stated}"
@@ -245,15 +271,33 @@ def _blosc_size(head: bytes) -> int | None:
     return int(struct.unpack_from("<I", head, 4)[0]) if len(head) >= 16 else None
 
 
-def _zstd_size(head: bytes) -> int | None:
-    """Return the decompressed size of a Zstandard frame (RFC 8878, section 3.1.1.1); None if it states none."""
-    if len(head) < 6 or head[:4] != b"\x28\xb5\x2f\xfd":
-        return None
+def _zstd_field(head: bytes) -> tuple[int, int]:
+    """Return the place and the width of the decompressed size in the head of a frame (RFC 8878, section 3.1.1.1)."""
     descriptor = head[4]
     single, flag = descriptor >> 5 & 1, descriptor >> 6
-    start = 5 + (1 - single) + (0, 1, 2, 4)[descriptor & 3]
-    width = (1 if single else 0, 2, 4, 8)[flag]
+    return 5 + (1 - single) + (0, 1, 2, 4)[descriptor & 3], (1 if single else 0, 2, 4, 8)[flag]
+
+
+def _zstd_size(head: bytes) -> int | None:
+    """Return the decompressed size that a Zstandard frame states; None if it states none."""
+    if len(head) < 6 or head[:4] != b"\x28\xb5\x2f\xfd":
+        return None
+    start, width = _zstd_field(head)
     field = head[start : start + width]
     if not width or len(field) < width:
         return None
-    return int.from_bytes(field, "little") + (256 if flag == 1 else 0)
+    return int.from_bytes(field, "little") + (256 if width == 2 else 0)
+
+
+def _continues(chunk: BinaryIO, head: bytes, after: int) -> bool:
+    """Return whether a chunk has more than one Zstandard frame and some bytes: a decoder would add further frames."""
+    place = sum(_zstd_field(head))
+    size = chunk.seek(0, 2)
+    while place + 3 <= size:
+        chunk.seek(place)
+        block = int.from_bytes(chunk.read(3), "little")  # RFC 8878, section 3.1.1.2: last, type, size
+        repeated = block >> 1 & 3 == 1
+        place += 3 + (1 if repeated else block >> 3)
+        if block & 1:
+            return place + (4 if head[4] & 4 else 0) + after < size
+    return False  # truncated: the decoder refuses it
