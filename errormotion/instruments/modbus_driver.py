@@ -10,7 +10,8 @@ from errormotion.plugins import Identity
 class ModbusDriver(Driver):
     """Base of drivers with one Modbus line.
 
-    Its settings have ``unit``, ``timeout``, ``retry``, ``retries`` and ``baudrate``, see `open_modbus`.
+    Its settings have ``unit``, ``timeout``, ``retry``, ``retries``, ``baudrate``, ``echo`` and ``leading_zeros``, see
+    `open_modbus`.
     """
 
     @property
@@ -43,4 +44,6 @@ class ModbusDriver(Driver):
             retry=settings.retry,
             retries=settings.retries,
             baudrate=settings.baudrate,
+            echo=settings.echo,
+            zeros=settings.leading_zeros,
         )

@@ -20,6 +20,7 @@ from errormotion.instruments.thermometer.dcon import (
     encode,
     parse_temperatures,
 )
+from errormotion.instruments.transports.loopback.serving import TcpServer
 
 ADDRESS = "sim://cframe/thermometer?seed=3"
 QUICK = DconSettings(timeout=0.3)
@@ -263,3 +264,24 @@ def test_an_unplugged_module_is_received_again_automatically(wire: str) -> None:
                 time.sleep(0.02)
         assert gaps >= 2
         assert after == pytest.approx(before, abs=0.2)  # ten sigma of 0.02 K
+
+
+@pytest.mark.parametrize("end", [b"\r", b"\r\n", b"\n"])
+@pytest.mark.parametrize("echo", [False, True])
+def test_an_echo_and_other_ends_of_lines_are_read(end: bytes, echo: bool) -> None:
+    answers = {b"$01M": b"!014018", b"$01F": b"!01A1.0", b"$012": b"!01100600", b"#01": b">+025.12+026.00"}
+
+    def reply(data: bytes) -> None:
+        server.send((data if echo else b"") + answers[data.strip()] + end)
+
+    server = TcpServer("dcon", reply)
+    server.start()
+    settings = DconSettings(channels=("a", "b"), timeout=1.0, echo=echo)
+    try:
+        with DconTemperature(server.url, settings) as thermometer:
+            assert [thermometer.read() for _ in range(3)] == [{"a": 25.12, "b": 26.0}] * 3
+        if echo:
+            with pytest.raises(ProtocolError, match="The line returns the request: set 'echo' to true"):
+                DconTemperature(server.url, settings.model_copy(update={"echo": False})).open()
+    finally:
+        server.close()

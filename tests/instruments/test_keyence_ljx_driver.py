@@ -1,6 +1,7 @@
 """The LJ-X8000A driver against its wire simulator, over real sockets."""
 
 import itertools
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ from errormotion.instruments.simulators.line_profiler.keyence_ljx import Simulat
 from errormotion.instruments.simulators.line_profiler.profile_sources import Lines, SweptSurface
 from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.loopback.serving import TcpServer
+from errormotion.instruments.transports.loopback.stream_serving import NewestConnectionServer
 from errormotion.plugins.readings import Profiles
 
 SMALL = "sim://cframe/profiler?seed=3&points=80"
@@ -173,6 +175,22 @@ def test_without_its_second_connection_a_stream_is_refused(ramp: SimulatedLJX) -
             time.sleep(0.01)
         with pytest.raises(InstrumentError, match=r"80A0 \(no connection for the stream"):
             profiler.read()
+
+
+def test_a_connection_that_its_client_has_closed_is_none_even_before_it_is_accepted() -> None:
+    server = NewestConnectionServer("stream", lambda data: None)  # its thread does not run: nothing is noticed
+    try:
+        place = parse_address(server.url)
+        first = socket.create_connection((place.host, place.port))
+        assert server.accept_pending()
+        first.close()
+        assert not server.accept_pending()
+        socket.create_connection((place.host, place.port)).close()
+        assert not server.accept_pending()
+        with socket.create_connection((place.host, place.port)):
+            assert server.accept_pending()
+    finally:
+        server.close()
 
 
 def test_a_wrong_start_code_is_refused(ramp: SimulatedLJX) -> None:

@@ -159,6 +159,28 @@ def test_the_client_of_pymodbus_reports_faults_as_silence_or_passes_over_them(an
             ours.open()
 
 
+@pytest.mark.parametrize("zeros", [0, 1, 3])
+@pytest.mark.parametrize("echo", [False, True])
+def test_two_wires_with_echo_and_zeros_are_read(echo: bool, zeros: int) -> None:
+    def reply(data: bytes) -> None:
+        answer = codec.encode_answer("rtu", 1, 3, [201, 202][: data[5]])
+        server.send((data if echo else b"") + bytes(zeros) + answer)
+
+    server = TcpServer("modbus", reply)
+    server.start()
+    url = f"modbus+rtu-tcp://127.0.0.1:{parse_address(server.url).port}?unit=1"
+    settings = ModbusSettings(channels=("a", "b"), scale=0.1, timeout=2.0, echo=echo, leading_zeros=bool(zeros))
+    try:
+        with ModbusTemperature(url, settings) as thermometer:
+            assert [thermometer.read() for _ in range(2)] == [pytest.approx({"a": 20.1, "b": 20.2})] * 2
+        if echo and not zeros:
+            plain = settings.model_copy(update={"echo": False})
+            with pytest.raises(ProtocolError, match="The line returns the request: set 'echo' to true"):
+                ModbusTemperature(url, plain).open()
+    finally:
+        server.close()
+
+
 def test_the_framers_of_pymodbus_pass_over_stray_bytes_and_other_units() -> None:
     framer = FramerRTU(DecodePDU(is_server=False))
     assert framer.decode(b"\0" + FRAME)[3] == FRAME[1:-2]

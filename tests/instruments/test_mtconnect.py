@@ -1,6 +1,7 @@
 """MTConnect agents: states, sequence numbers, lost observations, restarts, faults."""
 
 import math
+from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.controller.mtconnect import MTConnect, MTConnectSettings
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import world
+from errormotion.instruments.transports.http.serving import HttpServer
 
 ADDRESS = "sim://cframe/mtconnect?seed=3"
 QUICK = MTConnectSettings(timeout=0.3)
@@ -138,6 +140,35 @@ def test_a_restart_without_a_listener_is_detected_too() -> None:
         assert agent.restarts == 1
         assert agent.sample().restarted
         assert not agent.sample().restarted
+
+
+@pytest.mark.parametrize(
+    ("status", "head", "message"),
+    [
+        (
+            "301 Moved Permanently",
+            "Location: http://10.0.0.7:5000/agent\r\n",
+            r"redirects .*301.* to 'http://10.0.0.7:50",
+        ),
+        ("302 Found", "Location: /login\r\n", r"redirects .*302.* to '/login'"),
+        ("401 Unauthorized", "", "HTTP status 401 without a document of MTConnect"),
+        ("503 Service Unavailable", "", "HTTP status 503 without a document of MTConnect"),
+    ],
+)
+def test_the_status_of_a_server_is_named_and_not_its_page(status: str, head: str, message: str) -> None:
+    page = b"<html><body>Moved<br></body></html>"
+
+    def respond(path: str, query: Mapping[str, str]) -> Iterator[bytes]:
+        lines = f"HTTP/1.1 {status}\r\nContent-Type: text/html\r\n{head}Content-Length: {len(page)}\r\n\r\n"
+        yield lines.encode() + page
+
+    server = HttpServer("site", respond)
+    try:
+        with pytest.raises(InstrumentError, match=message) as caught:
+            MTConnect(server.url.replace("tcp://", "http://")).open()
+    finally:
+        server.close()
+    assert "XML" not in str(caught.value)
 
 
 def test_a_stream_continues_from_the_end_of_the_last_one() -> None:

@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
-from errormotion.instruments.transports import Transport, open_transport, parse_address
+from errormotion.instruments.transports import Transport, open_transport, parse_address, serial_line
+from errormotion.instruments.transports.base import LINE_ENDS
+from errormotion.instruments.transports.half_duplex import HalfDuplexTransport
 from errormotion.instruments.transports.loopback.serving import Server, TcpServer, make_server
 
 
@@ -168,3 +170,84 @@ def test_a_server_reports_whether_a_client_is_connected() -> None:
 def test_an_unknown_wire_is_refused() -> None:
     with pytest.raises(InstrumentError, match="wire=tcp"):
         make_server("smoke", "x", lambda data: None)
+
+
+# ------------------------------------------------------------------ serial lines, two wires, ends of lines
+
+
+def test_data_bits_and_flow_control_of_a_serial_line_are_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[dict[str, object]] = []
+    monkeypatch.setattr(serial_line.serial, "Serial", lambda path, speed, **more: opened.append(more))
+    for query in ("", "?databits=7&parity=E&stopbits=2&xonxoff=1"):
+        open_transport(f"serial:///dev/ttyUSB0{query}")
+    assert [each["bytesize"] for each in opened] == [8, 7]
+    assert [each["xonxoff"] for each in opened] == [False, True]
+    assert [each["parity"] for each in opened] == ["N", "E"]
+    for query in ("databits=6", "databits=9", "xonxoff=2"):
+        with pytest.raises(InstrumentError, match=query.partition("=")[0]):
+            open_transport(f"serial:///dev/ttyUSB0?{query}")
+
+
+class Pieces(Transport):
+    """A line that returns the given pieces, one by one."""
+
+    def __init__(self, *pieces: bytes) -> None:
+        super().__init__("serial:///dev/test", 0.05)
+        self.pieces, self.sent = list(pieces), b""
+
+    def _send(self, data: bytes) -> None:
+        self.sent += data
+
+    def _receive(self, max_bytes: int, timeout: float) -> bytes:
+        if not self.pieces:
+            raise InstrumentTimeoutError("nothing")
+        data = self.pieces.pop(0)
+        if len(data) > max_bytes:
+            self.pieces.insert(0, data[max_bytes:])
+        return data[:max_bytes]
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+@pytest.mark.parametrize("end", [b"\r", b"\n", b"\r\n"])
+@pytest.mark.parametrize("size", [1, 2, 3, 100])
+def test_each_of_several_ends_ends_a_line(end: bytes, size: int) -> None:
+    data = b"one" + end + b"two" + end + end + b"three" + end
+    line = Pieces(*(data[i : i + size] for i in range(0, len(data), size)))
+    assert [line.read_until(LINE_ENDS).strip(b"\r\n") for _ in range(3)] == [b"one", b"two", b"three"]
+    with pytest.raises(InstrumentTimeoutError):
+        line.read_until(LINE_ENDS)
+
+
+REQUEST, ANSWER = b"\x01\x03\x00", b"\x01\x05\x00\x00"
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 100])
+@pytest.mark.parametrize(
+    ("received", "echo", "zeros"),
+    [
+        (REQUEST + ANSWER, True, False),
+        (REQUEST + b"\0\0" + ANSWER, True, True),
+        (b"\0" + REQUEST + b"\0" + ANSWER, True, True),
+        (b"\0\0\0" + ANSWER, False, True),
+        (ANSWER, False, True),
+    ],
+)
+def test_echo_and_leading_zeros_are_removed(size: int, received: bytes, echo: bool, zeros: bool) -> None:
+    line = Pieces(*(received[i : i + size] for i in range(0, len(received), size)))
+    wires = HalfDuplexTransport(line, echo=echo, zeros=zeros)
+    wires.write(REQUEST)
+    assert line.sent == REQUEST
+    assert wires.read_exactly(len(ANSWER)) == ANSWER
+
+
+def test_another_byte_in_the_echo_and_a_missing_echo_are_errors() -> None:
+    wires = HalfDuplexTransport(Pieces(b"\x01\x04"), echo=True, zeros=False)
+    wires.write(REQUEST)
+    with pytest.raises(ProtocolError, match=r"expected the echo 01 03 of the request; found 01 04.*setting 'echo'"):
+        wires.read()
+    wires = HalfDuplexTransport(Pieces(b"\x01"), echo=True, zeros=False)
+    wires.write(REQUEST)
+    with pytest.raises(InstrumentTimeoutError, match="expected the echo 03 00"):
+        wires.read()

@@ -9,13 +9,13 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from errormotion.datasets.units import Length, Time
-from errormotion.plugins import PluginSettings
+from errormotion.instruments.two_wires import TwoWireSettings
 
 SIZES: Mapping[str, int] = {"i16": 1, "i32": 2}
 Three = tuple[int, int, int]
 
 
-class RegisterSettings(PluginSettings):
+class RegisterSettings(TwoWireSettings):
     """Settings of a PLC: its registers, counted from 0, and its line."""
 
     unit: int = Field(default=1, description="address of the PLC, if its URL states none", ge=0, le=255)

@@ -13,7 +13,9 @@ from pydantic import Field
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, LineThermometer, ThermometerSettings
+from errormotion.instruments.transports.base import LINE_ENDS
 from errormotion.instruments.transports.quiet import after_others
+from errormotion.instruments.two_wires import TwoWireSettings
 from errormotion.plugins import Identity, InstrumentInfo
 
 LINE_END = b"\r"
@@ -49,7 +51,7 @@ def decode(line: bytes, *, with_checksum: bool = False) -> str:
         The answer is not ASCII, or its checksum is wrong.
     """
     try:
-        text = line.removesuffix(LINE_END).decode("ascii")
+        text = line.rstrip(b"\r\n").decode("ascii")
     except UnicodeDecodeError:
         raise ProtocolError(f"Expected a line in ASCII; found {line!r}") from None
     if not with_checksum:
@@ -115,7 +117,7 @@ def check_configuration(text: str) -> None:
 # ---------------------------------------------------------------------- driver
 
 
-class DconSettings(ThermometerSettings):
+class DconSettings(ThermometerSettings, TwoWireSettings):
     """Settings of a DCON thermometer."""
 
     unit: int = Field(default=1, description="address of the module on its line", ge=0, le=255)
@@ -187,11 +189,14 @@ class DconTemperature(LineThermometer):
         with_checksum = self.settings.checksum
         with self.exchange() as line:
             line.write(encode(request, with_checksum=with_checksum))
-            answer = decode(line.read_until(LINE_END, limit=MAX_LINE_BYTES), with_checksum=with_checksum)
+            answer = decode(line.read_until(LINE_ENDS, limit=MAX_LINE_BYTES), with_checksum=with_checksum)
         if answer.startswith("?"):
             raise InstrumentError(f"The module {self._unit} at {self.address} refuses '{request}': '{answer}'")
         if not answer.startswith(expected):
-            raise ProtocolError(f"'{request}': expected an answer that starts with '{expected}'; found '{answer}'")
+            echo = ". The line returns the request: set 'echo' to true" if answer.startswith(request) else ""
+            raise ProtocolError(
+                f"'{request}': expected an answer that starts with '{expected}'; found '{answer}'{echo}"
+            )
         return answer.removeprefix(expected)
 
     def resynchronise(self) -> None:
@@ -207,7 +212,7 @@ class DconTemperature(LineThermometer):
         line.write(encode(f"${self._unit}M", with_checksum=self.settings.checksum))
         for others in range(MAX_LATE_LINES):
             try:
-                if line.read_until(LINE_END, limit=MAX_LINE_BYTES).startswith(start):
+                if line.read_until(LINE_ENDS, limit=MAX_LINE_BYTES).startswith(start):
                     return
             except InstrumentTimeoutError as error:
                 raise after_others(error, others, f"'${self._unit}M'") from None

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from errormotion.datasets.units import Temperature, Time
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, OUT_OF_RANGE, SHORTED, ThermometerSettings
+from errormotion.instruments.two_wires import TwoWireSettings
 
 Kind = Literal["u16", "i16", "u32", "i32", "f32"]
 Order = Literal["big", "little"]
@@ -37,7 +38,7 @@ MAPS: Mapping[str, Mapping[str, Any]] = {
 _MAX_CHANNELS = {"adam-6018": 8, "logger-16": 16}
 
 
-class ModbusSettings(ThermometerSettings):
+class ModbusSettings(ThermometerSettings, TwoWireSettings):
     """Settings of a thermometer with Modbus.
 
     A temperature is ``scale * number + offset``. Settings that are not given are those of the ``map``.

@@ -109,7 +109,7 @@ class Thermometer(Driver):
 class LineThermometer(Thermometer):
     """Base of thermometers on one line, serial or TCP, that is opened again after it was lost.
 
-    Settings called ``timeout`` (s), ``retry`` (s) and ``baudrate`` apply to the line.
+    Settings called ``timeout`` (s), ``retry`` (s) and ``baudrate`` apply to the line, and those of two wires.
     """
 
     def _connect(self) -> Transport:
@@ -121,4 +121,6 @@ class LineThermometer(Thermometer):
             timeout=settings.timeout,
             retry=settings.retry,
             baudrate=settings.baudrate,
+            echo=getattr(settings, "echo", False),
+            zeros=getattr(settings, "leading_zeros", False),
         )

@@ -9,6 +9,8 @@ from errormotion.errors import InstrumentTimeoutError, ProtocolError
 
 CHUNK = 65536
 """Largest number of bytes read at once, as by the reader of a stream."""
+LINE_ENDS = (b"\r\n", b"\r", b"\n")
+"""Ends of a line of text: that of each protocol, and those that converters and serial servers make of it."""
 PIECE = 16384
 """Largest number of bytes read at once by default: a decoder processes them within 10 ms."""
 
@@ -59,8 +61,13 @@ class Transport(ABC):
             return data
         return self._receive(max_bytes, self.timeout if timeout is None else timeout)
 
-    def read_until(self, terminator: bytes, *, limit: int = CHUNK, timeout: float | None = None) -> bytes:
+    def read_until(
+        self, terminator: bytes | tuple[bytes, ...], *, limit: int = CHUNK, timeout: float | None = None
+    ) -> bytes:
         """Return all bytes up to and with ``terminator``; later bytes remain for the next read.
+
+        Of several terminators the first one in the data ends it, the longer one of two at one place. Where only the
+        start of the longer one has arrived, the rest of it follows: empty lines are skipped.
 
         Raises
         ------
@@ -70,12 +77,14 @@ class Transport(ABC):
             ``limit`` bytes without a terminator.
         """
         allowed = self.timeout if timeout is None else timeout
+        ends = terminator if isinstance(terminator, tuple) else (terminator,)
+        longest = max(map(len, ends))
         end, data, searched = time.monotonic() + allowed, bytearray(), 0
-        while (found := data.find(terminator, searched)) < 0:
+        while not (found := _first(data, ends, searched, skip=len(ends) > 1)):
             if len(data) >= limit:
                 start = bytes(data[:32])
                 raise ProtocolError(f"{self.url}: {len(data)} bytes without {terminator!r}; they start with {start!r}")
-            searched = max(len(data) - len(terminator) + 1, 0)
+            searched = max(len(data) - longest + 1, 0) if len(ends) == 1 else 0
             try:
                 data += self.read(limit, timeout=max(end - time.monotonic(), 0.0))
             except InstrumentTimeoutError:
@@ -84,9 +93,8 @@ class Transport(ABC):
                     f"{self.url}: expected an answer that ends in {terminator!r} within {allowed:g} s; "
                     f"received {received}"
                 ) from None
-        end_of_line = found + len(terminator)
-        self._rest = bytes(data[end_of_line:]) + self._rest
-        return bytes(data[:end_of_line])
+        self._rest = bytes(data[found:]) + self._rest
+        return bytes(data[:found])
 
     def read_exactly(self, size: int, timeout: float | None = None) -> bytes:
         """Return exactly ``size`` bytes.
@@ -130,3 +138,15 @@ class Transport(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close the connection; idempotent."""
+
+
+def _first(data: bytearray, ends: tuple[bytes, ...], start: int, *, skip: bool) -> int:
+    """Return where the first line ends, 0 if it does not; with ``skip`` empty lines at the start are removed."""
+    while True:
+        found = [(place, -len(each)) for each in ends if (place := data.find(each, start)) >= 0]
+        if not found:
+            return 0
+        place, size = min(found)
+        if place or not skip:
+            return place - size
+        del data[:-size]

@@ -9,6 +9,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.transports import load_simulator
 from errormotion.instruments.transports.address import Address, parse_address
 from errormotion.instruments.transports.base import Transport
+from errormotion.instruments.transports.half_duplex import half_duplex
 from errormotion.instruments.transports.lost import Reopened
 from errormotion.instruments.transports.recording import Recorder, ReplayTransport
 
@@ -130,6 +131,8 @@ def open_reconnecting(
     timeout: float = 1.0,
     retry: float = 1.0,
     baudrate: int | None = None,
+    echo: bool = False,
+    zeros: bool = False,
 ) -> ReconnectingTransport | ReplayTransport:
     """Open a line of bytes that is opened again after it was lost; ``replay://`` as in `open_transport`.
 
@@ -143,6 +146,8 @@ def open_reconnecting(
         File to which the frames of all connections are recorded.
     retry : float
         Minimum interval between two attempts to connect, s.
+    echo, zeros : bool
+        See `HalfDuplexTransport`.
 
     Raises
     ------
@@ -157,7 +162,7 @@ def open_reconnecting(
         device = load_simulator(simulator, address.url)(address)
         wire = parse_address(device.url)
     try:
-        connect = _connector(wire, timeout, baudrate)
+        connect = half_duplex(_connector(wire, timeout, baudrate), echo=echo, zeros=zeros)
         recorder = None if record is None else Recorder(record, address.url)
     except BaseException:
         if device is not None:

@@ -12,7 +12,11 @@ DEFAULT_BAUDRATE = 9600
 
 
 class SerialTransport(Transport):
-    """A serial line: 8 data bits, no parity, one stop bit, unless ``parity=E``, ``parity=O`` or ``stopbits=2``."""
+    """A serial line: 8 data bits, no parity, one stop bit, no flow control.
+
+    Parameters of the address change this: ``databits=7``, ``parity=E`` or ``O``, ``stopbits=2``, ``xonxoff=1`` (either
+    end holds the other by DC3 and releases it by DC1, which are then no data).
+    """
 
     flow_control = False
 
@@ -20,10 +24,20 @@ class SerialTransport(Transport):
         super().__init__(address.url, timeout)
         speed = int(address.number("baudrate", baudrate or DEFAULT_BAUDRATE))
         parity, stop_bits = address.params.get("parity", "N"), address.whole("stopbits", 1, 2)
+        data_bits, held = address.whole("databits", 8, 8), address.whole("xonxoff", 0, 1)
+        if data_bits < 7:
+            raise InstrumentError(f"'databits' in '{address.url}': expected 7 or 8; found {data_bits}")
         self._port: serial.Serial | None = None
         try:
             self._port = serial.Serial(
-                address.path, speed, parity=parity, stopbits=stop_bits, timeout=timeout, write_timeout=timeout
+                address.path,
+                speed,
+                bytesize=data_bits,
+                parity=parity,
+                stopbits=stop_bits,
+                xonxoff=bool(held),
+                timeout=timeout,
+                write_timeout=timeout,
             )
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise InstrumentError(f"The serial line {self.url} cannot be opened at {speed} baud: {error}") from None

@@ -43,6 +43,18 @@ def unit():
 NO_ERROR = '+0,"No error"'
 
 
+def test_the_time_of_a_reading_is_relative_or_absolute(unit):
+    ask = unit()
+    setup = ("CONF:TEMP TC,K,(@101)", "FORM:READ:TIME ON", "FORM:READ:CHAN ON")
+    assert ask(*setup, "FORM:READ:TIME:TYPE?") == "REL"
+    assert ask("READ?").split(",")[1:] == ["00000000.017", "101"]
+    ask.device.world.elapse(86400.0 + 3723.5)
+    assert ask("FORMAT:READING:TIME:TYPE ABSOLUTE", "READ?").endswith(",2025,01,02,01,02,03.517,101")
+    assert ask("form:read:time:type abs", "FORM:READ:TIME:TYPE?") == "ABS"
+    assert ask("FORM:READ:TIME:TYPE LATE", "SYST:ERR?") == '-224,"Illegal parameter value"'
+    assert ask("*RST", "FORM:READ:TIME:TYPE?") == "REL"
+
+
 def test_long_and_short_forms_in_any_case_are_the_same(unit):
     ask = unit()
     for form in ("SYST:ERR?", "system:error?", ":SYSTem:ERRor?", "SYST:ERR:NEXT?"):

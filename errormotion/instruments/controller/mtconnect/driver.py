@@ -317,8 +317,12 @@ class MTConnect(Driver):
         try:
             document = parse(answer.body)
         except ProtocolError as error:
-            status = f" (HTTP status {answer.status})" if answer.status != 200 else ""
-            raise ProtocolError(f"{self.address}/{request}{status}: {error}") from None
+            if answer.status != 200:
+                raise ProtocolError(
+                    f"The server at {self.address} answers '{request}' with HTTP status {answer.status} without a "
+                    "document of MTConnect. Check the address, its port and path"
+                ) from None
+            raise ProtocolError(f"{self.address}/{request}: {error}") from None
         self._buffer_size = document.header.buffer
         if refused:
             self._refuse(document, request)

@@ -12,6 +12,7 @@ from errormotion.instruments import simulators
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.interferometer.attocube_ids import codec
 from errormotion.instruments.interferometer.attocube_ids.settings import IdsSettings, axis_name
+from errormotion.instruments.transports.base import LINE_ENDS
 from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 from errormotion.plugins.readings import Environment
@@ -93,7 +94,7 @@ class AttocubeIds(Driver):
             while True:
                 left = deadline - time.monotonic()
                 try:
-                    found = codec.reply(line.read_until(codec.LINE_END, limit=codec.MAX_REPLY, timeout=max(left, 0.0)))
+                    found = codec.reply(line.read_until(LINE_ENDS, limit=codec.MAX_REPLY, timeout=max(left, 0.0)))
                 except InstrumentTimeoutError as error:
                     raise after_others(error, stray, f"'{method}'") from None
                 if found.number == self._number or (found.number is None and found.refusal):

@@ -14,6 +14,7 @@ from errormotion.instruments.driver import Driver
 from errormotion.instruments.laser_tracker.leica_geocom import air, codec, codes
 from errormotion.instruments.laser_tracker.leica_geocom.settings import GeoComSettings
 from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.base import LINE_ENDS
 from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 from errormotion.plugins.readings import Environment, Measurement
@@ -95,7 +96,7 @@ class LeicaGeoCom(Driver):
         while True:
             try:
                 left = max(deadline - time.monotonic(), 0.0)
-                text = line.read_until(codec.LINE_END, limit=codec.MAX_REPLY, timeout=left)
+                text = line.read_until(LINE_ENDS, limit=codec.MAX_REPLY, timeout=left)
             except InstrumentTimeoutError as error:
                 if recorded and not others:
                     raise ProtocolError(

@@ -12,6 +12,7 @@ from errormotion.instruments.point_lds.capancdt.blocks import REASONS, block_dec
 from errormotion.instruments.point_lds.capancdt.settings import CapaSettings
 from errormotion.instruments.point_lds.counted import CountedReadings
 from errormotion.instruments.point_lds.counting import CountingDriver, check_range
+from errormotion.instruments.transports.base import LINE_ENDS
 from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo
 
@@ -189,7 +190,7 @@ class CapaNCDT(CountingDriver):
             line.write(codec.encode(command))
             for others in range(MAX_OTHER_LINES):
                 try:
-                    answer = line.read_until(codec.LINE_END, limit=codec.MAX_LINE_BYTES)
+                    answer = line.read_until(LINE_ENDS, limit=codec.MAX_LINE_BYTES)
                 except InstrumentTimeoutError as error:
                     raise after_others(error, others, f"'${command}'") from None
                 if codec.echoes(command, answer):

@@ -140,7 +140,7 @@ def decode(line: bytes) -> str:
     ProtocolError
         The line contains other bytes than printable ASCII.
     """
-    body = line.removesuffix(LINE_END)
+    body = line.rstrip(b"\r\n")
     if not all(0x20 <= byte < 0x7F for byte in body):
         raise ProtocolError(f"Expected a line of ASCII; found {line!r}")
     return body.decode("ascii")

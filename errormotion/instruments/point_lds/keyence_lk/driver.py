@@ -18,7 +18,6 @@ from errormotion.instruments.point_lds.keyence_lk.codec import (
     ERROR,
     GARBLED,
     HEADS,
-    LINE_END,
     MAX_LINE_BYTES,
     MEASURING,
     NO_OFFSET,
@@ -36,6 +35,7 @@ from errormotion.instruments.point_lds.keyence_lk.codec import (
 )
 from errormotion.instruments.point_lds.keyence_lk.settings import LKSettings
 from errormotion.instruments.transports import Transport, open_transport, parse_address
+from errormotion.instruments.transports.base import LINE_ENDS
 from errormotion.instruments.transports.quiet import after_others, discard_input
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, Samples
 
@@ -211,7 +211,7 @@ class KeyenceLK(Driver):
             self._enter(MEASURING)
         self._synchronised = False
         self.transport.write(encode(request))
-        text = decode(self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES))
+        text = decode(self.transport.read_until(LINE_ENDS, limit=MAX_LINE_BYTES))
         self._synchronised = error_code(request, text) is not None  # a refusal is also an answer
         answer = parse_answer(request, text, header)
         self._synchronised = True
@@ -226,10 +226,10 @@ class KeyenceLK(Driver):
         self.transport.write(encode(mode))
         for others in range(MAX_LATE_LINES):
             try:
-                line = self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES)
+                line = self.transport.read_until(LINE_ENDS, limit=MAX_LINE_BYTES)
             except InstrumentTimeoutError as error:
                 raise after_others(error, others, f"'{mode}'") from None
-            text = line.removesuffix(LINE_END).decode("ascii", errors="replace")
+            text = line.rstrip(b"\r\n").decode("ascii", errors="replace")
             # The error means that the controller was already in this mode.
             if text.endswith((mode, *(f"{ERROR},{mode},{code}" for code in STATE_ERRORS))):
                 self._synchronised = True

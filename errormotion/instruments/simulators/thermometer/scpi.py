@@ -15,10 +15,12 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Callable
+from datetime import timedelta
 from functools import partial
 
 from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.thermometer.temperatures import Inputs, Unplugging
+from errormotion.instruments.simulators.virtual_world.clock import EPOCH
 from errormotion.instruments.transports import Address
 
 IDENTITY = "HEWLETT-PACKARD,34970A,0,13-2-2"
@@ -70,6 +72,8 @@ NUMBERS: dict[str, tuple[float, float, float]] = {
 """Settings of channels with a number as value: lowest, highest, and value after a reset."""
 Command = tuple[Callable[[list[str]], str | None], int, int]
 """Function of the parameters, and their smallest and largest number."""
+CLOSING = 0.017
+"""Time from the start of a scan to a reading, s."""
 _FIELDS = ("ALARm", "CHANnel", "TIME", "UNIT")
 
 
@@ -135,6 +139,8 @@ class SimulatedScpiUnit(SimulatedDevice):
         self._scan: list[int] = []
         self._set_to: dict[tuple[str, int], str] = {}
         self._fields = dict.fromkeys(_FIELDS, False)
+        self._absolute = False
+        self._scanned_at = 0.0
         self._readings: list[tuple[int, float]] = []
         self._values = {"TRIGger:SOURce": "IMM", "TRIGger:COUNt": "+1.00000000E+00", "TRIGger:TIMer": "+1.0E+01"}
 
@@ -193,6 +199,8 @@ class SimulatedScpiUnit(SimulatedDevice):
         for name in _FIELDS:
             found[f"FORMat:READing:{name}"] = (partial(self._set_field, name), 1, 1)
             found[f"FORMat:READing:{name}?"] = (partial(self._get_field, name), 0, 0)
+        found["FORMat:READing:TIME:TYPE"] = (self._set_time_type, 1, 1)
+        found["FORMat:READing:TIME:TYPE?"] = (lambda _: "ABS" if self._absolute else "REL", 0, 0)
         for name in self._values:
             found[name] = (partial(self._set_trigger, name), 1, 1)
             found[f"{name}?"] = (partial(self._get_trigger, name), 0, 0)
@@ -276,6 +284,12 @@ class SimulatedScpiUnit(SimulatedDevice):
             raise _RefusedError(-224)
         self._fields[name] = value in ("ON", "1")
 
+    def _set_time_type(self, parameters: list[str]) -> None:
+        kind = next((kind for kind in ("ABSolute", "RELative") if _fits(parameters[0], kind)), "")
+        if not kind:
+            raise _RefusedError(-224)
+        self._absolute = kind == "ABSolute"
+
     def _get_field(self, name: str, _: list[str]) -> str:
         return str(int(self._fields[name]))
 
@@ -302,6 +316,7 @@ class SimulatedScpiUnit(SimulatedDevice):
     # ------------------------------------------------------------------ readings
 
     def _scan_inputs(self) -> list[tuple[int, float]]:
+        self._scanned_at = self.world.time
         temperatures = self._inputs.temperatures(self.world.time, self._rng)
         far = self.fault.hits("out_of_range", self._answers)
         found = []
@@ -316,12 +331,18 @@ class SimulatedScpiUnit(SimulatedDevice):
         if self._fields["UNIT"]:
             parts[0] += f" {self._unit.get(channel, 'C')}"
         if self._fields["TIME"]:
-            parts.append("00000000.017")
+            parts.append(_absolute_time(self._scanned_at + CLOSING) if self._absolute else f"{CLOSING:012.3f}")
         if self._fields["CHANnel"]:
             parts.append(str(channel))
         if self._fields["ALARm"]:
             parts.append("0")
         return ",".join(parts)
+
+
+def _absolute_time(seconds: float) -> str:
+    """Return a time of the world, s, as date and time of day: ``1997,11,21,15,30,23.000``."""
+    when = EPOCH + timedelta(milliseconds=round(1e3 * seconds))
+    return f"{when:%Y,%m,%d,%H,%M,%S}.{when.microsecond // 1000:03d}"
 
 
 def _nothing(_: list[str]) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,9 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.virtual_world.streams import Stream, TriggeredStream
 
 Array = np.ndarray[Any, Any]
+
+EPOCH = datetime(2025, 1, 1, tzinfo=UTC)
+"""Date and time of day at the time 0 of a world."""
 
 BLOCK = 4096  # samples produced at once when running freely
 PACED_BLOCK = 0.01  # s of samples produced at once when running at a pace

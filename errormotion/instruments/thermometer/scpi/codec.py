@@ -32,7 +32,7 @@ def encode(command: str) -> bytes:
 
 def decode(line: bytes) -> str:
     """Return the text of an answer without its line end; ProtocolError if it is not printable ASCII."""
-    text = line.removesuffix(LINE_END).removesuffix(b"\r")
+    text = line.rstrip(b"\r\n")
     if len(text) > LONGEST or any(not 0x20 <= byte <= 0x7E for byte in text):
         raise ProtocolError(f"Expected a line of printable ASCII; found {text[:60]!r}")
     return text.decode("ascii").strip()

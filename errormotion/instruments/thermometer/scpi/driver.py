@@ -11,6 +11,7 @@ from errormotion.instruments.thermometer.scpi import codec
 from errormotion.instruments.thermometer.scpi.settings import ScpiSettings
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, OUT_OF_RANGE, LineThermometer
 from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.base import LINE_ENDS
 from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo
 
@@ -149,7 +150,7 @@ class ScpiTemperature(LineThermometer):
 
     def _answer(self, line: Transport, command: str, parse: Callable[[str], T]) -> T:
         try:
-            return parse(codec.decode(line.read_until(codec.LINE_END, limit=codec.LONGEST)))
+            return parse(codec.decode(line.read_until(LINE_ENDS, limit=codec.LONGEST)))
         except InstrumentTimeoutError as error:
             raise InstrumentTimeoutError(f"'{command}': {error}") from None
 

@@ -201,6 +201,13 @@ class HttpTransport(Transport):
                 self._disconnect()
                 raise
             self._fresh = False
+            if 300 <= response.status < 400:
+                self._disconnect()
+                there = response.headers.get("location", "")[:200]
+                raise ProtocolError(
+                    f"The server at {self.url} redirects '{target}' (HTTP status {response.status}) to '{there}', which "
+                    "is not followed. If the device is there, state this address"
+                )
             return response, source
 
     def _deadline(self) -> float:

@@ -218,7 +218,7 @@ class TcpServer(Server):
         end = time.monotonic() + timeout
         while (left := end - time.monotonic()) > 0:
             line = self._line
-            if line is not None and not _closed(line):
+            if line is not None and not closed_by_client(line):
                 return self._connected.wait(left)
             time.sleep(ACCEPT_POLL)
         return False
@@ -280,7 +280,7 @@ class TcpServer(Server):
         self._listener.close()
 
 
-def _closed(line: socket.socket) -> bool:
+def closed_by_client(line: socket.socket) -> bool:
     """Whether the other side has closed a connection on which nothing is received."""
     try:
         return line.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""

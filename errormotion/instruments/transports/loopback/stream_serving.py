@@ -7,7 +7,7 @@ import socket
 import threading
 from collections.abc import Callable
 
-from errormotion.instruments.transports.loopback.serving import TcpServer
+from errormotion.instruments.transports.loopback.serving import TcpServer, closed_by_client
 
 MAX_CONNECTIONS = 16
 """Largest number of open connections; beyond it the oldest one is closed."""
@@ -26,7 +26,10 @@ class NewestConnectionServer(TcpServer):
         self._accepting = threading.Lock()
 
     def accept_pending(self) -> bool:
-        """Accept pending connections; return whether there is any connection."""
+        """Accept pending connections; return whether there is one that its client has not closed.
+
+        A client may have closed a connection before it was accepted, or without the thread having noticed.
+        """
         with self._accepting:
             while not self._ended.is_set():
                 try:
@@ -40,7 +43,7 @@ class NewestConnectionServer(TcpServer):
                 self._wake_write.send(b"+")
             for line in self._lines[:-MAX_CONNECTIONS]:
                 _shut(line)
-            return bool(self._lines)
+            return any(not closed_by_client(line) for line in self._lines)
 
     def select(self) -> None:
         """Send to the newest connection from now on."""

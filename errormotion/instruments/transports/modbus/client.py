@@ -127,11 +127,13 @@ class ModbusLine(Transport):
     def _exchange(self, what: str, encode: Encode, decode: Decode, prepare: Callable[[], None]) -> list[int]:
         prepare()
         self._number = (self._number + 1) % (1 << 16)
-        self._line.write(encode(self._number))
-        end, others = time.monotonic() + self.timeout, 0
+        asked = encode(self._number)
+        self._line.write(asked)
+        end, others, answer = time.monotonic() + self.timeout, 0, b""
         try:
             while True:
-                found = decode(self._frame(end), self._number)
+                answer = self._frame(end)
+                found = decode(answer, self._number)
                 if found is not None:
                     return found
                 others += 1
@@ -139,7 +141,8 @@ class ModbusLine(Transport):
             raise ModbusRefusal(error.code, f"{self.url}: {what}") from None
         except ProtocolError as error:
             self._settle()
-            raise ProtocolError(f"{self.url}: {error}") from None
+            echo = ". The line returns the request: set 'echo' to true" if answer and asked.startswith(answer) else ""
+            raise ProtocolError(f"{self.url}: {error}{echo}") from None
         except InstrumentTimeoutError as error:
             self._unanswered_at, self._passed_over = time.monotonic(), False
             disconnect_after_timeout(self._line)
@@ -231,6 +234,8 @@ def open_modbus(
     retry: float = 1.0,
     retries: int = 0,
     baudrate: int | None = None,
+    echo: bool = False,
+    zeros: bool = False,
 ) -> ModbusLine:
     """Open the Modbus line at an address; its ``unit`` and ``baudrate`` take precedence.
 
@@ -240,8 +245,8 @@ def open_modbus(
         See the module.
     unit, retries
         See `ModbusLine`.
-    simulator, record, timeout, retry, baudrate
-        See `open_reconnecting`.
+    simulator, record, timeout, retry, baudrate, echo, zeros
+        See `open_reconnecting`; ``echo`` and ``zeros`` have no effect on Modbus TCP.
 
     Raises
     ------
@@ -251,8 +256,9 @@ def open_modbus(
     address = parse_address(url)
     device = original(address)
     framing, unit = framing_of(device), device.whole("unit", unit, 255)
+    wires = {"echo": echo, "zeros": zeros} if framing == "rtu" else {}
     line = open_reconnecting(
-        _of_bytes(address), simulator=simulator, record=record, timeout=timeout, retry=retry, baudrate=baudrate
+        _of_bytes(address), simulator=simulator, record=record, timeout=timeout, retry=retry, baudrate=baudrate, **wires
     )
     return ModbusLine(line, framing, unit, retries)
 

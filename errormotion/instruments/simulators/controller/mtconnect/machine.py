@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from typing import Any
 
-EPOCH = datetime(2025, 1, 1, tzinfo=UTC)
-"""Time of agents and adapters at the world's time 0."""
+from errormotion.instruments.simulators.virtual_world.clock import EPOCH
+
 UNAVAILABLE = "UNAVAILABLE"
 SERIES_RATE = 100.0
 """Rate of the values of one observation with several values, Hz."""

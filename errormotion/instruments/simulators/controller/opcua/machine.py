@@ -9,7 +9,7 @@ from typing import Any
 from asyncua import ua
 from asyncua.ua.status_codes import StatusCodes
 
-from errormotion.instruments.simulators.controller.mtconnect.machine import EPOCH
+from errormotion.instruments.simulators.virtual_world.clock import EPOCH
 from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 
 AXES = "XYZ"
