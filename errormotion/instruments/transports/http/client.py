@@ -205,8 +205,8 @@ class HttpTransport(Transport):
                 self._disconnect()
                 there = response.headers.get("location", "")[:200]
                 raise ProtocolError(
-                    f"The server at {self.url} redirects '{target}' (HTTP status {response.status}) to '{there}', which "
-                    "is not followed. If the device is there, state this address"
+                    f"The server at {self.url} redirects '{target}' (HTTP status {response.status}) to '{there}'. "
+                    "Redirections are not followed: if the device is there, state this address"
                 )
             return response, source
 
