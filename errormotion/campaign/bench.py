@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from errormotion.campaign.files import BenchInstrument, BenchPlan
 from errormotion.campaign.storage.journal import cause_of
-from errormotion.errors import BenchError
+from errormotion.errors import BenchError, ErrormotionError
 from errormotion.instruments.simulators.virtual_world.described import describe
 from errormotion.plugins import Identity
 from errormotion.plugins.kind_registry import changes_machine
@@ -86,6 +86,25 @@ class OpenBench:
         self.description = plan.description
         self.answers: list[Answer] = []
         self._ask = ask
+
+    @classmethod
+    def closed(cls, plan: BenchPlan) -> Self:
+        """Return a bench whose drivers are made, and not opened: what they are and can do is known.
+
+        Raises
+        ------
+        BenchError
+            A driver cannot be made with its settings, or does not check limits.
+        """
+        bench = cls(plan)
+        for each in plan.instruments:
+            try:
+                driver = each.driver(each.address, each.settings)
+            except ErrormotionError as error:
+                raise BenchError(f"instrument '{each.name}': {error}") from error
+            bench._bind(driver)
+            bench.answers.append(Answer(each, driver))
+        return bench
 
     def open(self) -> None:
         """Open every instrument.

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 from errormotion import plugins
 from errormotion.campaign.sections import head
-from errormotion.campaign.sections.limits import NO_MOTIONS, Limits, extent, steps_of, violations
+from errormotion.campaign.sections.limits import NO_MOTIONS, Limits, extent, steps_of, violations, without_limits
 from errormotion.campaign.sections.machine import completed, contradictions, limits_within, read_machine
 from errormotion.campaign.sections.timeline import Timeline, follower
 from errormotion.compensation.online.settings import Limits as OffsetLimits
@@ -323,6 +323,9 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
     if isinstance(machine, dict):
         description, mistakes = read_machine(machine)
         data["machine"] = str(machine.get("name"))
+    if "limits" in data:
+        data["limits"], found = without_limits(data["limits"])
+        mistakes += found
     table, found = tomlfile.check(data, BenchTable)
     mistakes += found
     limits = table.limits if table else Limits()

@@ -15,6 +15,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from typing import Any, Protocol
 from uuid import uuid4
@@ -26,6 +27,7 @@ from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.claims import claimed, uses
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
 from errormotion.campaign.folder import FolderGoneError, RunFolder, Status, list_runs, new_entries, now
+from errormotion.campaign.planning.ready import accept_overdue, cannot_continue, require_ready
 from errormotion.campaign.planning.release import Release, announced, refuse, to_release
 from errormotion.campaign.sections import head
 from errormotion.campaign.sections.limits import NO_MOTIONS
@@ -282,12 +284,15 @@ class _Session:
         self.campaign, self.runs, self.run_id = campaign, runs, run_id
         self.progress = progress or Quiet()
         self.bench = OpenBench(campaign.bench, ask)
-        self.report, self.release = report, release
+        self.ask, self.report, self.release = ask, report, release
         self.records: Callable[[Path], None] = lambda run: None  # noqa: ARG005 - until the bench is opened
 
     def work(self, folders: dict[str, RunFolder]) -> list[RunFolder]:
         """Execute the unfinished tests."""
         unmeasured = to_measure(self.campaign, folders)
+        begun = [each.name for each in unmeasured if each.name in folders and _begun(folders[each.name], each)]
+        require_ready(self.campaign, unmeasured, stored=bool(folders), begun=begun)
+        accept_overdue(self.campaign, unmeasured, date.today(), self.progress.announce, self.ask)
         for test in unmeasured:
             self.progress.announce(announced(self.campaign, test))
         if motions := to_release(self.campaign, unmeasured):
@@ -311,7 +316,7 @@ class _Session:
                 self.progress.test(test.name, folder.path, number, len(self.campaign.tests))
                 # Locked until the end: no other process continues the campaign between two tests.
                 opened.enter_context(folder.locked())
-                with journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
+                with journal(folder.log), looking_beside(self.campaign.folder), _failures(folder, test):
                     self._test(folder, test, folders)
         return [folders[test.name] for test in self.campaign.tests]
 
@@ -495,7 +500,7 @@ class _Chunks:
 
 
 @contextmanager
-def _failures(folder: RunFolder) -> Iterator[None]:
+def _failures(folder: RunFolder, test: TestPlan) -> Iterator[None]:
     """Record the failure of a test in its ``run.json`` and its log, and state the location of the data."""
     try:
         yield
@@ -503,7 +508,7 @@ def _failures(folder: RunFolder) -> Iterator[None]:
         log.warning("interrupted by the operator")
         folder.step("stop", "interrupted")
         _mark(folder, "interrupted", "stopped by the operator")
-        raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_continuation(folder)}") from error
+        raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_continuation(folder, test)}") from error
     except Exception as error:
         reason = cause_of(error)
         log.exception("failed")
@@ -520,7 +525,7 @@ def _failures(folder: RunFolder) -> Iterator[None]:
         raise RunError(
             f"Test '{folder.data['test']}' failed: {reason}\n"
             f"{_kept(folder)} in {folder.path}; the log is {folder.log}.\n"
-            f"Remove the cause first. {_continuation(folder)}"
+            f"Remove the cause first. {_continuation(folder, test)}"
         ) from error
 
 
@@ -538,7 +543,17 @@ def _kept(folder: RunFolder) -> str:
     return f"{folder.data['samples'].get('count', 0)} samples are stored"
 
 
-def _continuation(folder: RunFolder) -> str:
+def _begun(folder: RunFolder, test: TestPlan) -> bool:
+    """Return whether a run has samples, and lacks others."""
+    if folder.data["acquired"] or not folder.raw.exists():
+        return False
+    return committed_length(folder.raw, test.method().append_dim(test.settings)) > 0
+
+
+def _continuation(folder: RunFolder, test: TestPlan) -> str:
+    with suppress(OSError, ErrormotionError):
+        if _begun(folder, test) and (why := cannot_continue(test)):
+            return why
     return f"Continue with 'errormotion run --resume --runs {folder.path.parent}'."
 
 

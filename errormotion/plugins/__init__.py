@@ -5,6 +5,7 @@ A plugin is a plain class, named in the entry-point group ``errormotion.instrume
 the same way.
 """
 
+from errormotion.plugins.commanding import unarmed
 from errormotion.plugins.contracts import (
     ERRORS_SCHEMA,
     Applied,
@@ -90,4 +91,5 @@ __all__ = [
     "owner_of_schema",
     "refresh",
     "replaced",
+    "unarmed",
 ]

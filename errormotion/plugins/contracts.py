@@ -415,6 +415,14 @@ class Method(Protocol):
     ``check_machine(settings, machine)`` : mapping of str to str
         Contradictions to the machine, by setting (an empty text for all settings), with the expected and the found
         value; called when a campaign is read.
+    ``check_bench(settings, bench, inputs)`` : list of str
+        Why a test cannot be measured with these instruments: one that it commands is not armed (`unarmed`) or cannot be
+        commanded, a channel does not exist, an input is missing. It may raise MethodError or BenchError instead. Called
+        before anything is opened or created; the drivers of ``bench`` are not open, ``inputs`` are the names of the
+        inputs of the test. Without it, a test with motions needs one armed instrument, if the bench has any that moves
+        a machine.
+    ``cannot_continue(settings)`` : str
+        Why an interrupted measurement cannot be continued, such as an axis that has cooled down; empty if it can.
     ``redrawing(raw, settings, errors)`` : `Redrawing`
         The sources of uncertainty of raw data, for ``identify --monte-carlo``; ``errors`` is the result of
         ``identify``.

@@ -74,7 +74,7 @@ def test_a_test_beyond_the_limits_is_an_error_when_it_is_read(tmp_path: Path, li
     [
         ('X = ["4 m", "0 m"]', "X: expected the lowest position, then the highest"),
         ("X = [0, 4]", r"limits\.X\[0\]: expected a length with its unit, such as '5 mm'; found 0"),
-        ('W = ["0 m", "4 m"]', r"limits\.W: unknown key"),
+        ('Q = ["0 m", "4 m"]', r"limits\.Q: unknown key"),
     ],
 )
 def test_invalid_limits_are_reported(tmp_path: Path, limits: str, message: str) -> None:

@@ -225,8 +225,9 @@ def test_invalid_steps_are_an_error(write: Write, steps: str) -> None:
 
 def test_a_bench_without_arm_causes_no_motion(write: Write, tmp_path: Path) -> None:
     path = write(METHOD + HONEST, BENCH.replace("arm = true\n", ""))
-    with pytest.raises(RunError, match=r"virtual_controller at .* only reads.*arm = true for the instrument in the be"):
+    with pytest.raises(BenchError, match=r"it moves the machine, and 'control' only read, since arm = false; set arm"):
         runner.run(load_campaign(path), runs=tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_driver_that_moves_without_limits_is_not_opened(write: Write, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from errormotion.campaign.background.publishing import ANSWER, STATUS
 from errormotion.campaign.claims import require_free, uses
 from errormotion.campaign.files import CampaignPlan, TestPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, is_locked, now, replace_text
+from errormotion.campaign.planning.ready import require_ready
 from errormotion.campaign.planning.release import OPTION, Release, refuse, to_release
 from errormotion.campaign.runner import folders_of, stored_plan, to_measure
 from errormotion.datasets.files.reading import read_bytes
@@ -209,6 +210,7 @@ def _start(
     if fcntl is None:
         raise RunError("A background process needs a system with file locks (Linux, macOS). Use 'errormotion run'.")
     machine = plan.bench.machine
+    require_ready(plan, tests, stored="--resume" in arguments)
     if tests:
         require_free(uses(plan.bench))
     if motions := to_release(plan, tests):

@@ -15,7 +15,22 @@ from errormotion.errors import MethodError
 from errormotion.plugins import MachineLimits, Step
 
 AXES = ("X", "Y", "Z")
+OTHER_AXES = ("A", "B", "C", "U", "V", "W")
+"""Axes of `[machine]` that nothing moves."""
 _ROUNDING = 1e-9
+
+
+def without_limits(data: Any) -> tuple[Any, list[str]]:
+    """Return ``[limits]`` without the axes that a machine may have and that have no limits, and a mistake for each."""
+    if not isinstance(data, dict):
+        return data, []
+    found = [axis for axis in data if axis in OTHER_AXES]
+    mistakes = [
+        f"limits.{axis}: the axis {axis} has no limits here, since no method and no driver moves it; [limits] can "
+        f"state {', '.join(Limits.model_fields)}. State the range of {axis} as machine.travel.{axis}, and remove this"
+        for axis in found
+    ]
+    return {key: each for key, each in data.items() if key not in found}, mistakes
 
 
 class Limits(BaseModel):

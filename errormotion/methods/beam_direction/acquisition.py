@@ -91,14 +91,7 @@ class Setup:
     def __init__(self, bench: Bench, settings: Settings) -> None:
         self.bench, self.settings, self.layout = bench, settings, settings.layout
         self.sensor = bench.of_kind("point_lds")
-        control = bench.of_kind("controller") if bench.has_kind("controller") else None
-        if control is None or not hasattr(control, "move_to"):
-            raise MethodError(
-                "Expected an instrument of kind 'controller' that can move the sensor to a position (move_to) over the "
-                "faces of the gauge; the bench has none. Measure manually, write the readings to a table, and use "
-                "'errormotion identify READINGS.csv'."
-            )
-        self.control: Any = control
+        self.control: Any = control_of(bench)
         virtual = hasattr(self.control, "elapse")
         self.origin: float | None = float(self.control.state()["time"]) if virtual else None
         self.low, self.high = (float(x) for x in self.sensor.measuring_range)
@@ -250,3 +243,21 @@ class Setup:
 
 def _mm(position: Array) -> str:
     return "({:.3f}, {:.3f}, {:.3f})".format(*(position * 1e3))
+
+
+def control_of(bench: Bench) -> Any:
+    """Return the control that moves the sensor.
+
+    Raises
+    ------
+    MethodError
+        The bench has none.
+    """
+    control = bench.of_kind("controller") if bench.has_kind("controller") else None
+    if control is None or not hasattr(control, "move_to"):
+        raise MethodError(
+            "Expected an instrument of kind 'controller' that can move the sensor to a position (move_to) over the "
+            "faces of the gauge; the bench has none. Measure manually, write the readings to a table, and use "
+            "'errormotion identify READINGS.csv'."
+        )
+    return control

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, ClassVar
 from errormotion.errors import DatasetError
 from errormotion.methods.beam_direction.schema import SCHEMA
 from errormotion.methods.beam_direction.settings import Settings as BeamSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
 
     import xarray as xr
 
@@ -71,6 +71,18 @@ class BeamDirection:
         if settings.receiver is None:
             found["receiver"] = RECEIVER_NEEDED
         return found
+
+    def check_bench(
+        self,
+        settings: BeamSettings,  # noqa: ARG002 - part of the protocol
+        bench: Bench,
+        inputs: Collection[str],  # noqa: ARG002 - part of the protocol
+    ) -> list[str]:
+        """Return why the bench cannot move the sensor over the faces of the gauge."""
+        from errormotion.methods.beam_direction.acquisition import control_of
+
+        control_of(bench)
+        return unarmed(bench, "controller")
 
     def append_dim(self, settings: BeamSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``plane``."""

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.methods.crossbeam_scan.schema import SCHEMA
 from errormotion.methods.crossbeam_scan.settings import Settings as ScanSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping
 
     import xarray as xr
 
@@ -74,6 +74,25 @@ class CrossbeamScan:
                 f"found {outside[0] * 1e3:g} mm"
             )
         return found
+
+    def check_bench(
+        self,
+        settings: ScanSettings,
+        bench: Bench,
+        inputs: Collection[str],
+    ) -> list[str]:
+        """Return why the scans cannot be made: no pose of the profiler, a control that must not move the axis."""
+        from errormotion.methods.crossbeam_scan.acquisition.moving import Controlled, mover
+        from errormotion.methods.crossbeam_scan.acquisition.pocket import require_streaming
+        from errormotion.methods.crossbeam_scan.acquisition.scans import pose_of
+
+        profiler = bench.of_kind("line_profiler")
+        if settings.procedure == "profiler_pose":
+            require_streaming(profiler)
+        elif "pose" not in inputs:
+            pose_of(settings, None)
+        moves = not hasattr(profiler, "scans") and isinstance(mover(bench), Controlled)
+        return unarmed(bench, "controller") if moves else []
 
     def append_dim(self, settings: ScanSettings) -> str:
         """Return ``scan`` for the profiler's pose, ``line`` for scans."""

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.methods.linear_positioning.schema import SCHEMA
 from errormotion.methods.linear_positioning.settings import Settings as PositioningSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
 
     import xarray as xr
 
@@ -101,6 +101,29 @@ class LinearPositioning:
                 f"{first * 1e3:.3f} mm to {last * 1e3:.3f} mm"
             }
         return {}
+
+    def cannot_continue(self, settings: PositioningSettings) -> str:
+        """Return why an interrupted test of a moving axis cannot be continued."""
+        from errormotion.methods.linear_positioning.acquisition.warming import NOT_CONTINUED
+
+        return NOT_CONTINUED if settings.moving is not None else ""
+
+    def check_bench(
+        self,
+        settings: PositioningSettings,
+        bench: Bench,
+        inputs: Collection[str],  # noqa: ARG002 - part of the protocol
+    ) -> list[str]:
+        """Return what the instruments of the bench cannot do: move the axis, or read its freedoms."""
+        from errormotion.methods.linear_positioning.acquisition.measure import AxisMeasurement, Motion
+        from errormotion.methods.linear_positioning.diagonals.acquisition import readers_of
+
+        if settings.diagonals is not None:
+            Motion(bench, settings)
+            readers_of(bench, settings)
+        else:
+            AxisMeasurement(bench, settings)
+        return unarmed(bench, "controller")
 
     def append_dim(self, settings: PositioningSettings) -> str:
         """Return ``run``, ``target`` for pendulum cycles, ``cycle`` for a moving axis, ``diagonal`` for diagonals."""

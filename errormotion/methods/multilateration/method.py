@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.methods.multilateration.schema import SCHEMA
 from errormotion.methods.multilateration.settings import Settings as MultilaterationSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
 
     import xarray as xr
 
@@ -86,6 +86,18 @@ class Multilateration:
                     f"found {min(column) * 1e3:g} mm to {max(column) * 1e3:g} mm"
                 )
         return contradictions
+
+    def check_bench(
+        self,
+        settings: MultilaterationSettings,
+        bench: Bench,
+        inputs: Collection[str],  # noqa: ARG002 - part of the protocol
+    ) -> list[str]:
+        """Return what the instruments of the bench cannot do: move the machine, or measure its targets."""
+        from errormotion.methods.multilateration.acquisition.measure import SetUps
+
+        SetUps(bench, settings, settings.measuring)
+        return unarmed(bench, "controller")
 
     def append_dim(self, settings: MultilaterationSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``station``."""

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.methods.normal_vector.schema import SCHEMA
 from errormotion.methods.normal_vector.settings import Settings as BallSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping
 
     import xarray as xr
 
@@ -91,6 +91,19 @@ class NormalVector:
         return {
             "tool_axes": f"expected '{machine.tool_axes}', the axes that carry the tool; found '{settings.tool_axes}'"
         }
+
+    def check_bench(
+        self,
+        settings: BallSettings,  # noqa: ARG002 - part of the protocol
+        bench: Bench,
+        inputs: Collection[str],  # noqa: ARG002 - part of the protocol
+    ) -> list[str]:
+        """Return why the bench cannot probe and warm up the machine."""
+        from errormotion.methods.normal_vector.acquisition.measure import route
+
+        _, _, active, driven = route(bench)
+        commanded = (["touch_probe"] if active else []) + (["controller"] if driven else [])
+        return [text for kind in commanded for text in unarmed(bench, kind)]
 
     def append_dim(self, settings: BallSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``time``."""

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 from errormotion.methods.spindle_drift.schema import SCHEMA
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping
 
     import xarray as xr
 
@@ -66,6 +66,22 @@ class SpindleDrift:
             "": "expected a spindle axis Z, the direction of the channel Z of the measuring frame; found "
             f"{machine.spindle_axis}"
         }
+
+    def check_bench(
+        self,
+        settings: DriftSettings,
+        bench: Bench,
+        inputs: Collection[str],  # noqa: ARG002 - part of the protocol
+    ) -> list[str]:
+        """Return why the bench cannot move the sphere, or start the schedule."""
+        from errormotion.methods.spindle_drift.acquisition.beams import control_of
+        from errormotion.methods.spindle_drift.acquisition.drift import starts_schedules
+
+        if settings.procedure == "beam_detection":
+            control_of(bench)
+        elif not starts_schedules(bench):
+            return []
+        return unarmed(bench, "controller")
 
     def append_dim(self, settings: DriftSettings) -> str:
         """Return ``sample`` for a beam detection (scan after scan), ``time`` for a drift record."""

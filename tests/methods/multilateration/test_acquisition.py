@@ -327,6 +327,8 @@ def test_absolute_distances_require_no_repetition():
 class Warm(Bench):
     """Return a bench with a thermometer; the scales warm up by 0.01 K with every reading."""
 
+    channels = ("x", "y", "z", "ambient")
+
     def __init__(self, failing=()):
         super().__init__()
         self.count, self.failing = 0, failing
@@ -346,11 +348,11 @@ class Warm(Bench):
 
 def test_temperatures_of_the_scales_are_recorded_at_start_and_end_of_a_set_up():
     sensors = QUICK.model_copy(update={"scale_sensors": ("x", "y", "z")})
-    raw = joined(measured(Warm(failing=(4, 5)), sensors))
+    raw = joined(measured(Warm(failing=(3, 4)), sensors))
     datasets.validate(raw)
     found = raw["scale_temperature"].values
-    # One reading tells the names; two for each set-up; both of the second fail but for one.
-    np.testing.assert_allclose(found[:, 0], [20.025, np.nan, 20.065, 20.085], equal_nan=True)
+    # Two readings for each set-up; both of the second fail but for one.
+    np.testing.assert_allclose(found[:, 0], [20.015, np.nan, 20.055, 20.075], equal_nan=True)
     assert (found[:, 1][np.isfinite(found[:, 0])] == 21.0).all()
     assert np.isnan(found[:, 2]).all()
     assert "scale_temperature" not in joined(measured(Warm()))

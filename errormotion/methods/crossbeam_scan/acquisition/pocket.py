@@ -54,11 +54,7 @@ def record_pocket(bench: Bench, settings: Settings, done: xr.Dataset | None) -> 
         A pass failed three times.
     """
     profiler = bench.of_kind("line_profiler")
-    if hasattr(profiler, "scans"):
-        raise MethodError(
-            "The scans of a pocket are not read from files: expected a line profiler that streams. A raw dataset of "
-            "the variant 'profiler pose' can be identified directly."
-        )
+    require_streaming(profiler)
     programs = program_texts(settings)
     move = mover(bench)
     static = _static(bench, settings, programs)
@@ -83,6 +79,15 @@ def record_pocket(bench: Bench, settings: Settings, done: xr.Dataset | None) -> 
         )
         found.attrs |= counts
         yield found
+
+
+def require_streaming(profiler: Any) -> None:
+    """Raise MethodError for a profiler whose scans are files."""
+    if hasattr(profiler, "scans"):
+        raise MethodError(
+            "The scans of a pocket are not read from files: expected a line profiler that streams. A raw dataset of "
+            "the variant 'profiler pose' can be identified directly."
+        )
 
 
 def _static(bench: Bench, settings: Settings, programs: dict[str, str]) -> xr.Dataset:

@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     from errormotion.plugins import Bench
 
 
+NOT_CONTINUED = (
+    "A test of a moving axis cannot be continued, since the axis has cooled down in the meantime. Let it cool "
+    "completely, and start a new run."
+)
+
+
 def measure_moving(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
     """Yield one raw dataset for each reading of both ends, to be joined along ``cycle``.
 
@@ -29,10 +35,7 @@ def measure_moving(bench: Bench, settings: Settings, done: xr.Dataset | None) ->
         An interrupted test, a broken beam in the cold state, and as of `measure_axis`.
     """
     if done is not None:
-        raise MethodError(
-            "A test of a moving axis cannot be continued, since the axis has cooled down in the meantime. Let it cool "
-            "completely, and start a new run."
-        )
+        raise MethodError(NOT_CONTINUED)
     low, high = ends(settings)
     axis = AxisMeasurement(bench, settings, zero=low)
     axis.move(low)

@@ -41,8 +41,7 @@ def measure_diagonals(bench: Bench, settings: Settings, done: xr.Dataset | None)
         The bench lacks an instrument, the axes do not reach a stop, or a diagonal has no zero or no reading.
     """
     motion = Motion(bench, settings)
-    channels = diagonals_of(settings).channels
-    readers = [diagonal_reader(bench, settings, channels.get(line.name, ""), line.name) for line in lines(settings)]
+    readers = readers_of(bench, settings)
     finished = 0 if done is None else int(done.sizes["diagonal"])
     for k, (line, stops, reader) in enumerate(zip(lines(settings), distances(settings), readers, strict=True)):
         if k < finished:
@@ -54,6 +53,18 @@ def measure_diagonals(bench: Bench, settings: Settings, done: xr.Dataset | None)
             f"Align the instrument to diagonal {line.name}, from {first} to {last} mm. Mount its reflector at the tool."
         )
         yield _measure(motion, line, stops, reader)
+
+
+def readers_of(bench: Bench, settings: Settings) -> list[Reader]:
+    """Return the reader of each diagonal.
+
+    Raises
+    ------
+    MethodError
+        No instrument on the bench can read one of them.
+    """
+    channels = diagonals_of(settings).channels
+    return [diagonal_reader(bench, settings, channels.get(line.name, ""), line.name) for line in lines(settings)]
 
 
 def _measure(motion: Motion, line: Line, stops: Array, reader: Reader) -> xr.Dataset:

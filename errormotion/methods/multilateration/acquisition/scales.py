@@ -36,7 +36,7 @@ class Scales:
                 f"{', '.join(sensors)}; found none. Add it, or remove the setting."
             )
         self._thermometer: Any = bench.of_kind("thermometer")
-        known = [str(name) for name in self._thermometer.read()]
+        known = [str(name) for name in self._thermometer.channels]
         if missing := [name for name in sensors if name not in known]:
             raise MethodError(
                 f"measuring.scale_sensors: expected sensors of the thermometer, {', '.join(known)}; found "

@@ -55,18 +55,9 @@ def acquire(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterat
         raise MethodError(
             f"balls: expected the approximate centres of three or more balls; found {len(settings.balls)}."
         )
-    probe = bench.of_kind("touch_probe")
-    control = bench.of_kind("controller") if bench.has_kind("controller") else None
-    moves = hasattr(control, "spindle") and hasattr(control, "move_to")
-    active = hasattr(type(probe), "control")  # it moves the machine itself
-    if active and not moves:
-        raise MethodError(
-            f"The touch probe '{probe.info.id}' moves the machine through its controller, and the warm-up needs an "
-            "instrument of kind 'controller' that turns the spindle; the bench has none. Add one; or let the machine "
-            "execute a program ('errormotion program') and use a touch probe that reads its printed lines."
-        )
+    probe, control, active, driven = route(bench)
     record = Record(bench, settings, probe, done)
-    if not moves or not (active or hasattr(control, "run_program")):
+    if not driven:
         yield from _listened(bench, probe, control, record, done)
         return
     fastest = max((event.spindle_speed for event in settings.schedule), default=0.0)
@@ -77,6 +68,29 @@ def acquire(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterat
         )
     measure = probe.measure if active else _ByProgram(probe, control, record).measure
     yield from _driven(Warming(control, settings, done), measure, record)
+
+
+def route(bench: Bench) -> tuple[Any, Any, bool, bool]:
+    """Return probe and controller (or None), whether the probe moves the machine, and whether anything does.
+
+    Otherwise the operator starts a program.
+
+    Raises
+    ------
+    MethodError
+        The probe moves the machine, and no controller turns the spindle.
+    """
+    probe = bench.of_kind("touch_probe")
+    control = bench.of_kind("controller") if bench.has_kind("controller") else None
+    moves = hasattr(control, "spindle") and hasattr(control, "move_to")
+    active = hasattr(type(probe), "control")  # it moves the machine itself
+    if active and not moves:
+        raise MethodError(
+            f"The touch probe '{probe.info.id}' moves the machine through its controller, and the warm-up needs an "
+            "instrument of kind 'controller' that turns the spindle; the bench has none. Add one; or let the machine "
+            "execute a program ('errormotion program') and use a touch probe that reads its printed lines."
+        )
+    return probe, control, active, moves and (active or hasattr(control, "run_program"))
 
 
 def _driven(machine: Warming, measure: Measure, record: Record) -> Iterator[xr.Dataset]:

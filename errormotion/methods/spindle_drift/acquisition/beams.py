@@ -35,12 +35,7 @@ def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
     recorded already are omitted, and the others are those of a detection without interruption.
     """
     frame = bench.of_kind("spindle_frame")
-    if not bench.has_kind("controller"):
-        raise MethodError(
-            "A beam detection needs an instrument of kind 'controller' that moves the sphere; the bench has none. Add "
-            "one, or use the beams of an earlier detection or the nominal beams."
-        )
-    controller = bench.of_kind("controller")
+    controller = control_of(bench)
     static = _scan_plan(bench, frame, settings)
     length = round(scan_seconds(settings.steps, settings.dwell) * frame.rate)
     recorded_samples = 0
@@ -68,6 +63,23 @@ def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
             recorded_samples -= omitted
             if omitted < chunk.sizes["sample"]:
                 yield chunk.isel(sample=slice(omitted, None)) if omitted else chunk
+
+
+def control_of(bench: Bench) -> Any:
+    """Return the controller that moves the sphere.
+
+    Raises
+    ------
+    MethodError
+        The bench has none.
+    """
+    controller = bench.of_kind("controller") if bench.has_kind("controller") else None
+    if not hasattr(controller, "run_steps"):
+        raise MethodError(
+            "A beam detection needs an instrument of kind 'controller' that moves the sphere in steps (run_steps); the "
+            "bench has none. Add one, or use the beams of an earlier detection or the nominal beams."
+        )
+    return controller
 
 
 def last_attempts(raw: xr.Dataset) -> dict[int, tuple[int, int]]:

@@ -88,9 +88,14 @@ def record_drift(
     raise MethodError(f"The stream ended at {pending.end / rate:.1f} s of {settings.duration:g} s.")
 
 
+def starts_schedules(bench: Bench) -> bool:
+    """Return whether a controller of the bench mounts the bar and executes the schedule; else an operator does."""
+    return bench.has_kind("controller") and hasattr(bench.of_kind("controller"), "start")
+
+
 def _start_machine(bench: Bench, settings: Settings, elapsed: float) -> bool:
     """Mount the bar and start the schedule; return whether the machine is virtual, with a time that can be set."""
-    if not bench.has_kind("controller"):
+    if not starts_schedules(bench):
         speeds = ", ".join(
             f"{e.spindle_speed:g} /min at {e.at:g} s" for e in settings.schedule if e.spindle_speed is not None
         )
