@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from errormotion.datasets.files.runfile import SCHEMA, read_run
-from errormotion.datasets.files.writing import sync
+from errormotion.datasets.files.writing import make_folder, replace_text, whole_folder
 from errormotion.datasets.provenance import make, plain
 from errormotion.errors import RunError
 
@@ -133,14 +133,14 @@ class RunFolder:
             The folder exists, or cannot be created.
         """
         name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{test}-{run_id}"
-        path, part = runs / name, runs / f".{name}.part"
+        path = runs / name
         if path.exists():
             raise RunError(f"{path}: already exists; a run is never overwritten")
         try:
-            part.mkdir(parents=True)
-            folder = cls(part, {"schema": SCHEMA, "id": run_id, "test": test, "created": now(), **data})
-            folder.save()
-            part.rename(path)
+            make_folder(runs)
+            with whole_folder(path) as part:
+                folder = cls(part, {"schema": SCHEMA, "id": run_id, "test": test, "created": now(), **data})
+                folder.save()
         except OSError as error:
             raise RunError(f"{path}: the run folder cannot be created: {error.strerror}") from error
         folder.path = path
@@ -318,14 +318,3 @@ def list_runs(runs: Path, skipped: list[str] | None = None) -> list[RunFolder]:
 def now() -> str:
     """Return the present time in UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a text file under a temporary name, synchronise it to disk, and rename it; an OSError names the file."""
-    part = path.with_name(f"{path.name}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        sync(part)
-        part.replace(path)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error

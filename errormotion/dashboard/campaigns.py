@@ -14,7 +14,6 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from errormotion.campaign.files import CampaignPlan, TestPlan
-from errormotion.campaign.folder import replace_text
 from errormotion.campaign.form.fields import Form, form_of, with_field, with_test, without_test
 from errormotion.campaign.planning.expected import expected, planned
 from errormotion.campaign.planning.motions import Motions, beside_limits, headline, motions, picture
@@ -22,6 +21,7 @@ from errormotion.dashboard.lab import NotFoundError
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.datasets.files.tomlfile import Key, parse_toml, read_toml
 from errormotion.datasets.files.tomltext import MAX_TEXT, value
+from errormotion.datasets.files.writing import replace_text
 from errormotion.errors import BenchError, ErrormotionError
 from errormotion.report.text import rounded, signs
 

@@ -1,10 +1,9 @@
-"""Trials on disk during an evaluation; each file is written under a temporary name and renamed."""
+"""Trials on disk during an evaluation; each file is complete and on the disk, or missing."""
 
 from __future__ import annotations
 
-import contextlib
+import io
 import json
-import os
 import re
 import shutil
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from errormotion.arrays import Array
+from errormotion.datasets.files.writing import is_part, make_folder, replace_bytes, replace_text
 from errormotion.errors import RunError
 
 KEY = "evaluation.json"
@@ -44,7 +44,7 @@ class Store:
     def __enter__(self) -> Self:
         file = self.folder / KEY
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder)
             if file.exists():
                 found = json.loads(_small(file))
                 if found != self._key:
@@ -57,12 +57,12 @@ class Store:
                         "the folder, or give another name to --out"
                     )
             # A process that ended during its start leaves such a part.
-            elif any(each != _part(file) for each in self.folder.iterdir()):
+            elif any(not is_part(each.name) for each in self.folder.iterdir()):
                 raise RunError(
                     f"{self.folder}: expected an empty folder or trials of this evaluation; found other files"
                 )
             else:
-                self._write(file, json.dumps(self._key, indent=1).encode())
+                replace_text(file, json.dumps(self._key, indent=1))
         except (OSError, ValueError, RecursionError) as error:
             raise RunError(f"{self.folder}: expected a writable folder for the trials; {error}") from error
         return self
@@ -123,23 +123,9 @@ class Store:
         return values if values.ndim == 2 and len(values) == size and values.dtype == np.float64 else None
 
     def _save(self, file: Path, values: Array) -> None:
-        part = _part(file)
-        with part.open("wb") as stream:
-            np.save(stream, np.asarray(values, dtype=np.float64), allow_pickle=False)
-            stream.flush()
-            with contextlib.suppress(OSError):
-                os.fsync(stream.fileno())
-        part.replace(file)
-
-    def _write(self, file: Path, content: bytes) -> None:
-        part = _part(file)
-        part.write_bytes(content)
-        part.replace(file)
-
-
-def _part(file: Path) -> Path:
-    """Return the temporary name of a file before it is renamed."""
-    return file.with_name(f".{file.name}.part")
+        stream = io.BytesIO()
+        np.save(stream, np.asarray(values, dtype=np.float64), allow_pickle=False)
+        replace_bytes(file, stream.getbuffer())
 
 
 def _small(file: Path) -> str:

@@ -1,7 +1,6 @@
 """The raw store contains the appended data, whichever write was the last."""
 
 import json
-import shutil
 import warnings
 from pathlib import Path
 
@@ -10,20 +9,13 @@ import pytest
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.campaign.storage import store as store_module
+from errormotion.campaign.storage import column as column_module
+from errormotion.campaign.storage.recorder import Recorder
 from errormotion.campaign.storage.store import RawStore, committed_length
 from errormotion.errors import RunError
 
 RATE = 1000.0
 LSB = 3.1e-8  # m; a step of a 16 bit sensor of 2 mm range
-
-
-def test_a_new_store_is_synchronised_before_it_is_renamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    synced: set[str] = set()
-    monkeypatch.setattr(store_module, "_sync", lambda path: synced.add(str(path)))
-    RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 1.0)
-    files = {str(tmp_path / "raw.zarr.part" / name) for name in ("zarr.json", "distance/zarr.json", "level/c/0")}
-    assert synced >= files | {str(tmp_path / "raw.zarr.part"), str(tmp_path)}
 
 
 def chunk(first: int, n: int, packed: bool = True) -> xr.Dataset:
@@ -129,65 +121,6 @@ def test_a_test_continues_in_the_middle_of_a_block(tmp_path: Path) -> None:
     same(path, chunk(0, 277))
 
 
-class PowerCutError(Exception):
-    """The process ends here."""
-
-
-@pytest.mark.slow
-def test_after_any_last_write_readers_see_complete_samples_and_writing_continues(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The process ends before each of its writes in turn (length of an array, a chunk, the new text of the root)."""
-    from zarr.storage import _local
-
-    put, replace = _local._put, store_module.replace_text
-    writes = cut_at = 0
-
-    def counted(function):  # type: ignore[no-untyped-def]
-        def write(*arguments, **keywords):  # type: ignore[no-untyped-def]
-            nonlocal writes
-            if writes == cut_at:
-                raise PowerCutError
-            writes += 1
-            return function(*arguments, **keywords)
-
-        return write
-
-    monkeypatch.setattr(_local, "_put", counted(put))
-    monkeypatch.setattr(store_module, "replace_text", counted(replace))
-    lengths = [40, 40, 1, 60]
-    seen = set()
-    cut_at = 10**9
-    RawStore.create(tmp_path / "new.zarr", chunk(0, 40), "time", 64 / RATE)
-    for case in range(200):
-        path = shutil.copytree(tmp_path / "new.zarr", tmp_path / f"{case}.zarr")
-        writes, cut_at = 0, case
-        try:
-            store = RawStore(path, "time")
-            first = 0
-            for n in lengths:
-                store.append(chunk(first, n))
-                first += n
-                store.commit()
-        except PowerCutError:
-            pass
-        else:
-            break
-        cut_at = 10**9
-        kept = committed_length(path, "time")
-        seen.add(kept)
-        if kept:
-            same(path, chunk(0, kept))
-        store = RawStore(path, "time")
-        assert store.count == kept
-        store.append(chunk(kept, 100))
-        store.commit()
-        same(path, chunk(0, kept + 100))
-    else:
-        pytest.fail("the writing never came to its end")
-    assert seen == {0, 40, 80, 81}
-
-
 def test_gap_is_refused_with_the_time_that_was_expected(tmp_path: Path) -> None:
     store = RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 0.1)
     store.append(chunk(0, 10))
@@ -215,6 +148,127 @@ def test_an_incompatible_dataset_is_an_error(tmp_path: Path, change, message: st
     store.append(chunk(0, 10))
     with pytest.raises(RunError, match=message):
         store.append(change(chunk(10, 10)))
+
+
+def pulses(first: int, n: int, **changes: object) -> xr.Dataset:
+    """A chunk with what a method states once: pulses of an index, a place, a flag, a name, and an unknown value."""
+    raw = chunk(first, n).assign_coords(place=("direction", [0.1, np.nan, 0.3]))
+    once = {"index_time": ("pulse", np.arange(17.0)), "count": 3, "ok": True, "who": "A. Operator", **changes}
+    return raw.assign(once).assign_attrs(rotation="right", offsets=[0.0, 1e-3])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda raw: raw.assign(index_time=("pulse", np.arange(17.0, 66))),
+            r"'index_time' .* \{'pulse': 17\}.*'pulse': 49",
+        ),
+        (lambda raw: raw.assign(index_time=("pulse", np.arange(1.0, 18))), r"'index_time' does not grow along 'time'"),
+        (lambda raw: raw.assign(index_time=("pulse", np.full(17, np.nan))), "'index_time' does not grow"),
+        (lambda raw: raw.assign(index_time=("other", np.arange(17.0))), "'index_time' does not grow"),
+        (lambda raw: raw.assign(count=4), "'count' does not grow"),
+        (lambda raw: raw.assign(ok=False), "'ok' does not grow"),
+        (lambda raw: raw.assign(who="B. Operator"), r"'who' .* expected one value \(A\. Operator\); found one value"),
+        (lambda raw: raw.assign_coords(sensor=["frame", "table"]), "'sensor' does not grow"),
+        (lambda raw: raw.assign_coords(place=("direction", [0.1, 0.2, 0.3])), "'place' does not grow"),
+        (lambda raw: raw.assign(more=("pulse", np.arange(17.0))), "'more' is new"),
+        (lambda raw: raw.drop_vars("index_time"), "'index_time' is missing"),
+        (lambda raw: raw.assign_attrs(rotation="left"), "attribute 'rotation' of the dataset .* 'right'; found 'left'"),
+        (lambda raw: raw.assign_attrs(offsets=[0.0, 2e-3]), "attribute 'offsets' of the dataset"),
+        (lambda raw: raw.assign_attrs(note="new"), "attribute 'note' of the dataset .* expected None; found 'new'"),
+        (lambda raw: raw.assign_attrs(sample_rate=2000.0), "attribute 'sample_rate'"),
+        (lambda raw: raw.assign(temperature=raw["temperature"].assign_attrs(units="K")), "'units' of 'temperature'"),
+        (lambda raw: raw.assign(temperature=raw["temperature"].astype(complex)), "'temperature' of the type float64"),
+        (lambda raw: raw.assign_coords(time=np.linspace(0.01, 0.03, 10)), "expected 10 samples at 1000.0 Hz"),
+    ],
+)
+def test_what_would_be_lost_is_refused_and_the_data_so_far_stay(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "raw.zarr"
+    first = pulses(0, 10)
+    store = RawStore.create(path, first, "time", 0.1)
+    store.append(first)
+    same_again = pulses(10, 10)
+    with pytest.raises(RunError, match=message):
+        store.append(change(same_again))
+    assert store.count == 10
+    store.append(same_again)
+    store.close()
+    again = RawStore(path, "time")  # continued: compared with what is stored
+    with pytest.raises(RunError, match=message):
+        again.append(change(pulses(20, 10)))
+    again.append(pulses(20, 10))
+    again.close()
+    same(path, pulses(0, 30))
+
+
+def test_another_type_of_values_is_stored_only_without_a_change(tmp_path: Path) -> None:
+    first = xr.Dataset({"count": ("scan", np.arange(3, dtype=np.int32)), "name": ("scan", ["a", "bb", "c"])})
+    store = RawStore.create(tmp_path / "raw.zarr", first, "scan")
+    store.append(first)
+    store.append(first.assign(count=first["count"].astype(np.int16)))
+    for other in (float, np.int64, np.uint32):
+        with pytest.raises(RunError, match="'count' of the type int32"):
+            store.append(first.assign(count=first["count"].astype(other)))
+    store.close()
+    same(tmp_path / "raw.zarr", xr.concat([first, first], "scan"))
+
+
+def test_times_and_other_objects_are_refused_by_name(tmp_path: Path) -> None:
+    for values in (np.array(["2026-03-31"], "datetime64[s]"), np.array([{}], object)):
+        with pytest.raises(RunError, match="expected numbers or texts; 'when' has the type"):
+            RawStore.create(tmp_path / "raw.zarr", xr.Dataset({"when": ("scan", values)}), "scan")
+
+
+def test_the_recorder_keeps_what_came_before_a_refused_dataset(tmp_path: Path) -> None:
+    path = tmp_path / "raw.zarr"
+    with pytest.raises(RunError, match="'index_time' does not grow"), Recorder(path, "time", 1.0, {}) as recorder:
+        recorder.put(pulses(0, 10))
+        recorder.put(pulses(10, 10))
+        recorder.put(pulses(20, 10, index_time=("pulse", np.arange(66.0))))
+        while True:
+            recorder.put(pulses(30, 10))
+    same(path, pulses(0, 20))
+
+
+def test_a_commit_costs_what_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bytes of values given to the compression, at any length of the record."""
+    encoded = column_module.encoded
+    sizes: list[int] = []
+    monkeypatch.setattr(
+        column_module, "encoded", lambda values, meta: sizes.append(values.nbytes) or encoded(values, meta)
+    )
+    rate, new = 20_000.0, 10_000
+    parts = [chunk(k * new, new).assign_attrs(sample_rate=rate, time_start=k * new / rate) for k in range(30)]
+    store = RawStore.create(tmp_path / "raw.zarr", parts[0], "time", 4 * 3600.0)
+    costs = []
+    for part in parts:
+        sizes.clear()
+        store.append(part)
+        store.commit()
+        costs.append(sum(sizes))
+    of_new = new * (5 * 2 + 2 * 8)
+    assert np.mean(costs) < 5 * of_new
+    assert max(costs) < 10 * of_new
+
+
+@pytest.mark.parametrize("damage", ["", "{", None])
+def test_damaged_metadata_of_an_array_are_rebuilt_from_the_root(tmp_path: Path, damage: str | None) -> None:
+    path = tmp_path / "raw.zarr"
+    fill(path, [50, 27], expected=64)
+    for file in path.glob("*/zarr.json"):
+        file.unlink() if damage is None else file.write_text(damage)
+    (path / "distance" / "c" / "0" / ".1.0123456789abcdef.part").write_bytes(b"")
+    (path / "distance" / "c" / "0" / "1.0123456789abcdef.partial").write_bytes(b"")
+    (path / "distance" / "c" / "0" / "2").write_bytes(b"")  # of samples that were not committed
+    same(path, chunk(0, 77))
+    store = RawStore(path, "time")
+    assert not [*path.rglob("*.part"), *path.rglob("*.partial")]
+    store.append(chunk(77, 200))
+    store.close()
+    same(path, chunk(0, 277))
+    with xr.open_zarr(path, consolidated=False) as found:
+        assert found.sizes["time"] == 277
 
 
 def test_joins_along_named_channels(tmp_path: Path) -> None:

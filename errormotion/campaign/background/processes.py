@@ -27,11 +27,12 @@ from errormotion.campaign.background.detached import printed, spawn
 from errormotion.campaign.background.publishing import ANSWER, STATUS
 from errormotion.campaign.claims import require_free, uses
 from errormotion.campaign.files import CampaignPlan, TestPlan, load_campaign
-from errormotion.campaign.folder import RunFolder, is_locked, now, replace_text
+from errormotion.campaign.folder import RunFolder, is_locked, now
 from errormotion.campaign.planning.ready import require_ready
 from errormotion.campaign.planning.release import OPTION, Release, refuse, to_release
 from errormotion.campaign.runner import folders_of, stored_plan, to_measure
 from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.writing import replace_text
 from errormotion.errors import RunError
 
 try:

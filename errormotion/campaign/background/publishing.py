@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.writing import replace_text
 
 STATUS, ANSWER = "status.json", "answer"
 INTERVAL = 0.5
@@ -108,7 +109,5 @@ class Published:
     def _write(self) -> None:
         """Replace the state; a write error, such as a full disk, does not end the measurement."""
         self._written = time.monotonic()
-        part = self._folder / f"{STATUS}.part"
         with suppress(OSError):
-            part.write_text(json.dumps(self._state), encoding="utf-8")
-            part.replace(self._folder / STATUS)
+            replace_text(self._folder / STATUS, json.dumps(self._state), flush=False)

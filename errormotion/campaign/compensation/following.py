@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from errormotion.campaign.folder import is_locked
 from errormotion.compensation.online.settings import Limits
 from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.writing import replace_text
 from errormotion.errors import CompensationError
 
 AUDIT = "audit.jsonl"
@@ -119,9 +120,7 @@ def write_status(folder: Path, status: Status) -> None:
     OSError
         The file cannot be written.
     """
-    part = folder / f".{STATUS}.part"
-    part.write_text(status.model_dump_json(), encoding="utf-8")
-    part.replace(folder / STATUS)
+    replace_text(folder / STATUS, status.model_dump_json(), flush=False)
 
 
 def read_status(folder: Path) -> Status:

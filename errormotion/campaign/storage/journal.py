@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
+from errormotion.datasets.files.writing import sync
 from errormotion.errors import ErrormotionError
 
 ROOT = "errormotion"
@@ -43,6 +45,14 @@ class _Handler(logging.FileHandler):
     def emit(self, record: logging.LogRecord) -> None:
         with suppress(OSError):  # errors of opening, which the standard handler does not catch
             super().emit(record)
+            if record.levelno >= logging.ERROR:
+                self.sync()
+
+    def sync(self) -> None:
+        """Flush the lines so far to the disk: the cause of an end, and the end, survive a power cut."""
+        if self.stream is not None:
+            os.fsync(self.stream.fileno())
+            sync(Path(self.baseFilename).parent)
 
     def handleError(self, record: logging.LogRecord) -> None:
         pass
@@ -63,5 +73,7 @@ def journal(path: Path, level: int = logging.INFO) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.setLevel(before)
+        with suppress(OSError):
+            handler.sync()
         with suppress(OSError):
             handler.close()

@@ -7,6 +7,7 @@ import logging
 import queue
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -102,6 +103,9 @@ class Recorder:
             self._write_all()
         except BaseException as error:
             log.exception("the recorder stopped")
+            if isinstance(error, RunError) and self._store:  # data were refused; those before are kept
+                with suppress(OSError, RunError):
+                    self._commit(self._store)
             self._error = error
 
     def _write_all(self) -> None:
@@ -122,6 +126,7 @@ class Recorder:
                 waiting_since = None
         if self._store:
             self._commit(self._store)
+            self._store.close()
 
     def _commit(self, store: RawStore) -> None:
         store.attrs.update(self._clock.attributes())

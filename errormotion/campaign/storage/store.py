@@ -1,36 +1,44 @@
 """The raw store: a Zarr v3 folder that grows during a measurement and is complete at any time.
 
-Samples are written in blocks along one dimension. The order of writing keeps the folder consistent if the process is
-killed at any time:
+Samples are written in blocks along one dimension. The order of writing keeps all committed samples if the process is
+killed, or the power fails, at any time. A commit
 
-1. the chunks of a block are written, each to a temporary file that is renamed;
-2. then the root ``zarr.json`` is replaced by a rename. It contains the (consolidated) metadata of all arrays, which
+1. writes the chunks with new samples. A chunk that already has committed samples is replaced by a rename, after its new
+   content is on the disk; then the names in the folders are flushed, too;
+2. replaces the root ``zarr.json`` in the same way. It contains the (consolidated) metadata of all arrays, which
    therefore get their new length simultaneously: a reader of the store sees complete samples only.
 
-Chunks written before a crash between 1 and 2 are invisible; the next opening of the store overwrites them.
+Chunks written before a crash between 1 and 2 are invisible; the next opening of the store overwrites them. The
+``zarr.json`` of each array is a copy for readers that do not use the root: it is written when the store is closed, and
+when a store is opened whose copies are damaged or old.
+
+A commit rewrites the last, incomplete block of each array. A block is therefore short: about the samples of a second.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self, cast
 
 import numpy as np
 import xarray as xr
-import zarr
-from xarray.conventions import encode_cf_variable
 from zarr.codecs import BloscCodec
 
-from errormotion.campaign.folder import Presence, replace_text
+from errormotion.campaign.folder import Presence
+from errormotion.campaign.storage.column import Column, dims_of, encode, fits, is_text
+from errormotion.campaign.storage.fixed import Fixed, plain_attrs, stored_variables
 from errormotion.datasets.files.containers import MAX_METADATA
 from errormotion.datasets.files.reading import parse_json, read_bytes
-from errormotion.datasets.files.writing import sync
+from errormotion.datasets.files.writing import is_part, replace_all, replace_text, sync, whole_folder
 from errormotion.errors import RunError
 
 BLOCK_BYTES = 24 * 2**20
 """Largest size of one block of all appended variables in memory, bytes."""
+
+SMALL_BLOCK_BYTES = 2**18
+"""Size of a block that is written in a few milliseconds, bytes; a block may have it at any rate of samples."""
 
 MAX_BLOCK_LENGTH = 2**18
 """Largest number of samples in one block."""
@@ -41,8 +49,8 @@ BEFORE_COMMIT = {"zarr_format", "node_type", "attributes"}
 MAX_SAMPLES = 2**53
 """A length from this on is invalid."""
 
-PER_CHUNK = ("dropped", "invalid", "time_start")
-"""Attributes that differ between the datasets that a method yields."""
+_KINDS = "biufU"
+"""Kinds of the types that are stored: numbers, booleans and texts."""
 
 
 class RawStore:
@@ -66,24 +74,25 @@ class RawStore:
     def __init__(self, path: Path, dim: str) -> None:
         self.path = path
         self.dim = dim
-        self._group = zarr.open_group(str(path), mode="r+", use_consolidated=False)
-        self._root = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+        self.count = self.committed = committed_length(path, dim)
+        self._root = parse_json(read_bytes(path / "zarr.json", MAX_METADATA))
         self._static: dict[str, dict[str, Any]] = {}
-        self._arrays: dict[str, _Column] = {}
-        for name, array in sorted(self._group.arrays()):
-            metadata = json.loads((path / name / "zarr.json").read_text(encoding="utf-8"))
-            if dim in _dims(metadata):
-                self._arrays[name] = _Column(path / name, array, metadata, dim)
+        self._arrays: dict[str, Column] = {}
+        for name, metadata in sorted(_array_metadata(path, self._root).items()):
+            if dim in dims_of(metadata):
+                self._arrays[name] = Column(path / name, metadata, dim)
             else:
                 self._static[name] = metadata
         if not self._arrays:
             raise RunError(f"{path}: expected at least one variable along '{dim}'; found none")
         self.block = next(iter(self._arrays.values())).block
-        self.count = self.committed = committed_length(path, dim)
+        self._presence = Presence(path)
+        self._unsynced: set[Path] = set()
+        _remove_parts(path)
+        self._write_copies()
         for column in self._arrays.values():
             column.load(self.count)
-        self._unsynced: set[Path] = set()
-        self._presence = Presence(path)
+        self._fixed = Fixed.read(path, self._static, dim)
 
     @classmethod
     def create(cls, path: Path, first: xr.Dataset, dim: str, expected: float = np.inf) -> Self:
@@ -94,9 +103,9 @@ class RawStore:
         path : Path
             The folder to create; it must not exist.
         first : Dataset
-            The first dataset to append. Variables without the dimension ``dim`` are stored once, here. A variable whose
-            ``encoding`` has ``dtype`` (an integer), ``scale_factor``, ``add_offset`` and ``_FillValue`` is packed
-            accordingly if this is lossless.
+            The first dataset to append. Variables without the dimension ``dim`` are stored once, here; all datasets to
+            append must have the same. A variable whose ``encoding`` has ``dtype`` (an integer), ``scale_factor``,
+            ``add_offset`` and ``_FillValue`` is packed accordingly if this is lossless.
         dim : str
             The dimension that grows.
         expected : float
@@ -106,14 +115,19 @@ class RawStore:
             raise RunError(f"{path.parent} is gone: it was moved or deleted before data were written to it")
         if dim not in first.dims:
             raise RunError(f"expected data along '{dim}'; the method yielded dims {', '.join(map(str, first.dims))}")
-        growing = {str(name): variable for name, variable in _stored(first, dim).items() if dim in variable.dims}
+        for name, variable in stored_variables(first, dim).items():
+            if variable.dtype.kind not in _KINDS and not is_text(variable):
+                raise RunError(f"expected numbers or texts; '{name}' has the type {variable.dtype}")
+        growing = {
+            str(name): variable for name, variable in stored_variables(first, dim).items() if dim in variable.dims
+        }
         packings = {name: _packing(variable) for name, variable in growing.items()}
         length = expected * float(first.attrs.get("sample_rate", 1.0))
-        block = _block_length(growing, packings, dim, length)
+        block = _block_length(growing, packings, dim, length, float(first.attrs.get("sample_rate", 0.0)))
         skeleton = first.isel({dim: slice(0, 0)}).drop_vars(
-            [n for n in first.variables if n not in _stored(first, dim)]
+            [n for n in first.variables if n not in stored_variables(first, dim)]
         )
-        skeleton = skeleton.drop_attrs(deep=False).assign_attrs(_plain(first.attrs))
+        skeleton = skeleton.drop_attrs(deep=False).assign_attrs(plain_attrs(first.attrs))
         encoding: dict[str, dict[str, Any]] = {}
         # Every version of xarray stores objects as texts of variable length; an empty array of objects has no type.
         texts = {
@@ -131,13 +145,9 @@ class RawStore:
                 encoding[name]["compressors"] = [_codec(np.dtype(packings[name].get("dtype", variable.dtype)))]
             if variable.dtype.kind == "f":
                 encoding[name] |= {"fill_value": packings[name].get("_FillValue", np.nan)}
-        part = path.with_name(path.name + ".part")
-        # xarray's stub lacks zarr_format=3 with encodings per variable
-        cast(Any, skeleton).to_zarr(part, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
-        for each in (*part.rglob("*"), part):  # otherwise a power failure would leave empty files
-            _sync(each)
-        part.rename(path)
-        _sync(path.parent)
+        with whole_folder(path) as part:
+            # xarray's stub lacks zarr_format=3 with encodings per variable
+            cast(Any, skeleton).to_zarr(part, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
         store = cls(path, dim)
         store.commit()
         return store
@@ -148,21 +158,23 @@ class RawStore:
         Raises
         ------
         RunError
-            The dataset does not continue the store, has other variables, or the folder was moved or deleted.
+            The dataset does not continue the store, has other variables or attributes, another value of a variable
+            that does not grow, or the folder was moved or deleted. Nothing of the dataset is appended.
         OSError
             The data cannot be written.
         """
         if self.dim not in chunk.dims:
             raise RunError(f"expected data along '{self.dim}'; the method yielded {dict(chunk.sizes)}")
         length = chunk.sizes[self.dim]
-        self._check_continues(chunk)
-        values = {name: self._encoded(name, variable) for name, variable in _stored(chunk, self.dim).items()
+        values = {name: self._encoded(name, variable) for name, variable in stored_variables(chunk, self.dim).items()
                   if self.dim in variable.dims}  # fmt: skip
         if set(values) != set(self._arrays):
             raise RunError(
                 f"{self.path}: expected the variables {', '.join(sorted(self._arrays))} along '{self.dim}'; "
                 f"the method yielded {', '.join(sorted(values))}"
             )
+        self._fixed.check(chunk, {name: column.attributes for name, column in self._arrays.items()}, self.attrs)
+        self._check_continues(chunk)
         taken = 0
         while taken < length:
             fill = self.count % self.block
@@ -188,17 +200,23 @@ class RawStore:
         with self._presence.held():
             self._commit()
 
+    def close(self) -> None:
+        """Commit, and write the length of each array to its own metadata, for readers that do not use the root."""
+        with self._presence.held():
+            self._commit()
+            self._write_copies()
+
     def _commit(self) -> None:
-        if self.count % self.block:
+        if self.count % self.block and self.count > self.committed:
             self._write_block()
-        for path in self._unsynced:
-            _sync(path)
+        for path in sorted(self._unsynced, key=lambda path: path.is_dir()):  # files before the names of them
+            sync(path)
         self._unsynced.clear()
         root = dict(self._root)
         root["consolidated_metadata"] = {
             "kind": "inline",
             "must_understand": False,
-            "metadata": self._static | {name: column.metadata(self.count) for name, column in self._arrays.items()},
+            "metadata": self._metadata(),
         }
         replace_text(self.path / "zarr.json", json.dumps(root))  # indented, it would take ten times as long
         self.committed = self.count
@@ -212,8 +230,28 @@ class RawStore:
         """Write the current block of every array."""
         self._presence.check()
         start = (self.count - 1) // self.block * self.block
-        for column in self._arrays.values():
-            self._unsynced.add(column.write(start, self.count))
+        contents = {column.file(start): column.content(self.count - start) for column in self._arrays.values()}
+        for name in self._arrays:
+            self._unsynced |= _make_folders(self.path / name, contents)
+        # Files without committed samples are flushed by the commit, all at once.
+        is_committed = start < self.committed
+        replace_all(contents, flush=is_committed)
+        if not is_committed:
+            self._unsynced |= {*contents, *(file.parent for file in contents)}
+
+    def _metadata(self) -> dict[str, Any]:
+        return self._static | {name: column.metadata(self.count) for name, column in self._arrays.items()}
+
+    def _write_copies(self) -> None:
+        """Write the metadata of each array to its folder, unless they are there."""
+        for name, metadata in self._metadata().items():
+            file = self.path / name / "zarr.json"
+            try:
+                if parse_json(read_bytes(file, MAX_METADATA)) == metadata:
+                    continue
+            except (OSError, ValueError, RecursionError):
+                pass
+            replace_text(file, json.dumps(metadata))
 
     def _encoded(self, name: str, variable: xr.Variable) -> np.ndarray:
         if name not in self._arrays:
@@ -225,7 +263,12 @@ class RawStore:
         found = {str(d): n for d, n in variable.sizes.items() if d != self.dim}
         if found != expected:
             raise RunError(f"{self.path}: '{name}' has the sizes {found}; expected {expected}")
-        packed = _encode(variable.transpose(*column.dims), column.packing)
+        if not (column.packing or fits(variable, column.dtype)):
+            raise RunError(
+                f"{self.path}: expected '{name}' of the type {column.dtype}, as in the first dataset; found "
+                f"{variable.dtype}"
+            )
+        packed = encode(variable.transpose(*column.dims), column.packing)
         if packed is None:
             raise RunError(
                 f"{self.path}: expected '{name}' in integer steps of {column.packing['scale_factor']!r}, as the "
@@ -236,7 +279,16 @@ class RawStore:
     def _check_continues(self, chunk: xr.Dataset) -> None:
         rate, start = chunk.attrs.get("sample_rate"), chunk.attrs.get("time_start")
         origin = self.attrs.get("time_start", 0.0)
-        if self.dim != "time" or rate is None or start is None:
+        if self.dim != "time" or rate is None:
+            return
+        if "time" in chunk.variables and chunk.sizes["time"]:  # not stored: rate and start state it
+            first, last = (float(chunk["time"].values[k]) for k in (0, -1))
+            if abs((last - first) * rate - (chunk.sizes["time"] - 1)) > 0.5:
+                raise RunError(
+                    f"{self.path}: expected {chunk.sizes['time']} samples at {rate} Hz; their times are from "
+                    f"{first:.6f} s to {last:.6f} s. The method must fill gaps with NaN."
+                )
+        if start is None:
             return
         expected = origin + self.count / rate
         if self.count and abs(start - expected) * rate > 0.5:
@@ -254,61 +306,6 @@ class RawStore:
         self.attrs["invalid"] = json.dumps(total)
 
 
-class _Column:
-    """One array along the growing dimension, with its current block in memory."""
-
-    def __init__(self, path: Path, array: Any, metadata: dict[str, Any], dim: str) -> None:
-        self.path = path
-        self.array = array
-        self.dims = _dims(metadata)
-        self.axis = self.dims.index(dim)
-        self.block = int(array.chunks[self.axis])
-        self.packing = {
-            key: metadata["attributes"][key] for key in ("scale_factor", "add_offset") if key in metadata["attributes"]
-        }
-        if self.packing:
-            self.packing |= {"dtype": array.dtype.name, "_FillValue": metadata["fill_value"]}
-        self._metadata = metadata
-        shape = list(array.shape)
-        shape[self.axis] = self.block
-        self._values = np.empty(shape, dtype=array.dtype)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(self.array.shape)
-
-    def _at(self, start: int, stop: int) -> tuple[slice, ...]:
-        return tuple(slice(start, stop) if axis == self.axis else slice(None) for axis in range(len(self.dims)))
-
-    def load(self, count: int) -> None:
-        """Read the last, incomplete block, and discard data beyond it."""
-        self._resize(count)
-        start = count // self.block * self.block
-        if count > start:
-            self._values[self._at(0, count - start)] = self.array[self._at(start, count)]
-
-    def put(self, fill: int, values: np.ndarray, first: int, length: int) -> None:
-        self._values[self._at(fill, fill + length)] = values[self._at(first, first + length)]
-
-    def write(self, start: int, stop: int) -> Path:
-        """Write one block; return the file of its chunk."""
-        self._resize(stop)
-        self.array[self._at(start, stop)] = self._values[self._at(0, stop - start)]
-        index = tuple(start // self.block if axis == self.axis else 0 for axis in range(len(self.dims)))
-        return self.path / str(self.array.metadata.encode_chunk_key(index))
-
-    def _resize(self, length: int) -> None:
-        if self.array.shape[self.axis] != length:
-            shape = list(self.array.shape)
-            shape[self.axis] = length
-            self.array.resize(tuple(shape))
-
-    def metadata(self, count: int) -> dict[str, Any]:
-        shape = list(self._metadata["shape"])
-        shape[self.axis] = count
-        return self._metadata | {"shape": shape}
-
-
 def committed_length(path: Path, dim: str) -> int:
     """Return the number of samples visible to a reader of a store; 0 before the first commit.
 
@@ -323,8 +320,8 @@ def committed_length(path: Path, dim: str) -> int:
         if set(root) <= BEFORE_COMMIT and root["zarr_format"] == 3:
             return 0
         for metadata in root["consolidated_metadata"]["metadata"].values():
-            if dim in _dims(metadata):
-                length = metadata["shape"][_dims(metadata).index(dim)]
+            if dim in dims_of(metadata):
+                length = metadata["shape"][dims_of(metadata).index(dim)]
                 if isinstance(length, int) and 0 <= length < MAX_SAMPLES:
                     return length
         raise ValueError(f"no variable has a length along '{dim}'")
@@ -334,25 +331,31 @@ def committed_length(path: Path, dim: str) -> int:
         raise RunError(f"{file}: is damaged; restore it from a copy ({error})") from error
 
 
-def _dims(metadata: Mapping[str, Any]) -> tuple[str, ...]:
-    return tuple(metadata.get("dimension_names") or ())  # a scalar has no dimensions
+def _array_metadata(path: Path, root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the metadata of all arrays: those of the root, or before the first commit those of their folders."""
+    held = root.get("consolidated_metadata")
+    if held:
+        return dict(held["metadata"])
+    return {each.parent.name: parse_json(read_bytes(each, MAX_METADATA)) for each in path.glob("*/zarr.json")}
 
 
-def _sync(path: Path) -> None:
-    if path.exists():  # a chunk that is entirely NaN has no file
-        sync(path)
+def _make_folders(array: Path, files: Iterable[Path]) -> set[Path]:
+    """Create missing folders of chunks below that of an array; return the folders with a new name."""
+    changed = set()
+    for file in files:
+        if file.is_relative_to(array):
+            for part in reversed([each for each in file.parents if each.is_relative_to(array) and each != array]):
+                if not part.is_dir():
+                    part.mkdir()  # without its parents: a folder that was moved is not created again
+                    changed.add(part.parent)
+    return changed
 
 
-def _stored(dataset: xr.Dataset, dim: str) -> dict[str, xr.Variable]:
-    """Return the stored variables: all but the times of evenly spaced samples, which follow from rate and start."""
-    regular = dim == "time" and "sample_rate" in dataset.attrs
-    return {str(n): v for n, v in dataset.variables.items() if not (regular and n == "time")}
-
-
-def _plain(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return attributes as JSON values, without those of one chunk; ``time_start`` is kept as that of the store."""
-    kept = {str(k): v for k, v in attrs.items() if k not in PER_CHUNK or k == "time_start"}
-    return {k: v.tolist() if isinstance(v, np.generic | np.ndarray) else v for k, v in kept.items()}
+def _remove_parts(path: Path) -> None:
+    """Remove temporary files of a process that was killed."""
+    for file in path.rglob("*.part*"):
+        if is_part(file.name) or file.suffix == ".partial":  # those of this package, and of zarr in earlier versions
+            file.unlink(missing_ok=True)
 
 
 def _counts(value: Any) -> dict[str, int]:
@@ -374,37 +377,7 @@ def _packing(variable: xr.Variable) -> dict[str, Any]:
         "add_offset": float(wanted["add_offset"]),
         "_FillValue": int(wanted["_FillValue"]),
     }
-    return packing if dtype.kind in "iu" and _encode(variable, packing) is not None else {}
-
-
-def _encode(variable: xr.Variable, packing: Mapping[str, Any]) -> np.ndarray | None:
-    """Return the numbers to store; None if the packing would lose more than the rounding error."""
-    values = variable.values
-    if not packing:
-        if values.dtype.kind == "U":
-            return values.astype(object)
-        if values.dtype.kind in "fiu":  # needs no encoding
-            return values
-        return np.asarray(encode_cf_variable(xr.Variable(variable.dims, values)).values)
-    scale, offset, fill = packing["scale_factor"], packing["add_offset"], packing["_FillValue"]
-    limits = np.iinfo(packing["dtype"])
-    steps = values - offset
-    steps /= scale
-    whole = np.rint(steps)
-    missing = np.isnan(steps)
-    some = bool(missing.any())
-    with np.errstate(invalid="ignore"):
-        steps -= whole
-        # 1e-6 of a step is far above the rounding of float64 (and that of 16 bit steps), far below half a step
-        good = np.abs(steps, out=steps) < 1e-6
-        good &= whole >= limits.min
-        good &= whole <= limits.max
-        good &= whole != fill
-    if some:
-        good |= missing
-        whole[missing] = fill
-    packed: np.ndarray | None = whole.astype(packing["dtype"]) if good.all() else None
-    return packed
+    return packing if dtype.kind in "iu" and encode(variable, packing) is not None else {}
 
 
 def _codec(stored: np.dtype[Any]) -> BloscCodec:
@@ -419,14 +392,22 @@ def _codec(stored: np.dtype[Any]) -> BloscCodec:
 
 
 def _block_length(
-    growing: Mapping[str, xr.Variable], packings: Mapping[str, Mapping[str, Any]], dim: str, expected: float
+    growing: Mapping[str, xr.Variable],
+    packings: Mapping[str, Mapping[str, Any]],
+    dim: str,
+    expected: float,
+    rate: float,
 ) -> int:
-    """Return the samples of one block: a power of two within the size limits, not far above the expected total."""
+    """Return the samples of one block: a power of two within the size limits, not far above the expected total.
+
+    A commit rewrites a block: one of more than the samples of a second is small.
+    """
     per_sample = 0
     for name, variable in growing.items():
         size = np.dtype(packings[name].get("dtype", variable.dtype)).itemsize
         per_sample += max(size, 1) * int(np.prod([n for d, n in variable.sizes.items() if d != dim], dtype=np.int64))
     most = min(MAX_BLOCK_LENGTH, max(BLOCK_BYTES // max(per_sample, 1), 1))
+    most = min(most, max(SMALL_BLOCK_BYTES // max(per_sample, 1), 1 << int(np.ceil(np.log2(max(rate, 1.0))))))
     if np.isfinite(expected) and expected >= 1:
         most = min(most, 1 << int(np.ceil(np.log2(expected))))
     return 1 << int(np.log2(max(most, 1)))

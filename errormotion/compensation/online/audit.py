@@ -28,6 +28,7 @@ from typing import Any, Self
 from errormotion.compensation.online import anchors
 from errormotion.compensation.online.anchors import Anchor
 from errormotion.datasets.files.reading import require_regular
+from errormotion.datasets.files.writing import sync
 from errormotion.errors import CompensationError
 
 START = "0" * 64
@@ -117,6 +118,7 @@ class AuditLog:
         self._synced, self._saved = time.monotonic(), -1
         self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o600)
         try:
+            sync(path.parent)  # the name of a new file
             self._sync()
         except OSError as error:
             os.close(self._file)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import codecs
 import itertools
-import os
 import re
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing
@@ -22,6 +21,7 @@ from errormotion.compensation.program.reading.words import MAX_LINE, BlockError,
 from errormotion.compensation.program.writing.dividing import Correcting
 from errormotion.compensation.program.writing.rewriting import Rewriting, Summary
 from errormotion.datasets.files.reading import require_regular
+from errormotion.datasets.files.writing import replacing
 from errormotion.errors import ProgramError
 
 MAX_PROGRAM = 1 << 29
@@ -121,11 +121,10 @@ def compensate(
     if require_regular(program).st_size > MAX_PROGRAM:
         raise ProgramError(f"{program}: expected a file of at most {MAX_PROGRAM} bytes")
     why = ""
-    beside = out.with_name(out.name + ".part")
-    try:
+    with replacing(out) as beside:
         if chosen.route != "interpreter":
             try:
-                return _written(program, None, beside, out, correcting, offsets, chosen, head, why)
+                return _written(program, None, beside, correcting, offsets, chosen, head, why)
             except ProgramError as error:
                 if chosen.route == "plain" or canonical.interpreter() is None:
                     raise
@@ -135,11 +134,9 @@ def compensate(
                 raise ProgramError("LinuxCNC's interpreter starts in mm: state the unit in the program (G20)")
             source = [text for _, text in lines_of(_lines(program))]
             screen(source)
-            return _written(program, source, beside, out, correcting, offsets, chosen, head, why)
+            return _written(program, source, beside, correcting, offsets, chosen, head, why)
         except ProgramError as error:
             raise ProgramError(f"{error}" + (f"\nThe plain reader: {why}" if why else "")) from error
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def _expanded(source: list[str], expansion: Expansion, offsets: Offsets, settings: Settings) -> Generator[str]:
@@ -151,7 +148,6 @@ def _written(
     program: Path,
     source: list[str] | None,
     beside: Path,
-    out: Path,
     correcting: Correcting,
     offsets: Offsets,
     settings: Settings,
@@ -185,7 +181,6 @@ def _written(
             )
         except ProgramError as error:
             raise ProgramError(f"the check of the new program: {error}") from error
-    os.replace(beside, out)
     return Outcome(rewriting.summary, "plain" if source is None else "interpreter", why, checked, _digest(program))
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from errormotion.datasets.files.reading import require_regular
+from errormotion.datasets.files.writing import sync
 from errormotion.errors import RunError
 
 FILE = "events.jsonl"
@@ -101,6 +102,8 @@ def append(folder: Path, made: Event) -> Path:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
+        if not size:
+            sync(folder)  # the name of a new file
     except OSError as error:
         raise RunError(f"{file}: the note cannot be written: {error.strerror}") from error
     return file

@@ -1,13 +1,20 @@
-"""Atomic writing of files: to a temporary file in the same folder, which is flushed to the disk and renamed."""
+"""Atomic writing of files and folders; every file that replaces another one is written by this module.
+
+The content goes to a temporary file in the same folder, which is flushed to the disk and renamed; then the folder is
+flushed. When a function of this module returns, the file therefore survives a power cut. A temporary file has a random
+name and is created by this process: neither a link nor an existing file is opened for writing. Its name begins with a
+point and ends with ``.part``; after a power cut it may remain, and is ignored by all readers.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
 import re
+import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from errormotion.errors import DatasetError
@@ -23,6 +30,10 @@ _REASONS = {
     errno.ENAMETOOLONG: "the name is too long",
 }
 
+_PART = re.compile(r"\..+\.[0-9a-f]{16}\.part", re.DOTALL)
+_LONGEST = 60
+"""Number of characters of a name that are kept in the temporary name, since a file system limits the length."""
+
 
 def reason(error: Exception, missing: str) -> str:
     """Return the reason why a file cannot be read or written; ``missing`` if a file or folder does not exist."""
@@ -36,8 +47,8 @@ def reason(error: Exception, missing: str) -> str:
 
 
 @contextmanager
-def writing(path: Path, part: Path) -> Iterator[None]:
-    """Remove a temporary file after its context, and report errors of the disk.
+def writing(path: Path) -> Iterator[None]:
+    """Report errors of the disk.
 
     Raises
     ------
@@ -49,33 +60,171 @@ def writing(path: Path, part: Path) -> Iterator[None]:
     except (OSError, RuntimeError) as error:
         # On a full disk HDF5 raises a RuntimeError with the message of the system.
         raise DatasetError(f"{path}: cannot be written: {reason(error, 'there is no such folder')}") from error
-    finally:
-        remove(part)
 
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Yield the path of a temporary file, which then replaces the file in one step.
+    """Yield the path of an empty temporary file, which then replaces the file in one step.
 
     Raises
     ------
     DatasetError
         As `writing`. An existing file is not changed.
     """
-    part = path.with_name(f"{path.name}.part")
-    with writing(path, part):
+    with writing(path), replacing(path) as part:
+        yield part
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield the path of an empty temporary file, as `whole`; errors are not converted.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written. An existing file is not changed.
+    """
+    with _part(path) as part:
         yield part
         sync(part)
         part.replace(path)
+        sync(path.parent)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """Yield the path of an empty temporary folder, which then gets its name; with its content it is on the disk.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written. An existing folder or file is not changed.
+    """
+    part = _part_name(path)
+    try:
+        part.mkdir()
+        yield part
+        sync_all(part)
+        _replace(part, path)
+        sync(path.parent)
+    finally:
+        remove(part)
+
+
+def replace_all(contents: Mapping[Path, bytes | memoryview], *, flush: bool = True) -> None:
+    """Write or replace files; each changes in one step, and on return all are on the disk.
+
+    The files are flushed before the first of them gets its name. Without ``flush`` they may be empty or old after a
+    power cut: for what is flushed later by `sync`, and for states that are meaningless after a power cut and written
+    by threads that must not wait for the disk.
+
+    Raises
+    ------
+    OSError
+        A file cannot be written; the error names it. An existing file is not changed, or completely.
+    """
+    with ExitStack() as stack:
+        parts = {}
+        for path, content in contents.items():
+            with _named(path):
+                part = parts[path] = stack.enter_context(_part(path))
+                with part.open("r+b") as file:
+                    file.write(content)
+                    if flush:
+                        file.flush()
+                        os.fsync(file.fileno())
+        for path, part in parts.items():
+            with _named(path):
+                part.replace(path)
+    if flush:
+        for folder in dict.fromkeys(path.parent for path in parts):
+            with _named(folder):
+                sync(folder)
+
+
+def replace_bytes(path: Path, content: bytes | memoryview, *, flush: bool = True) -> None:
+    """Write or replace a file, as `replace_all`."""
+    replace_all({path: content}, flush=flush)
+
+
+def replace_text(path: Path, text: str, *, flush: bool = True) -> None:
+    """Write or replace a text file (UTF-8), as `replace_all`."""
+    replace_bytes(path, text.encode("utf-8"), flush=flush)
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder and the missing ones above it; on return they are on the disk. An existing folder is kept."""
+    missing = [each for each in (path, *path.parents) if not each.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    for each in missing:
+        sync(each.parent)
 
 
 def sync(path: Path) -> None:
-    """Flush a file or the names in a folder to the disk."""
+    """Flush a file, or the names in a folder, to the disk."""
+    if os.name == "nt" and path.is_dir():  # Windows opens no folders
+        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if not (error.errno in (errno.EINVAL, errno.ENOTSUP) and path.is_dir()):  # a file system without this call
+            raise
     finally:
         os.close(descriptor)
+
+
+def sync_all(path: Path) -> None:
+    """Flush a folder with its content to the disk."""
+    for folder, _, names in os.walk(path):
+        for name in names:
+            sync(Path(folder) / name)
+        sync(Path(folder))
+
+
+def is_part(name: str) -> bool:
+    """Return whether a file or folder of this name is a temporary one."""
+    return _PART.fullmatch(name) is not None
+
+
+@contextmanager
+def _part(path: Path) -> Iterator[Path]:
+    """Create an empty temporary file; remove it after the context unless it was renamed."""
+    part = _part_name(path)
+    options = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+    os.close(os.open(part, options, 0o666))
+    try:
+        yield part
+    finally:
+        remove(part)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Name a file in the errors of the system, instead of the temporary one."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _part_name(path: Path) -> Path:
+    return path.with_name(f".{path.name[:_LONGEST]}.{secrets.token_hex(8)}.part")
+
+
+def _replace(part: Path, path: Path) -> None:
+    """Rename a finished folder; an existing folder, which cannot be replaced in one step, is renamed first."""
+    if not path.is_dir():
+        part.rename(path)
+        return
+    old = _part_name(path).with_suffix(".old")
+    path.rename(old)
+    try:
+        part.rename(path)
+    except OSError:
+        old.rename(path)
+        raise
+    remove(old)
 
 
 def remove(path: Path) -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import traceback
-import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +17,7 @@ from xarray.indexes import RangeIndex
 from errormotion.datasets.checks import storable_violations
 from errormotion.datasets.files.containers import check_netcdf, check_zarr
 from errormotion.datasets.files.reading import require_regular
-from errormotion.datasets.files.writing import reason, remove, sync, writing
+from errormotion.datasets.files.writing import reason, replace_bytes, whole_folder, writing
 from errormotion.datasets.schemas import SCHEMA
 from errormotion.datasets.storage.compression import as_stored, encoding
 from errormotion.datasets.storage.netcdf import compose_netcdf, open_netcdf
@@ -112,20 +110,19 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     unstorable = storable_violations(ds)
     if unstorable:
         raise DatasetError(f"{path}: cannot be written:", unstorable)
-    part = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
-    with writing(path, part):
+    with writing(path):
         if path.suffix == ".zarr":
             from errormotion.datasets.storage.folder_store import FolderStore  # loads zarr
 
-            storable(ds).to_zarr(FolderStore(part), mode="w-", zarr_format=3, consolidated=False)
+            with whole_folder(path) as part:
+                storable(ds).to_zarr(FolderStore(part), mode="w-", zarr_format=3, consolidated=False)
+                _refuse_existing(path, overwrite)
         else:
             # Composed in memory, since HDF5 crashes the process if the disk is full while a file is open.
             ready = storable(ds)
-            part.write_bytes(compose_netcdf(ready, encoding(ready)))
-        _sync(part)
-        _refuse_existing(path, overwrite)
-        _replace(part, path)
-        sync(path.parent)
+            content = compose_netcdf(ready, encoding(ready))
+            _refuse_existing(path, overwrite)
+            replace_bytes(path, content)
     return path
 
 
@@ -233,31 +230,6 @@ def reading(path: str | Path) -> Iterator[None]:
 def _refuse_existing(path: Path, overwrite: bool) -> None:
     if not overwrite and (path.exists() or path.is_symlink()):
         raise DatasetError(f"{path}: already exists; choose another name, or allow overwriting")
-
-
-def _replace(part: Path, path: Path) -> None:
-    """Rename the finished part; an existing folder, which cannot be replaced in one step, is renamed first."""
-    if not path.is_dir():
-        part.replace(path)
-        return
-    old = part.with_suffix(".old")
-    path.rename(old)
-    try:
-        part.rename(path)
-    except OSError:
-        old.rename(path)
-        raise
-    remove(old)
-
-
-def _sync(path: Path) -> None:
-    """Flush a file, or a folder with its content, to the disk."""
-    for folder, _, names in os.walk(path):
-        for name in names:
-            sync(Path(folder) / name)
-        sync(Path(folder))
-    if path.is_file():
-        sync(path)
 
 
 def _tidy(ds: xr.Dataset) -> xr.Dataset:

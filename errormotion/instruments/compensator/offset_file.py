@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pydantic import Field
 
 from errormotion.datasets.files.reading import require_regular
+from errormotion.datasets.files.writing import replace_text
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator.door import OffsetDoor
@@ -126,13 +125,9 @@ class OffsetFile:
         values = dict(zip("XYZ", self._door.offset(offset), strict=True))
         self._number += 1
         content = {"schema": SCHEMA, "number": self._number, "unit": "m", "valid": self.settings.valid, **values}
-        new = self.path.with_name(f".{self.path.name}.new")
         try:
-            new.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
-            os.replace(new, self.path)
+            replace_text(self.path, json.dumps(content, allow_nan=False) + "\n")
         except (OSError, ValueError) as error:
-            with suppress(OSError):
-                new.unlink()
             raise InstrumentError(f"{self.address}: the offset cannot be written: {error}") from None
 
     def _require_open(self) -> None:

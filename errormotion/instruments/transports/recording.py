@@ -32,6 +32,7 @@ from typing import Any, ClassVar
 from zlib import crc32
 
 from errormotion.datasets.files.reading import require_regular
+from errormotion.datasets.files.writing import replace_text
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
 from errormotion.instruments.transports.base import Transport
 
@@ -312,7 +313,7 @@ def add_note(path: Path, note: Mapping[str, Any]) -> None:
             f"The note of the recording {path} has {len(text)} bytes; expected at most {MAX_NOTE_BYTES}"
         )
     head = f"{word} {rest}".rstrip()
-    path.write_text("\n".join([head, text, *lines[1 + _has_note(lines) :]]) + "\n", encoding="utf-8")
+    replace_text(path, "\n".join([head, text, *lines[1 + _has_note(lines) :]]) + "\n")
 
 
 def read_note(path: Path) -> dict[str, Any] | None:
@@ -344,4 +345,4 @@ def rewrite(path: Path, frames: Sequence[tuple[str, bytes]]) -> None:
     for line, (direction, data) in zip(lines[first:-1], frames, strict=True):
         crc = crc32(direction.encode() + data, crc)
         changed.append(f"{direction} {line.split(' ')[1]} {crc:08x} {data.hex()}")
-    path.write_text("\n".join([*changed, f"END {len(frames)} {crc:08x}"]) + "\n", encoding="ascii")
+    replace_text(path, "\n".join([*changed, f"END {len(frames)} {crc:08x}"]) + "\n")

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.writing import replace_text
 from errormotion.record.runs.entry import Entry, from_plain
 
 FILE = ".errormotion-index.json"
@@ -60,11 +59,7 @@ def load(folder: Path) -> Entries:
 def save(folder: Path, kept: Mapping[str, tuple[Stamp, Entry]]) -> None:
     """Write an index by a rename; without write permission nothing is written."""
     runs = [{**entry.plain(), **asdict(stamp)} for stamp, entry in kept.values()]
-    part = folder / f"{FILE}.{os.getpid()}.part"
     try:
-        part.write_text(json.dumps({"schema": SCHEMA, "runs": runs}, separators=(",", ":")), encoding="utf-8")
-        part.replace(folder / FILE)
+        replace_text(folder / FILE, json.dumps({"schema": SCHEMA, "runs": runs}, separators=(",", ":")), flush=False)
     except OSError as error:
         log.info("no index in %s: %s", folder, error.strerror)
-        with suppress(OSError):
-            part.unlink(missing_ok=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from errormotion.datasets.files.writing import remove, writing
+from errormotion.datasets.files.writing import whole_folder, writing
 from errormotion.report.document import Cell, Table
 
 Entry = float | str | None
@@ -89,10 +89,7 @@ def write_csv(sheets: Sequence[Sheet], folder: Path, *, comma: bool = False) -> 
 
     With ``comma``, numbers have a decimal comma and columns are separated by semicolons.
     """
-    beside = folder.with_name(folder.name + ".part")
-    remove(beside)
-    with writing(folder, beside):
-        beside.mkdir(parents=True)
+    with writing(folder), whole_folder(folder) as beside:
         for each in sheets:
             text = io.StringIO()
             writer = csv.writer(text, delimiter=";" if comma else ",", lineterminator="\r\n")
@@ -103,8 +100,6 @@ def write_csv(sheets: Sequence[Sheet], folder: Path, *, comma: bool = False) -> 
                 writer.writerow([_safe(f"# {note}")])
             name = f"{each.number:02d}-{re.sub(r'[^a-z0-9]+', '-', each.section.lower()).strip('-')[:40]}.csv"
             (beside / name).write_bytes(text.getvalue().encode("utf-8-sig"))
-        remove(folder)
-        beside.replace(folder)
     return folder
 
 

@@ -6,6 +6,7 @@ import base64
 from pathlib import Path
 
 from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.writing import replace_bytes
 
 LARGEST = 512 << 10
 """Bytes."""
@@ -34,7 +35,7 @@ def mistake(path: Path) -> str:
 def copy(path: Path, folder: Path) -> None:
     """Copy a logo into a run folder, if it can still be used."""
     if not mistake(path):
-        (folder / f"{NAME}{path.suffix.lower()}").write_bytes(read_bytes(path, LARGEST))
+        replace_bytes(folder / f"{NAME}{path.suffix.lower()}", read_bytes(path, LARGEST))
 
 
 def of_folder(folder: Path) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import threading
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from errormotion.datasets.files.writing import replace_text
 from errormotion.instruments.compensator.offset_file import SCHEMA
 from errormotion.instruments.simulators.compensator.machine import MachinePart
 from errormotion.instruments.simulators.faults import parse_fault
@@ -78,6 +78,4 @@ class SimulatedReader:
             return
         offset = dict(zip("XYZ", self.machine.offset, strict=True))
         content = {"schema": SCHEMA, "busy": self.machine.busy, "fault": self.machine.fault, **offset}
-        new = self._state.with_name(".state.new")
-        new.write_text("damaged" if self._fault == "garbage" else json.dumps(content), encoding="utf-8")
-        os.replace(new, self._state)
+        replace_text(self._state, "damaged" if self._fault == "garbage" else json.dumps(content), flush=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +16,7 @@ from errormotion.cli.commands.campaigns.init.writing import Answers, Instrument,
 from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json
 from errormotion.datasets.files.tomltext import value_of
+from errormotion.datasets.files.writing import replace_text
 from errormotion.errors import BenchError, ErrormotionError
 
 BENCH, CAMPAIGN = "bench.toml", "campaign.toml"
@@ -141,12 +141,7 @@ def _write(path: Path, text: str, force: bool) -> None:
         with path.open("x", encoding="utf-8") as file:  # fails if the file was created meanwhile
             file.write(text)
         return
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    replace_text(path, text)
 
 
 def _prompt(question: str, default: str) -> str:
