@@ -1,7 +1,7 @@
 # Each target installs its requirements into .venv if it is missing or a lock file has changed.
 # demo needs only the dependencies of errormotion; the other targets need the development packages.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo compiled test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults mutations endurance following programs pictures lowest lock
+.PHONY: help setup demo compiled test test-all lint docs wheel bench validate closed-loop fuzz guided wire faults power mutations endurance following programs pictures lowest lock
 
 BIN := .venv/bin
 ARGS ?=
@@ -56,6 +56,9 @@ wire: .venv/.dev  ## try all drivers with disturbed connections, and write docs/
 
 faults: .venv/.dev  ## kill runs, let disks fail, set clocks, and resume the runs, 10 minutes, and write docs/reliability.md
 	$(BIN)/python tools/faults.py $(ARGS)
+
+power: .venv/.dev  ## simulate 1000 power cuts while files of all kinds are written, 2 minutes, and write docs/reliability.md
+	$(BIN)/python tools/power_cuts.py $(ARGS)
 
 endurance: .venv/.dev  ## monitor a machine for 24 simulated hours with a fault every minute, and write docs/reliability.md
 	$(BIN)/python tools/endurance.py $(ARGS)

@@ -222,12 +222,17 @@ def test_times_and_other_objects_are_refused_by_name(tmp_path: Path) -> None:
 
 def test_the_recorder_keeps_what_came_before_a_refused_dataset(tmp_path: Path) -> None:
     path = tmp_path / "raw.zarr"
-    with pytest.raises(RunError, match="'index_time' does not grow"), Recorder(path, "time", 1.0, {}) as recorder:
-        recorder.put(pulses(0, 10))
-        recorder.put(pulses(10, 10))
-        recorder.put(pulses(20, 10, index_time=("pulse", np.arange(66.0))))
-        while True:
-            recorder.put(pulses(30, 10))
+
+    def record() -> None:
+        with Recorder(path, "time", 1.0, {}) as recorder:
+            recorder.put(pulses(0, 10))
+            recorder.put(pulses(10, 10))
+            recorder.put(pulses(20, 10, index_time=("pulse", np.arange(66.0))))
+            while True:
+                recorder.put(pulses(30, 10))
+
+    with pytest.raises(RunError, match="'index_time' does not grow"):
+        record()
     same(path, pulses(0, 20))
 
 

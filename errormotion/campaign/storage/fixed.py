@@ -11,12 +11,16 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
+from errormotion.datasets.clock import ORIGIN
 from errormotion.datasets.storage.zarr_folder import open_zarr
 from errormotion.errors import RunError
 
 _REMEDY = "All datasets that a method yields must be equal in what does not grow. What is measured so far is stored."
 
-PER_CHUNK = ("dropped", "invalid", "time_start")
+STARTS = ("time_start", "start", ORIGIN)
+"""Attributes that state the beginning of a dataset; the store has those of the first one."""
+
+PER_CHUNK = ("dropped", "invalid", *STARTS)
 """Attributes that differ between the datasets that a method yields."""
 
 
@@ -106,8 +110,8 @@ def stored_variables(dataset: xr.Dataset, dim: str) -> dict[str, xr.Variable]:
 
 
 def plain_attrs(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return attributes as JSON values, without those of one chunk; ``time_start`` is kept as that of the store."""
-    kept = {str(k): v for k, v in attrs.items() if k not in PER_CHUNK or k == "time_start"}
+    """Return attributes as JSON values, without the counts of one chunk."""
+    kept = {str(k): v for k, v in attrs.items() if k not in PER_CHUNK or k in STARTS}
     return {k: v.tolist() if isinstance(v, np.generic | np.ndarray) else v for k, v in kept.items()}
 
 

@@ -12,8 +12,9 @@ import os
 import stat
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import h5py  # type: ignore[import-untyped]
 import numpy as np
@@ -241,38 +242,46 @@ def _wrong_chunks(folder: Path, metadata: Mapping[str, Any], size: int) -> Itera
     items = math.prod(_chunk_shape(metadata))
     counts = [-(-size // chunk) for size, chunk in zip(metadata["shape"], _chunk_shape(metadata), strict=True)]
     largest = _most(size) if metadata["data_type"] == _TEXT else items * _item(metadata)
-    for file in _below(folder / "c"):
-        if not _is_chunk(Path(file).relative_to(folder).parts[1:], counts):
-            continue  # temporary, or written before a crash: no reader opens it
-        with open(file, "rb") as chunk:
+    for file in _chunks(str(folder / "c"), counts):
+        with open(file, "rb", buffering=0) as chunk:  # a record has thousands of chunks: a buffer would take as long
             head = chunk.read(18)
             stated = _blosc_size(head) if packed == "blosc" else _zstd_size(head)
             longer = stated is not None and packed == "zstd" and _continues(chunk, head, checked)
-        name = Path(file).relative_to(folder)
         if stated is None:
-            yield f"{name}: expected a chunk that states its size; it is truncated or damaged: copy the folder again"
-            return
-        if longer:
-            yield f"{name}: expected a chunk of one Zstandard frame; found more behind it"
-            return
-        if stated > largest:
-            yield f"{name}: expected a chunk of at most {largest} bytes; it states {stated}"
-            return
+            wrong = "that states its size; it is truncated or damaged: copy the folder again"
+        elif longer:
+            wrong = "of one Zstandard frame; found more behind it"
+        elif stated > largest:
+            wrong = f"of at most {largest} bytes; it states {stated}"
+        else:
+            continue
+        yield f"{Path(file).relative_to(folder)}: expected a chunk {wrong}"
+        return
 
 
-def _below(path: Path) -> Iterator[str]:
-    if path.is_file():
-        yield str(path)
-    for folder, _, names in os.walk(path):
-        for name in names:
-            yield os.path.join(folder, name)
+def _chunks(path: str, counts: Sequence[int]) -> Iterator[str]:
+    """Yield the files of an array with some chunks along each dimension.
+
+    Others, temporary or written before a crash, are not opened by a reader.
+    """
+    if not counts:
+        if os.path.isfile(path):
+            yield path
+        return
+    try:
+        with os.scandir(path) as inside:
+            found = [each.path for each in inside if _is_below(each.name, counts[0])]
+    except NotADirectoryError:
+        return
+    if len(counts) == 1:
+        yield from found
+    else:
+        for each in found:
+            yield from _chunks(each, counts[1:])
 
 
-def _is_chunk(key: Sequence[str], counts: Sequence[int]) -> bool:
-    """Return whether a file belongs to the values of an array with some chunks along each dimension."""
-    return len(key) == len(counts) and all(
-        part.isascii() and part.isdigit() and int(part) < count for part, count in zip(key, counts, strict=True)
-    )
+def _is_below(name: str, count: int) -> bool:
+    return name.isascii() and name.isdigit() and int(name) < count
 
 
 def _blosc_size(head: bytes) -> int | None:
@@ -298,7 +307,7 @@ def _zstd_size(head: bytes) -> int | None:
     return int.from_bytes(field, "little") + (256 if width == 2 else 0)
 
 
-def _continues(chunk: BinaryIO, head: bytes, after: int) -> bool:
+def _continues(chunk: FileIO, head: bytes, after: int) -> bool:
     """Return whether a chunk has more than one Zstandard frame and some bytes: a decoder would add further frames."""
     place = sum(_zstd_field(head))
     size = chunk.seek(0, 2)

@@ -208,8 +208,10 @@ class _Array(BackendArray):
             box = np.empty([len(each) for each in ranges], self.dtype)
         else:
             box = self._box([min(each[0], each[-1]) for each in ranges], [max(each[0], each[-1]) for each in ranges])
-            box = box[(*(slice(None, None, each.step) for each in ranges), ...)]
-        return np.asarray(box[(*(slice(None) if isinstance(each, slice) else 0 for each in key), ...)])
+            steps: tuple[Any, ...] = (*(slice(None, None, each.step) for each in ranges), ...)
+            box = box[steps]
+        kept: tuple[Any, ...] = (*(slice(None) if isinstance(each, slice) else 0 for each in key), ...)
+        return np.asarray(box[kept])  # with the dots, a single text remains an array
 
     def _box(self, first: Sequence[int], last: Sequence[int]) -> np.ndarray:
         """Return the values from one place to another, both included."""

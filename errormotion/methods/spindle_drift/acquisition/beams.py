@@ -15,7 +15,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets import clock
 from errormotion.errors import InstrumentError, MethodError
-from errormotion.methods.spindle_drift.acquisition.drift import CHUNK_DURATION
+from errormotion.methods.spindle_drift.acquisition.drift import CHUNK_DURATION, warmth
 from errormotion.methods.spindle_drift.acquisition.motions import sphere_centres
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
 from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
@@ -37,6 +37,7 @@ def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
     frame = bench.of_kind("spindle_frame")
     controller = control_of(bench)
     static = _scan_plan(bench, frame, settings)
+    static.attrs["sensors_warm"] = warmth(frame, done)
     length = round(scan_seconds(settings.steps, settings.dwell) * frame.rate)
     recorded_samples = 0
     if hasattr(controller, "elapse"):
@@ -110,7 +111,6 @@ def _scan_plan(bench: Bench, frame: Any, settings: Settings) -> xr.Dataset:
             "schema": SCHEMA,
             "machine": bench.machine,
             "start": datetime.now(UTC).isoformat(timespec="seconds"),
-            "sensors_warm": int(bool(frame.warm)),
             "sample_rate": float(frame.rate),
             "dwell": settings.dwell,
         },

@@ -64,6 +64,7 @@ def record_drift(
     first = 0 if done is None else int(done.sizes["time"])
     thermometer = bench.of_kind("thermometer") if bench.has_kind("thermometer") else None
     static = _static(bench, frame, settings, beams)
+    static.attrs["sensors_warm"] = warmth(frame, done)
     static.attrs["sample_rate"] = rate
     virtual = _start_machine(bench, settings, first / rate)
     pending = _Pending(static, rate, settings, first, thermometer, frame.encoding)
@@ -132,6 +133,24 @@ def _current_sample(done: xr.Dataset, rate: float) -> int:
     return int(done.sizes["time"]) + 1 if math.isnan(seconds) else round(seconds * rate)
 
 
+def warmth(frame: Any, done: xr.Dataset | None) -> int:
+    """Return whether the sensors are warm (1) or not (0), for all data of a record: those of an interrupted one too.
+
+    Raises
+    ------
+    MethodError
+        They were warm before the interruption, and are not any more.
+    """
+    now = int(bool(frame.warm))
+    before = now if done is None else int(done.attrs.get("sensors_warm", now))
+    if before > now:
+        raise MethodError(
+            "The sensors were warm before the interruption, and have been switched on again since. Continue when they "
+            "are warm, or start a new run."
+        )
+    return before
+
+
 def _static(bench: Bench, frame: Any, settings: Settings, beams: xr.Dataset | None) -> xr.Dataset:
     """Return a raw dataset without its samples."""
     g = frame.geometry
@@ -156,7 +175,6 @@ def _static(bench: Bench, frame: Any, settings: Settings, beams: xr.Dataset | No
         "schema": SCHEMA,
         "machine": bench.machine,
         "events": json.dumps(events),
-        "sensors_warm": int(bool(frame.warm)),
         "beam_source": "beam detection" if beams is not None else "nominal",
     }
     return xr.Dataset(variables, coords=labels, attrs=attrs)
