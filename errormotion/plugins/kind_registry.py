@@ -116,6 +116,15 @@ def members(protocol: type) -> dict[str, Any]:
     return found
 
 
+def members_of(driver: Any, protocol: Any) -> dict[str, Any]:
+    """Return the members of a contract and of its capabilities that a driver has; see `members`."""
+    found = members(protocol)
+    for capability in getattr(protocol, "capabilities", ()):
+        if _has(driver, _first(capability)):
+            found |= members(capability)
+    return {name: method for name, method in found.items() if _has(driver, name)}
+
+
 def deviations(driver: Any, protocol: type) -> list[str]:
     """Return the deviations of an instrument from a contract, one sentence each; nothing is called.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from typing import Any
 
 from errormotion import plugins
@@ -22,9 +23,14 @@ _EXPECTED = {
 
 
 def check_plugin(
-    group: Group, plugin_id: str, *, address: str | None = None, mutants: int | None = None
+    group: Group,
+    plugin_id: str,
+    *,
+    address: str | None = None,
+    mutants: int | None = None,
+    only: Sequence[str] = (),
 ) -> list[CheckResult]:
-    """Run all checks on one plugin of the registry.
+    """Run the checks on one plugin of the registry.
 
     Parameters
     ----------
@@ -34,6 +40,8 @@ def check_plugin(
         Address of the instrument or the machine; default: that of its simulator.
     mutants : int, optional
         Number of changed frames for a driver; default: as its subject states.
+    only : sequence of str
+        Names of the checks to be run; empty: all.
 
     Returns
     -------
@@ -43,20 +51,33 @@ def check_plugin(
     Raises
     ------
     PluginError
-        The id is unknown, or the plugin cannot be loaded or states no subject.
+        The id is unknown, or the plugin cannot be loaded or states no subject; or there is no check of a name.
     """
     results = []
     for subject in subjects_of(group, plugin_id, address=address):
         if mutants is not None and isinstance(subject, InstrumentSubject | CompensatorSubject):
             subject = replace(subject, mutants=mutants)
-        for result in run_checks(subject):
+        for result in run_checks(subject, only):
             results.append(replace(result, name=f"{result.name}[{subject.name}]") if subject.name else result)
     return results
 
 
-def run_checks(subject: Subject) -> list[CheckResult]:
-    """Run all checks of the kit on one subject."""
-    return [run_check(check, subject) for check in checks_for(subject)]
+def run_checks(subject: Subject, only: Sequence[str] = ()) -> list[CheckResult]:
+    """Run the checks of the kit on one subject: those of the names ``only``, or all.
+
+    Raises
+    ------
+    PluginError
+        There is no check of a name for such a subject.
+    """
+    checks = checks_for(subject)
+    names = [check.name for check in checks]
+    for name in only:
+        if name not in names:
+            near = get_close_matches(name, names, n=1)
+            hint = f". Did you mean '{near[0]}'?" if near else ""
+            raise PluginError(f"There is no check '{name}'; expected one of {', '.join(names)}{hint}")
+    return [run_check(check, subject) for check in checks if not only or check.name in only]
 
 
 def checks_for(subject: Subject) -> Sequence[Check[Any]]:

@@ -26,7 +26,18 @@ def registered(monkeypatch):
 def test_runs_all_checks_and_reports_which_do_not_apply():
     results = check_plugin("instruments", "dcon_temperature")
     assert all(result.ok for result in results)
-    assert {result.name for result in results if result.skipped} == {"stream_blocks", "monotonic_time", "counted_drops"}
+    assert {result.name for result in results if result.skipped} == {
+        *("stream_blocks", "monotonic_time", "counted_drops", "refusals")
+    }
+
+
+def test_some_checks_are_run_alone():
+    found = check_plugin("instruments", "dcon_temperature", only=("readings", "identify"))
+    assert [result.name for result in found] == ["identify", "readings"]
+    with pytest.raises(
+        PluginError, match=r"no check 'reading'; expected one of info_complete, .*Did you mean 'readings'"
+    ):
+        check_plugin("instruments", "dcon_temperature", only=("reading",))
 
 
 def test_an_address_replaces_the_simulator():

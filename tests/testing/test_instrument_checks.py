@@ -78,7 +78,12 @@ class Sound:
                 raise InstrumentTimeoutError("the sensor is silent")
             self.log.append(piece)
             text += piece
+        if text.startswith("refused"):
+            self.refuse(text)
         return text
+
+    def refuse(self, text):
+        raise InstrumentError(f"the sensor refuses: {text}")
 
     def value(self, text):
         try:
@@ -121,13 +126,17 @@ def wire(fault):
             yield from text
         elif fault == "silence" and counter >= 3:
             return
+        elif fault == "refuse" and counter >= 3:
+            yield f"refused {counter}\n"
         elif fault == "garbage" and counter == 6:
             yield "6 0.x\n"
         elif not (fault == "drop" and 9 <= counter < 12):
             yield text
 
 
-SOUND = InstrumentSubject(Sound, "sim://bench/sound", faults=("silence", "garbage", "drop", "split"), time_limit=0.5)
+SOUND = InstrumentSubject(
+    Sound, "sim://bench/sound", faults=("silence", "garbage", "refuse", "drop", "split"), time_limit=0.5
+)
 
 
 class TestSound(InstrumentConformance):
@@ -257,6 +266,17 @@ class ReplaysFromMemory(Sound):
         return wire("") if self.address.startswith("replay") else super().connect()
 
 
+class BreaksAMember(Sound):
+    @property
+    def mid_range(self):
+        return {}["range"]
+
+
+class TakesARefusalForSilence(Sound):
+    def refuse(self, text):
+        raise InstrumentTimeoutError("the sensor is silent")
+
+
 class LeavesAThread(Sound):
     ended = threading.Event()
 
@@ -291,6 +311,8 @@ BROKEN = [
     ("counted_drops", ClosesTheGap),
     ("faults", TakesGarbageForNumbers),
     ("faults", RaisesIndexErrors),
+    ("members", BreaksAMember),
+    ("refusals", TakesARefusalForSilence),
     ("record_and_replay", ReplaysFromMemory),
     ("nothing_left", LeavesAThread),
     ("nothing_left", LeavesASocket),
@@ -373,7 +395,7 @@ def test_checks_without_a_stream_do_not_apply_to_a_driver_without_one():
     assert [result.message for result in results if not result.ok] == []
     skipped = {result.name for result in results if result.skipped}
     of_streams = {"stream_blocks", "monotonic_time", "split_reads", "counted_drops", "faults"}
-    assert skipped == of_streams | {"late_answers", "time_limit", "baudrate"}
+    assert skipped == of_streams | {"refusals", "late_answers", "time_limit", "baudrate"}
 
 
 def test_faults_are_not_tried_with_a_real_device():

@@ -161,6 +161,10 @@ class CannotSayWhatItCannotSee(Sound):
     info = replace(Sound.info, cannot_see="its shape")
 
 
+class NeedsAnUnknownKind(Sound):
+    needs = Needs(("point_lsd",), SCHEMA)
+
+
 class SwallowsUnknownSettings(Sound):
     class Settings(Settings):
         model_config = ConfigDict(extra="ignore")
@@ -310,6 +314,7 @@ class ForgetsItsCalibration(Redrawn):
 
 BROKEN = [
     ("info_complete", CannotSayWhatItCannotSee),
+    ("info_complete", NeedsAnUnknownKind),
     ("settings_strict", SwallowsUnknownSettings),
     ("motions_stated", WritesProgramsOfUnknownMoves),
     ("schema", ForgetsItsVersion),

@@ -17,6 +17,7 @@ import numpy as np
 from errormotion.errors import InstrumentError
 from errormotion.plugins import InstrumentInfo, InstrumentSubject, Samples, kind_registry
 from errormotion.testing.checks import fuzz as fuzz_checks
+from errormotion.testing.checks import members as member_checks
 from errormotion.testing.checks import shared
 from errormotion.testing.checks import wire as wire_checks
 from errormotion.testing.kit import CheckFailedError, Checks, require
@@ -278,6 +279,8 @@ def _complaint(outcome: Session, sound: Session, subject: InstrumentSubject, har
     return ""
 
 
+INSTRUMENT_CHECKS.add(limit=60.0, why_not=member_checks.no_members)(member_checks.members)
+INSTRUMENT_CHECKS.add(limit=60.0, why_not=member_checks.no_refusals)(member_checks.refusals)
 INSTRUMENT_CHECKS.add(limit=60.0, why_not=wire_checks.no_late_answers)(wire_checks.late_answers)
 INSTRUMENT_CHECKS.add(why_not=wire_checks.no_time_limit)(wire_checks.time_limit)
 INSTRUMENT_CHECKS.add(why_not=wire_checks.no_baudrate)(wire_checks.baudrate)

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from errormotion import datasets
+from errormotion import datasets, plugins
 from errormotion.datasets.schemas import variants
 from errormotion.errors import ErrormotionError
 from errormotion.kinematics import twists
@@ -41,12 +41,20 @@ SAME_SINGLE = 0.1
 
 @METHOD_CHECKS.add()
 def info_complete(subject: MethodSubject) -> str:
-    """``info`` states id, summary, status, version and what the method cannot determine; ``needs`` has a raw schema."""
+    """``info`` states id, summary, status, version and what it cannot determine; ``needs`` known kinds and a schema."""
     info, needs = subject.plugin.info, subject.plugin.needs
     shared.check_info(info, MethodInfo, "id")
     blind = isinstance(info.cannot_see, tuple) and all(isinstance(text, str) and text for text in info.cannot_see)
     require(blind, f"info.cannot_see: expected a tuple of sentences, found {info.cannot_see!r}")
     require(isinstance(needs, Needs), f"needs: expected a Needs, found {type(needs).__name__}")
+    drivers = (each.cls for each in plugins.available("instruments") if each.cls is not None)
+    known = {*kind_registry.kinds(), *(driver.info.kind for driver in drivers)}
+    unknown = [kind for kind in needs.instruments if kind not in known]
+    require(
+        not unknown,
+        f"needs.instruments: no kind '{', '.join(unknown)}' is registered, and no instrument has it; expected some of "
+        f"{', '.join(sorted(known))}",
+    )
     named = needs.raw_schema.startswith("errormotion.raw.") and "/" in needs.raw_schema
     require(named, f"needs.raw_schema: expected 'errormotion.raw.NAME/VERSION', found {needs.raw_schema!r}")
     return f"{info.id} {info.version}, {info.status}"

@@ -35,12 +35,15 @@ def plugins_check(
     mutants: Annotated[
         int | None, typer.Option(min=0, help="Number of changed frames to try; default: 300, in at most 6 s.")
     ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Name of a check to run; can be repeated. Default: all.")
+    ] = None,
     json_: options.Json = False,
 ) -> None:
     """Run the conformance kit on a plugin."""
     from errormotion.cli.commands.plugins import listing as command
 
-    if not command.check_plugin(plugin, address, mutants, json_):
+    if not command.check_plugin(plugin, address, mutants, only or (), json_):
         raise typer.Exit(INVALID)
 
 

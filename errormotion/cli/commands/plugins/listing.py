@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -65,13 +66,13 @@ def show_plugin(plugin_id: str, as_json: bool) -> None:
     show(table(["setting", "default", "meaning"], rows) if rows else "This plugin has no settings.")
 
 
-def check_plugin(plugin_id: str, address: str | None, mutants: int | None, as_json: bool) -> bool:
-    """Run the conformance kit on a plugin, print each check, and return whether all passed."""
+def check_plugin(plugin_id: str, address: str | None, mutants: int | None, only: Sequence[str], as_json: bool) -> bool:
+    """Run the conformance kit on a plugin, or some of its checks; print each, and return whether all passed."""
     from errormotion import testing
     from errormotion.campaign.claims import claimed, use_of
 
     with claimed([] if address is None else [use_of(address)], "a check of a plugin"):
-        results = testing.check_plugin(group_of(plugin_id), plugin_id, address=address, mutants=mutants)
+        results = testing.check_plugin(group_of(plugin_id), plugin_id, address=address, mutants=mutants, only=only)
     good = all(result.ok for result in results)
     if as_json:
         show_json({"ok": good, "plugin": plugin_id, "checks": [asdict(result) for result in results]})
