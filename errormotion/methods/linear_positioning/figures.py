@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 OTHER_FIGURES = ("E", "R", "B")
 """Figures of merit of straightness, angles and diagonals."""
+ALIGNED_FIGURES = ("A", "A_forward", "A_backward", "E", "E_forward", "E_backward", "M")
+"""Figures of positioning that a cosine error changes."""
 DISTORTIONS = {"range_60min": "within the first 60 min, range", "range_moving": "while the axis moved, range"}
 """Figures of merit of a test with a moving axis."""
 
@@ -41,12 +43,19 @@ def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
         for name in FIGURES if along else OTHER_FIGURES:
             limit = errors.attrs.get(LIMITS.get(name, "")) if along else None
             merits += _merit(selected, name, f"{name} of {freedom} (ISO 230-2)", unit, limit)
+        if along and "aligned_value" in errors:
+            for name in ALIGNED_FIGURES:
+                merits += _merit(
+                    selected, name, f"{name} of {freedom}, corrected for the alignment", unit, kind="aligned"
+                )
     return merits
 
 
-def _merit(errors: xr.Dataset, figure: str, title: str, unit: str, limit: float | None = None) -> list[FigureOfMerit]:
+def _merit(
+    errors: xr.Dataset, figure: str, title: str, unit: str, limit: float | None = None, kind: str = "figure"
+) -> list[FigureOfMerit]:
     """Return a figure of one freedom or diagonal; nothing if it is unknown."""
-    value, bias, u = (float(errors[name].sel(figure=figure)) for name in ("figure_value", "figure_bias", "figure_u"))
+    value, bias, u = (float(errors[f"{kind}_{part}"].sel(figure=figure)) for part in ("value", "bias", "u"))
     return [FigureOfMerit(title, value, float(expanded(bias, u)), unit, limit)] if math.isfinite(value) else []
 
 

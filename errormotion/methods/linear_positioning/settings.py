@@ -36,18 +36,25 @@ class Side(PluginSettings):
     sensors: tuple[str, ...] = Field(default=(), description="names of the temperature sensors on this side")
 
 
+ASSUMED_LENGTH, ASSUMED_ALIGNMENT = 0.5e-6, 0.2e-3
+"""Standard uncertainties of lengths (relative) and of the alignment (rad) where nothing states them."""
+
+
 class Budget(PluginSettings):
     """Standard uncertainties by source, where the data do not state them (ISO/TR 230-9)."""
 
-    length: Ratio = Field(
-        default=0.5e-6, ge=0, description="relative, of the lengths of the instrument: wavelength, air, calibration"
+    length: Ratio | None = Field(
+        default=None,
+        ge=0,
+        description="relative, of the lengths of the instrument: wavelength, air, calibration; default 0.5 um/m, "
+        "assumed",
     )
-    alignment: Angle = Field(
-        default=0.2e-3,
+    alignment: Angle | None = Field(
+        default=None,
         ge=0,
         le=0.1,
-        description="of the angle between the measured line and the axis, in each of two directions; its cosine error "
-        "is corrected on average",
+        description="of the angle between the measured line and the axis, in each of two directions. If it is stated, "
+        "further figures are corrected for its mean cosine error; default 0.2 mrad, assumed, for the uncertainty only",
     )
     temperature: TemperatureStep = Field(default=0.2, ge=0, description="of the temperature of one side")
     drift: Length | None = Field(
@@ -59,6 +66,16 @@ class Budget(PluginSettings):
     scatter: Length | None = Field(
         default=None, gt=0, description="standard deviation of a reading; required with a single run"
     )
+
+    @property
+    def length_or_assumed(self) -> float:
+        """Relative standard uncertainty of lengths, stated or assumed."""
+        return ASSUMED_LENGTH if self.length is None else self.length
+
+    @property
+    def alignment_or_assumed(self) -> float:
+        """Standard uncertainty of the alignment, stated or assumed, rad."""
+        return ASSUMED_ALIGNMENT if self.alignment is None else self.alignment
 
 
 class Moving(PluginSettings):

@@ -72,8 +72,8 @@ def raw_and_truth(settings: Settings, seed: int, behaviour: Behaviour) -> tuple[
     budget = settings.uncertainty
     T = 20.0 + EXCESS_TEMPERATURE + 0.2 * generator.normal(size=(settings.runs, 1, 1))
     alpha = EXPANSION + 0.6e-6 * generator.normal()
-    scale = budget.length * generator.normal()
-    angle = budget.alignment * generator.normal(size=2)
+    scale = budget.length_or_assumed * generator.normal()
+    angle = budget.alignment_or_assumed * generator.normal(size=2)
     if along in columns:
         x[columns.index(along)] += (alpha * (T - 20.0) + scale - (angle @ angle) / 2.0) * lever
     measured_T = np.broadcast_to(T + budget.temperature * generator.normal(), departures.shape[1:])
@@ -83,8 +83,8 @@ def raw_and_truth(settings: Settings, seed: int, behaviour: Behaviour) -> tuple[
         "target_position": ("target", P, _M),
         "zero_position": ((), float(P[0]), _M),
         "functional_point": ("direction", np.zeros(3), _M),
-        "length_uncertainty": ((), budget.length, {"units": "1"}),
-        "alignment_uncertainty": ((), budget.alignment, {"units": "rad"}),
+        "length_uncertainty": ((), budget.length_or_assumed, {"units": "1"}),
+        "alignment_uncertainty": ((), budget.alignment_or_assumed, {"units": "rad"}),
         "temperature": (SENSORS, measured_T[..., None], {"units": "degC"}),
         "temperature_uncertainty": ((), budget.temperature, {"units": "K"}),
         "machine_expansion": ((), EXPANSION, {"units": "1/K"}),

@@ -43,7 +43,9 @@ def simulate_moving(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Datas
     size = 1.0 + 0.3 * generator.normal(size=len(columns))
     shape = np.array([GROWTH * (P - P[0]) * (k == along) + SHIFT for k in columns])
     change = size[:, None, None] * warmth[None, :, None] * shape[:, None, :]  # (freedom, cycle, end)
-    scale = settings.uncertainty.length * generator.normal()  # change of the instrument's scale since the cold state
+    scale = (
+        settings.uncertainty.length_or_assumed * generator.normal()
+    )  # change of the instrument's scale since the cold state
     read = change + NOISE * generator.normal(size=change.shape)
     if along in columns:
         read[columns.index(along), cold:] += scale * (P - P[0])
@@ -54,7 +56,7 @@ def simulate_moving(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Datas
         "reading_time": ("cycle", time, {"units": "s"}),
         "moving": ("cycle", moving.astype(float), {"units": "1"}),
         "functional_point": ("direction", np.zeros(3), {"units": "m"}),
-        "length_uncertainty": ((), settings.uncertainty.length, {"units": "1"}),
+        "length_uncertainty": ((), settings.uncertainty.length_or_assumed, {"units": "1"}),
     }
     coords = {"freedom": [names[name] for name in settings.freedoms], "direction": list("xyz")}
     machine = VirtualMachine(MACHINE, seed=seed)

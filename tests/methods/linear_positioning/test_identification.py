@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from errormotion.datasets.results.merit import figures_of
 from errormotion.errors import MethodError
 from errormotion.methods.linear_positioning.identification import scatter
 
@@ -67,16 +68,42 @@ def test_expansion_of_an_artefact_has_the_opposite_sign(raw_of, identify):
     np.testing.assert_allclose(errors["EX"], identify(raw_of(noisy(), P))["EX"], atol=1e-15)
 
 
-def test_mean_cosine_error_is_corrected_and_its_spread_stated(raw_of, identify):
+def test_a_stated_alignment_changes_further_figures_only(raw_of, identify):
     plain, u = identify(raw_of(noisy(), P)), 1e-3
     errors = identify(raw_of(noisy(), P), uncertainty={"length": 0.0, "alignment": u})
-    np.testing.assert_allclose(errors["EX"] - plain["EX"], u**2 * P, atol=1e-15)
+    for name in ("EX", "deviations", "figure_value"):
+        np.testing.assert_array_equal(errors[name], plain[name])
+    moved = identify(raw_of(noisy() + u**2 * P, P))
+    np.testing.assert_allclose(errors["aligned_value"], moved["figure_value"].sel(freedom="EXX"), atol=1e-15)
+    names = [each.name for each in figures_of(errors)]
+    assert {"A of EXX (ISO 230-2)", "A of EXX, corrected for the alignment"} <= set(names)
+    assert "aligned_value" not in plain
+    assert not any("corrected" in each.name for each in figures_of(plain))
+
+
+@pytest.mark.parametrize("assumed", [{}, {"length": 0.0}, {"alignment": 0.0}])
+def test_what_is_assumed_is_in_a_note_and_changes_no_figure(raw_of, identify, assumed):
+    exact = identify(raw_of(noisy(), P))
+    errors = identify(raw_of(noisy(), P), uncertainty=assumed)
+    for name in ("EX", "deviations", "figure_value"):
+        np.testing.assert_array_equal(errors[name], exact[name])
+    notes = " ".join(errors.em.notes)
+    assert ("0.2 mrad" in notes) == ("alignment" not in assumed)
+    assert ("0.5 um/m" in notes) == ("length" not in assumed)
+    assert "no expansion of the workpiece" in notes
+    assert (errors["covariance"].values[1:, 0, 0] > exact["covariance"].values[1:, 0, 0]).all()
+
+
+def test_the_one_sided_cosine_error_is_within_the_uncertainty(raw_of, identify):
+    u = 1e-3
+    errors = identify(raw_of(noisy(), P), uncertainty={"length": 0.0, "alignment": u})
     # two normal components: half the square of the angle is exponential, mean and standard deviation u^2
     angles = u * np.random.default_rng(0).normal(size=(200_000, 2))
     half = (angles**2).sum(axis=1) / 2.0
     budget = errors.em.budget().sel(group="alignment", dof="EX").values
-    np.testing.assert_allclose(budget, half.std() * P, rtol=0.02)
-    np.testing.assert_allclose(half.mean(), u**2, rtol=0.02)
+    # The readings are not corrected: the root mean square of the error, mean included.
+    np.testing.assert_allclose(budget, np.sqrt((half**2).mean()) * P, rtol=0.02)
+    assert (half <= 2.0 * np.sqrt(2.0) * u**2).mean() > 0.94
 
 
 def test_a_straightness_does_not_depend_on_the_line_of_the_instrument(raw_of, identify):

@@ -71,6 +71,7 @@ def identify_diagonals(raw: xr.Dataset, settings: Settings, info: MethodInfo, *,
     """
     notes: list[str] = []
     diagonals = evaluate_diagonals(raw, settings, notes, planned=planned)
+    notes += budget.assumptions(raw, settings)
     sources, groups, effects = shared_sources(diagonals)
     value = np.array([each.evaluated.mean[0] for each in diagonals])
     own = np.array([each.evaluated.variance[0] for each in diagonals])
@@ -101,7 +102,7 @@ def identify_diagonals(raw: xr.Dataset, settings: Settings, info: MethodInfo, *,
         reference=REFERENCE,
         method=info.id,
         method_version=info.version,
-        provenance=provenance.make(settings, raw, None, steps=["mean cosine error of the alignment corrected"]),
+        provenance=provenance.make(settings, raw, None, steps=[]),
         influence=effects,
         sources=sources,
         source_groups=groups,
@@ -253,7 +254,7 @@ def _extras(diagonals: list[EvaluatedDiagonal], square: Squareness, settings: Se
         "deviations": (
             ("diagonal", "approach", "run", "target"),
             [each.evaluated.readings.x[0] for each in diagonals],
-            {**metre, "long_name": "readings, mean cosine error corrected"},
+            {**metre, "long_name": "readings"},
         ),
         "unidirectional_mean": (mean_dims, [each.mean for each in statistics], metre),
         "unidirectional_s": (mean_dims, [each.s for each in statistics], metre),

@@ -44,7 +44,7 @@ def simulate_diagonals(
     generator = np.random.default_rng(seed)
     draw = generator.standard_normal
     diagonals, distance = lines(settings), distances(settings)
-    scale = settings.uncertainty.length * draw()
+    scale = settings.uncertainty.length_or_assumed * draw()
     shape = (settings.runs, 2, distance.shape[1])
     sign = np.array([1.0, -1.0])[:, None]
     true, read = [], []
@@ -53,7 +53,7 @@ def simulate_diagonals(
     for line, stops, moved in zip(diagonals, distance, displaced, strict=True):
         displacement = stops - stops[0]
         deviation = (moved - moved[0]) @ line.unit - behaviour.reversal / 2.0
-        angle = settings.uncertainty.alignment * draw(2)
+        angle = settings.uncertainty.alignment_or_assumed * draw(2)
         z = displacement / (displacement[-1] / 2.0) - 1.0
         drift = behaviour.offset * draw((shape[0], 1, 1)) + behaviour.slope * draw((shape[0], 1, 1)) * z
         errors = sign * behaviour.reversal / 2.0 + drift + behaviour.noise * draw(shape)
@@ -63,8 +63,8 @@ def simulate_diagonals(
         "diagonal_deviation": (STOPS, np.array(read), _M),
         "stop_point": (("diagonal", "stop", "direction"), points, _M),
         "functional_point": ("direction", np.zeros(3), _M),
-        "length_uncertainty": ((), settings.uncertainty.length, {"units": "1"}),
-        "alignment_uncertainty": ((), settings.uncertainty.alignment, {"units": "rad"}),
+        "length_uncertainty": ((), settings.uncertainty.length_or_assumed, {"units": "1"}),
+        "alignment_uncertainty": ((), settings.uncertainty.alignment_or_assumed, {"units": "rad"}),
     }
     names = [line.name for line in diagonals]
     coords = {"diagonal": names, "approach": list(APPROACHES), "direction": list("xyz")}

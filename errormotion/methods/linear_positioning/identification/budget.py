@@ -6,7 +6,9 @@ the measured line, and expansion.
 
 Alignment: along a line at the angle g to the axis, the length l is measured as ``l cos g``, too short by ``l g^2 / 2``.
 With independent components of standard uncertainty u, g^2 / 2 has an exponential distribution of mean u^2 and standard
-deviation u^2. The mean is a bias and is corrected; the standard deviation is a source.
+deviation u^2. The readings are not corrected, as the standard defines its figures: the source is the root mean square
+of this one-sided error, sqrt(2) u^2. Where the alignment is stated, further figures are corrected for the mean; their
+source is the standard deviation.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from errormotion.kinematics.iso import iso_names
 from errormotion.methods.linear_positioning.identification.expansion import Shared
 from errormotion.methods.linear_positioning.identification.reading import Readings, length_uncertainty, per_freedom
 from errormotion.methods.linear_positioning.identification.scatter import DRIFTS, Scatter
-from errormotion.methods.linear_positioning.settings import Settings
+from errormotion.methods.linear_positioning.settings import ASSUMED_ALIGNMENT, ASSUMED_LENGTH, Settings
 
 DRIFT, ALIGNMENT, LENGTH, GAIN, END = (
     *("drift from run to run", "alignment", "scale of the lengths"),
@@ -28,13 +30,41 @@ DRIFT, ALIGNMENT, LENGTH, GAIN, END = (
 """Groups of sources."""
 
 
-def alignment_bias(raw: xr.Dataset, readings: Readings, settings: Settings) -> Array:
-    """Return the mean cosine error, by which readings along the axis are too large, (target,), m."""
-    return np.asarray(-readings.lever * _alignment(raw, settings) ** 2)
+def cosine_error(raw: xr.Dataset, readings: Readings, settings: Settings) -> Array | None:
+    """Return the mean by which readings along the axis are too small by a stated alignment, (target,), m; else None."""
+    stated = stated_alignment(raw, settings)
+    return None if not stated else np.asarray(readings.lever * stated**2)
+
+
+def stated_alignment(raw: xr.Dataset, settings: Settings) -> float | None:
+    """Return the standard uncertainty of the alignment that the data or the settings state, rad; None if none does."""
+    return float(raw["alignment_uncertainty"]) if "alignment_uncertainty" in raw else settings.uncertainty.alignment
 
 
 def _alignment(raw: xr.Dataset, settings: Settings) -> float:
-    return float(raw["alignment_uncertainty"]) if "alignment_uncertainty" in raw else settings.uncertainty.alignment
+    stated = stated_alignment(raw, settings)
+    return settings.uncertainty.alignment_or_assumed if stated is None else stated
+
+
+def assumptions(raw: xr.Dataset, settings: Settings) -> list[str]:
+    """Return a note on each standard uncertainty that is assumed, because neither data nor settings state it."""
+    notes = [assumed_length(raw, settings)]
+    if stated_alignment(raw, settings) is None:
+        notes.append(
+            f"Assumed, because it is not stated: an alignment of {1e3 * ASSUMED_ALIGNMENT:g} mrad "
+            "(uncertainty.alignment). It contributes to the uncertainties only."
+        )
+    return [note for note in notes if note]
+
+
+def assumed_length(raw: xr.Dataset, settings: Settings) -> str:
+    """Return a note if the uncertainty of lengths is assumed; else an empty text."""
+    if "length_uncertainty" in raw or settings.uncertainty.length is not None:
+        return ""
+    return (
+        "Assumed, because it is not stated: an uncertainty of the instrument's lengths of "
+        f"{1e6 * ASSUMED_LENGTH:g} um/m (uncertainty.length). It contributes to the uncertainties only."
+    )
 
 
 def instrument_sources(raw: xr.Dataset, readings: Readings, settings: Settings, mean: Array) -> list[Shared]:
@@ -45,7 +75,7 @@ def instrument_sources(raw: xr.Dataset, readings: Readings, settings: Settings, 
         k = readings.freedoms.index(readings.along)
         for name, group, size in (
             (LENGTH, LENGTH, length_uncertainty(raw, settings)),
-            ("angle of the measured line to the axis", ALIGNMENT, _alignment(raw, settings) ** 2),
+            ("angle of the measured line to the axis", ALIGNMENT, np.sqrt(2.0) * _alignment(raw, settings) ** 2),
         ):
             effect = np.zeros((count, m))
             effect[k] = size * readings.lever

@@ -16,7 +16,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.linear_positioning.identification.reading import Readings
-from errormotion.methods.linear_positioning.settings import Settings, Side
+from errormotion.methods.linear_positioning.settings import Budget, Settings, Side
 
 SIDES = {"machine": 1.0, "workpiece": -1.0}
 """Sides, and the sign with which they enter a deviation."""
@@ -70,6 +70,7 @@ def expansion(raw: xr.Dataset, readings: Readings, settings: Settings, notes: li
         if alpha is None and excess is None:
             continue
         if not (alpha or u_alpha) and excess is None:  # no expansion on this side
+            notes.append(f"Assumed: no expansion of the {name} ({name}.expansion = 0).")
             continue
         if alpha is None or excess is None:
             raise MethodError(
@@ -77,6 +78,7 @@ def expansion(raw: xr.Dataset, readings: Readings, settings: Settings, notes: li
                 f"the settings) and its temperature ({name}.temperature, or the names of its sensors in "
                 f"{name}.sensors); found {'no coefficient' if alpha is None else 'no temperature'}."
             )
+        notes += _assumptions(raw, name, side, settings)
         total += sign * alpha * excess * readings.lever
         complete |= name == "machine"
         mean = excess.mean(axis=(0, 1))
@@ -94,6 +96,22 @@ def expansion(raw: xr.Dataset, readings: Readings, settings: Settings, notes: li
             "The temperature of the positioning system is not stated: the errors apply to the temperature of the test."
         )
     return Correction(total, sources, complete)
+
+
+def _assumptions(raw: xr.Dataset, name: str, side: Side, settings: Settings) -> list[str]:
+    """Return a note on each uncertainty of a side that has the default of its setting."""
+    notes = []
+    if f"{name}_expansion_uncertainty" not in raw and side.expansion_uncertainty == Side().expansion_uncertainty:
+        notes.append(
+            f"Assumed: a standard uncertainty of the coefficient of expansion of the {name} of "
+            f"{1e6 * side.expansion_uncertainty:g} um/m/K ({name}.expansion_uncertainty)."
+        )
+    if "temperature_uncertainty" not in raw and settings.uncertainty.temperature == Budget().temperature:
+        notes.append(
+            f"Assumed: a standard uncertainty of the temperature of the {name} of "
+            f"{settings.uncertainty.temperature:g} K (uncertainty.temperature)."
+        )
+    return notes
 
 
 def _along(readings: Readings, change: Array) -> Array:

@@ -114,10 +114,18 @@ def _trials(x: Array, observed: Statistics, spread: Scatter, shared: Array, targ
         _curve(curve, noise, drift / runs, z, about_zero=k > 0, generator=generator)
         for k, (curve, drift) in enumerate(zip(curves, (common, opposite), strict=False))
     ]
-    drawn[0] += draw((trials, len(shared))) @ shared + target_u * draw((trials, m))
+    of_sources = draw((trials, len(shared))) @ shared + target_u * draw((trials, m))
+    drawn[0] += of_sources
     mean = np.full((trials, 2, m), np.nan)
     if both:
         mean[:, 0], mean[:, 1] = drawn[0] + drawn[1], drawn[0] - drawn[1]
+        single = (n > 0) & ~(n > 0).all(axis=0)  # targets that were reached by this approach only
+        for approach in np.flatnonzero(single.any(axis=1)):
+            of_runs = (common + opposite) / runs
+            alone = _curve(
+                observed.mean[approach], of_mean[:, approach], of_runs, z, about_zero=False, generator=generator
+            )
+            mean[:, approach, single[approach]] = (alone + of_sources)[:, single[approach]]
     else:
         mean[:, int(measured.argmax())] = drawn[0]
     total = own + ((common + opposite) @ np.stack([np.ones_like(z), z**2]))[:, None, :]
@@ -171,6 +179,11 @@ def _curve(
     """
     known = np.isfinite(curve)
     m, trials = int(known.sum()), len(noise)
+    if m < 2:  # no line
+        out = np.full((trials, z.size), np.nan)
+        spread = np.sqrt(noise[:, known] + drift[:, :1])
+        out[:, known] = curve[known] + spread * generator.standard_normal((trials, m))
+        return out
     Z = np.stack([np.ones(m), z[known]], axis=1)
     normal = np.linalg.inv(Z.T @ Z)
     coefficient = normal @ Z.T @ curve[known]

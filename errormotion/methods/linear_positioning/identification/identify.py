@@ -38,7 +38,7 @@ class Evaluated:
     Attributes
     ----------
     readings : Readings
-        ``x`` corrected for expansion and alignment.
+        ``x`` corrected for expansion.
     mean : ndarray, (freedom, target)
         Mean bidirectional deviations; of a straightness relative to the line through its ends.
     variance : ndarray, (freedom, target)
@@ -48,6 +48,8 @@ class Evaluated:
         All sources, and those that are not estimated from the scatter of the readings.
     at_target : ndarray, (freedom,)
         Standard uncertainty that is independent from target to target, of the instrument.
+    cosine : ndarray, (target,), or None
+        Mean by which the readings along the axis are too small by a stated alignment, m.
     reference : str
     """
 
@@ -58,6 +60,7 @@ class Evaluated:
     sources: list[Shared]
     systematic: list[Shared]
     at_target: Array
+    cosine: Array | None
     reference: str
 
     def straight(self, k: int) -> bool:
@@ -76,6 +79,19 @@ class Evaluated:
             straight=self.straight(k),
             trials=trials,
         )
+
+    def aligned_figures(self, trials: int) -> Extremes | None:
+        """Return the figures along the axis, corrected for the mean cosine error; None if no alignment is stated."""
+        if self.cosine is None:
+            return None
+        k = self.readings.freedoms.index(self.readings.along)
+        x = self.readings.x.copy()
+        x[k] += self.cosine
+        of_angle = [
+            replace(each, effect=each.effect / np.sqrt(2.0)) if each.group == budget.ALIGNMENT else each
+            for each in self.systematic
+        ]
+        return replace(self, readings=replace(self.readings, x=x), systematic=of_angle).figures(k, trials)
 
     def scatter_of_means(self) -> Array:
         """Return the standard deviations of the means by the scatter of the readings, (freedom, approach, target)."""
@@ -164,9 +180,11 @@ def evaluate(raw: xr.Dataset, settings: Settings, notes: list[str], *, planned: 
     recorded = read(raw, settings, notes)
     correction = expansion(raw, recorded, settings, notes)
     x = recorded.x.copy()
+    cosine = None
     if recorded.along in recorded.freedoms:
-        bias = budget.alignment_bias(raw, recorded, settings)
-        x[recorded.freedoms.index(recorded.along)] -= correction.along + bias
+        x[recorded.freedoms.index(recorded.along)] -= correction.along
+        cosine = budget.cosine_error(raw, recorded, settings)
+        notes += budget.assumptions(raw, settings)
     readings = replace(recorded, x=x)
     stated_u = settings.uncertainty
     drift = None if stated_u.drift is None else stated_u.drift / np.sqrt(12.0)
@@ -193,6 +211,7 @@ def evaluate(raw: xr.Dataset, settings: Settings, notes: list[str], *, planned: 
         sources=[*budget.drift_sources(readings, spreads), *systematic],
         systematic=systematic,
         at_target=per_freedom(raw, "target_uncertainty", len(spreads)),
+        cosine=cosine,
         reference=f"zero of the instrument with the axis at {recorded.zero * 1e3:.6g} mm, at {temperature}",
     )
     if any(evaluated.straight(k) for k in range(len(spreads))):
@@ -267,6 +286,10 @@ def _extras(evaluated: Evaluated, settings: Settings) -> dict[str, xr.DataArray]
             for ending, values in (("", of_axis.value), ("_bias", of_axis.bias), ("_u", of_axis.u)):
                 attrs = {"units": "m", "long_name": MEANINGS[name] if not ending else f"of {name}"}
                 arrays[name + ending] = xr.DataArray(float(values[k]), attrs=attrs)
+        if (aligned := evaluated.aligned_figures(settings.trials)) is not None:
+            for part, values in (("value", aligned.value), ("bias", aligned.bias), ("u", aligned.u)):
+                attrs = {"units": "m", "long_name": f"figure_{part}, corrected for the mean cosine error"}
+                arrays[f"aligned_{part}"] = xr.DataArray(values, dims="figure", attrs=attrs)
     return arrays
 
 
@@ -292,8 +315,7 @@ def _identities(raw: xr.Dataset, axis: str, names: list[str]) -> dict[str, str]:
 
 def _steps(evaluated: Evaluated) -> list[str]:
     readings = evaluated.readings
-    steps = ["mean cosine error of the alignment corrected"] if readings.along in readings.freedoms else []
-    steps += ["corrected for expansion"] if any(source.group == "expansion" for source in evaluated.systematic) else []
+    steps = ["corrected for expansion"] if any(source.group == "expansion" for source in evaluated.systematic) else []
     names = iso_names(readings.axis)
     for name, spread in zip(readings.freedoms, evaluated.spreads, strict=True):
         steps.append(f"{names[name]}: {ONE_VARIANCE[spread.pooled]}")

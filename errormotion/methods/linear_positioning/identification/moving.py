@@ -23,6 +23,7 @@ from errormotion.datasets.results.extremes import expanded, range_from_reference
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
+from errormotion.methods.linear_positioning.identification.budget import assumed_length
 from errormotion.methods.linear_positioning.identification.reading import (
     axis_of,
     freedoms_of,
@@ -75,6 +76,8 @@ def identify_moving(raw: xr.Dataset, settings: Settings, info: MethodInfo, state
     value = np.concatenate([np.zeros_like(change[:, :1]), change[:, ~cold]], axis=1)  # (freedom, time, end)
     u_cold = noise[:, None] / np.sqrt(known)
     relative = length_uncertainty(raw, settings)
+    if note := assumed_length(raw, settings):
+        notes.append(note)
     along = DOF[direction_of(axis)]
     lever = np.array([relative * (P[order] - P[order][0]) if name == along else np.zeros(2) for name in freedoms])
     names = iso_names(axis)

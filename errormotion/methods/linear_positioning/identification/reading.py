@@ -115,7 +115,7 @@ def per_freedom(raw: xr.Dataset, name: str, count: int) -> Array:
 
 def length_uncertainty(raw: xr.Dataset, settings: Settings) -> float:
     """Return the relative standard uncertainty of lengths, of the data or else of the settings."""
-    return float(raw["length_uncertainty"]) if "length_uncertainty" in raw else settings.uncertainty.length
+    return float(raw["length_uncertainty"]) if "length_uncertainty" in raw else settings.uncertainty.length_or_assumed
 
 
 def axis_of(raw: xr.Dataset) -> str:

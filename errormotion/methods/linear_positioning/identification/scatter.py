@@ -116,6 +116,7 @@ def scatter(
     residual, coefficient, g = _lines(x, Z)
     own, factor, pooled = _own(residual, kind)
     mean_own = float(np.nanmean(own))
+    own = np.where(np.isnan(own) & np.isfinite(x).any(axis=1), mean_own, own)  # readings of runs without a line
     both = len(approaches) == 2
     half_sum = coefficient.mean(axis=0) if both else coefficient[approaches[0]]
     half_difference = (coefficient[0] - coefficient[1]) / 2.0 if both else np.zeros_like(half_sum)

@@ -7,6 +7,8 @@ import math
 import numpy as np
 import xarray as xr
 
+from errormotion.datasets.results.extremes import expanded
+from errormotion.methods.linear_positioning.figures import ALIGNED_FIGURES
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, MEANINGS
 from errormotion.methods.linear_positioning.report import drawings
 from errormotion.methods.linear_positioning.report.view import View, views
@@ -24,7 +26,9 @@ def part(source: Source, key: str) -> Part:
     """Return the chapter; ``key`` makes the identifiers of its figures unique."""
     errors, freedoms = source.errors, views(source.errors)
     limits = drawings.limits_of(errors, LIMITS) if freedoms[0].along else {}
-    sections = [Section("figures", "Figures of ISO 230-2", _figures(freedoms, limits, f"{key}-limits"))]
+    aligned = [_aligned_table(errors, freedoms[0])] if "aligned_value" in errors and freedoms[0].along else []
+    of_standard = _figures(freedoms, limits, f"{key}-limits")
+    sections = [Section("figures", "Figures of ISO 230-2", [*of_standard[:1], *aligned, *of_standard[1:]])]
     sections += [
         Section(
             f"graph-{view.name}",
@@ -92,7 +96,7 @@ def figure_table(view: View, limits: dict[str, float]) -> Table:
         value, bias, u = view.value[name], view.bias[name], view.u[name]
         rows.append(
             [
-                name.replace("_forward", "↑").replace("_backward", "↓").replace("B_mean", "mean B"),
+                _sign(name),
                 MEANINGS[name],
                 estimate(value, view.expanded(name), signed=name == "B_mean", reason="not measured in both directions"),
                 fixed(bias, decimals_of(2.0 * u, 2), signed=True) if name != "B_mean" else "",
@@ -106,6 +110,26 @@ def figure_table(view: View, limits: dict[str, float]) -> Table:
         "number of runs."
     )
     return Table(caption, ["figure", "meaning", "value", "excess", "true figure", "limit"], rows, numeric=False)
+
+
+def _aligned_table(errors: xr.Dataset, view: View) -> Table:
+    """Return the figures that are corrected for the stated alignment."""
+    rows: list[list[Cell | str]] = []
+    for name in ALIGNED_FIGURES:
+        value, bias, u = (
+            float(errors[f"aligned_{part}"].sel(figure=name)) / view.size for part in ("value", "bias", "u")
+        )
+        if math.isfinite(value):
+            rows.append([_sign(name), MEANINGS[name], estimate(value, float(expanded(bias, u)), signed=False)])
+    caption = (
+        f"Figures of {view.name} in {view.unit} corrected for the mean cosine error of the stated alignment; after ±: "
+        "expanded uncertainty, k = 2, excess included."
+    )
+    return Table(caption, ["figure", "meaning", "value"], rows, numeric=False)
+
+
+def _sign(name: str) -> str:
+    return name.replace("_forward", "↑").replace("_backward", "↓").replace("B_mean", "mean B")
 
 
 def target_tables(view: View) -> list[Block]:
@@ -151,7 +175,6 @@ def _uncertainty(errors: xr.Dataset, view: View) -> list[Block]:
         budget.table(errors.isel(position=-1), f"at {fixed(view.position[-1], 1)} mm"),
         Text(
             "Independent: from target to target, by the scatter of the readings. The error of every other source is "
-            "the same in the whole test. Bands and figures use the readings corrected for expansion and mean cosine "
-            "error."
+            "the same in the whole test. Bands and figures use the readings corrected for expansion."
         ),
     ]
